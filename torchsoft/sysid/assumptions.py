@@ -106,12 +106,20 @@ class Assumption:
 @dataclass(frozen=True)
 class Variation(Assumption):
     """An assumption with its variation: `vary` gives another recording, None where that has no
-    meaning for it. An `extension` is a parameter that the rig does not have yet; a `fault` is one
-    of a channel's sensor."""
+    meaning for it, and `by` does so by any amount [unit]. An `extension` is a parameter that the
+    rig does not have yet; a `fault` is one of a channel's sensor."""
 
     vary: Callable[[Recording], Recording | None] | None = None
+    by: Callable[[Recording, float], Recording | None] | None = None
     extension: bool = False
     fault: tuple[str, Any] | None = None
+
+    def of(self, amount: float) -> "Variation":
+        """The variation by another amount, where it can be had."""
+        by = self.by
+        if by is None:
+            return self
+        return replace(self, amount=amount, vary=lambda recording: by(recording, amount))
 
     @property
     def label(self) -> str:
@@ -160,15 +168,17 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
                               "only every second one were known", vary=sparser))  # fmt: skip
     out += [
         Variation("clock of the set-points", "known", "set-points and sensors have one clock",
-                  "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r: delayed(r, CLOCK)),
+                  "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r: delayed(r, CLOCK),
+                  by=lambda r, amount: delayed(r, 1e-3 * amount)),
         Variation("scale of the clock", "known", "clocks of set-points and sensors run alike",
                   "that of the set-points ran slower", 100 * SLOWER, "%",
-                  vary=lambda r: stretched(r, SLOWER)),
+                  vary=lambda r: stretched(r, SLOWER),
+                  by=lambda r, amount: stretched(r, 1e-2 * amount)),
     ]  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
         out.append(Variation("feed-forward", "known", "what was fed forward is known",
             f"it were {FORCE} N more", FORCE, "N",
-                              vary=lambda r: raised(r, FORCE)))  # fmt: skip
+                              vary=lambda r: raised(r, FORCE), by=raised))  # fmt: skip
     if isinstance(rig, SoftGrasp):
         out += of_the_paper(first, rig, unknown)
     pushed = {one.pushes for one in rig.actuators.values()}

@@ -239,9 +239,11 @@ def new_fits(
             if first[one.name].gain < enough:
                 return
             bar.set_description(plain(f"new fit with another {one.name} ({number} of {count})"))
-            other = refit(problem, end, one, loss, notify)
+            tried = one.of(first[one.name].favoured)
+            other = refit(problem, end, tried, loss, notify)
             if other is not None and as_stated is not None:
-                checks[one.name] = judge.fit(one, other, as_stated, checks[one.name])
+                found = judge.fit(tried, other, as_stated, checks[one.name])
+                checks[one.name] = replace(found, amount=one.amount)
             bar.update()
             yield one
             if judge.explained([checks[one.name]]):
@@ -366,7 +368,7 @@ class Judge:
         left = float(at.r @ at.r)
         rest = max(1.0, left / self.dof)
         moves = np.array([again.of(label) for label in self.labels]) - self.end.x[self.end.free]
-        favoured, sd = one.amount, (rest / max(gain, 1e-300)) ** 0.5 * one.amount
+        favoured, sd = one.amount, (rest / max(gain, 1e-300)) ** 0.5 * abs(one.amount)
         if one.label:
             c, free = again.problem.coordinates, again.free
             k = c.labels.index(one.label)
