@@ -137,11 +137,7 @@ def rolled(file: RigFile, degrees: float) -> RigFile:
 def planner(file: RigFile, stated: Goal, over: Any = None, y0: Any = None) -> Evaluator:
     """The runs of a goal's plan, of draws if there are any."""
     built = file.build()
-    free = {
-        name: one if not isinstance(one, Range) else (one.low, one.high)
-        for name, one in stated.free.items()
-    }
-    variables = Variables(built.rig, built.rig.reference, free, float(built.t[-1]))
+    variables = Variables(built.rig, built.rig.reference, stated.variables, float(built.t[-1]))
     terms = Terms(None, stated.targets, stated.limits)
     return Evaluator(
         built.rig, built.t, variables, terms, built.y0 if y0 is None else y0, over or {},

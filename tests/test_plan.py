@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tqdm import tqdm
 
 from torchsoft import simulate
 from torchsoft.cli import main
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.evaluation import Evaluator, Terms
+from torchsoft.plan.search import Search
 from torchsoft.plan.variables import Free, Variables
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.goal import Goal, drawn
@@ -136,6 +138,34 @@ def test_several_starts_begin_with_the_best() -> None:
     assert min(one.missed for one in found.history) < found.history[0].missed
     with pytest.raises(ValueError, match="finite bounds"):
         planned({"actuators.left_y.Kp": (0.0, math.inf)}, targets={"turn": TURN}, starts=3)
+
+
+def test_the_best_of_several_starts_has_its_slopes() -> None:
+    """Looks without gradient only choose among the starts."""
+    free = {"left_y": Bounds(low=-6e-3, high=6e-3, speed=0.3, after=0.2)}
+    variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
+    terms = Terms(None, {"turn": TURN}, {})
+    evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, {}, 1e-3, None)
+    search = Search(evaluator, "mean", 1.0, math.inf, tqdm(disable=True))
+    search.begin(4, 0)
+    assert np.abs(search.look(search.found.z).slopes[1]).min() > 0
+
+
+def test_a_plan_whose_finer_run_fails_is_not_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does the search lose it where a finer one cannot begin."""
+    look = Evaluator.look
+
+    def failing(self: Evaluator, z: Any, rtol: float | None = None, **how: Any) -> Any:
+        found = look(self, z, rtol, **how)
+        if (self.rtol if rtol is None else rtol) < 1e-3:
+            found.lost = "draw 0: made to fail"
+        return found
+
+    monkeypatch.setattr(Evaluator, "look", failing)
+    found = planned(targets={"turn": TURN} | PLACE)
+    assert not found.reached
+    assert found.holds == 0.0
+    assert any(text.startswith("by rtol = 1e-05 a run fails") for text in found.notices)
 
 
 def test_what_cannot_be_reached_says_why() -> None:

@@ -134,7 +134,7 @@ def plan(
     terms = Terms(objective, targets or {}, limits or {})
     evaluator = Evaluator(rig, t, variables, terms, y0, drawn, rtol, threads)
     weight = (1.0 if objective is None else 0.0) if change is None else change
-    notices = []
+    notices, checked = list[str](), None
     with tqdm(desc="plan", unit=" evaluations", disable=not progress) as bar:
         search = Search(evaluator, robust, weight, seconds, bar)
         try:
@@ -153,7 +153,7 @@ def plan(
             notices.append(f"ended after {seconds:g} s, as was asked for")
     if search.lost:
         notices.append(f"{len(search.lost)} plans could not be run, the first: {search.lost[0]}")
-    return finished(search, rig, notices, {
+    return finished(search, checked, rig, notices, {
         "torchsoft": version("torchsoft"), "method": method, "robust": robust,
         "free": {k: tuple(v) if isinstance(v, tuple) else v.model_dump() for k, v in free.items()},
         "draws": evaluator.draws, "iterations": iterations, "starts": starts, "change": weight,
@@ -170,11 +170,16 @@ def kept(look: Look) -> NDArray[np.bool_]:
     )
 
 
-def finished(search: Search, rig: Rig, notices: list[str], made_by: dict[str, Any]) -> Plan:
-    """The best plan of a search, checked by a run of a finer tolerance."""
+def finished(
+    search: Search, checked: Look | None, rig: Rig, notices: list[str], made_by: dict[str, Any]
+) -> Plan:
+    """The best plan of a search by a run of a finer tolerance: `checked`, if that is of this plan.
+    A plan whose finer run fails is not reached."""
     evaluator, z = search.evaluator, search.found.z
     rtol = CHECK * made_by["rtol"]
-    look = evaluator.look(z, rtol, gradient=False)
+    if checked is None or not np.array_equal(checked.z, z):
+        checked = evaluator.look(z, rtol, gradient=False)
+    look, held = checked, kept(checked)
     if look.lost:
         notices.append(f"by rtol = {rtol:g} a run fails: {look.lost}")
         look = search.found
@@ -185,7 +190,6 @@ def finished(search: Search, rig: Rig, notices: list[str], made_by: dict[str, An
         {name: torch.from_numpy(column) for name, column in zip(those, values.T)}
         for those, values in zip(names, (look.errors, look.excess))
     )
-    held = kept(look)
     reasons: list[str] = []
     if not held[0]:
         reasons += [

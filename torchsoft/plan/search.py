@@ -110,7 +110,7 @@ class Search:
         try:
             look = self.evaluator.look(z, gradient=gradient)
         except ValueError as refused:
-            if self.best is None:
+            if not self.history:
                 raise
             look = Look(z, torch.zeros(0), None, self.evaluator.terms, str(refused))
         if look.lost:
@@ -134,9 +134,11 @@ class Search:
 
     def value(self, look: Look) -> float:
         """What is lowered while targets and limits are kept."""
-        spread = look.errors if self.robust == "worst" else look.errors - look.errors.mean(0)
-        each = self.scale * look.value + 0.5 * np.square(spread).sum(1)
-        combined = each.max() if self.robust == "worst" else each.mean()
+        if self._worst:
+            combined = self._costs(look).max()
+        else:
+            spread = look.errors - look.errors.mean(0)
+            combined = (self.scale * look.value + 0.5 * np.square(spread).sum(1)).mean()
         return float(combined) + self.changed(look.z)[0]
 
     def changed(self, z: Array) -> tuple[float, Array]:
@@ -158,10 +160,15 @@ class Search:
         return self.best
 
     def refine(self, rtol: float) -> None:
-        """Go on by another relative tolerance, from the best plan so far."""
-        self.evaluator.rtol, z = rtol, self.found.z
+        """Go on by another relative tolerance, from the best plan so far, which is looked at anew,
+        with its slopes; it stays the best where that fails or is interrupted."""
+        self.evaluator.rtol, z, known = rtol, self.found.z, (self.best, self.best_visit)
         self.best, self._last, self.best_visit = None, None, Visit(0.0, np.inf, np.inf)
-        self.look(z)
+        try:
+            self.look(z)
+        finally:
+            if self.best is None:
+                self.best, self.best_visit = known
 
     def begin(self, starts: int, seed: int) -> None:
         """Look at so many starts: the plan as it is given, and Sobol points of all bounds. Raises
@@ -172,9 +179,10 @@ class Search:
             sampler = qmc.Sobol(variables.n, rng=np.random.default_rng(seed))
             for u in sampler.random_base2((starts - 1).bit_length())[: starts - 1]:
                 self.look(variables.spread(u), gradient=False)
-            self._last = None
         if self.best is None:
             raise ValueError(f"no start of the plan can be run: {self.lost[0]}")
+        if starts > 1:
+            self.refine(self.evaluator.rtol)
         if self.evaluator.terms.objective is not None:
             slope = float(np.linalg.norm(self.look(self.best.z).slopes[0].mean(0)))
             self.scale = UNIT / slope if slope > 0 else 1.0
@@ -246,8 +254,7 @@ class Search:
         dx = look.slopes[2]
         over = 2 * PRICE * np.maximum(look.excess, 0.0)
         each = self._cost_slopes(look) + np.einsum("dm,dmn->dn", over, dx)
-        k = int(np.argmax(self._costs(look)))
-        of = each[k] if self.robust == "worst" else each.mean(0)
+        of = each[int(np.argmax(self._costs(look)))] if self._worst else each.mean(0)
         return of + self.changed(look.z)[1]
 
     # SLSQP sees x = (ways, s): in these the price of change is round; s bounds what the worst draw

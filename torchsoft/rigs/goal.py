@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import knots
 from torchsoft.plan.planning import RTOL, Method, Robust
+from torchsoft.plan.variables import Free
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.tables import SEED, Table, from_toml
@@ -55,6 +56,14 @@ class Goal(Table):
         """Read from a TOML file. Raises `InvalidTable` in one sentence."""
         return from_toml(path, cls.model_validate)
 
+    @property
+    def variables(self) -> Free:
+        """Free variables as `plan` takes them."""
+        return {
+            name: one if isinstance(one, Bounds) else (one.low, one.high)
+            for name, one in self.free.items()
+        }
+
 
 class Planned(NamedTuple):
     """A plan, and the rig file that carries it out."""
@@ -97,13 +106,9 @@ def plan_file(file: RigFile, goal: Goal, *, progress: bool = False) -> Planned:
     """
     built = file.build()
     over, y0 = drawn(file, goal, goal.draws, goal.seed) if goal.uncertain else ({}, built.y0)
-    free = {
-        name: one if isinstance(one, Bounds) else (one.low, one.high)
-        for name, one in goal.free.items()
-    }
     found = plan(
-        built.rig, built.t, free, targets=goal.targets, limits=goal.limits, y0=y0, over=over,
-        robust=goal.robust, method=goal.method, iterations=goal.iterations, starts=goal.starts,
+        built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits, y0=y0,
+        over=over, robust=goal.robust, method=goal.method, iterations=goal.iterations, starts=goal.starts,
         seconds=goal.seconds, rtol=goal.rtol, seed=goal.seed, progress=progress,
     )  # fmt: skip
     moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
