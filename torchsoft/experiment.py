@@ -13,10 +13,12 @@ import torch
 import tyro
 from matplotlib.figure import Figure
 from torch import Tensor
+from tqdm import tqdm
 
 from torchsoft import Rig
 from torchsoft.files import replacing, write_json
 from torchsoft.plot.figures import save
+from torchsoft.threads import parallel_map
 
 C = TypeVar("C")
 T = TypeVar("T")
@@ -67,6 +69,12 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
 
 
 @torch.no_grad()
+def repeated(found: Callable[[int], T], count: int, workers: int, label: str) -> list[T]:
+    """What so many seeds gave, in their order, with progress."""
+    work = tqdm(parallel_map(found, count, workers), desc=label, total=count)
+    return [one for _, one in sorted(work, key=lambda pair: pair[0])]
+
+
 def at_the_points(rig: Rig, t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Penetration [m] and slip speed [m/s] of all contact points, (T, points) each, in the states y
     (T, size)."""

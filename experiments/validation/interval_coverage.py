@@ -25,17 +25,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 from scipy.signal import lfilter
-from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
-from torchsoft.experiment import COARSE, markdown, options, write
+from torchsoft.experiment import COARSE, markdown, options, repeated, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
-from torchsoft.threads import parallel_map
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -169,15 +167,12 @@ def run(config: Config) -> Result:
         (WHITE, 0.0, by_identify), (FOUND, config.rho, by_identify),
         (IGNORED, config.rho, by_white_least_squares),
     ):  # fmt: skip
-        work = parallel_map(
+        out[case] = repeated(
             lambda seed, rho=rho, way=way: way(
                 problem(recordings, truth, rho, seed), truth, config.rtol
             ),
-            config.seeds,
-            config.workers,
-        )
-        pairs = sorted(tqdm(work, desc=case, total=config.seeds), key=lambda pair: pair[0])
-        out[case] = [one for _, one in pairs]
+            config.seeds, config.workers, case,
+        )  # fmt: skip
     return Result(config, truth, out)
 
 

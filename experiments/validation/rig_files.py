@@ -26,14 +26,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
-from tqdm import tqdm
 
-from torchsoft.experiment import markdown, options, write
+from torchsoft.experiment import markdown, options, repeated, write
 from torchsoft.files import replacing
 from torchsoft.rigs import RigFile
 from torchsoft.sysid import Recording, Sensor, identify, record
 from torchsoft.sysid.measured import load
-from torchsoft.threads import parallel_map
 
 RIGS = Path(__file__).parents[2] / "rigs"
 
@@ -213,15 +211,12 @@ def run(config: Config) -> Result:
         text = stated(case, settings, list(truths[name]))
         (folder / "fit.toml").write_text(text, encoding="utf-8")
         data = exact(case, file, truths[name])
-        work = parallel_map(
+        answers[name] = repeated(
             lambda seed, args=(folder, data, case, truths[name]): found(
                 *args, seed, seed < config.checked
             ),
-            config.seeds,
-            config.workers,
-        )
-        pairs = sorted(tqdm(work, desc=name, total=config.seeds), key=lambda pair: pair[0])
-        answers[name] = [one for _, one in pairs]
+            config.seeds, config.workers, name,
+        )  # fmt: skip
     return Result(config, truths, answers)
 
 

@@ -108,8 +108,8 @@ def plan_file(file: RigFile, goal: Goal, *, progress: bool = False) -> Planned:
     over, y0 = drawn(file, goal, goal.draws, goal.seed) if goal.uncertain else ({}, built.y0)
     found = plan(
         built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits, y0=y0,
-        over=over, robust=goal.robust, method=goal.method, iterations=goal.iterations, starts=goal.starts,
-        seconds=goal.seconds, rtol=goal.rtol, seed=goal.seed, progress=progress,
+        over=over, robust=goal.robust, method=goal.method, iterations=goal.iterations,
+        starts=goal.starts, seconds=goal.seconds, rtol=goal.rtol, seed=goal.seed, progress=progress,
     )  # fmt: skip
     moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
     numbers = {name: value.tolist() for name, value in found.parameters.items()}
