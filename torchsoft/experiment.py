@@ -68,13 +68,13 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
     return out, perf_counter() - start
 
 
-@torch.no_grad()
 def repeated(found: Callable[[int], T], count: int, workers: int, label: str) -> list[T]:
     """What so many seeds gave, in their order, with progress."""
     work = tqdm(parallel_map(found, count, workers), desc=label, total=count)
     return [one for _, one in sorted(work, key=lambda pair: pair[0])]
 
 
+@torch.no_grad()
 def at_the_points(rig: Rig, t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Penetration [m] and slip speed [m/s] of all contact points, (T, points) each, in the states y
     (T, size)."""
