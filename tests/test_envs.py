@@ -114,6 +114,35 @@ def test_the_reward_is_of_the_goal(ready: RigEnv) -> None:
     assert info["distance"] == pytest.approx(float(distance.norm()), rel=1e-12)
 
 
+def test_an_episode_is_disturbed() -> None:
+    """By a peak that a run along the same lines has, and by another one in every episode."""
+    push = {"pushes": "disc.x", "feed_forward": "push"}
+    file = FILE.override(
+        solver={"rtol": 1e-6},
+        actuators={"push": push},
+        motion={"push": {"kind": "hold", "value": 0.5}},
+    )
+    env = small(rig=file, disturbances={"push": (-4.0, 4.0)}, duration=0.2)
+    env.reset(seed=0)
+    begun = env.moment
+    ((when, peak),) = begun.peaks.tolist()
+    assert 1 <= when <= 3
+    assert -4.0 <= peak <= 4.0
+    held = {k: Lines([0.0], x[None]) for k, x in zip(env.dynamics.actions, f64(0.0, 0.0, -6.0))}
+    env.moment = begun._replace(action=f64(0.0, 0.0, 1.0))  # -6 N; the file's -5 N are out of range
+    for _ in range(4):
+        env.step(np.array([0.0, 0.0, 1.0], np.float32))
+    times = 0.05 * torch.arange(5, dtype=torch.float64)
+    values = 0.5 + peak * (torch.arange(5) == when)
+    own = env.dynamics.rig.reference
+    reference = Reference(upper_rate=own["upper_rate"], push=Lines(times, values), **held)
+    run = simulate(env.dynamics.rig, times, y0=begun.y, reference=reference, rtol=1e-6)
+    assert run["x_disc"].abs().max() > 1e-5
+    assert (env.moment.y - run.y[-1]).abs().max() < 1e-4 * run.y[-1].abs().max()
+    env.reset()
+    assert env.moment.peaks.tolist() != [[when, peak]]
+
+
 def test_time_is_limited(ready: RigEnv) -> None:
     env = small(duration=0.1)
     env.reset(seed=0)
@@ -289,6 +318,10 @@ def test_make_vec_takes_threads() -> None:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "signal": ({"actions": {"lower_y": (0, 1)}}, "`actions` names `lower_y`; did you mean `lower_"),
+    "disturbed": (
+        {"disturbances": {"grip": (0.0, 1.0)}},
+        "`disturbances` names `grip`; signals that no action sets are upper_rate",
+    ),
     "no action": ({"actions": {}}, "`actions` is empty; name signals of lower_x"),
     "range": ({"actions": {"grip": (1.0, 1.0)}}, "must be a pair of finite numbers, low and high"),
     "channel": ({"observations": {"x_disk": (0, 1)}}, "names `x_disk`; did you mean `x_disc`"),

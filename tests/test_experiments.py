@@ -10,6 +10,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
+from conftest import f64
 
 from torchsoft import Ellipse, Prony
 
@@ -339,3 +341,36 @@ def test_startup_smoke(tmp_path: Path) -> None:
     found = json.loads((tmp_path / "summary.json").read_text())
     assert found["wheel_s"]["first run"] < 0.2 * found["fallback_s"]["first run"]
     assert found["processes_s"]["import torchsoft"] < found["processes_s"]["import torch"]
+
+
+def test_a_policy_becomes_a_controller(tmp_path: Path) -> None:
+    """Ranges of what it sees and does are folded into the network of the rig file."""
+    module = experiment("learn_policy")
+    env = module.environment()
+    policy = module.network(4, 3, seed=0)
+    rig = module.deployed(module.Config(out=tmp_path), policy, env).build().rig
+    coordinates = f64(0.2, 1e-3, -2e-3, 3e-3, 0.04)
+    rates = f64(0.5, -0.02, 0.1, -0.2, 0.03)
+    goal = f64(-0.3, 0.0)
+    seen = [1e-3 / 10e-3, 0.2, -0.02 / 0.1, 0.5 / 3.0, (-0.3 - 0.2) / 0.1, -1e-3 / 2e-3]
+    lower, upper, grip = policy(f64(*seen)).tolist()
+    expected = {
+        "lower_x": 2e3 * (12e-3 * lower + 2e-3) - 60.0 * 0.1,
+        "upper_x": 2e3 * (12e-3 * upper - 3e-3) + 60.0 * 0.2,
+        "upper_y": -13.0 + 7.0 * grip,
+    }
+    given = goal, torch.zeros_like(goal), f64(0.0)[0], coordinates, rates
+    for name, effort in expected.items():
+        law = rig.actuators[f"policy_{name}"].law
+        assert law(*given).item() == pytest.approx(effort, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_learn_policy_smoke(tmp_path: Path) -> None:
+    module = experiment("learn_policy")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    numbers = json.loads((tmp_path / "summary.json").read_text())
+    assert {one["method"] for one in numbers["trainings"]} == set(module.METHODS)
+    for near, far in zip(*numbers["deployed"]["missed_rad"].values()):
+        assert abs(near - far) < 0.1
+    assert torch.jit.load(tmp_path / "policy.pt")(f64(*[0.0] * 6)).shape == (3,)

@@ -53,13 +53,15 @@ class Goal:
 
 class Moment(NamedTuple):
     """Everything that the next step starts from: the state y (size,), the action (actions,) that
-    was reached, the control intervals since the begin, and the target (coordinates,) [m, rad] of
-    the goal; and the forces recorded there (recorded,), which observations read."""
+    was reached, the control intervals since the begin, the target (coordinates,) [m, rad] of the
+    goal, and the control interval after which each disturbance peaks, with its peak,
+    (disturbances, 2); and the forces recorded there (recorded,), which observations read."""
 
     y: Tensor
     action: Tensor
     steps: int
     target: Tensor
+    peaks: Tensor
     recorded: Tensor
 
 
@@ -86,7 +88,9 @@ class Dynamics:
     An observation holds the channels, then the distances to the goal over their scales, then the
     action that was reached. Between two control times, `interval` [s] apart, a signal goes linearly
     from one action to the next. Until `begin` [s] the rig follows its own motion, and all other
-    signals always do. `samples` are the outputs of the run that a reward of one's own is given.
+    signals always do. `disturbances` are signals that nothing observes: an episode adds a peak to
+    each, at one control time, from the one before and until the one after; between control times
+    they are lines. `samples` are the outputs of the run that a reward of one's own is given.
 
     Raises `ValueError` naming the field.
     """
@@ -94,7 +98,7 @@ class Dynamics:
     def __init__(
         self, built: BuiltRig[Rig], *, actions: Ranges, observations: Ranges, interval: float,
         goal: Goal | None, reward: Reward | None, begin: float, samples: int,
-        solver: Mapping[str, Any],
+        solver: Mapping[str, Any], disturbances: Ranges,
     ) -> None:  # fmt: skip
         self.rig, self._y0, self.solver = built.rig, built.y0, dict(solver)
         self._stepper: ImplicitStepper | None = None
@@ -115,6 +119,10 @@ class Dynamics:
             raise ValueError(f"`actions` is empty; name signals of {', '.join(rig.signals)}")
         self.actions = checked("actions", actions, rig.signals, "signals are")
         self._low, self._half = limits(self.actions)
+        others = [name for name in rig.signals if name not in self.actions]
+        self.disturbances = checked(
+            "disturbances", disturbances, others, "signals that no action sets are"
+        )
         free = ((body, i) for body, axes in rig.layout.free.items() for i in axes)
         names = (f"{body}.{COORDINATES[i]}" for body, i in free)
         self.coordinates = dict(zip(names, rig.layout.rigid))
@@ -159,8 +167,9 @@ class Dynamics:
         self._scale = torch.tensor(scale, dtype=torch.float64)
 
     def begin(self, target: Tensor | None = None) -> Moment:
-        """The moment at `begin`, after the rig's own motion. An episode has the parameters as they
-        are now, whose graph serves one backward pass. Raises `SimulationFailed`."""
+        """The moment at `begin`, after the rig's own motion, without a disturbance. An episode has
+        the parameters as they are now, whose graph serves one backward pass. Raises
+        `SimulationFailed`."""
         self._stepper = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver).stepper
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         rows = attached([self._run(t, self._y0, own).solved])[0]
@@ -169,7 +178,8 @@ class Dynamics:
             now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
         target = self.targets.mean(1) if target is None else target
         reached = (now - self._low) / self._half - 1
-        return Moment(rows.y[there], reached, 0, target, rows.recorded[there])
+        none = torch.zeros(len(self.disturbances), 2, dtype=torch.float64)
+        return Moment(rows.y[there], reached, 0, target, none, rows.recorded[there])
 
     def step(self, now: Moment, action: Tensor, knots: Tensor | None = None) -> Transition:
         """From a moment to the next control time, with an action (actions,) in [-1, 1]; `knots` are
@@ -180,11 +190,13 @@ class Dynamics:
         end = self.start + (now.steps + 1) * self.interval
         t = torch.linspace(begin, end, self.samples + 1, dtype=torch.float64)
         before, after = (self._low + self._half * (1 + a) for a in (now.action, action))
-        ends = torch.tensor([begin, end], dtype=torch.float64)
-        reference = self._following(Lines(ends, both) for both in torch.stack((before, after), -1))
+        both = torch.stack((before, after), -1)
+        reference = self._following(t[[0, -1]], torch.cat((both, self._disturbed(now))))
         outcome = self._run(t, now.y, reference, knots)
         rows = attached([outcome.solved])[0]
-        moment = Moment(rows.y[-1], action, now.steps + 1, now.target, rows.recorded[-1])
+        moment = now._replace(
+            y=rows.y[-1], action=action, steps=now.steps + 1, recorded=rows.recorded[-1]
+        )
         if self.reward is not None:
             given = self.reward(outcome.trajectory(rows), action)
             value = torch.as_tensor(given, dtype=torch.float64)
@@ -200,7 +212,8 @@ class Dynamics:
         """A short run that begins at a moment, whose first sample shows it."""
         t = self.start + now.steps * self.interval + torch.tensor([0.0, LOOK]).double()
         held = self._low + self._half * (1 + now.action)
-        reference = self._following(Lines([0.0], value[None]) for value in held)
+        held = torch.cat((held, self._disturbed(now)[:, 0]))[:, None]
+        reference = self._following(t[:1], held)
         with torch.no_grad():
             return self._run(t, now.y, reference).trajectory()
 
@@ -238,10 +251,22 @@ class Dynamics:
                     "wrap the environment in gymnasium.wrappers.ClipAction"
                 )
 
-    def _following(self, set_by_action: Iterable[Lines]) -> Reference:
-        """The rig's own reference with other signals where actions set them."""
+    def _disturbed(self, now: Moment) -> Tensor:
+        """Disturbed signals (disturbances, 2) at both ends of the interval that begins now."""
+        if not self.disturbances:
+            return now.peaks
+        steps = now.steps + torch.arange(2)
+        t = self.start + self.interval * steps.double()
+        own = torch.stack([self.rig.reference(x, list(self.disturbances))[:, 0] for x in t], -1)
+        when, peak = now.peaks[:, :1], now.peaks[:, 1:]
+        return own + torch.where((when == steps) & (steps > 0), peak, 0.0)
+
+    def _following(self, times: Tensor, values: Tensor) -> Reference:
+        """The rig's own reference with lines through values (signals, T) where actions or
+        disturbances set them."""
         own = {name: self.rig.reference[name] for name in self.rig.signals}
-        return Reference(**own | dict(zip(self.actions, set_by_action)))
+        lines = [Lines(times, row) for row in values]
+        return Reference(**own | dict(zip((*self.actions, *self.disturbances), lines)))
 
     def _run(
         self, t: Tensor, y: Tensor, reference: Reference, knots: Tensor | None = None

@@ -40,9 +40,10 @@ class RedrawnStart(UserWarning):
 class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """The rig of a file, or one built in Python, under actions at a control rate.
 
-    What `actions`, `observations`, `interval`, `goal`, `reward`, `begin` and `samples` are,
-    `torchsoft.envs.dynamics.Dynamics` says; `env.dynamics` and `env.moment` are the environment in
-    torch, with gradients.
+    What `actions`, `observations`, `interval`, `goal`, `reward`, `begin`, `disturbances` and
+    `samples` are, `torchsoft.envs.dynamics.Dynamics` says; each episode draws a peak between the
+    low and high of a disturbance, and its control time. `env.dynamics` and `env.moment` are the
+    environment in torch, with gradients.
 
     duration: time limit [s] after `begin`, a multiple of `interval`; by default the rest of the
     file's. bounds: by coordinate such as "disc.y", beyond which an episode terminates [m, rad].
@@ -63,7 +64,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         observations: Ranges, interval: float = 0.1, goal: Goal | None = None,
         reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
         bounds: Ranges | None = None, held: Sequence[str] = (), lost: float = -1.0,
-        parameters: Ranges | None = None, samples: int = 1, render_mode: Mode | None = None,
+        parameters: Ranges | None = None, disturbances: Ranges | None = None, samples: int = 1,
+        render_mode: Mode | None = None,
     ) -> None:  # fmt: skip
         self._file = RigFile.from_toml(rig) if isinstance(rig, str | Path) else rig
         if not isinstance(self._file, RigFile | BuiltRig):
@@ -71,10 +73,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 "`rig` must be a rig file, its path, or a rig with its start (`BuiltRig`), but is "
                 f"{type(rig).__name__}"
             )
-        self.parameters, self.lost = (
-            self._checked_parameters(parameters or {}),
-            number("lost", lost),
-        )
+        self.parameters = self._checked_parameters(parameters or {})
+        self.lost = number("lost", lost)
         built, solver = self._built({}), SOLVER
         if isinstance(self._file, RigFile):
             solver = self._file.solver.model_dump(exclude_none=True)
@@ -82,6 +82,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._how: dict[str, Any] = {
             "actions": actions, "observations": observations, "interval": interval, "goal": goal,
             "reward": reward, "begin": begin, "samples": samples, "solver": solver,
+            "disturbances": disturbances or {},
         }  # fmt: skip
         self.dynamics = Dynamics(built, **self._how)
         left = float(built.t[-1]) - begin if duration is None else number("duration", duration)
@@ -144,10 +145,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         versions = [x._version for x in self.dynamics.rig.parameters()]
         if self.parameters or self._begun is None or versions != self._versions:
             self._begun, self._versions = self._drawn_start(), versions
-        self.moment, self._over = (
-            self._begun._replace(target=self._drawn_target(options or {})),
-            False,
-        )
+        target, peaks = self._drawn_target(options or {}), self._drawn_peaks()
+        self.moment, self._over = self._begun._replace(target=target, peaks=peaks), False
         if self.render_mode == "human":
             self.render()
         return self._seen(self.dynamics.observe(self.moment)), self._info(self.moment)
@@ -163,6 +162,12 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if not np.isfinite(target).all():
             raise ValueError(f"`target` must be finite, but is {given}")
         return torch.from_numpy(target)
+
+    def _drawn_peaks(self) -> Tensor:
+        """Control time and height of the peak of every disturbance."""
+        ends, draw = self.dynamics.disturbances.values(), self.np_random
+        peaks = [(draw.integers(1, max(self.limit, 2)), draw.uniform(*range_)) for range_ in ends]
+        return torch.tensor(peaks, dtype=torch.float64).reshape(-1, 2)
 
     def _drawn_start(self) -> Moment:
         """The begin with parameters drawn anew."""
@@ -203,7 +208,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             info = self._info(now) | {"failure": str(failure)}
             return self._seen(dynamics.observe(now)), self.lost, True, False, info
         self.moment = done.moment
-        ended = self._ended(done.moment)
+        ended = self.ended(done.moment)
         truncated = done.moment.steps >= self.limit
         self._over = bool(ended) or truncated
         info = self._info(done.moment) | ({"ended": ended} if ended else {})
@@ -212,10 +217,10 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward = self.lost if ended else float(done.reward)
         return self._seen(done.observation), reward, bool(ended), truncated, info
 
-    def _ended(self, now: Moment) -> str:
-        """Why an episode is over, empty where it goes on."""
+    def ended(self, now: Moment) -> str:
+        """Why an episode terminates at a moment, empty where it goes on."""
         for name, (low, high) in self.bounds.items():
-            x = float(now.y[self.dynamics.coordinates[name]])
+            x = now.y[self.dynamics.coordinates[name]].item()
             if not low <= x <= high:
                 return f"{name} = {x:.4g} left its bounds, {low:g} to {high:g}"
         for body, slices in self.held.items():
