@@ -337,7 +337,7 @@ def deployed(config: Config, policy: nn.Module, env: RigEnv) -> RigFile:
     given["motion"] |= QUIET | {name: {"kind": "hold", "value": 0.0} for name in ("theta_d", "x_d")}
     given["actuators"] |= PUSHES
     path = config.out / "policy.toml"
-    path.write_text(to_toml(RigFile.model_validate(given)))
+    path.write_text(to_toml(RigFile.model_validate(given)), encoding="utf-8")
     return RigFile.from_toml(path)
 
 

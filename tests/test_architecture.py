@@ -38,7 +38,7 @@ FLOWS = {
         criterion planner design
         columns configuration rig_recordings rehearsal measured rig_design figures report .
     """,
-    "plan": "knots variables goals evaluation search planning .",
+    "plan": "knots adam variables goals evaluation search planning .",
     "rigs": """
         fields parts control motion geometry build places course balance check written goal run .
     """,

@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 from scipy.stats import qmc
 from tqdm import tqdm
 
+from torchsoft.plan.adam import ProjectedAdam
 from torchsoft.plan.evaluation import Evaluator, Look
 from torchsoft.plan.knots import Array
 from torchsoft.solve.adjoint import GradientFailed
@@ -32,6 +33,9 @@ PRICE = 30.0
 
 CLIPPED = 1.0
 """Norm of a slope at the most, for Adam."""
+
+MEMORY = 0.9, 0.999
+"""How much of its slopes, and of their squares, Adam remembers."""
 
 STAGES, SHORTER, SHORTEST = 30, 0.4, 0.01
 """Stages of SLSQP at the most; the part of the way to the targets that is aimed at when a run
@@ -227,27 +231,22 @@ class Search:
 
     def adam(self, z: Array, iterations: int, rate: float) -> None:
         """Projected Adam from z on, with squared errors and excess as a price."""
-        variables = self.evaluator.variables
-        now = torch.from_numpy(z.copy()).requires_grad_()
-        optimizer = torch.optim.Adam([now], lr=rate)
-        for i in range(iterations):
-            look = self.look(now.detach().numpy().copy())
+        adam = ProjectedAdam(z, self.evaluator.variables.nearest, MEMORY)
+        for _ in range(iterations):
+            look = self.look(adam.z)
             try:
                 slope = None if look.lost else self._priced(look)
             except GradientFailed as failure:
                 self.lost.append(str(failure))
                 slope = None
             if slope is None or not np.isfinite(slope).all():
-                assert self.best is not None
-                now.data.copy_(torch.from_numpy(self.best.z))
-                optimizer.param_groups[0]["lr"] *= 0.5
+                adam.set(self.found.z)
+                rate *= 0.5
                 continue
             norm = float(np.linalg.norm(slope))
-            now.grad = torch.from_numpy(slope * min(1.0, CLIPPED / max(norm, 1e-300)))
-            optimizer.param_groups[0]["lr"] *= 0.1 ** (1 / iterations)
-            optimizer.step()
-            now.data.copy_(torch.from_numpy(variables.nearest(now.detach().numpy())))
-        self.look(now.detach().numpy().copy(), gradient=False)
+            rate *= 0.1 ** (1 / iterations)
+            adam.step(slope * min(1.0, CLIPPED / max(norm, 1e-300)), rate)
+        self.look(adam.z, gradient=False)
 
     def _priced(self, look: Look) -> Array:
         """Slope (n,) of the value with squared errors and excess beside it."""

@@ -7,10 +7,10 @@ from importlib.metadata import version
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from torchsoft.excitation import Excitation, Knots
+from torchsoft.plan.adam import ProjectedAdam
 from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
@@ -84,8 +84,7 @@ class Search:
     def set_out(self, moves: Moves, seen: DesignEvaluation) -> None:
         """From the motion of some knots on, by gradient."""
         self.planner, self.seen, self.z = self.planner.of(moves), seen, moves.start
-        self.now = torch.from_numpy(self.z.copy()).requires_grad_(True)
-        self.adam = torch.optim.Adam([self.now], lr=self.rate, betas=MEMORY)
+        self.adam = ProjectedAdam(self.z, moves.nearest, MEMORY)
         self.best, _ = self.visit(self.z)
         self.history = [self.best]
 
@@ -103,7 +102,7 @@ class Search:
 
     def look(self) -> None:
         """Keeps the motion as it is now, if it is the best."""
-        z = self.now.detach().numpy().copy()
+        z = self.adam.z
         visit, seen = self.visit(z)
         self.history.append(visit)
         if seen is not None and visit.score < self.best.score:
@@ -111,7 +110,7 @@ class Search:
 
     def move(self, iterations: int) -> None:
         """One step, or none where the motion is lost."""
-        moves, z = self.planner.moves, self.now.detach().numpy()
+        moves, z = self.planner.moves, self.adam.z
         try:
             shifted = moves.nearest(z + self.smoothing * self.rng.standard_normal(moves.n))
             if self.robust == "worst":
@@ -126,19 +125,13 @@ class Search:
             self.lost, self.in_a_row = self.lost + 1, self.in_a_row + 1
             if self.in_a_row >= FAILURES:
                 self.in_a_row, self.rate = 0, 0.5 * self.rate
-                with torch.no_grad():
-                    self.now.copy_(torch.from_numpy(self.z))
+                self.adam.set(self.z)
             return
         self.iteration, self.in_a_row = self.iteration + 1, 0
         most = OUTLIER * float(np.median(np.abs(slopes)))
-        self.now.grad = torch.from_numpy(np.clip(slopes, -most, most))
         part = self.iteration / iterations
-        self.adam.param_groups[0]["lr"] = (
-            self.rate * min(1.0, self.iteration / 5) * (0.1 + 0.9 * (1 - part))
-        )
-        self.adam.step()
-        with torch.no_grad():
-            self.now.copy_(torch.from_numpy(moves.nearest(self.now.detach().numpy())))
+        rate = self.rate * min(1.0, self.iteration / 5) * (0.1 + 0.9 * (1 - part))
+        self.adam.step(np.clip(slopes, -most, most), rate)
         if self.iteration % LOOK == 0:
             self.look()
 
