@@ -18,7 +18,7 @@ from torchsoft.plan.evaluation import Evaluator, Terms
 from torchsoft.plan.search import Search
 from torchsoft.plan.variables import Free, Variables
 from torchsoft.rigs import RigFile
-from torchsoft.rigs.goal import Goal, drawn
+from torchsoft.rigs.goal import Goal, drawn, plan_file
 
 ROOT = Path(__file__).parents[1]
 FILE = RigFile.from_toml(ROOT / "experiments" / "reorient.toml").override(
@@ -303,6 +303,19 @@ def test_draws_of_a_goal_begin_with_the_stated_numbers() -> None:
     assert bool(((over[name] > 4e5) & (over[name] < 6e5)).all())
     assert y0.shape == (4, BUILT.rig.layout.size)
     assert not torch.equal(y0[0], y0[1])
+
+
+def test_draws_of_an_identification_begin_with_its_estimates() -> None:
+    name, other = "materials.silicone.E", "laws.dry.K_n"
+    goal = Goal.model_validate(GOAL | {"uncertain": {name: {"low": 4e5, "high": 6e5}}})
+    over, y0 = drawn(FILE, goal, 2, seed=0, known={other: [2e5, 1.9e5, 2.1e5]})
+    assert over[other].tolist() == [2e5, 1.9e5, 2.1e5]
+    assert float(over[name][0]) == 5e5
+    assert not torch.equal(y0[0], y0[1])
+    with pytest.raises(ValueError, match=f"uncertain.{name} is drawn by the identification"):
+        drawn(FILE, goal, 1, seed=0, known={name: [5e5, 5e5]})
+    with pytest.raises(ValueError, match=r"uncertain.*contact"):
+        plan_file(FILE, goal, {"contact.K_n": [1e5, 1e5]})
 
 
 def test_the_search_scales_an_objective() -> None:

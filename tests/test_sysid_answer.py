@@ -105,6 +105,32 @@ def path(result: IdentificationResult, tmp_path_factory: pytest.TempPathFactory)
     return path
 
 
+def test_draws_are_those_of_the_covariance(result: IdentificationResult) -> None:
+    """The estimates first; parameters that are not identifiable stay, and a ratio is multiplied."""
+    with pytest.warns(UserWarning, match="not identifiable"):
+        drawn = result.draws(2000, "second", seed=1)
+    seen = {e.name: e for e in result.estimates if e.identifiable and e.kind == "parameter"
+            and e.recording in (None, "second")}  # fmt: skip
+    assert 0 < len(seen) < len(drawn)
+    for name, values in drawn.items():
+        assert values.shape == (2001,)
+        assert values[0] == pytest.approx(result.recorded("second").identified[name])
+        if name in seen:
+            sd = np.log(values[1:]).std()
+            assert sd == pytest.approx(seen[name].relative_sd, rel=0.1)
+        else:
+            assert (values == values[0]).all()
+    E = next(i for i, c in enumerate(result.coordinates) if c.name == "pad.E")
+    ratio = replace(result.coordinates[E], ratio_to="contact.K_n")
+    others = [ratio if i == E else c for i, c in enumerate(result.coordinates)]
+    with pytest.warns(UserWarning, match="not identifiable"):
+        ends = [one.draws(3, "second", seed=1)["pad.E"]
+                for one in (result, replace(result, coordinates=others))]  # fmt: skip
+    assert ends[0] == pytest.approx(ends[1])  # K_n is known
+    with pytest.raises(ValueError, match="`count`"):
+        result.draws(0, "second")
+
+
 def test_the_published_schema_is_current() -> None:
     published = json.loads((ROOT / "docs" / "answer.schema.json").read_text(encoding="utf-8"))
     assert published == schema(), f"write it anew: {PUBLISH}"

@@ -12,9 +12,10 @@ Which motion brings the rig where it is wanted?
 RIG.toml is a rig file that runs, with a motion to begin with. GOAL.toml has [free.NAME] for every
 motion whose knots may move (low, high, speed, after) and every number of the file that may change
 (low, high), [targets.NAME] (channel, value, tolerance, at) and [limits.NAME] (channel, low, high,
-since, until). With [uncertain."NUMBER"] (low, high) the plan is made for draws of them. Writes the
-rig file that carries the plan out as motion.toml, with plan.json and run.nc; the exit status is 1
-where a target or limit is not kept."""
+since, until). With [uncertain."NUMBER"] (low, high) the plan is made for draws of them; with
+--answer, the file of an identification with `rig = "RIG.toml"`, for draws of what that leaves
+unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json and run.nc;
+the exit status is 1 where a target or limit is not kept."""
 
 
 def add_commands(commands: Any) -> None:
@@ -25,6 +26,8 @@ def add_commands(commands: Any) -> None:
     )  # fmt: skip
     one.add_argument("rig", type=Path, metavar="RIG.toml")
     one.add_argument("goal", type=Path, metavar="GOAL.toml")
+    said = "draw what an identification of the rig leaves unknown"
+    one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=said)
     add_out(one, default=Path("out/plan"), help="folder for the results (%(default)s)")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
     one.set_defaults(run=plan)
@@ -38,8 +41,13 @@ def plan(options: argparse.Namespace) -> int:
     from torchsoft.rigs.written import located, to_toml
 
     file, goal = RigFile.from_toml(options.rig), Goal.from_toml(options.goal)
+    known = None
+    if options.answer is not None:
+        from torchsoft.sysid.result import load_answer
+
+        known = load_answer(options.answer).draws(goal.draws, seed=goal.seed)
     try_folder(options.out, options.force)
-    found, written = plan_file(file, goal, progress=not options.no_progress)
+    found, written = plan_file(file, goal, known, progress=not options.no_progress)
     with replacing(options.out / "motion.toml") as partial:
         partial.write_text(to_toml(located(written)), encoding="utf-8")
     write_json(options.out / "plan.json", found.summary())

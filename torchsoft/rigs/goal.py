@@ -1,11 +1,12 @@
 """Goal of a rig file's motion, as a TOML file states it, and the plan that reaches it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
@@ -65,6 +66,10 @@ class Goal(Table):
         }
 
 
+Draws = Mapping[str, Sequence[float] | NDArray[np.float64]]
+"""Draws (1 + count,) of numbers of a rig file by name, the estimates first."""
+
+
 class Planned(NamedTuple):
     """A plan, and the rig file that carries it out."""
 
@@ -84,28 +89,42 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def drawn(file: RigFile, goal: Goal, count: int, seed: int) -> tuple[dict[str, Any], Any]:
+def drawn(
+    file: RigFile, goal: Goal, count: int, seed: int, known: Draws | None = None
+) -> tuple[dict[str, Any], Any]:
     """Uncertain numbers by name (1 + count, ...), the stated ones first, and the starts (1 + count,
-    size) of rigs that have them. Raises `ValueError`."""
-    rng, rows, starts = np.random.default_rng(seed), [], []
+    size) of rigs that have them; those of `known` as they are drawn there. Raises `ValueError`."""
+    rng, rows, starts, known = np.random.default_rng(seed), [], [], known or {}
+    if twice := known.keys() & goal.uncertain.keys():
+        raise ValueError(f"uncertain.{min(twice)} is drawn by the identification; leave it out")
+    names = [*goal.uncertain, *known]
     for i in range(1 + count):
         values = {name: rng.uniform(one.low, one.high) for name, one in goal.uncertain.items()}
+        values = (values if i else {}) | {name: float(one[i]) for name, one in known.items()}
         with at_field("uncertain"):
-            built = (file.override(**nested(values)) if i else file).build()
-        rows.append({name: built.rig.parameter(name).detach() for name in goal.uncertain})
+            built = (file.override(**nested(values)) if values else file).build()
+        rows.append({name: built.rig.parameter(name).detach() for name in names})
         starts.append(built.y0)
-    over = {name: torch.stack([row[name] for row in rows]) for name in goal.uncertain}
+    over = {name: torch.stack([row[name] for row in rows]) for name in names}
     return over, torch.stack(starts)
 
 
-def plan_file(file: RigFile, goal: Goal, *, progress: bool = False) -> Planned:
+def plan_file(
+    file: RigFile, goal: Goal, known: Draws | None = None, *, progress: bool = False
+) -> Planned:
     """The plan that reaches a goal, and the rig file with it. Numbers of materials and laws that
-    are free leave the start as the file has it.
+    are free leave the start as the file has it. `known` are draws of what an identification of the
+    file leaves unknown, `goal.draws` of them after the estimates
+    (`IdentificationResult.draws`); the file that is written has the estimates.
 
     Raises `ValueError` for names that the rig or its run has not, and where no start can be run.
     """
-    built = file.build()
-    over, y0 = drawn(file, goal, goal.draws, goal.seed) if goal.uncertain else ({}, built.y0)
+    if known:
+        estimates = nested({name: float(one[0]) for name, one in known.items()})
+        with at_field("uncertain"):
+            file = file.override(**estimates)
+    built, uncertain = file.build(), goal.uncertain or known
+    over, y0 = drawn(file, goal, goal.draws, goal.seed, known) if uncertain else ({}, built.y0)
     found = plan(
         built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits, y0=y0,
         over=over, robust=goal.robust, method=goal.method, iterations=goal.iterations,

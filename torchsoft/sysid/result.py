@@ -25,6 +25,7 @@ from torchsoft.display import Shown, suggestion
 from torchsoft.files import check_file, finite, replacing
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
+from torchsoft.physics.arguments import whole
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.estimate import (
@@ -300,6 +301,40 @@ class IdentificationResult(Shown):
                 stacklevel=2,
             )
         return self._identified(deepcopy(rig), one)
+
+    def draws(
+        self, count: int, recording: str | None = None, seed: int = 0
+    ) -> dict[str, NDArray[np.float64]]:
+        """What the fit leaves unknown: values (1 + count,) [unit] of the parameters by name, first
+        the estimates, then draws from the normal distribution of the coordinates within their
+        bounds. `torchsoft.plan` takes them as `over`.
+
+        Warns of parameters that are not identifiable, which stay where the search ended. Raises
+        `ValueError` for no count, and where no parameter is identifiable.
+        """
+        whole("count", count, 1)
+        one = self.recorded(recording)
+        told = {e.name for e in self.estimates if e.identifiable and e.kind == "parameter"
+                and e.recording in (None, one.name)}  # fmt: skip
+        mine = [(i, c) for i, c in enumerate(self.coordinates)
+                if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
+        free = [i for i, c in mine if c.name in told]
+        if not free:
+            raise ValueError("no parameter is identifiable, so that there is nothing to draw")
+        if weak := {c.name: one.identified[c.name] for _, c in mine if c.name not in told}:
+            warnings.warn(undetermined(weak), stacklevel=2)
+        x = np.tile(self.x, (1 + count, 1))
+        C = np.array(self.covariance, dtype=float)[np.ix_(free, free)]
+        rng = np.random.default_rng(seed)
+        x[1:, free] += rng.multivariate_normal(np.zeros(len(free)), C, count)
+        values = {
+            c.name: np.clip([c.to_value(one) for one in x[:, i]], c.low, c.high) for i, c in mine
+        }
+        for i, c in mine:
+            if c.ratio_to:  # to another unknown, or to a number that is known
+                known_one = one.identified[c.name] / c.to_value(self.x[i])
+                values[c.name] = values[c.name] * values.get(c.ratio_to, known_one)
+        return values
 
     def _rig(self, one: RecordedRig) -> Rig:
         """A rig of its own with the numbers of before the fit."""
