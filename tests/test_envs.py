@@ -143,6 +143,15 @@ def test_an_episode_is_disturbed() -> None:
     assert env.moment.peaks.tolist() != [[when, peak]]
 
 
+def test_steps_are_judged_like_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = small(judged=True, duration=0.1)
+    env.reset(seed=0)
+    assert env.step(TURN)[-1]["doubts"] == []
+    monkeypatch.setattr("torchsoft.solve.ledger.COMPRESSED", 1e-3)
+    (*_, said) = env.step(TURN)[-1]["doubts"]
+    assert "beyond linear elasticity" in said
+
+
 def test_time_is_limited(ready: RigEnv) -> None:
     env = small(duration=0.1)
     env.reset(seed=0)

@@ -20,6 +20,7 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.places import replaced
+from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
 
 Mode = Literal["rgb_array", "human"]
@@ -48,10 +49,11 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     duration: time limit [s] after `begin`, a multiple of `interval`; by default the rest of the
     file's. bounds: by coordinate such as "disc.y", beyond which an episode terminates [m, rad].
     held: bodies that terminate it when no contact touches them at a control time. lost: what the
-    reward of such an end, and of a failed run, is. parameters: ranges between which each episode
-    draws numbers of the rig file by name, such as "materials.rubber.E" [Pa] or
-    "bodies.disc.start.x" [m]; the rig is then built anew each time, which takes some tenths of a
-    second.
+    reward of such an end, and of a failed run, is. judged: whether every step is, as a run of
+    `simulate` is, by its energies and how deep its pads are pressed, in two thirds more time;
+    `info["doubts"]` then holds what is wrong. parameters: ranges between which each episode draws
+    numbers of the rig file by name, such as "materials.rubber.E" [Pa] or "bodies.disc.start.x"
+    [m]; the rig is then built anew each time, which takes some tenths of a second.
 
     `info` has the time [s], and "ended" or, where the simulation failed, "failure", as a sentence.
     Raises `ValueError` naming the field and the remedy.
@@ -65,7 +67,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
         bounds: Ranges | None = None, held: Sequence[str] = (), lost: float = -1.0,
         parameters: Ranges | None = None, disturbances: Ranges | None = None, samples: int = 1,
-        render_mode: Mode | None = None,
+        judged: bool = False, render_mode: Mode | None = None,
     ) -> None:  # fmt: skip
         self._file = RigFile.from_toml(rig) if isinstance(rig, str | Path) else rig
         if not isinstance(self._file, RigFile | BuiltRig):
@@ -74,7 +76,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 f"{type(rig).__name__}"
             )
         self.parameters = self._checked_parameters(parameters or {})
-        self.lost = number("lost", lost)
+        self.lost, self.judged = number("lost", lost), judged
         built, solver = self._built({}), SOLVER
         if isinstance(self._file, RigFile):
             solver = self._file.solver.model_dump(exclude_none=True)
@@ -212,6 +214,9 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         truncated = done.moment.steps >= self.limit
         self._over = bool(ended) or truncated
         info = self._info(done.moment) | ({"ended": ended} if ended else {})
+        if self.judged:
+            found = doubts(done.outcome.trajectory(), self.dynamics.rig)
+            info["doubts"] = list(found.values())
         if self.render_mode == "human":
             self.render()
         reward = self.lost if ended else float(done.reward)
