@@ -39,7 +39,7 @@ docs: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("torchsoft needs Python 3.11 or newer; set PYTHON=..." if sys.version_info < (3, 11) else 0)'
-	@echo "setting up $(VENV) (once, about two minutes)"
+	@echo "setting up $(VENV) (once, two to ten minutes)"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	$(BIN)/python -m torchsoft.solve.kernel.build

@@ -532,6 +532,18 @@ def test_columns_may_stand_in_any_order_beside_others(loaded: Callable[..., Any]
     assert one.fingerprint == plain.fingerprint
 
 
+def test_a_laboratorys_headings_stand_for_ours(loaded: Callable[..., Any]) -> None:
+    def change(table: Table) -> None:
+        at = next(i for i, cell in enumerate(table[0]) if cell.startswith("x_C "))
+        table[0][at] = table[0][at].replace("x_C", "Disc x")
+
+    plain = loaded().problem.recordings[0]
+    one = loaded(change, 'columns."Disc x" = "x_C"\n' + CONFIG).problem.recordings[0]
+    assert one.fingerprint == plain.fingerprint
+    with pytest.raises(ValueError, match="x_D' is no channel of the rig; did you mean"):
+        loaded(change, 'columns."Disc x" = "x_D"\n' + CONFIG)
+
+
 def test_a_constant_stands_for_a_column_that_is_missing(
     loaded: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -110,7 +110,8 @@ def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Fou
     bad = replace(answer, residuals=residuals, chi2_stated=200.0)
     first = "The model does not explain the data: residuals of F_y are 29 times the stated noise"
     assert bad.table().startswith(first)
-    assert "200 against the stated noise" in bad.headline
+    assert "(χ² = 200), and intervals may miss the truth" in bad.headline
+    assert "identifiable" not in bad.headline
     assert first in page_of(bad, *traces(bad, problem, None))
 
 

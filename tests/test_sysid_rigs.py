@@ -154,7 +154,11 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
         replaced("lead = 0.0", "position_sd = 1e-3"),
         "position_sd is of the paper's rig",
     ),
-    "columns alone": (TOML, replaced('rig = "rig.toml"', ""), "columns rename those of a `rig`"),
+    "columns": (
+        TOML,
+        replaced('camera = "x_disc"', 'camera = "x_dsk"'),
+        "columns.camera = 'x_dsk'",
+    ),
     "unit": (CSV, replaced("camera (mm)", "camera (kg)"), "column `camera` cannot be in 'kg'"),
     "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: did you mean `y_disc`"),
     "own name": (CSV, replaced("camera", "x_disc"), "`x_disc` is not known"),
@@ -225,7 +229,7 @@ def test_a_rehearsal_says_what_an_experiment_would_identify(folder: Path) -> Non
 @pytest.mark.parametrize(
     ("change", "more", "words"),
     [
-        (replaced('rig = "rig.toml"', ""), (), "columns rename those of a `rig` file"),
+        (replaced('rig = "rig.toml"', ""), (), "a rehearsal simulates the rig of a file"),
         (
             lambda text: text,
             ("run.csv",),

@@ -3,7 +3,7 @@ The paper's manipulation
 ========================
 
 How does the contact force spread over the pads while the disc rolls? A disc is grasped between two
-silicone pads and rolled by 20 mm; the picture shows the forces on every touching node at 5 s.
+rubber pads and rolled by 20 mm; the picture shows the forces on every touching node at 5 s.
 """
 
 import torch

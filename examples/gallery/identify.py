@@ -15,10 +15,8 @@ import matplotlib.pyplot as plt
 from torchsoft.sysid import identify
 from torchsoft.sysid.measured import load
 
-folder = next(
-    path / "examples" / "identify" for path in (Path.cwd(), *Path.cwd().parents)
-    if (path / "examples" / "identify" / "rolling.csv").exists()
-)  # fmt: skip
+here = Path("examples") / "identify"  # in the repository
+folder = next((p / here for p in (Path.cwd(), *Path.cwd().parents) if (p / here).exists()), here)
 print((folder / "rolling.csv").read_text(encoding="utf-8").splitlines()[0])
 
 question = """

@@ -10,8 +10,8 @@ import matplotlib.pyplot as plt
 import torch
 from torch import nn
 
-from torchsoft import Parameters, Reference, SoftGrasp
-from torchsoft.excitation import CATALOGUE
+from torchsoft import Parameters, SoftGrasp
+from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Unknown, identify, record
 
 
@@ -28,19 +28,22 @@ class Pressed(nn.Module):
         return (E - self.mu * torch.exp(-self.fall * F_N) * F_N).clamp(min=0.0) / (R + 10.0)
 
 
-def build(settings: Parameters, reference: Reference) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=Pressed(mu=0.5, fall=0.02))  # where to begin
-
-
 # a bench is stood in for by the simulator: a light grasp, shaken, with noise of the sensors
 p = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2})
 motion = CATALOGUE["light shaking"].model_copy(update={"duration": 1.2})
 sensors = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
 truth = {"contact.friction.mu": 0.7, "contact.friction.fall": 0.05}
-made = record("bench", motion, p, p, sensors, build=build, values=truth)
+plain = begin(motion, p).rig
+
+
+def grasp(mu: float, fall: float) -> SoftGrasp:
+    return SoftGrasp(plain.settings, plain.reference, friction=Pressed(mu, fall))
+
+
+made = record("bench", begin(motion, p), grasp(*truth.values()), sensors)
 
 # a recording is a rig with the reference that it followed, and samples (times, values) by channel
-recording = Recording("bench", made.rig, made.samples)
+recording = Recording("bench", grasp(mu=0.5, fall=0.02), made.samples)
 problem = Problem([recording], sensors, {name: Unknown() for name in truth})
 result = identify(problem, rtol=1e-4, assumptions="trusted")
 print(result.table())

@@ -50,13 +50,10 @@ def add_commands(commands: Any) -> None:
 
 def add_command(one: argparse.ArgumentParser) -> None:
     """Arguments of either."""
-    one.add_argument(
-        "files",
-        nargs="+",
-        type=Path,
-        metavar="CONFIG.toml" if one.prog.endswith("rehearse") else "DATA.csv ... CONFIG.toml",
-        help="data files and one configuration",
-    )
+    metavar, said = "DATA.csv ... CONFIG.toml", "data files and a configuration"
+    if one.prog.endswith("rehearse"):
+        metavar, said = "CONFIG.toml", "the configuration"
+    one.add_argument("files", nargs="+", type=Path, metavar=metavar, help=said)
     add_out(one, default=Path("out/identify"), help="folder for the results (%(default)s)")
     one.add_argument("--workers", type=int, help="threads, one recording each (fit.workers)")
     one.add_argument(

@@ -18,7 +18,7 @@ from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.initial_state import AtRest, Standing
+from torchsoft.sysid.initial_state import SETTLE, AtRest, Standing
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Nuisance, Sensor
@@ -179,6 +179,11 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         out.append(Variation("feed-forward", "known", "what was fed forward is known",
             f"it were {FORCE} N more", FORCE, "N",
                               vary=lambda r: raised(r, FORCE), by=raised))  # fmt: skip
+    if isinstance(first.start, Standing):
+        lead, other = first.start.lead, 0.0 if first.start.lead else SETTLE
+        stated = f"bodies were put where they stand {lead:g} s before the first sample (lead)"
+        out.append(Variation("lead", "law", stated, f"it were {other:g} s",
+                             vary=partial(led, lead=other)))  # fmt: skip
     if isinstance(rig, SoftGrasp):
         out += of_the_paper(first, rig, unknown)
     pushed = {one.pushes for one in rig.actuators.values()}
@@ -340,6 +345,14 @@ def retimed(recording: Recording, rate: float, shift: float) -> Recording | None
         return None
     return with_reference(
         recording, **{name: Retimed(deepcopy(one), rate, shift) for name, one in known.items()}
+    )
+
+
+def led(recording: Recording, lead: float) -> Recording | None:
+    """Bodies put where they stand another time [s] before the first sample."""
+    start = recording.start
+    return (
+        replace(recording, start=start._replace(lead=lead)) if isinstance(start, Standing) else None
     )
 
 

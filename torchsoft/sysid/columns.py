@@ -15,7 +15,7 @@ import xarray as xr
 
 from torchsoft import csvfile
 from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS
-from torchsoft.display import enumerated, nearest
+from torchsoft.display import enumerated, nearest, suggestion
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
@@ -32,6 +32,16 @@ class Vocabulary(NamedTuple):
     signals: tuple[str, ...]
     needed: tuple[str, ...] = ()
     headings: Mapping[str, str] = {}
+
+    def renamed(self, headings: Mapping[str, str]) -> "Vocabulary":
+        """With headings of other names. Raises `ValueError` for one that stands for no column."""
+        for heading, name in headings.items():
+            if name not in self.units:
+                raise ValueError(
+                    f"columns.{heading} = {shown(name)} is no channel of the rig; "
+                    f"{suggestion(name, self.units, 'there are')}"
+                )
+        return self._replace(headings=headings)
 
     @property
     def measured(self) -> tuple[str, ...]:

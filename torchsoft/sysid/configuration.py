@@ -199,10 +199,10 @@ class Config(Table):
 
     `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors`
     are tables by the dotted names of parameters and by channels. With a `rig` file the names are
-    those of its tables, `settings` replaces fields of it, and `columns` has channels and signals by
-    headings of another name; `heldout` names recordings that
-    are predicted and not fitted, `ignore` columns that are left out, and `acknowledged` findings
-    that are no mistakes. `missing` and `start` hold for all recordings that say nothing else.
+    those of its tables, and `settings` replaces fields of it. `columns` has channels and signals by
+    headings of another name, `heldout` names recordings that are predicted and not fitted, `ignore`
+    columns that are left out, and `acknowledged` findings that are no mistakes. `missing` and
+    `start` hold for all recordings that say nothing else.
     `compare` has competing laws by name.
     """
 
@@ -230,8 +230,6 @@ class Config(Table):
     @model_validator(mode="after")
     def _the_rig_says_what_it_is_made_of(self) -> "Config":
         if self.rig is None:
-            if self.columns:
-                raise ValueError("columns rename those of a `rig` file, and there is none")
             return self
         for field in ("pads", "missing"):
             if field in self.model_fields_set:

@@ -387,7 +387,12 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     stated = read_config(config) if stated is None else stated
     entries, tables = sources(data, config, stated), dict[str, Tables]()
     file, columns = None, PAPER
-    if stated.rig is not None:
+    if stated.rig is None:
+        try:
+            columns = PAPER.renamed(stated.columns)
+        except ValueError as error:
+            raise ValueError(f"{config}: {error}") from None
+    else:
         try:
             file = RigFile.from_toml(config.parent / stated.rig)
             columns = vocabulary(file.assemble(), stated.columns)

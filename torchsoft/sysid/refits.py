@@ -71,6 +71,9 @@ def ended(
     return End(x, at, free, tuple(which), base, steps, rtol, workers, journal)
 
 
+EARLY = 2e-3
+"""Steps [s] before those of the fit, where a run begins earlier in a variation."""
+
 WRONG = {"bias": 1e4, "delay": 0.02, "gain": 0.5, "drift": 1e4, "clock": 0.05}
 """How far a fault of a sensor is looked for: bias and drift [/s] over the noise, delay [s], gain
 [1], clock [1]."""
@@ -129,12 +132,22 @@ def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None
     other = varied(problem, end.which, one)
     if isinstance(other, str):
         return None, other
-    got = other.residuals(
-        Runner(other.recordings, end.workers, end.journal), end.x, end.which, end.steps
-    )
+    runner = Runner(other.recordings, end.workers, end.journal)
+    steps = {r.name: since(end.steps[r.name], float(r.times[0] - r.start.lead))
+             for r in other.recordings if r.name in end.steps}  # fmt: skip
+    got = other.residuals(runner, end.x, end.which, steps)
     if got.lost:
         return None, f"a run failed: {next(iter(got.lost.values())).reason}"
     return got.r - end.base.r, ""
+
+
+def since(steps: Frozen, begin: float) -> Frozen:
+    """The same steps of a run that begins at another time [s]."""
+    knots = steps.knots
+    if begin == knots[0]:
+        return steps
+    early = np.arange(begin, knots[0], EARLY) if begin < knots[0] else np.array([begin])
+    return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
 
 
 class Refit(NamedTuple):

@@ -236,8 +236,8 @@ class IdentificationResult(Shown):
 
     @property
     def headline(self) -> str:
-        """First line of a report: whether the model explains the data, and how many parameters are
-        identifiable."""
+        """First line of a report: that the model does not explain the data, or how many parameters
+        are identifiable."""
         mine = [e for e in self.estimates if e.kind == "parameter"]
         worst = max(self.residuals, key=lambda one: one.stated, default=None)
         text = (
@@ -249,7 +249,10 @@ class IdentificationResult(Shown):
         if worst is None or worst.stated < UNEXPLAINED:
             return text
         size = f"residuals of {worst.channel} are {worst.stated:.2g} times the stated noise"
-        return f"The model does not explain the data: {size}; {text}"
+        return (
+            f"The model does not explain the data: {size} (χ² = {self.chi2_stated:.3g}), and "
+            "intervals may miss the truth"
+        )
 
     def recorded(self, recording: str | None = None) -> RecordedRig:
         """A recording and its rig, the first one by default. Raises `ValueError` for one that is

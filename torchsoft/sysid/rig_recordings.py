@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from torchsoft.channels import UNITS
-from torchsoft.display import suggestion
 from torchsoft.physics.motion import Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
@@ -22,7 +21,6 @@ from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Sensor, by_channel
-from torchsoft.tables import shown
 
 APART = {"m": 1e-3, "rad": 0.05}
 """How far [m, rad] the first sample of a coordinate may be from the file's start, besides what its
@@ -39,13 +37,7 @@ def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
     known |= {name: touch.unit(name) for name in touch}
     names = (*signals, *(f"{name}_dot" for name in signals), *measurable(rig), *touch)
     columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
-    for heading, name in headings.items():
-        if name not in columns:
-            raise ValueError(
-                f"columns.{heading} = {shown(name)} is no channel of the rig; "
-                f"{suggestion(name, columns, 'there are')}"
-            )
-    return Vocabulary(columns, signals, headings=headings)
+    return Vocabulary(columns, signals).renamed(headings)
 
 
 def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | None) -> Sampled:
