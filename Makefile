@@ -14,7 +14,7 @@ test: $(STAMP)
 	$(BIN)/python -m pytest
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow --ignore tests/hostile
+	$(BIN)/python -m pytest -m slow --dist worksteal --ignore tests/hostile
 
 # the newest Python that has wheels of everything; a plain install of torch brings some GB of CUDA
 NEWEST ?= python3.13
@@ -23,7 +23,7 @@ test-newest:
 
 test-hostile: $(STAMP)
 	rm -rf out/hostile
-	$(BIN)/python -m pytest -m slow tests/hostile --timeout 1800
+	$(BIN)/python -m pytest -m slow --dist worksteal tests/hostile --timeout 1800
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

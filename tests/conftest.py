@@ -1,5 +1,7 @@
 """Shared rigs and states: at rest, in the grasp, rolling, and at random."""
 
+import gc
+
 import pytest
 import torch
 from torch import Tensor
@@ -11,6 +13,7 @@ from torchsoft.physics.state import State
 register_method()
 
 torch.set_num_threads(1)
+gc.set_threshold(50_000, 20, 20)
 
 COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
@@ -90,6 +93,12 @@ def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
             velocity=moved(state.velocity, slip * f64(1.0, 1.0, 50.0)),
         )
     )
+
+
+def pytest_collection_finish() -> None:
+    """Keep modules out of garbage collections, which are a twentieth of the time else."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(params=["massless", "inertial"])

@@ -39,6 +39,23 @@ def at_random(start: Start, seed: int) -> Tensor:
     return shaken(rig, rig.unpack(y0), seed)
 
 
+@torch.no_grad()
+def telling(start: Start) -> int:
+    """The first seed of a state in which every contact touches at some of its points only; of all
+    that touch some stick and some slip."""
+    rig = start[0]
+    for seed in range(100):
+        touching, slipping = [], []
+        for one in rig.evaluate(0.01, rig.unpack(at_random(start, seed))).interfaces.values():
+            on = one.frame.g > 0
+            touching.append(on)
+            slipping.append(one.out[..., 6][on] != 0)
+        some = torch.cat(slipping)
+        if all(on.any() and not on.all() for on in touching) and some.any() and not some.all():
+            return seed
+    raise AssertionError("no state touches, sticks and slips at every contact")
+
+
 def assert_power_balanced(start: Start, seed: int, t: float = 0.01) -> None:
     """dH/dt = supplied + driven - dissipated to rounding, no R field supplies power, and every
     transformer is dual."""

@@ -251,13 +251,12 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
 def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """The command, carried out in this process; its folder and its data."""
     folder = tmp_path_factory.mktemp("command")
-    (folder / "rig.toml").write_text(CONFIG)
+    (folder / "rig.toml").write_text(f'{CONFIG}assumptions = "trusted"\n')
     files = [str(write(folder / "data.csv", rows(42))), str(folder / "rig.toml")]
     assert main(["identify", *files, "--out", str(folder / "out"), "--no-progress"]) == 0
     return folder, files
 
 
-@pytest.mark.xdist_group("identify-command")
 def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
     out = answered[0] / "out"
     assert sorted(path.name for path in out.iterdir()) == ["answer.json", "report.html"]
@@ -276,7 +275,6 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("identify-command")
 def test_options_come_before_the_configuration(
     answered: tuple[Path, list[str]], capsys: Any
 ) -> None:
@@ -309,7 +307,6 @@ def test_options_come_before_the_configuration(
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("identify-command")
 def test_an_interrupted_command_continues_and_ends_the_same(
     answered: tuple[Path, list[str]], capsys: Any
 ) -> None:

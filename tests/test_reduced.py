@@ -1,8 +1,6 @@
 """Reduced models: known equations recovered, all routes through one list of terms equal, divergence
 and bad data reported."""
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -301,8 +299,3 @@ def test_a_run_without_any_series_of_a_record_is_refused() -> None:
         match=r"`source` has none of x_C, .*, x_d.*; take a run of `SoftGrasp`",
     ):
         record(run)
-
-
-def test_pysindy_is_imported_only_when_it_is_used() -> None:
-    code = "import sys, torchsoft.reduced; sys.exit('pysindy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

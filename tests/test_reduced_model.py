@@ -9,7 +9,6 @@ from test_experiments import experiment
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("reduced_model")
 def test_reduced_model_smoke(tmp_path: Path) -> None:
     module = experiment("reduced_model")
     result = module.run(module.Config(out=tmp_path, smoke=True))

@@ -286,36 +286,40 @@ def test_what_is_saved_is_what_ran() -> None:
 # ----------------------------------------------------------------------
 
 
+def made_and_run() -> list[Tensor]:
+    """Parts made, a motion begun and run with gradients and sensitivities."""
+    motion = MultiSine(amplitude_x=1e-3, frequency=(5.0, 20.0))
+    begun = begin(
+        Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings
+    )
+    run = simulate(begun.rig, times(0.1, 6), y0=begun.y0, gradient="discrete")
+    forward = simulate(begun.rig, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
+    gradients = torch.autograd.grad(run["y_C"][-1], [begun.rig.pad.E, begun.rig.contact.K_t])
+    oval = SoftGrasp(
+        begun.rig.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4)
+    )
+    parts = [
+        rest(oval),
+        oval(0.0, rest(oval)),
+        run.y,
+        *run.channels.values(),
+        *run.energy.values(),
+    ]
+    return [*parts, *gradients, forward.sensitivities]  # pyright: ignore[reportReturnType]
+
+
+@pytest.fixture(scope="module")
+def expected() -> list[Tensor]:
+    return made_and_run()
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_torchs_default_dtype_does_not_matter(dtype: torch.dtype) -> None:
-    """Parts made, a motion begun and run with gradients and sensitivities: the same bits."""
-
-    def answer() -> list[Tensor]:
-        motion = MultiSine(amplitude_x=1e-3, frequency=(5.0, 20.0))
-        begun = begin(
-            Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings
-        )
-        run = simulate(begun.rig, times(0.1, 6), y0=begun.y0, gradient="discrete")
-        forward = simulate(
-            begun.rig, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"]
-        )
-        gradients = torch.autograd.grad(run["y_C"][-1], [begun.rig.pad.E, begun.rig.contact.K_t])
-        oval = SoftGrasp(
-            begun.rig.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4)
-        )
-        parts = [
-            rest(oval),
-            oval(0.0, rest(oval)),
-            run.y,
-            *run.channels.values(),
-            *run.energy.values(),
-        ]
-        return [*parts, *gradients, forward.sensitivities]  # pyright: ignore[reportReturnType]
-
-    expected, before = answer(), torch.get_default_dtype()
+def test_torchs_default_dtype_does_not_matter(dtype: torch.dtype, expected: list[Tensor]) -> None:
+    """To the bit."""
+    before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     try:
-        found = answer()
+        found = made_and_run()
     finally:
         torch.set_default_dtype(before)
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))

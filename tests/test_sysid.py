@@ -49,12 +49,13 @@ NOISE = {
     "F_y": 0.1,
 }
 SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
-STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9, senses="bracket")
+GRASP: dict[str, Any] = {"grasp_time": 0.2, "settle": 0.05, "senses": "bracket"}
+STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.65, **GRASP)
 SHAKE = Excitation(
     motion=MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2, 12)),
-    duration=0.9,
+    duration=0.65,
     depth=8e-4,
-    senses="bracket",
+    **GRASP,
 )
 TRUTH = {
     "pad.E": 0.9e6,
@@ -178,9 +179,7 @@ def rest_known() -> dict[str, Unknown]:
 
 
 def test_what_the_data_do_not_determine_is_not_a_number() -> None:
-    gentle = Excitation(
-        motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.9, senses="bracket"
-    )
+    gentle = Excitation(motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.65, **GRASP)
     data = record("gentle", begin(gentle, BASE), {}, SENSORS, seed=1)
     answer = identify(
         Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), rtol=RTOL,
@@ -232,8 +231,8 @@ def shaking() -> Recording:
     """Hard, by fine steps, without noise."""
     hard = Excitation(
         motion=MultiSine(amplitude_x=4e-3, amplitude_y=2e-4, frequency=(10, 40)),
-        duration=0.9,
-        senses="bracket",
+        duration=0.65,
+        **GRASP,
     )
     return record("shaking", begin(hard, BASE), {}, SENSORS, rtol=1e-7, noise=0.0)
 

@@ -44,6 +44,9 @@ from torchsoft.sysid.suspects import assumption_notices
 BASE = Parameters().override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9)
+BRIEF = Excitation(
+    motion=Strokes(travel=8e-3, stroke_time=0.15), duration=0.3, grasp_time=0.12, settle=0.03
+)
 SENSORS = {
     "x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5),
     "F_x": Sensor(noise=0.1), "F_y": Sensor(noise=0.1),
@@ -77,7 +80,7 @@ def checked(
 @pytest.fixture(scope="module")
 def same() -> Checked:
     """Of data that the same model made."""
-    return checked(recorded())
+    return checked(recorded(excitation=BRIEF))
 
 
 def test_nothing_is_said_of_what_is_right(same: Checked) -> None:
@@ -320,7 +323,7 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same: Checked) -> None
 
 def test_two_causes_are_both_named() -> None:
     """An offset of one sensor and the gain of another: the second one besides the first."""
-    data = turned(recorded())
+    data = turned(recorded(excitation=BRIEF))
     t, force = data.samples["F_y"]
     found = checked(replace(data, samples=data.samples | {"F_y": (t, 1.03 * force)}), explain=False)
     first, *_ = sorted(found.checks, key=lambda one: -one.odds)
@@ -343,7 +346,7 @@ def test_extensions_are_suspects() -> None:
 
 
 def test_every_pad_is_meshed_anew_where_it_was() -> None:
-    data = recorded()
+    data = recorded(excitation=BRIEF)
     other = remeshed(data, 2, 3)
     assert other is not None
     for name, pad in data.rig.pads.items():
@@ -357,7 +360,7 @@ def test_every_pad_is_meshed_anew_where_it_was() -> None:
 
 
 def test_what_is_unknown_is_not_taken_for_granted() -> None:
-    data = recorded()
+    data = recorded(excitation=BRIEF)
     names = {one.name for one in assumptions([data], set())}
     left = {
         one.name for one in assumptions([data], {"disc.radius", "contact.epsilon", "start.disc.x"})
@@ -378,7 +381,7 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
         ]
 
     monkeypatch.setattr("torchsoft.sysid.sensitivity.assumptions", bare)
-    found = checked(recorded())
+    found = checked(recorded(excitation=BRIEF))
     assert any(
         sentence.startswith("it could not be checked what it does that the pads have few elements")
         for sentence in assumption_notices(found)
@@ -422,7 +425,7 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch: pytest.Mo
         return difference(*args)  # pyright: ignore[reportArgumentType]
 
     monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
-    problem = Problem([recorded()], SENSORS, {name: Unknown() for name in TRUTH})
+    problem = Problem([recorded(excitation=BRIEF)], SENSORS, {name: Unknown() for name in TRUTH})
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.01)
     assert any("interrupted, so these were not tried: " in text for text in answer.notices)

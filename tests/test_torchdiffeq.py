@@ -17,14 +17,15 @@ from torchsoft.solve.torchdiffeq import TorchdiffeqSolver
 
 OPTIONS = {"step_size": 2e-3, "tolerance": 1e-10}
 
+Rolling = tuple[SoftGrasp, torch.Tensor]
 SOLVERS = importlib.import_module("torchdiffeq._impl.odeint").SOLVERS
 
 
-def test_an_import_leaves_torchdiffeq_alone() -> None:
+def test_an_import_leaves_torchdiffeq_alone_and_pysindy_for_later() -> None:
     code = (
         "import torchdiffeq; from torchdiffeq._impl.odeint import SOLVERS; before = dict(SOLVERS); "
         "import torchsoft; assert SOLVERS == before; torchsoft.register_method(); assert SOLVERS "
-        "!= before"
+        "!= before; import sys, torchsoft.reduced; assert 'pysindy' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -106,7 +107,8 @@ def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_their
     assert torch.equal(got.detach(), simulate(model, t, y0=y0, step=2e-3).y)
 
 
-def rolling() -> tuple[SoftGrasp, torch.Tensor]:
+@pytest.fixture(scope="module")
+def rolling() -> Rolling:
     """A model and two states (2, size) in its grasp."""
     model = coarse()
     manipulation = grasp_and_roll(model, grasp_force=75.0)
@@ -137,9 +139,9 @@ def gradients(
     return start.grad, {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
 
 
-def test_odeint_adjoint_equals_odeint() -> None:
+def test_odeint_adjoint_equals_odeint(rolling: Rolling) -> None:
     """Interval by interval, for a batch of two, every parameter and the initial states."""
-    model, y0 = rolling()
+    model, y0 = rolling
     y0_bar, bars = gradients(model, y0, odeint)
     y0_bar_adjoint, bars_adjoint = gradients(model, y0, odeint_adjoint)
     assert float((y0_bar - y0_bar_adjoint).abs().max()) < 1e-11 * float(y0_bar.abs().max())
@@ -147,8 +149,8 @@ def test_odeint_adjoint_equals_odeint() -> None:
         assert float((bar - bars_adjoint[name]).abs().max()) <= 1e-11 * float(bar.abs().max()), name
 
 
-def test_odeint_adjoint_of_a_forgotten_run_says_so() -> None:
-    model, y0 = rolling()
+def test_odeint_adjoint_of_a_forgotten_run_says_so(rolling: Rolling) -> None:
+    model, y0 = rolling
     t = torch.tensor([0.3, 0.31], dtype=torch.float64)
     y = odeint_adjoint(model, y0[0].clone().requires_grad_(True), t, method=METHOD)
     for shift in range(5):
@@ -157,11 +159,11 @@ def test_odeint_adjoint_of_a_forgotten_run_says_so() -> None:
         y.sum().backward()
 
 
-def test_continuous_adjoint_agrees_on_a_short_window() -> None:
+def test_continuous_adjoint_agrees_on_a_short_window(rolling: Rolling) -> None:
     """0.2 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the
     discrete adjoint."""
-    model, y0 = rolling()
-    start = y0[1]
+    model, y0 = rolling
+    start = y0[1].clone()
     start[model.layout.slices["velocity", "disc"]] -= f64(0.0195, 0.0, 0.0)  # slow enough to stick
     t = torch.linspace(0.5, 0.5002, 3, dtype=torch.float64)
     names = ("contact.K_t", "contact.R_t", "contact.K_n", "pad.E", "disc.mass")

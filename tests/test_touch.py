@@ -91,9 +91,10 @@ def test_gradients_of_every_channel_are_the_differences(name: str) -> None:
     make, wanted, how = RUNS[name]
     rig, y0 = make()
     t = times(0.03, 14)
-    names = list(Touch(rig))
+    touch = Touch(rig)
+    names = list(touch)
     weights = torch.randn(len(names), generator=torch.Generator().manual_seed(1)).double()
-    units = [Touch(rig).unit(one) for one in names]
+    units = [touch.unit(one) for one in names]
     weights *= torch.tensor([{"N": 1.0, "N.m": 50.0, "m": 1e3}[unit] for unit in units])
     run = simulate(rig, t, y0=y0, tolerance=1e-10, gradient="discrete", **how)
     kept = {"step": how["step"]} if "step" in how else {"knots": run.knots}
@@ -107,7 +108,7 @@ def test_gradients_of_every_channel_are_the_differences(name: str) -> None:
         assert bool(touching[5:].all())
     forward = simulate(
         rig, t, y0=y0, tolerance=1e-10, gradient="forward", wrt=wanted,
-        touch=[*Touch(rig).arrays, *Touch(rig).single], **kept,
+        touch=[*touch.arrays, *touch.single], **kept,
     )  # fmt: skip
     slopes = torch.stack([forward.touch_sensitivities[one] for one in names], 1)
     by_forward = torch.einsum("tcn,c->tn", slopes, weights)

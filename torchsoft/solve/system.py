@@ -260,11 +260,11 @@ class Compiled:
             own = 2 * pad.surface.numpy()[:, None] + np.arange(2)
             surface[2 * node_start[i] : 2 * node_start[i + 1]] = own.ravel()
             stiffness, pattern = both[i], patterns[i]
-            for row in range(here.stop - here.start):
-                columns = pattern.indices[pattern.indptr[row] : pattern.indptr[row + 1]]
-                column[dofs[i] + row, : len(columns)] = columns
-                for k in range(2):
-                    K[k][dofs[i] + row, : len(columns)] = stiffness[k][[row]].toarray()[0, columns]
+            row = np.repeat(np.arange(here.stop - here.start), np.diff(pattern.indptr))
+            at = dofs[i] + row, np.arange(len(row)) - pattern.indptr[row]
+            column[at] = pattern.indices
+            for k in range(2):
+                K[k][at] = stiffness[k][row, pattern.indices]
         make: Any = Inertia
         return make(
             _ints(dofs), surface, np.zeros((1, total)), np.ones(len(dofs) - 1, np.int64), X, area,
