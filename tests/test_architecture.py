@@ -27,7 +27,7 @@ FLOWS = {
     "physics.shapes": "shape oval rounded contour .",
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint
-        touch tangent inputs trajectory netcdf vtk
+        touch tangent inputs trajectory netcdf vtk mcap
         ledger simulate batch torchdiffeq .
     """,
     "sysid": """
