@@ -111,8 +111,11 @@ def make(options: argparse.Namespace) -> int:
         if config.step is not None and config.step > COARSE:
             note = "is coarse: the energy balance may be off by percents"
             say(f"note: step = {config.step:g} s {note}", error=True)
-        cluster = generate.dask_cluster if options.scheduler else generate.local_workers
-        with cluster(options.scheduler or workers) as executor:
+        with (
+            generate.dask_cluster(options.scheduler)
+            if options.scheduler
+            else generate.local_workers(workers)
+        ) as executor:
             count = generate.generate(config, options.out, executor, workers, part=mine)
     except BrokenProcessPool:
         failed("a worker was killed, perhaps for memory; start again to make what is missing")

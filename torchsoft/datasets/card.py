@@ -14,6 +14,8 @@ from torchsoft.datasets.schema import variables
 from torchsoft.datasets.subject import SPLITS
 from torchsoft.tables import line
 
+UNSTATED = "Not stated: say it here and at the top before others are given the data."
+
 REASONS = 5
 """Reasons of failures that it lists."""
 
@@ -41,11 +43,13 @@ tags: [simulation, contact-mechanics, soft-robotics]
 
 {config.description}
 
-- **Trajectories.** {counts(data)}, of {config.duration:g} s, sampled every {config.sample_interval:g} s.
-- **Origin.** Simulated with torchsoft {manifest.torchsoft}, seed {config.seed}, design `{config.method}`; no measurement, no
-  noise. `manifest.json` holds the configuration, the commit and the digests.
+- **Trajectories.** {counts(data)}.
+- **Time.** {config.duration:g} s each, sampled every {config.sample_interval:g} s.
+- **Origin.** Simulated with torchsoft {manifest.torchsoft}, seed {config.seed}, design
+  `{config.method}`; no measurement, no noise. `manifest.json` holds the configuration, the commit
+  and the digests.
 - **Rig.** {rig(config)}
-- **Licence.** {config.license or "Not stated: say it here and at the top before others are given the data."}
+- **Licence.** {config.license or UNSTATED}
 
 ```python
 from torchsoft.datasets import Trajectories, open_dataset

@@ -41,8 +41,8 @@ class Config(Table):
     """One dataset, of the paper's rig or of that of a `rig` file. `ValueError` names the field that
     is wrong.
 
-    Everything but `title`, `description` and `license` decides the data; `trajectories_per_shard` and
-    `samples_per_chunk` decide only where they lie. Parameters are known by the names of
+    Everything but `title`, `description` and `license` decides the data; `trajectories_per_shard`
+    and `samples_per_chunk` decide only where they lie. Parameters are known by the names of
     `Parameters`, those of a rig file by the names of its tables.
     """
 

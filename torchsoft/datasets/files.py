@@ -157,9 +157,7 @@ class Layout(Table):
             return content
         remedy = COPY
         if (shard := self.shard(key)) is not None:
-            again = (
-                "start `torchsoft dataset make` again, which makes this shard anew"
-            )
+            again = "start `torchsoft dataset make` again, which makes this shard anew"
             remedy = f"remove {url}/{record_key(shard)} and {again}"
         raise StoreError(f"{url}/{key} is {'missing' if content is None else 'damaged'}; {remedy}")
 

@@ -65,12 +65,11 @@ def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
     return [shard for shard in part.shards(config) if shard not in finished]
 
 
-def cost(
-    config: Config, workers: int, count: int | None = None, each: float | None = None
-) -> Cost:
+def cost(config: Config, workers: int, count: int | None = None, each: float | None = None) -> Cost:
     """Of `count` trajectories, all by default, made by that many workers, where one takes `each`
     [s]; the time of a usual one by default."""
-    subject, count = config.subject, config.trajectories if count is None else count
+    subject = config.subject
+    count = config.trajectories if count is None else count
     at_once = max(min(workers, config.shards), 1)
     seconds, step = config.duration + subject.prelude, subject.steps.get("step")
     if step is not None:

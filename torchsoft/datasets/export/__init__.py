@@ -10,7 +10,7 @@ import numpy as np
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.export.source import Source
 from torchsoft.datasets.files import Manifest, store_errors
-from torchsoft.datasets.reader import open_dataset
+from torchsoft.datasets.reader import Vouched
 from torchsoft.files import make_folder
 
 WRITERS = {"the-well": "the_well", "lerobot": "lerobot", "mcap": "mcap"}
@@ -20,7 +20,7 @@ def export(url: str, to: str, out: Path) -> str:
     """Write the sound trajectories of a finished dataset to a new folder; a sentence on what is in
     it. Raises `StoreError` for a dataset that is damaged or unfinished, and `ValueError` for one
     that this form cannot hold, and for a folder that is not empty."""
-    data, config = open_dataset(url), Config.model_validate(Manifest.read(url).config)
+    data, config = Vouched(url).data(chunks=None), Config.model_validate(Manifest.read(url).config)
     sound = np.flatnonzero(data.failed.values == 0)
     if not len(sound):
         raise ValueError(f"{url}: every trajectory failed; there is nothing to be exported")

@@ -23,12 +23,13 @@ CHUNK, SIZE = 1000, 100
 """Files of a folder, and size of a file [MB], at the most."""
 
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+SEEN = "observation."
 INDICES = ("frame_index", "episode_index", "index", "task_index")
 
 
 def write(source: Source, out: Path) -> str:
-    """Data, episodes, tasks and statistics. Raises `ValueError` where there is not a whole number of
-    samples a second."""
+    """Data, episodes, tasks and statistics. Raises `ValueError` for a rate of samples that is no
+    whole number."""
     arrow, parquet = needed("pyarrow", "export"), needed("pyarrow.parquet", "export")
     rate = 1.0 / source.config.sample_interval
     if abs(rate - round(rate)) > 1e-6 * rate:
@@ -41,10 +42,13 @@ def write(source: Source, out: Path) -> str:
     length, episodes, known = source.data.sizes["time"], list[dict[str, Any]](), list[str]()
     frame = sum(4 * one["shape"][0] for one in features.values())
     per_file = max(1, int(SIZE * 1e6 / (length * frame)))
+    forces = [key.removeprefix(SEEN) for key, one in features.items() if one["names"] is None]
+    kept = [name for name in (*source.channels, *source.drawn, *forces, "kind")
+            if name in source.data]  # fmt: skip
     order = [index for some in source.splits.values() for index in some]
     sink: Any = None
     for i, index in enumerate(order):
-        run = source.trajectory(index)
+        run = source.trajectory(index, kept)
         task = str(run["kind"].item()) if "kind" in run else source.config.title
         if task not in known:
             known.append(task)
@@ -102,12 +106,12 @@ def of_frames(source: Source) -> Iterator[tuple[str, dict[str, Any]]]:
             "LeRobot needs actions and a state: keep motions or efforts (F_*), and coordinates, "
             "in `channels`"
         )
-    for key, names in (("action", action), ("observation.state", state)):
+    for key, names in (("action", action), (f"{SEEN}state", state)):
         yield key, {"dtype": "float32", "shape": [len(names)], "names": names}
     for name, one in source.data.data_vars.items():
         if str(name).partition("_force_")[0] in ("normal", "friction") and one.ndim == 3:
             shape = [one.shape[-1]]
-            yield f"observation.{name}", {"dtype": "float32", "shape": shape, "names": None}
+            yield f"{SEEN}{name}", {"dtype": "float32", "shape": shape, "names": None}
     yield "timestamp", {"dtype": "float32", "shape": [1], "names": None}
     for name in INDICES:
         yield name, {"dtype": "int64", "shape": [1], "names": None}
@@ -121,8 +125,8 @@ def values(
     for key in features:
         if key in named:
             out[key] = np.stack([run[name].values for name in named[key]], -1).astype(np.float32)
-        elif key.startswith("observation."):
-            out[key] = run[key.removeprefix("observation.")].values.astype(np.float32)
+        elif key.startswith(SEEN):
+            out[key] = run[key.removeprefix(SEEN)].values.astype(np.float32)
     return out
 
 
@@ -133,7 +137,7 @@ def column(arrow: Any, values: NDArray) -> Any:
     return arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), values.shape[1])
 
 
-def statistics(values: NDArray) -> dict[str, list[float]]:
+def statistics(values: NDArray) -> dict[str, Any]:
     """What LeRobot keeps of an episode's feature."""
     x = values.reshape(len(values), -1).astype(float)
     found = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}

@@ -1,6 +1,6 @@
 """The sound trajectories of a dataset as exporters take them."""
 
-
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +41,6 @@ class Source(NamedTuple):
         """Numbers of a trajectory that are drawn."""
         return list(self.config.subject.labels)
 
-    def trajectory(self, index: int) -> xr.Dataset:
-        """One of them, in memory."""
-        return self.data.isel(trajectory=index).load()
+    def trajectory(self, index: int, names: Iterable[str]) -> xr.Dataset:
+        """Some arrays of one of them, in memory."""
+        return self.data[[*names]].isel(trajectory=index).load()

@@ -5,12 +5,11 @@ A dataset a pad, since all fields of one share their grid. Displacements are two
 vector field of The Well has as many components as its grid has dimensions, here one.
 """
 
-from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from torchsoft.datasets.export.source import Source
@@ -35,15 +34,18 @@ def write(source: Source, out: Path) -> str:
             path.parent.mkdir(parents=True)
             with h5py.File(path, "w") as file:
                 names = lay_out(file, source, surface, len(rows))
+                moved, single = f"displacement_{surface}", (*source.channels, *source.drawn)
+                arrays: Any = file
                 for i, index in enumerate(rows):
-                    run = source.trajectory(index)
-                    found = fields(run, surface, names)
-                    for name, values in found.items():
-                        file["t0_fields"][name][i] = values
+                    run = source.trajectory(index, (*names[:-2], moved, *single))
+                    shift = dict(zip(names[-2:], np.moveaxis(run[moved].values, -1, 0)))
+                    for name in names:
+                        values = shift[name] if name in shift else run[name].values
+                        arrays["t0_fields"][name][i] = values
                         if split == "train":
                             grown.add(name, values)
-                    for name in (*source.channels, *source.drawn):
-                        file["scalars"][name][i] = run[name].values
+                    for name in single:
+                        arrays["scalars"][name][i] = run[name].values
         if grown.of:
             (out / surface / "stats.yaml").write_text(grown.yaml(), encoding="utf-8")
     lacking = [name for name in NAMES if name not in source.splits]
@@ -52,15 +54,9 @@ def write(source: Source, out: Path) -> str:
     )
 
 
-def fields(run: xr.Dataset, surface: str, names: Iterable[str]) -> dict[str, NDArray]:
-    """Fields (times, points) of a pad's surface."""
-    moved = run[f"displacement_{surface}"].values
-    parts = {f"displacement_{axis}": moved[..., i] for i, axis in enumerate("xy")}
-    return {name: parts[name] if name in parts else run[name].values for name in names}
-
-
 def lay_out(file: h5py.File, source: Source, surface: str, count: int) -> list[str]:
-    """Groups and attributes of a file of `count` trajectories; the names of its fields."""
+    """Groups and attributes of a file of `count` trajectories; the names of its fields, the
+    displacements last."""
     config, data, point = source.config, source.data, f"{surface}_point"
     names = [str(name) for name in data if data[name].dims == ("trajectory", "time", point)]
     names += ["displacement_x", "displacement_y"]
