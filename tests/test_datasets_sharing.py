@@ -139,10 +139,12 @@ def test_an_estimate_is_measured_on_the_sets_own_runs(
 ) -> None:
     """Of what is left; the first run, which loads kernels, does not count."""
     pauses = iter((0.5, *3 * (0.05,)))
-    monkeypatch.setattr(generation, "simulate_task", lambda *_: time.sleep(next(pauses)))
+    slow = lambda *_: time.sleep(next(pauses)) or {"steps": 7}
+    monkeypatch.setattr(generation, "simulate_task", slow)
     many = made[1].model_copy(update={"trajectories": 1000})
     price = estimate(many, str(tmp_path / "none"), 1)
     assert 50.0 < price.seconds < 100.0
+    assert price.steps == 7000
     assert generation.cost(many, 1).seconds > 1000 * generation.STATICS
     assert estimate(made[1], str(made[0]), 1).seconds == 0.0
 

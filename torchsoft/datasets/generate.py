@@ -27,7 +27,7 @@ THREADS = 3
 """Threads of one process at the most: a third of a trajectory's time is not compiled, and holds the
 interpreter's lock."""
 
-STATICS = 0.7
+STATICS = 0.5
 """Time [s] that a trajectory takes besides its steps: statics of the start and of the grasp,
 energies."""
 
@@ -65,20 +65,15 @@ def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
     return [shard for shard in part.shards(config) if shard not in finished]
 
 
-def cost(config: Config, workers: int, count: int | None = None, each: float | None = None) -> Cost:
-    """Of `count` trajectories, all by default, made by that many workers, where one takes `each`
-    [s]; the time of a usual one by default."""
+def cost(
+    config: Config, workers: int, count: int | None = None, each: tuple[float, float] | None = None
+) -> Cost:
+    """Of `count` trajectories, all by default, made by that many workers, where one takes `each`:
+    time [s] and steps, those of a usual one by default."""
     subject = config.subject
     count = config.trajectories if count is None else count
     at_once = max(min(workers, config.shards), 1)
-    seconds, step = config.duration + subject.prelude, subject.steps.get("step")
-    if step is not None:
-        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
-    else:  # an output between two steps takes half the time of a step
-        rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
-        steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
-    if each is None:
-        each = steps * rig_step(subject.template) + STATICS
+    seconds, steps = usual(config) if each is None else each
     kept = sum(  # of one trajectory [GiB]
         v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in variables(config).values()
     )
@@ -88,27 +83,38 @@ def cost(config: Config, workers: int, count: int | None = None, each: float | N
     design = 8 * 2 * config.trajectories * subject.drawn / 2**30
     return Cost(
         steps=count * steps,
-        seconds=count * each / at_once,
+        seconds=count * seconds / at_once,
         memory=design + shard * at_once,
         disk=kept * count,
     )
 
 
-def measured(config: Config) -> float:
-    """Mean time [s] of some trajectories of the set, after one that loads the kernels."""
-    began, design = 0.0, points(config)
+def usual(config: Config) -> tuple[float, float]:
+    """Time [s] and steps of one trajectory by experience, rather too many."""
+    subject = config.subject
+    seconds, step = config.duration + subject.prelude, subject.steps.get("step")
+    if step is not None:
+        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
+    else:  # an output between two steps takes half the time of a step
+        rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
+        steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
+    return steps * rig_step(subject.template) + STATICS, steps
+
+
+def measured(config: Config) -> tuple[float, float]:
+    """The same of some trajectories of the set in the mean, after one that loads the kernels."""
+    began, steps, design = 0.0, 0, points(config)
     with threads.single_threaded():
         for i in range(TRIED + 1):
-            simulate_task(config, task(config, i, design[i]))
-            began = began or time.perf_counter()
-    return (time.perf_counter() - began) / TRIED
+            row = simulate_task(config, task(config, i, design[i]))
+            began, steps = (began, steps + row["steps"]) if began else (time.perf_counter(), 0)
+    return (time.perf_counter() - began) / TRIED, steps / TRIED
 
 
 def estimate(config: Config, url: str, workers: int, part: Part = WHOLE) -> Cost:
     """What is left of a part will cost; of many trajectories, by a few of them."""
     count = sum(len(config.rows(shard)) for shard in unfinished(config, url, part))
-    one = cost(config, 1, 1).seconds
-    tried = count >= MANY and (TRIED + 1) * one < PATIENCE
+    tried = count >= MANY and (TRIED + 1) * usual(config)[0] < PATIENCE
     return cost(config, workers, count, measured(config) if tried else None)
 
 
