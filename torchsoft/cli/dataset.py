@@ -53,7 +53,7 @@ def add_commands(commands: Any) -> None:
     add_config(one)
     one.add_argument("--part", type=part, default=(1, 1), metavar="I/N", help="such as 2/8")
     workers = "threads, or processes if more than a few"
-    one.add_argument("--workers", type=workers_of, default=os.cpu_count() or 1, help=workers)
+    one.add_argument("--workers", type=count, default=os.cpu_count() or 1, help=workers)
     one.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
     one.add_argument(
         "--yes", action="store_true", help="begin even what takes hours, or much memory or disk"
@@ -84,12 +84,11 @@ def part(text: str) -> tuple[int, int]:
     return int(number), int(count)
 
 
-def workers_of(text: str) -> int:
+def count(text: str) -> int:
     """Number of local workers."""
-    count = int(text)
-    if not 0 <= count <= MOST:
-        raise argparse.ArgumentTypeError(f"should be from 0 to {MOST}, not {count}")
-    return count
+    if not (text.isdecimal() and int(text) <= MOST):
+        raise argparse.ArgumentTypeError(f"should be from 0 to {MOST}, not {text}")
+    return int(text)
 
 
 def make(options: argparse.Namespace) -> int:
@@ -116,7 +115,7 @@ def make(options: argparse.Namespace) -> int:
             if options.scheduler
             else generate.local_workers(workers)
         ) as executor:
-            count = generate.generate(config, options.out, executor, workers, part=mine)
+            bad = generate.generate(config, options.out, executor, workers, part=mine)
     except BrokenProcessPool:
         failed("a worker was killed, perhaps for memory; start again to make what is missing")
         return 3
@@ -129,7 +128,7 @@ def make(options: argparse.Namespace) -> int:
         say(f"another process is making shards {listed(elsewhere)}")
         made -= sum(len(config.rows(shard)) for shard in elsewhere)
     say(
-        f"{made} trajectories in {options.out}; {count} of those made now failed, each with its "
+        f"{made} trajectories in {options.out}; {bad} of those made now failed, each with its "
         "reason"
     )
     if left := generate.unfinished(config, options.out):
