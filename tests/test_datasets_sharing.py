@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from torchsoft.datasets.export import export, lerobot, the_well
 from torchsoft.datasets.export.source import Source
 from torchsoft.datasets.files import StoreError, listed
 from torchsoft.datasets.generate import Part, Serial, estimate, generate, unfinished
+from torchsoft.datasets.simulation import simulate_task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid.columns import read_table
@@ -58,10 +60,21 @@ def half(made: tuple[Path, Config], tmp_path: Path) -> Path:
     return tmp_path / "the set"
 
 
-def test_parts_make_the_set_that_one_process_makes(
-    made: tuple[Path, Config], tmp_path: Path
+def test_two_who_make_one_set_at_once_share_the_work(
+    made: tuple[Path, Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    generate(made[1], str(tmp_path / "set"), Serial(), progress=False)
+    """Every trajectory is simulated once, and the set is that of the parts."""
+    simulated, url = list[int](), str(tmp_path / "set")
+
+    def simulate(config: Config, task: Any) -> Any:
+        simulated.append(task.index)
+        return simulate_task(config, task)
+
+    monkeypatch.setattr(generation, "simulate_task", simulate)
+    with ThreadPoolExecutor(2) as two:
+        both = [two.submit(generate, made[1], url, Serial(), progress=False) for _ in range(2)]
+    assert [one.result() for one in both] == [0, 0]
+    assert sorted(simulated) == [0, 1, 2]
     assert contents(tmp_path / "set") == contents(made[0])
     assert sound(made[0])
 

@@ -33,6 +33,9 @@ MOST = 1000
 COARSE = 5e-3
 """Steps longer than this [s] get a note."""
 
+BRIEF = 10.0
+"""Time [s] that is not worth a word."""
+
 HELP = "take fewer trajectories, a looser rtol or a shorter duration"
 
 
@@ -105,7 +108,7 @@ def make(options: argparse.Namespace) -> int:
         config, mine = Config.from_toml(options.config), generate.Part(*options.part)
         price = generate.estimate(config, options.out, workers, mine)
         agree(price, options.yes, HELP)
-        if price.seconds > generate.PATIENCE:
+        if price.seconds > BRIEF:
             say(price.sentence, error=True)
         if config.step is not None and config.step > COARSE:
             note = "is coarse: the energy balance may be off by percents"

@@ -47,8 +47,7 @@ def write(source: Source, out: Path) -> str:
             if name in source.data]  # fmt: skip
     order = [index for some in source.splits.values() for index in some]
     sink: Any = None
-    for i, index in enumerate(order):
-        run = source.trajectory(index, kept)
+    for i, run in enumerate(source.runs(order, kept)):
         task = str(run["kind"].item()) if "kind" in run else source.config.title
         if task not in known:
             known.append(task)
@@ -69,7 +68,7 @@ def write(source: Source, out: Path) -> str:
             sink = parquet.ParquetWriter(path, table.schema)
         sink.write_table(table)
         episodes.append(
-            {"episode_index": i, "tasks": [task], "length": length, "trajectory": index}
+            {"episode_index": i, "tasks": [task], "length": length, "trajectory": order[i]}
             | {name: run[name].item() for name in source.drawn}
             | {"dataset_from_index": i * length, "dataset_to_index": (i + 1) * length}
             | {"data/chunk_index": chunk, "data/file_index": file}

@@ -9,8 +9,7 @@ from torchsoft.solve.mcap import write_log
 def write(source: Source, out: Path) -> str:
     """Channels of every trajectory; what was drawn for it is the log's metadata."""
     told = (*source.drawn, "split")
-    for index in source.sound.tolist():
-        run = source.trajectory(index, (*source.channels, *told))
+    for run in source.runs(source.sound.tolist(), (*source.channels, *told)):
         about = {name: str(run[name].item()) for name in (*told, "trajectory")}
-        write_log(out / f"{index:06d}.mcap", run[source.channels], about)
+        write_log(out / f"{run.trajectory.item():06d}.mcap", run[source.channels], about)
     return f"{len(source.sound)} logs of {len(source.channels)} channels"

@@ -1,11 +1,12 @@
 """The sound trajectories of a dataset as exporters take them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.subject import SPLITS
@@ -41,6 +42,8 @@ class Source(NamedTuple):
         """Numbers of a trajectory that are drawn."""
         return list(self.config.subject.labels)
 
-    def trajectory(self, index: int, names: Iterable[str]) -> xr.Dataset:
-        """Some arrays of one of them, in memory."""
-        return self.data[[*names]].isel(trajectory=index).load()
+    def runs(self, rows: Sequence[int], names: Iterable[str]) -> Iterator[xr.Dataset]:
+        """Some arrays of some trajectories, one after the other, in memory."""
+        some = self.data[[*names]]
+        for index in tqdm(rows, unit=" trajectories", mininterval=1.0, leave=False):
+            yield some.isel(trajectory=index).load()

@@ -36,8 +36,7 @@ def write(source: Source, out: Path) -> str:
                 names = lay_out(file, source, surface, len(rows))
                 moved, single = f"displacement_{surface}", (*source.channels, *source.drawn)
                 arrays: Any = file
-                for i, index in enumerate(rows):
-                    run = source.trajectory(index, (*names[:-2], moved, *single))
+                for i, run in enumerate(source.runs(rows, (*names[:-2], moved, *single))):
                     shift = dict(zip(names[-2:], np.moveaxis(run[moved].values, -1, 0)))
                     for name in names:
                         values = shift[name] if name in shift else run[name].values
