@@ -130,9 +130,9 @@ def values(
 
 
 def column(arrow: Any, values: NDArray) -> Any:
-    """A column of numbers, or of vectors."""
-    if values.ndim == 1:
-        return arrow.array(values)
+    """A column of vectors, or of numbers, as which LeRobot takes vectors of one."""
+    if values.size == len(values):
+        return arrow.array(values.ravel())
     return arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), values.shape[1])
 
 
