@@ -1,5 +1,4 @@
-"""The command `python -m data_gen.generate CONFIG.toml --out DIR` is
-`torchsoft dataset make`."""
+"""The command `python -m data_gen.generate CONFIG.toml --out DIR` is `torchsoft dataset make`."""
 
 import sys
 

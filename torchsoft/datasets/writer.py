@@ -70,7 +70,7 @@ class Store:
         if (path := self.claim_file(shard)) is None:
             yield lambda: None
             return
-        with claimed(path) as handle:
+        with store_errors(self.url), claimed(path) as handle:
             yield None if handle is None else lambda: os.write(handle, b".")
 
     def claim_file(self, shard: int) -> Path | None:
