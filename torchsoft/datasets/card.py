@@ -9,7 +9,7 @@ import xarray as xr
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.distributions import Choice, Normal
 from torchsoft.datasets.files import CARD, Manifest, read_bytes, store_errors, write_bytes
-from torchsoft.datasets.reader import open_dataset
+from torchsoft.datasets.reader import Vouched
 from torchsoft.datasets.schema import variables
 from torchsoft.datasets.subject import SPLITS
 from torchsoft.tables import line
@@ -29,7 +29,7 @@ def write_card(url: str) -> None:
 
 def card(url: str) -> str:
     """The card of a finished dataset. Raises `StoreError` for another."""
-    manifest, data = Manifest.read(url), open_dataset(url)
+    manifest, data = Manifest.read(url), Vouched(url).data(chunks=None)
     config = Config.model_validate(manifest.config)
     example = next(iter(config.subject.signals), "stored_energy")
     return f"""\
