@@ -1,4 +1,4 @@
-"""The command `python -m data_gen.check DIR`; `torchsoft.datasets.check` does the work."""
+"""The command `python -m data_gen.check DIR` is `torchsoft dataset check`."""
 
 import sys
 

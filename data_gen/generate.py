@@ -1,5 +1,4 @@
-"""The command `python -m data_gen.generate CONFIG.toml --out DIR`; `torchsoft.datasets.generate`
-does the work."""
+"""The command `python -m data_gen.generate CONFIG.toml --out DIR` is `torchsoft dataset make`."""
 
 import sys
 

@@ -27,7 +27,7 @@ FLOWS = {
     "physics.shapes": "shape oval rounded contour .",
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint
-        touch tangent inputs trajectory netcdf vtk
+        touch tangent inputs trajectory netcdf vtk mcap
         ledger simulate batch torchdiffeq .
     """,
     "sysid": """
@@ -42,7 +42,7 @@ FLOWS = {
     "rigs": """
         fields parts control motion geometry build places course balance check written goal run .
     """,
-    "cli": "results rigs plan identify design material plot .",
+    "cli": "results rigs plan identify design material dataset plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
     """,

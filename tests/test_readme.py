@@ -36,6 +36,8 @@ ELSEWHERE = {
     "rehearse fit.toml": "test_sysid_rigs.py",
     "tcp://head": "test_datasets.py",
     "dask_jobqueue": "a cluster",
+    "dataset slurm": "test_datasets_sharing.py",
+    "sbatch": "a cluster",
 }
 """Parts of blocks that need more than a test has, and where they are tried instead."""
 DATASET = "data_gen"

@@ -6,6 +6,7 @@ import os
 import re
 import secrets
 import stat
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
@@ -31,6 +32,9 @@ CHECKPOINT = "torchsoft-checkpoint"
 
 PARTIAL = re.compile(r"\.[0-9a-f]{16}\.partial$")
 """How the name of a partial file ends, after the name of the file that it becomes."""
+
+TRIES = 5
+"""How often a file is asked for that somebody else has."""
 
 
 @contextmanager
@@ -76,6 +80,41 @@ def new_partial(path: Path) -> tuple[Path, int]:
         if partial.exists():
             return partial, handle
         os.close(handle)  # removed between its making and its lock
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[int | None]:
+    """Handle of the partial file `path`, emptied, while nobody else has it; None where somebody
+    does. It goes with its holder. Where a file system has no locks, everybody is given it."""
+    handle = hold(path)
+    try:
+        if handle is not None:
+            os.truncate(handle, 0)
+        yield handle
+    finally:
+        if handle is not None:
+            path.unlink(missing_ok=True)
+            os.close(handle)
+
+
+def hold(path: Path) -> int | None:
+    """A locked handle of a file that is there; None where another process has it."""
+    make_folder(path.parent)
+    for _ in range(TRIES):
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:  # by its holder, or for an instant by who removes partial files
+            os.close(handle)
+            time.sleep(0.05)
+            continue
+        except OSError:  # no such locks
+            return handle
+        if path.exists() and os.path.samestat(os.fstat(handle), os.stat(path)):
+            return handle
+        os.close(handle)  # removed between its making and its lock
+    return None
 
 
 def remove_partials(paths: Iterable[Path]) -> None:

@@ -1,5 +1,5 @@
-"""The command `torchsoft`: rigs in files, identification from files, materials from tests, and
-pictures of runs."""
+"""The command `torchsoft`: rigs in files, identification from files, materials from tests,
+datasets, and pictures of runs."""
 
 import argparse
 import io
@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 
-from torchsoft.cli import design, identify, material, plan, plot, rigs
+from torchsoft.cli import dataset, design, identify, material, plan, plot, rigs
 from torchsoft.cli.results import failed, say
 
 GRACE = 1.5
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"torchsoft {version('torchsoft')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (rigs, plan, identify, design, material, plot):
+    for group in (rigs, plan, identify, design, material, dataset, plot):
         group.add_commands(commands)
     for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
         if isinstance(stream, io.TextIOWrapper):

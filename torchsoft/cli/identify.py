@@ -11,7 +11,7 @@ IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
 
 DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta
-[deg]`, or trajectory files of this project (.nc). CONFIG.toml states what is known, what is
+[deg]`, or runs of this project (.nc, .mcap). CONFIG.toml states what is known, what is
 unknown and how good the sensors are; examples/identify has both. Recordings that look wrong (a
 sign, a unit, set-points too far apart) are refused, or named, before anything is fitted. Writes
 answer.json and report.html, and comparison.json where there are competing laws. Interrupted, the

@@ -25,6 +25,7 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--html", action="store_true", help="write the interactive player")
     one.add_argument("--pdf", action="store_true", help="write a camera-ready dashboard")
     one.add_argument("--vtk", action="store_true", help="write the pads for ParaView")
+    one.add_argument("--mcap", action="store_true", help="write the channels as an MCAP log")
     one.add_argument(
         "--width", choices=("page", "column"), default="page", help="of the PDF (%(default)s)"
     )
@@ -58,6 +59,9 @@ def plot(options: argparse.Namespace) -> int:
         listed = made.with_name(f"{made.name}.pvd")
         run.to_vtk(listed, None if options.time is None else [options.time])
         written.append(listed)
+    if options.mcap:
+        written.append(made.with_name(f"{made.name}.mcap"))
+        run.to_mcap(written[-1])
     if not written:
         written.append(made.with_name(f"{made.name}.png"))
         save(dashboard(run, title=title, **common), written[-1])

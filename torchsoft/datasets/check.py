@@ -1,9 +1,5 @@
-"""Re-read a dataset and list what is wrong with it: `python -m torchsoft.datasets.check DIR`.
+"""Re-read a dataset, list what is wrong with it, and draw what it covers."""
 
-One line a finding; exit status 1 if there is any. `--picture FILE` draws what the set covers.
-"""
-
-import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +10,16 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, filesystem, keys, record_key
+from torchsoft.datasets.files import (
+    CARD,
+    MANIFEST,
+    Manifest,
+    StoreError,
+    filesystem,
+    keys,
+    listed,
+    record_key,
+)
 from torchsoft.datasets.reader import Vouched, open_dataset
 from torchsoft.datasets.schema import not_finite, variables
 from torchsoft.datasets.simulation import points, task
@@ -68,8 +73,7 @@ def findings(url: str) -> Iterator[str]:
         return
     if unfinished := sorted(set(range(config.shards)) - store.finished):
         yield (
-            f"{len(unfinished)} of {config.shards} shards are not finished, the first is shard "
-            f"{unfinished[0]}"
+            f"{len(unfinished)} of {config.shards} shards are not finished: {listed(unfinished)}"
         )
     design = points(config)
     for shard in sorted(store.finished):
@@ -87,7 +91,7 @@ def check_files(url: str, manifest: Manifest) -> Iterator[str]:
             yield str(error)
     running = len(layout.finished(url)) < layout.shards
     for key in there:
-        known = key in (MANIFEST, *manifest.digests) or layout.shard(key) is not None
+        known = key in (MANIFEST, CARD, *manifest.digests) or layout.shard(key) is not None
         if not known and not (running and PARTIAL.search(key)):
             yield f"{url}/{key} does not belong to the dataset; remove it"
 
@@ -236,30 +240,32 @@ def moving(data: xr.Dataset, config: Config) -> list[str]:
     return sorted(names, key=lambda name: -spread[name])[:3]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m torchsoft.datasets.check", description=__doc__)
-    parser.add_argument("store", help="folder or fsspec URL")
-    parser.add_argument(
-        "--picture", type=Path, help="where to write a picture of what the set covers"
-    )
-    given = parser.parse_args(arguments)
+def report(url: str, picture: Path | None = None) -> int:
+    """Print every finding, sizes and counts; how many findings there are."""
     count = 0
-    for count, finding in enumerate(check(given.store), 1):
+    for count, finding in enumerate(check(url), 1):
         print(finding)
     try:
-        data = open_dataset(given.store, unfinished=True)
-        print(summary(given.store, data))
-        if given.picture is not None:
-            config = Config.model_validate(Manifest.read(given.store).config)
-            save(figure(data, config), given.picture, dpi=120)
-            print(f"picture in {given.picture}")
+        data = open_dataset(url, unfinished=True)
+        print(summary(url, data))
+        if picture is not None:
+            config = Config.model_validate(Manifest.read(url).config)
+            save(figure(data, config), picture, dpi=120)
+            print(f"picture in {picture}")
     except (
         Exception
     ) as error:  # a damaged store has been reported above; the picture must not hide it
         count += 1
         print(line(f"no summary or picture: {type(error).__name__}: {error}"))
     print("sound" if count == 0 else f"{count} findings")
-    return int(count > 0)
+    return count
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command `torchsoft dataset check`."""
+    from torchsoft.cli import main as command
+
+    return command(["dataset", "check", *(sys.argv[1:] if arguments is None else arguments)])
 
 
 if __name__ == "__main__":

@@ -41,13 +41,15 @@ class Config(Table):
     """One dataset, of the paper's rig or of that of a `rig` file. `ValueError` names the field that
     is wrong.
 
-    Everything but `title` and `description` decides the data; `trajectories_per_shard` and
-    `samples_per_chunk` decide only where they lie. Parameters are known by the names of
+    Everything but `title`, `description` and `license` decides the data; `trajectories_per_shard`
+    and `samples_per_chunk` decide only where they lie. Parameters are known by the names of
     `Parameters`, those of a rig file by the names of its tables.
     """
 
     title: str
     description: str = ""
+    license: str = ""
+    """of the data, by its name in SPDX, such as CC-BY-4.0"""
     seed: int = Field(ge=0, le=SEED)
     trajectories: int = Field(ge=1, le=10_000_000)
     trajectories_per_shard: int = Field(16, ge=1, le=100_000)
@@ -125,7 +127,8 @@ class Config(Table):
     @model_serializer(mode="wrap")
     def _own_fields(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         foreign = OF_A_FILE if self.rig is None else OF_THE_PAPER
-        return {name: x for name, x in handler(self).items() if name not in foreign}
+        left_out = (*foreign, *(() if self.license else ("license",)))
+        return {name: x for name, x in handler(self).items() if name not in left_out}
 
     def _made(self) -> Subject:
         return PaperGrasp(self) if self.rig is None else RigOfFile(self)

@@ -10,7 +10,7 @@ Errors say what to do about them.
 import errno
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
@@ -26,6 +26,7 @@ from torchsoft.tables import LISTED, InvalidTable, Table, line
 T = TypeVar("T")
 
 MANIFEST = "manifest.json"
+CARD = "README.md"
 FINISHED = "finished"
 RECORD = f"{FINISHED}/{{shard}}.sha256"
 COPY = "restore it from a copy, or make the dataset anew in another folder"
@@ -42,6 +43,10 @@ REMEDIES = {
     errno.EROFS: "may not be written, the file system is read-only; choose another folder",
 }
 """What the operating system's errors mean for a dataset."""
+
+
+MOST = 20
+"""Spans of shards that a message lists."""
 
 
 class StoreError(RuntimeError):
@@ -152,9 +157,7 @@ class Layout(Table):
             return content
         remedy = COPY
         if (shard := self.shard(key)) is not None:
-            again = (
-                "start `python -m torchsoft.datasets.generate` again, which makes this shard anew"
-            )
+            again = "start `torchsoft dataset make` again, which makes this shard anew"
             remedy = f"remove {url}/{record_key(shard)} and {again}"
         raise StoreError(f"{url}/{key} is {'missing' if content is None else 'damaged'}; {remedy}")
 
@@ -206,6 +209,18 @@ class Manifest(Table):
         written."""
         data = read_bytes(url, key)
         return self.layout.vouch(url, key, data, digest(data or b"") == self.digests[key])
+
+
+def listed(shards: Iterable[int]) -> str:
+    """Numbers of shards as people write them: 0, 3-7, 9."""
+    spans = list[list[int]]()
+    for shard in sorted(shards):
+        if spans and shard == spans[-1][-1] + 1:
+            spans[-1] = [spans[-1][0], shard]
+        else:
+            spans.append([shard])
+    some = ["-".join(map(str, one)) for one in spans]
+    return ", ".join(some if len(some) <= MOST else [*some[:MOST], "..."])
 
 
 def record_key(shard: int) -> str:

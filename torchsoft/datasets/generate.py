@@ -1,57 +1,79 @@
-"""Make a dataset: `python -m torchsoft.datasets.generate CONFIG.toml --out DIR [--workers N]
-[--scheduler tcp://...]`.
+"""Make a dataset, or a part of one; started again on the same folder, what is missing of it.
 
-Started again on the same folder it makes what is missing. Ctrl-C and kill are safe at any moment.
+Shards are shared out: a part has its own, and no two processes make one at the same time.
 """
 
-import argparse
 import math
-import os
 import sys
+import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
 from torchsoft import threads
-from torchsoft.cost import RUN, Cost, agree, rig_row, rig_step, steps_per_second
+from torchsoft.cost import Cost, rig_row, rig_step, steps_per_second
+from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import StoreError
+from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, read_bytes
 from torchsoft.datasets.schema import variables
 from torchsoft.datasets.simulation import points, simulate_task, task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.processes import local_processes
-from torchsoft.tables import line
-
-CLUSTER = 16
-"""Workers that a cluster is taken to have."""
-
-MOST = 1000
-"""Local workers."""
 
 THREADS = 3
 """Threads of one process at the most: a third of a trajectory's time is not compiled, and holds the
 interpreter's lock."""
 
-COARSE = 5e-3
-"""Steps longer than this [s] get a note."""
+STATICS = 0.5
+"""Time [s] that a trajectory takes besides its steps: statics of the start and of the grasp,
+energies."""
 
-HELP = "take fewer trajectories, a looser rtol or a shorter duration"
+MANY, TRIED = 200, 3
+"""Trajectories from which on some are tried before the others, and how many."""
+
+PATIENCE = 60.0
+"""Time [s] that these may take."""
 
 
-def cost(config: Config, workers: int) -> Cost:
-    """Of the whole dataset, made by that many workers."""
-    subject, at_once = config.subject, max(min(workers, config.shards), 1)
-    seconds, step = config.duration + subject.prelude, subject.steps.get("step")
-    if step is not None:
-        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
-    else:  # an output between two steps takes half the time of a step
-        rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
-        steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
+class Part(NamedTuple):
+    """Every `of`-th shard, from number - 1 on. Parts have no shard in common."""
+
+    number: int = 1
+    of: int = 1
+
+    def shards(self, config: Config) -> range:
+        """Its shards. Raises `ValueError` for a part that has none."""
+        if self.of > config.shards:
+            raise ValueError(
+                f"--part {self.number}/{self.of}: the set has only {config.shards} shards of "
+                f"{config.trajectories_per_shard} trajectories; take {config.shards} parts at the "
+                "most, or smaller trajectories_per_shard"
+            )
+        return range(self.number - 1, config.shards, self.of)
+
+
+WHOLE = Part()
+
+
+def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
+    """Shards of a part that nobody has finished, in a place that may be empty yet."""
+    begun = read_bytes(url, MANIFEST) is not None
+    finished = Manifest.read(url).layout.finished(url) if begun else set[int]()
+    return [shard for shard in part.shards(config) if shard not in finished]
+
+
+def cost(
+    config: Config, workers: int, count: int | None = None, each: tuple[float, float] | None = None
+) -> Cost:
+    """Of `count` trajectories, all by default, made by that many workers, where one takes `each`:
+    time [s] and steps, those of a usual one by default."""
+    subject = config.subject
+    count = config.trajectories if count is None else count
+    at_once = max(min(workers, config.shards), 1)
+    seconds, steps = usual(config) if each is None else each
     kept = sum(  # of one trajectory [GiB]
         v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in variables(config).values()
     )
@@ -60,11 +82,40 @@ def cost(config: Config, workers: int) -> Cost:
     ) + config.samples * rig_row(subject.template)
     design = 8 * 2 * config.trajectories * subject.drawn / 2**30
     return Cost(
-        steps=config.trajectories * steps,
-        seconds=config.trajectories * (steps * rig_step(subject.template) + RUN) / at_once,
+        steps=count * steps,
+        seconds=count * seconds / at_once,
         memory=design + shard * at_once,
-        disk=kept * config.trajectories,
+        disk=kept * count,
     )
+
+
+def usual(config: Config) -> tuple[float, float]:
+    """Time [s] and steps of one trajectory by experience, rather too many."""
+    subject = config.subject
+    seconds, step = config.duration + subject.prelude, subject.steps.get("step")
+    if step is not None:
+        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
+    else:  # an output between two steps takes half the time of a step
+        rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
+        steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
+    return steps * rig_step(subject.template) + STATICS, steps
+
+
+def measured(config: Config) -> tuple[float, float]:
+    """The same of some trajectories of the set in the mean, after one that loads the kernels."""
+    began, steps, design = 0.0, 0, points(config)
+    with threads.single_threaded():
+        for i in range(TRIED + 1):
+            row = simulate_task(config, task(config, i, design[i]))
+            began, steps = (began, steps + row["steps"]) if began else (time.perf_counter(), 0)
+    return (time.perf_counter() - began) / TRIED, steps / TRIED
+
+
+def estimate(config: Config, url: str, workers: int, part: Part = WHOLE) -> Cost:
+    """What is left of a part will cost; of many trajectories, by a few of them."""
+    count = sum(len(config.rows(shard)) for shard in unfinished(config, url, part))
+    tried = count >= MANY and (TRIED + 1) * usual(config)[0] < PATIENCE
+    return cost(config, workers, count, measured(config) if tried else None)
 
 
 class Serial(Executor):
@@ -77,50 +128,63 @@ class Serial(Executor):
 
 
 def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
-    """Simulate and write one shard; how many trajectories it holds and how many of them failed."""
-    config = store.config
-    with threads.single_threaded():
-        rows = [
-            simulate_task(config, task(config, i, u))
-            for i, u in zip(config.rows(shard), design, strict=True)
-        ]
-    store.write(shard, rows)
+    """Simulate and write one shard; how many of its trajectories are finished, and how many of
+    those simulated here failed. None are where another process makes the shard."""
+    config, rows = store.config, list[dict[str, Any]]()
+    with store.claim(shard) as simulated, threads.single_threaded():
+        if simulated is None:
+            return 0, 0
+        if store.finished(shard):  # by another process, since it was submitted
+            return len(config.rows(shard)), 0
+        for i, u in zip(config.rows(shard), design, strict=True):
+            rows.append(simulate_task(config, task(config, i, u)))
+            simulated()
+        store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
 
 
 def generate(
-    config: Config, url: str, executor: Executor, workers: int = 1, progress: bool = True
-) -> int:
-    """Make every unfinished shard at `url`; the number of failed simulations among them.
+    config: Config, url: str, executor: Executor, workers: int = 1, progress: bool = True,
+    part: Part = WHOLE,
+) -> int:  # fmt: skip
+    """Make every unfinished shard of a part at `url`, but for those that other processes are
+    making, and the set's card once all are finished; the number of failed simulations among them.
 
     At most a few shards a worker are submitted at a time, so that Ctrl-C is heard and memory is
-    bounded. Raises `StoreError`.
+    bounded. Raises `StoreError`, and `ValueError` for a part that has no shard.
     """
+    mine = part.shards(config)
     store, design = open_or_create(url, config), points(config)
-    left, failed, running = store.unfinished()[::-1], 0, set[Future[tuple[int, int]]]()
-    finished = config.trajectories - sum(len(config.rows(shard)) for shard in left)
+    left, failed = unfinished(config, url, part)[::-1], 0
+    running = dict[Future[tuple[int, int]], int]()
+    total = sum(len(config.rows(shard)) for shard in mine)
+    finished = total - sum(len(config.rows(shard)) for shard in left)
     what: Any = {
         "unit": " simulated s",
         "unit_scale": config.duration,
         "disable": not progress,
         "smoothing": 0.05,
+        "mininterval": 0.1 if sys.stderr.isatty() else 30.0,  # [s], a line each in a log
     }
-    with tqdm(total=config.trajectories, initial=finished, **what) as bar:
+    with tqdm(total=total, initial=finished, **what) as bar:
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):
                     here = config.rows(shard := left.pop())
-                    running.add(
-                        executor.submit(run_shard, store, shard, design[here.start : here.stop])
-                    )
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                for count, bad in (future.result() for future in done):
-                    failed += bad
-                    bar.set_postfix_str(f"{failed} failed", refresh=False)
-                    bar.update(count)
+                    some = design[here.start : here.stop]
+                    running[executor.submit(run_shard, store, shard, some)] = shard
+                done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+                for future in done:
+                    count, bad = future.result()
+                    finished, failed = finished + count, failed + bad
+                    del running[future]
+                bar.set_postfix_str(f"{failed} failed", refresh=False)
+                bar.update(max(finished + sum(map(store.simulated, running.values())) - bar.n, 0))
         finally:
             for future in running:
                 future.cancel()
+    if not store.unfinished():
+        write_card(url)
     return failed
 
 
@@ -145,59 +209,10 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m torchsoft.datasets.generate", description=__doc__
-    )
-    parser.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
-    parser.add_argument("--out", required=True, help="folder or fsspec URL of the store")
-    workers = "threads, or processes if more than a few"
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help=workers)
-    parser.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
-    parser.add_argument(
-        "--yes", action="store_true", help="begin even what takes hours, or much memory or disk"
-    )
-    given = parser.parse_args(arguments)
-    if not 0 <= given.workers <= MOST:
-        parser.error(f"argument --workers: should be from 0 to {MOST}, not {given.workers}")
-    workers = CLUSTER if given.scheduler else given.workers
-    try:
-        config = Config.from_toml(given.config)
-        agree(cost(config, workers), given.yes, HELP)
-        if config.step is not None and config.step > COARSE:
-            note = (
-                f"note: step = {config.step:g} s is coarse: the energy balance may be off by "
-                "percents"
-            )
-            print(note, file=sys.stderr)
-        with (
-            dask_cluster(given.scheduler) if given.scheduler else local_workers(workers) as executor
-        ):
-            failed = generate(config, given.out, executor, workers)
-    except (ValueError, StoreError, OSError) as error:
-        said = (
-            f"{error.filename}: {error.strerror}"
-            if isinstance(error, OSError) and error.filename
-            else error
-        )
-        print(f"error: {line(said, 2000)}", file=sys.stderr)
-        return 2
-    except BrokenProcessPool:
-        print(
-            "error: a worker was killed, perhaps for memory; start again to make what is missing",
-            file=sys.stderr,
-        )
-        return 3
-    except KeyboardInterrupt:
-        print(
-            "interrupted: finished shards are kept; start again to make what is missing",
-            file=sys.stderr,
-        )
-        return 130
-    print(
-        f"{config.trajectories} trajectories in {given.out}; {failed} of those made now failed, "
-        "each with its reason"
-    )
-    return 0
+    """The command `torchsoft dataset make`."""
+    from torchsoft.cli import main as command
+
+    return command(["dataset", "make", *(sys.argv[1:] if arguments is None else arguments)])
 
 
 if __name__ == "__main__":

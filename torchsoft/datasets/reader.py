@@ -16,7 +16,15 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 from torchsoft.cost import machine_memory
-from torchsoft.datasets.files import Manifest, StoreError, digest, folder, read_record, record_key
+from torchsoft.datasets.files import (
+    Manifest,
+    StoreError,
+    digest,
+    folder,
+    listed,
+    read_record,
+    record_key,
+)
 from torchsoft.datasets.subject import SPLITS
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import whole
@@ -42,11 +50,11 @@ class Vouched(WrapperStore[Store]):
         manifest = Manifest.read(url)
         self.url, self.layout, self.digests = url, manifest.layout, dict(manifest.digests)
         self.finished = self.layout.finished(url)
-        if (lacking := self.layout.shards - len(self.finished)) and not unfinished:
+        if (lacking := set(range(self.layout.shards)) - self.finished) and not unfinished:
             raise StoreError(
-                f"{url}: {lacking} of {self.layout.shards} shards are not finished; start `python "
-                "-m torchsoft.datasets.generate` again to make them, or give `unfinished=True` to "
-                "leave their trajectories out"
+                f"{url}: {len(lacking)} of {self.layout.shards} shards are not finished "
+                f"({listed(lacking)}); start `torchsoft dataset make` again to make them, or give "
+                "`unfinished=True` to leave their trajectories out"
             )
         here = folder(url)
         super().__init__(

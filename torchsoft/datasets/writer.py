@@ -1,8 +1,11 @@
 """The writing of a dataset: laid out whole at the start, then one shard at a time, each with its
 record after its data."""
 
+import os
 import subprocess
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,7 +34,7 @@ from torchsoft.datasets.files import (
     write_bytes,
 )  # fmt: skip
 from torchsoft.datasets.schema import not_finite, variables
-from torchsoft.files import PARTIAL, finite, remove_partials
+from torchsoft.files import PARTIAL, claimed, finite, remove_partials
 
 SMALL = (ZstdCodec(level=3), Crc32cCodec())
 LARGE = (BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec())
@@ -54,6 +57,32 @@ class Store:
     def unfinished(self) -> list[int]:
         """Shards that have no record."""
         return sorted(set(range(self.config.shards)) - self.manifest.layout.finished(self.url))
+
+    def finished(self, shard: int) -> bool:
+        """Whether a shard has a record."""
+        return read_bytes(self.url, record_key(shard)) is not None
+
+    @contextmanager
+    def claim(self, shard: int) -> Iterator[Callable[[], object] | None]:
+        """A shard for one process alone: what is to be called for every trajectory simulated, None
+        while another process makes the shard. Object stores, and file systems without locks, give
+        a shard to everybody, who make the same of it."""
+        if (path := self.claim_file(shard)) is None:
+            yield lambda: None
+            return
+        with store_errors(self.url), claimed(path) as handle:
+            yield None if handle is None else lambda: os.write(handle, b".")
+
+    def claim_file(self, shard: int) -> Path | None:
+        """A file that is there while the shard is made, a byte for every trajectory simulated."""
+        here = folder(self.url)
+        return here and here / f"{record_key(shard)}.{0:016}.partial"
+
+    def simulated(self, shard: int) -> int:
+        """Trajectories of an unfinished shard that are simulated, whoever makes it."""
+        with suppress(OSError):
+            return path.stat().st_size if (path := self.claim_file(shard)) else 0
+        return 0
 
     def write(self, shard: int, rows: list[dict[str, Any]]) -> None:
         """Write a whole shard, then its record. Raises `StoreError` when there is no room or no

@@ -231,6 +231,12 @@ class Trajectory(Shown):
 
         return write(self, Path(path), times)
 
+    def to_mcap(self, path: str | Path) -> None:
+        """Write the channels as an MCAP log, a message a sample; needs the extra `export`."""
+        from torchsoft.solve.mcap import write_log
+
+        write_log(Path(path), self.to_xarray(), {})
+
     def save(self, path: str | Path) -> None:
         """Write NetCDF with a checksum. The file appears whole or not at all."""
         save(self.to_xarray(), path)

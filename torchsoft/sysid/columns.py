@@ -16,6 +16,7 @@ import xarray as xr
 from torchsoft import csvfile
 from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS
 from torchsoft.display import enumerated, nearest, suggestion
+from torchsoft.solve.mcap import read_log
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
@@ -196,8 +197,8 @@ def check_times(tables: Tables) -> None:
 
 
 def read_table(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
-    """A CSV or NetCDF file, by its suffix, without the columns `ignore`."""
-    if path.suffix in (".nc", ".h5"):
+    """A CSV, NetCDF or MCAP file, by its suffix, without the columns `ignore`."""
+    if path.suffix in (".nc", ".h5", ".mcap"):
         return read_trajectory(path, ignore, known)
     return read_csv(path, ignore, known)
 
@@ -224,9 +225,9 @@ def read_csv(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER
 
 
 def read_trajectory(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
-    """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises
-    `ValueError`."""
-    data = load(path)
+    """The table in a file of `Trajectory.save` or `to_mcap`; rows are called samples, counted from
+    0. Raises `ValueError`."""
+    data = read_log(path) if path.suffix == ".mcap" else load(path)
     values = read_channels(data, path, known)
     left_out = tuple(name for name in values if name in ignore)
     values = {name: column for name, column in values.items() if name not in ignore}

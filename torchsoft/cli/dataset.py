@@ -1,0 +1,162 @@
+"""Datasets: made, in parts too, checked, and given to others."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from torchsoft.cli.results import failed, say
+
+MAKE = """\
+Simulates the dataset of CONFIG.toml, shard by shard, into a folder or what fsspec opens. Ctrl-C and
+kill are safe at any moment, and the same command makes what is missing. Any number of processes may
+write into one folder: --part 2/8 makes every eighth shard from the second on, and no shard is made
+by two at a time."""
+
+SLURM = """\
+Writes a job array that makes a dataset in parts to the standard output, for `sbatch`. Where some of
+it is made already, the array has the parts that are not."""
+
+EXPORT = """\
+Writes a finished dataset, without its failed trajectories, in the form of another project:
+the-well   fields over each pad's surface in HDF5, as The Well reads them
+lerobot    motions, forces and set-points as episodes of LeRobot v3
+mcap       a log a trajectory, for Foxglove and the like; `torchsoft identify` reads them"""
+
+CLUSTER = 16
+"""Workers that a cluster is taken to have."""
+
+MOST = 1000
+"""Local workers."""
+
+COARSE = 5e-3
+"""Steps longer than this [s] get a note."""
+
+BRIEF = 10.0
+"""Time [s] that is not worth a word."""
+
+HELP = "take fewer trajectories, a looser rtol or a shorter duration"
+
+
+def add_commands(commands: Any) -> None:
+    """The command `dataset` and its own commands."""
+    group = commands.add_parser("dataset", help="make datasets, check them, and give them away")
+    own = group.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(name: str, run: Any, help: str, description: str) -> argparse.ArgumentParser:
+        one = own.add_parser(
+            name, help=help, description=description,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )  # fmt: skip
+        one.set_defaults(run=run)
+        return one
+
+    one = add("make", make, "make a dataset, or a part of one", MAKE)
+    add_config(one)
+    one.add_argument("--part", type=part, default=(1, 1), metavar="I/N", help="such as 2/8")
+    workers = "threads, or processes if more than a few"
+    one.add_argument("--workers", type=count, default=os.cpu_count() or 1, help=workers)
+    one.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
+    one.add_argument(
+        "--yes", action="store_true", help="begin even what takes hours, or much memory or disk"
+    )
+    one = add("slurm", slurm, "write the job array that makes a dataset in parts", SLURM)
+    add_config(one)
+    one.add_argument("--parts", type=int, required=True, metavar="N", help="jobs of the array")
+    one = add("check", check, "read a dataset and say what is wrong with it", "One line a finding.")
+    one.add_argument("store", help="folder or fsspec URL")
+    one.add_argument("--picture", type=Path, help="where to draw what the set covers")
+    one = add("export", export, "write a dataset in the form of another project", EXPORT)
+    one.add_argument("store", help="folder or fsspec URL")
+    one.add_argument("--to", required=True, choices=("the-well", "lerobot", "mcap"))
+    one.add_argument("--out", type=Path, required=True, help="a new folder")
+
+
+def add_config(one: argparse.ArgumentParser) -> None:
+    """The configuration, and the place of the dataset."""
+    one.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
+    one.add_argument("--out", required=True, help="folder or fsspec URL of the store")
+
+
+def part(text: str) -> tuple[int, int]:
+    """Number and count of parts."""
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise argparse.ArgumentTypeError(f"should be such as 2/8, from 1/8 to 8/8, not {text!r}")
+    return int(number), int(count)
+
+
+def count(text: str) -> int:
+    """Number of local workers."""
+    if not (text.isdecimal() and int(text) <= MOST):
+        raise argparse.ArgumentTypeError(f"should be from 0 to {MOST}, not {text}")
+    return int(text)
+
+
+def make(options: argparse.Namespace) -> int:
+    """Make what is missing of a dataset, or of a part."""
+    from concurrent.futures.process import BrokenProcessPool
+
+    from torchsoft.cost import agree
+    from torchsoft.datasets import generate
+    from torchsoft.datasets.config import Config
+    from torchsoft.datasets.files import listed
+
+    workers = CLUSTER if options.scheduler else options.workers
+    try:
+        config, mine = Config.from_toml(options.config), generate.Part(*options.part)
+        price = generate.estimate(config, options.out, workers, mine)
+        agree(price, options.yes, HELP)
+        if price.seconds > BRIEF:
+            say(price.sentence, error=True)
+        if config.step is not None and config.step > COARSE:
+            note = "is coarse: the energy balance may be off by percents"
+            say(f"note: step = {config.step:g} s {note}", error=True)
+        with (
+            generate.dask_cluster(options.scheduler)
+            if options.scheduler
+            else generate.local_workers(workers)
+        ) as executor:
+            bad = generate.generate(config, options.out, executor, workers, part=mine)
+    except BrokenProcessPool:
+        failed("a worker was killed, perhaps for memory; start again to make what is missing")
+        return 3
+    except KeyboardInterrupt:
+        told = "interrupted: finished shards are kept; start again to make what is missing"
+        print(told, file=sys.stderr)
+        return 130
+    made = sum(len(config.rows(shard)) for shard in mine.shards(config))
+    if elsewhere := generate.unfinished(config, options.out, mine):
+        say(f"another process is making shards {listed(elsewhere)}")
+        made -= sum(len(config.rows(shard)) for shard in elsewhere)
+    say(
+        f"{made} trajectories in {options.out}; {bad} of those made now failed, each with its "
+        "reason"
+    )
+    if left := generate.unfinished(config, options.out):
+        say(f"of the whole set {len(left)} of {config.shards} shards are left: {listed(left)}")
+    return 0
+
+
+def slurm(options: argparse.Namespace) -> int:
+    """Write a job array."""
+    from torchsoft.datasets.slurm import job_array
+
+    say(job_array(options.config, options.out, options.parts).rstrip())
+    return 0
+
+
+def check(options: argparse.Namespace) -> int:
+    """Say what is wrong with a dataset; the exit status is 1 for any finding."""
+    from torchsoft.datasets.check import report
+
+    return int(report(options.store, options.picture) > 0)
+
+
+def export(options: argparse.Namespace) -> int:
+    """Write a dataset in the form of another project."""
+    from torchsoft.datasets.export import export
+
+    say(export(options.store, options.to, options.out))
+    return 0

@@ -1,0 +1,127 @@
+"""The card of a dataset: `README.md` in its folder, in the form that hubs of datasets read."""
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+import xarray as xr
+
+from torchsoft.datasets.config import Config
+from torchsoft.datasets.distributions import Choice, Normal
+from torchsoft.datasets.files import CARD, Manifest, read_bytes, store_errors, write_bytes
+from torchsoft.datasets.reader import Vouched
+from torchsoft.datasets.schema import variables
+from torchsoft.datasets.subject import SPLITS
+from torchsoft.tables import line
+
+UNSTATED = "Not stated: say it here and at the top before others are given the data."
+
+REASONS = 5
+"""Reasons of failures that it lists."""
+
+
+def write_card(url: str) -> None:
+    """Write the card of a finished dataset, unless it has one, which may have been edited."""
+    if read_bytes(url, CARD) is None:
+        with store_errors(url):
+            write_bytes(url, CARD, card(url).encode())
+
+
+def card(url: str) -> str:
+    """The card of a finished dataset. Raises `StoreError` for another."""
+    manifest, data = Manifest.read(url), Vouched(url).data(chunks=None)
+    config = Config.model_validate(manifest.config)
+    example = next(iter(config.subject.signals), "stored_energy")
+    return f"""\
+---
+pretty_name: {json.dumps(config.title, ensure_ascii=False)}
+license: {config.license or "unknown"}
+tags: [simulation, contact-mechanics, soft-robotics]
+---
+
+# {config.title}
+
+{config.description}
+
+- **Trajectories.** {counts(data)}.
+- **Time.** {config.duration:g} s each, sampled every {config.sample_interval:g} s.
+- **Origin.** Simulated with torchsoft {manifest.torchsoft}, seed {config.seed}, design
+  `{config.method}`; no measurement, no noise. `manifest.json` holds the configuration, the commit
+  and the digests.
+- **Rig.** {rig(config)}
+- **Licence.** {config.license or UNSTATED}
+
+```python
+from torchsoft.datasets import Trajectories, open_dataset
+data = open_dataset("FOLDER")  # this one; xarray with named dimensions and units
+windows = Trajectories("FOLDER", ["{example}"], split="train", window=20)  # for torch's DataLoader
+```
+
+## What differs between trajectories
+
+{table(("number", "distribution", "unit"), drawn(config))}
+
+## Arrays
+
+{table(("array", "dimensions", "unit", "meaning"), arrays(config))}
+"""
+
+
+def counts(data: xr.Dataset) -> str:
+    """Numbers of trajectories: all, of every split, and failed for which reasons."""
+    failed = data.failed.values.astype(bool)
+    said = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
+    out = f"{len(failed)} ({said}; {int(failed.sum())} failed, their series are NaN"
+    reasons = sorted({line(x, 100) for x in data.reason.values[failed]})
+    more = ["..."] if len(reasons) > REASONS else []
+    return "; ".join([out, *reasons[:REASONS], *more]) + ")"
+
+
+def rig(config: Config) -> str:
+    """The parts of the rig, and what touches."""
+    it = config.subject.template
+    of = "That of the paper" if config.rig is None else f"`{config.rig.get('title', 'rig file')}`"
+    touching = (f"{one.body} on {one.pad}" for one in it.contacts.values())
+    groups = {"bodies": it.bodies, "pads": it.pads, "contacts": touching, "actuators": it.actuators}
+    said = (f"{name} {', '.join(some)}" for name, some in groups.items())
+    return f"{of}: {'; '.join(said)}."
+
+
+def drawn(config: Config) -> Iterable[tuple[str, ...]]:
+    """What is drawn: numbers of the rig, and of its motions."""
+    schema = variables(config)
+    for name, one in config.parameters.items():
+        unit = schema[name.replace("/", "_over_")].unit
+        yield f"`{name}`", distribution(one), "1" if one.ratio_to else unit
+    if config.rig is None:
+        yield "`grasp_depth`", distribution(config.grasp_depth), "m"
+    for kind in config.kinds:
+        said = (f"{name} {distribution(one)}" for name, one in kind.ranges.items())
+        yield f"motion `{kind.kind}`, weight {kind.weight:g}", "; ".join(said), "SI"
+
+
+def distribution(one: Any) -> str:
+    """A distribution in words."""
+    span = f"{one.low:g} to {one.high:g}"
+    if isinstance(one, Choice):
+        said = "one of " + ", ".join(f"{x:g}" for x in one.choices)
+    elif isinstance(one, Normal):
+        said = f"normal, mean {one.mean:g}, standard deviation {one.sd:g}, {span}"
+    else:
+        said = span + (", logarithmic" if one.scale == "log" else "")
+    base = getattr(one, "ratio_to", None)
+    return said + (f", times `{base}`" if base else "")
+
+
+def arrays(config: Config) -> Iterable[tuple[str, ...]]:
+    """Every array: dimensions, unit, meaning."""
+    for name, one in variables(config).items():
+        parts = f": {', '.join(one.components)}" if one.components else ""
+        yield f"`{name}`", ", ".join(one.sizes), one.unit, one.meaning + parts
+
+
+def table(heading: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """A table in Markdown."""
+    lines = [heading, ("---",) * len(heading), *rows]
+    cells = ([cell.replace("|", "/") for cell in one] for one in lines)
+    return "\n".join(f"| {' | '.join(one)} |" for one in cells)

@@ -1,0 +1,15 @@
+"""One MCAP log a trajectory."""
+
+from pathlib import Path
+
+from torchsoft.datasets.export.source import Source
+from torchsoft.solve.mcap import write_log
+
+
+def write(source: Source, out: Path) -> str:
+    """Channels of every trajectory; what was drawn for it is the log's metadata."""
+    told = (*source.drawn, "split")
+    for run in source.runs(source.sound.tolist(), (*source.channels, *told)):
+        about = {name: str(run[name].item()) for name in (*told, "trajectory")}
+        write_log(out / f"{run.trajectory.item():06d}.mcap", run[source.channels], about)
+    return f"{len(source.sound)} logs of {len(source.channels)} channels"

@@ -1,0 +1,49 @@
+"""The sound trajectories of a dataset as exporters take them."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from torchsoft.datasets.config import Config
+from torchsoft.datasets.subject import SPLITS
+
+
+class Source(NamedTuple):
+    """A dataset, and the numbers of its `sound` trajectories."""
+
+    config: Config
+    data: xr.Dataset
+    sound: NDArray[np.integer]
+
+    @property
+    def splits(self) -> dict[str, list[int]]:
+        """Sound trajectories of every split that has any."""
+        split = self.data.split.values[self.sound]
+        found = {name: self.sound[split == name].tolist() for name in SPLITS}
+        return {name: some for name, some in found.items() if some}
+
+    @property
+    def channels(self) -> list[str]:
+        """Series of the rig: coordinates, efforts, motions."""
+        return list(self.config.subject.signals)
+
+    @property
+    def motions(self) -> list[str]:
+        """Channels that say what the rig is asked for."""
+        of = self.config.subject.template.signals
+        return [name for name in self.channels if name.removesuffix("_dot") in of]
+
+    @property
+    def drawn(self) -> list[str]:
+        """Numbers of a trajectory that are drawn."""
+        return list(self.config.subject.labels)
+
+    def runs(self, rows: Sequence[int], names: Iterable[str]) -> Iterator[xr.Dataset]:
+        """Some arrays of some trajectories, one after the other, in memory."""
+        some = self.data[[*names]]
+        for index in tqdm(rows, unit=" trajectories", mininterval=1.0, leave=False):
+            yield some.isel(trajectory=index).load()
