@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
+from torchsoft.display import Shown
 from torchsoft.extras import needed
 from torchsoft.reduced.ode import ReducedModel, Rollout, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record
@@ -185,14 +186,20 @@ def fit(
     )
 
 
-@dataclass(frozen=True)
-class Score:
+@dataclass(frozen=True, repr=False)
+class Score(Shown):
     """A rollout against its record: root mean square error by state, over the record's range and
     over its standard deviation; infinite where it diverged."""
 
     nrmse: dict[str, float]
     over_deviation: dict[str, float]
     rollout: Rollout
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        return f"Score: {self.rollout}, error at most {self.worst:.2%} of the range", [
+            (name, f"{error:.2%} of the range, {self.over_deviation[name]:.2%} of the deviation")
+            for name, error in self.nrmse.items()
+        ]
 
     @property
     def worst(self) -> float:
