@@ -309,7 +309,9 @@ def beside() -> Trajectory:
     return run_of(template("t"), x_d=x_d)[1]
 
 
-def test_a_set_point_counts_from_where_its_coordinate_starts(beside: Trajectory) -> None:
+def test_a_set_point_counts_from_where_its_coordinate_starts(
+    beside: Trajectory, tmp_path: Path
+) -> None:
     """The law of the loop holds in the variables of the record, from any begin on."""
     for begin in (None, 0.01):
         one = record(beside, begin=begin)
@@ -326,6 +328,9 @@ def test_a_set_point_counts_from_where_its_coordinate_starts(beside: Trajectory)
         record(series, beside.t)
     again = record(series, beside.t, measured="x_Br").series["x_d"]
     assert np.array_equal(again, record(beside).series["x_d"])
+    beside.save(tmp_path / "run.nc")
+    loaded = record(Trajectory.load(tmp_path / "run.nc"))
+    assert np.array_equal(again, loaded.series["x_d"])
     with pytest.raises(ValueError, match="`measured` = 'x' is not in `source`"):
         record(series, beside.t, measured="x")
 
@@ -361,6 +366,8 @@ def test_a_fit_that_misses_its_record_says_why(motions: list[Record]) -> None:
     law = {"F_x": {other.get(name, name): gain for name, gain in LAW["F_x"].items()}}
     with pytest.warns(UserWarning, match=r"`feedback` makes F_x off by .* N: give the gains"):
         fit(problem, RECIPE, law)
+    with pytest.warns(UserWarning, match=r"rolled out on record 0, it misses it.*`feedback` makes"):
+        choose(problem, [motions[0]], RECIPE, (0.01,), law)
     away = {"F_x": {name: -gain for name, gain in LAW["F_x"].items()}}
     with pytest.warns(UserWarning, match=r"record \d, it diverged at t = 0\.\d+ s; its `feedback`"):
         fit(problem, RECIPE, away)

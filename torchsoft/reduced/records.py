@@ -119,7 +119,7 @@ def _start(
         return float(np.asarray(source[measured], dtype=float)[keep][0])
     starts = {name: origin[name] for name in ("x_C", "x_Br") if name in origin}
     if not starts or max(starts.values()) - min(starts.values()) > ALIKE:
-        where = " and ".join(f"{name} at {x:.6g} m" for name, x in starts.items())
+        where = " and ".join(f"{name} at {x:.9g} m" for name, x in starts.items())
         raise ValueError(
             f"x_d is counted from where the coordinate starts that its loop measures, but "
             f"{where or 'neither x_C nor x_Br'} may be it; give `measured`, as in "
