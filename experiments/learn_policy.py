@@ -15,8 +15,8 @@ clock. The last policy of the first seed becomes the weights of a controller of 
 runs compiled and continuously, and a TorchScript program.
 
 Command: .venv/bin/python experiments/learn_policy.py [--seeds 5] [--seconds 200] [--smoke]
-Expected: the gradient is at 95 % of PPO's last return in a fifth of the samples, PPO ends 4 % higher;
-experiments/README.md has the table. Five seeds of three methods take an hour on a core.
+Expected: the gradient is at 95 % of the last return of PPO in a fifth of the samples, and PPO ends
+4 % higher; experiments/README.md has the table. Five seeds of three methods take an hour on a core.
 """
 
 import warnings

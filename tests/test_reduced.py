@@ -3,6 +3,7 @@ and bad data reported."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +13,16 @@ from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
 from torchsoft import Profile, Reference, press, simulate
+from torchsoft.physics.statics import BuiltRig
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, score
 from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics, polynomials, variable
+from torchsoft.rigs import RigFile
 from torchsoft.rigs.written import template
+from torchsoft.solve.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[1]
 
 R = 0.0183
 TRUTH = {
@@ -287,15 +293,92 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
         record({name: series[name].values for name in series} | {"omega": values}, run.t)
 
 
-def test_a_run_without_any_series_of_a_record_is_refused() -> None:
-    ready = (
-        template("t")
-        .override(outputs={"duration": 0.02, "interval": 5e-3, "snapshots": ()})
-        .build()
-    )
-    run = simulate(ready.rig, ready.t, y0=ready.y0)
+def run_of(file: RigFile, **motion: dict[str, object]) -> tuple[BuiltRig, Trajectory]:
+    """A file's rig and its first 20 ms."""
+    outputs = {"duration": 0.02, "interval": 5e-4, "snapshots": ()}
+    ready = file.override(outputs=outputs, motion=motion).build()
+    return ready, simulate(ready.rig, ready.t, y0=ready.y0, step=5e-4)
+
+
+@pytest.fixture(scope="module")
+def beside() -> Trajectory:
+    """A run whose loop measures the bracket, 0.3 mm beside the disc."""
+    x_d = {"kind": "profile", "times": [0.0, 0.02], "values": ["start", 1e-4]}
+    return run_of(template("t"), x_d=x_d)[1]
+
+
+def test_a_set_point_counts_from_where_its_coordinate_starts(
+    beside: Trajectory, tmp_path: Path
+) -> None:
+    """The law of the loop holds in the variables of the record, from any begin on."""
+    for begin in (None, 0.01):
+        one = record(beside, begin=begin)
+        e, e_dot = (
+            one.series[a] - one.series[b] for a, b in (("x_d", "x_Br"), ("x_d_dot", "v_Br"))
+        )
+        offset = float(beside["x_d"][-len(one.t)] - beside["x_bracket"][-len(one.t)])
+        assert one.series["x_d"][0] == pytest.approx(offset, abs=1e-12)
+        assert one.series["F_x"] == pytest.approx(1e5 * e + 400.0 * e_dot, abs=1e-6)
+        assert one.series["F_x"].std() > 0.3
+    series = {name: beside[f"{name}_disc"] for name in ("theta", "omega")}
+    series |= {"x_C": beside["x_disc"], "x_Br": beside["x_bracket"], "x_d": beside["x_d"]}
+    with pytest.raises(ValueError, match=r'x_C at 0\.0003 m and x_Br at 0 m may be it; .*"x_Br"'):
+        record(series, beside.t)
+    again = record(series, beside.t, measured="x_Br").series["x_d"]
+    assert np.array_equal(again, record(beside).series["x_d"])
+    beside.save(tmp_path / "run.nc")
+    loaded = record(Trajectory.load(tmp_path / "run.nc"))
+    assert np.array_equal(again, loaded.series["x_d"])
+    with pytest.raises(ValueError, match="`measured` = 'x' is not in `source`"):
+        record(series, beside.t, measured="x")
+
+
+def test_bodies_of_a_record_have_any_names(beside: Trajectory) -> None:
+    """Efforts on one coordinate add up; set-points of several loops are no x_d."""
     with pytest.raises(
-        ValueError,
-        match=r"`source` has none of x_C, .*, x_d.*; take a run of `SoftGrasp`",
+        ValueError, match="`disc` = 'disk' is no body of the run; did you mean `disc"
     ):
-        record(run)
+        record(beside, disc="disk")
+    with pytest.raises(ValueError, match=r"has none of x_C, .*, x_d.*; .* as in \{\"x_C\": data"):
+        record({"x_disc": beside["x_disc"]}, beside.t)
+    theta_d = {"kind": "profile", "times": [0.0, 0.02], "values": [0.0, 1e-2]}
+    ready, run = run_of(RigFile.from_toml(ROOT / "rigs/orientation.toml"), theta_d=theta_d)
+    one = record(run, bracket="upper")
+    efforts = run["F_carry_upper"] + run["F_turn_upper"]
+    assert np.array_equal(one.series["F_x"], efforts.numpy())
+    assert float(run["F_turn_upper"].abs().max()) > 0.1
+    assert np.array_equal(one.series["v_Br"], run["v_x_upper"].numpy())
+    assert "x_d" not in one.series
+    assert ready.rig.actuators["turn_upper"].pushes == "upper.x"
+
+
+def test_a_fit_that_misses_its_record_says_why(motions: list[Record]) -> None:
+    """Coarse samples of a large motion; a law on the wrong coordinate; no law at all."""
+    coarse_ones = [Record(one.t[::100], {k: x[::100] for k, x in one.series.items()})
+                   for one in (motion(truth(), seed, 3.0) for seed in range(4))]  # fmt: skip
+    slow = Recipe(width=0.05, window=3.0)
+    with pytest.warns(UserWarning, match=r"record \d, it .*; take small taps .* a sample is 10 ms"):
+        fit(assemble(coarse_ones, mechanics(R), slow), slow, LAW)
+    problem = assemble(motions, mechanics(R), RECIPE)
+    other = {"x_C": "x_Br", "v_C": "v_Br"}
+    law = {"F_x": {other.get(name, name): gain for name, gain in LAW["F_x"].items()}}
+    with pytest.warns(UserWarning, match=r"`feedback` makes F_x off by .* N: give the gains"):
+        fit(problem, RECIPE, law)
+    with pytest.warns(UserWarning, match=r"rolled out on record 0, it misses it.*`feedback` makes"):
+        choose(problem, [motions[0]], RECIPE, (0.01,), law)
+    away = {"F_x": {name: -gain for name, gain in LAW["F_x"].items()}}
+    with pytest.warns(UserWarning, match=r"record \d, it diverged at t = 0\.\d+ s; its `feedback`"):
+        fit(problem, RECIPE, away)
+    with pytest.warns(UserWarning, match="give `feedback`, the law that makes F_x"):
+        fit(problem, replace(RECIPE, threshold=0.3))
+
+
+def test_objects_show_themselves_in_a_few_lines(motions: list[Record]) -> None:
+    problem = assemble(motions, mechanics(R), RECIPE)
+    done = score(fit(problem, RECIPE, LAW), motions[0])
+    for thing in (motions[0], done, done.rollout, problem):
+        assert len(repr(thing).splitlines()) <= 10, thing
+        assert len(repr(thing)) < 700
+    assert repr(motions[0]).startswith("Record: 0 to 0.3 s, 3001 samples, one every 0.1 ms\n  x_C ")
+    assert f"{100 * done.nrmse['omega']:.3g} % of the range" in repr(done)
+    assert "omega'  360 rows, 5 candidate terms" in repr(problem)

@@ -11,7 +11,7 @@ import torch
 
 from torchsoft import Profile, Reference, SoftGrasp, simulate
 from torchsoft.physics.motion import Waves, wave
-from torchsoft.reduced import Recipe, assemble, fit, mechanics, record, rollout_of, score
+from torchsoft.reduced import Recipe, Record, assemble, fit, mechanics, record, rollout_of, score
 from torchsoft.scenario import grasp_and_roll
 
 model = SoftGrasp()
@@ -23,7 +23,7 @@ still = Reference(
 begin = simulate(model, torch.tensor([0.0, 1.0]).double(), y0=grasp.y0, reference=still).y[-1]
 
 
-def tapped(seed: int, size: float, end: float) -> object:
+def tapped(seed: int, size: float, end: float) -> Record:
     """A record of the settled grasp under a multi-sine of the set-point about where it is."""
     torch.manual_seed(seed)
     f = torch.logspace(0.5, 2.1, 10).tolist()
@@ -42,7 +42,7 @@ K, R = model.settings.control.K_81, model.settings.control.R_80
 law = {"F_x": {"x_d": K, "x_d_dot": R, "x_C": -K, "v_C": -R}}  # Eq. 33, 34
 recipe = Recipe(threshold=0.05, width=0.004, window=0.3)
 reduced = fit(assemble(taps, mechanics(r=18.35e-3), recipe), recipe, law)
-print(*reduced.text(), sep="\n")
+print(reduced)
 
 other = tapped(99, 6e-6, 0.3)
 out = rollout_of(reduced, other)

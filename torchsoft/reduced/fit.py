@@ -9,17 +9,26 @@ it is used.
 import contextlib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 
+from torchsoft.display import Shown, amount
 from torchsoft.extras import needed
-from torchsoft.reduced.ode import ReducedModel, Rollout, Term
+from torchsoft.reduced.ode import ReducedModel, Rollout, Term, symbol
 from torchsoft.reduced.records import KINEMATICS, STATES, Record
 from torchsoft.reduced.terms import Candidates
+
+GROSS = 1.0
+"""Root mean square error of a rollout, in standard deviations of the record, that says that the
+model is not one of the record: a constant would do as well."""
+
+LAW_OFF = 0.3
+"""Root mean square error of a control law's effort, in standard deviations of the record's, that
+says that it is another law."""
 
 ROWS_PER_TERM = 10
 """Fewest rows of a regression per candidate term."""
@@ -47,7 +56,7 @@ class Recipe:
     seed: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Regression:
     """Rows of one equation: columns (rows, terms) and rate (rows,), each of unit root mean square,
     and those sizes."""
@@ -59,14 +68,22 @@ class Regression:
     rate_size: float
 
 
-@dataclass(frozen=True)
-class Problem:
-    """The regressions of all equations, which every threshold shares."""
+@dataclass(frozen=True, repr=False)
+class Problem(Shown):
+    """The regressions of all equations, which every threshold shares, and the records behind
+    them."""
 
     regressions: dict[str, Regression]
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     scale: np.ndarray
+    records: tuple[Record, ...]
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        return f"Problem: {len(self.records)} records, inputs {', '.join(self.inputs)}", [
+            (f"{target}'", f"{len(one.rate)} rows, {len(one.terms)} candidate terms")
+            for target, one in self.regressions.items()
+        ]
 
 
 def assemble(
@@ -132,7 +149,7 @@ def assemble(
             )
         out[target] = Regression(terms, scaled, rate[:, j] / rate_size, size, rate_size)
     scale = np.max([np.abs(one[:, : len(states)]).max(0) for one in data], axis=0)
-    return Problem(out, states, tuple(inputs), scale)
+    return Problem(out, states, tuple(inputs), scale, tuple(records))
 
 
 class Equation(NamedTuple):
@@ -177,22 +194,36 @@ def build(
 def fit(
     problem: Problem, recipe: Recipe, feedback: Mapping[str, Mapping[str, float]] | None = None
 ) -> ReducedModel:
-    """The sparse model of a problem at the recipe's threshold."""
-    return build(
+    """The sparse model of a problem at the recipe's threshold.
+
+    Warns where a rollout of the model diverges or misses a record of the problem by more than
+    `GROSS` standard deviations, and where `feedback` is not the law of the record's effort.
+    """
+    model = build(
         problem,
         {target: solve(problem, target, recipe) for target in problem.regressions},
         feedback,
     )
+    _warn_of_misses(model, problem.records, [score(model, one) for one in problem.records])
+    return model
 
 
-@dataclass(frozen=True)
-class Score:
+@dataclass(frozen=True, repr=False)
+class Score(Shown):
     """A rollout against its record: root mean square error by state, over the record's range and
     over its standard deviation; infinite where it diverged."""
 
     nrmse: dict[str, float]
     over_deviation: dict[str, float]
     rollout: Rollout
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        if self.rollout.diverged_at is not None:
+            return f"Score: the rollout {self.rollout}", []
+        return f"Score: error at most {100 * self.worst:.3g} % of the range", [
+            (name, f"{100 * error:.3g} % of the range, {self.over_deviation[name]:.3g} deviations")
+            for name, error in self.nrmse.items()
+        ]
 
     @property
     def worst(self) -> float:
@@ -221,6 +252,49 @@ def score(model: ReducedModel, on: Record) -> Score:
     return Score(over_range, over_deviation, out)
 
 
+def _warn_of_misses(
+    model: ReducedModel, records: Sequence[Record], scores: Sequence[Score]
+) -> None:
+    """Warn of the record whose rollout is the worst, if it is a gross miss or under another law,
+    with the remedy."""
+    misses = [max(one.over_deviation.values()) for one in scores]
+    i = int(np.argmax(misses))
+    on, out = records[i], scores[i]
+    state = max(out.over_deviation, key=out.over_deviation.__getitem__)
+    said = (
+        f"misses it: the error of {state} is {misses[i]:.3g} of its standard deviations"
+        if out.rollout.diverged_at is None
+        else str(out.rollout)
+    )
+    wrong = []
+    for name, law in model.feedback.items():
+        if name in on.series:
+            error = on.columns(list(law)) @ list(law.values()) - on.series[name]
+            if np.sqrt((error**2).mean()) > LAW_OFF * on.series[name].std():
+                wrong.append(f"{name} off by {amount(float(np.abs(error).max()), symbol(name)[1])}")
+    if misses[i] <= GROSS and not wrong:
+        return
+    if "F_x" in model.outer:
+        remedy = (
+            "give `feedback`, the law that makes F_x: under a recorded F_x nothing holds the "
+            "position, and it drifts"
+        )
+    elif wrong:
+        remedy = (
+            f"its `feedback` makes {', '.join(wrong)}: give the gains of the rig, on the "
+            "coordinate that its loop measures"
+        )
+    else:
+        remedy = (
+            "take small taps of a settled grasp, sampled every 0.25 ms, that begin at rest, and "
+            f"no coarse samples of a large motion; here a sample is {1e3 * on.step:.3g} ms"
+        )
+    warnings.warn(
+        f"the reduced model is not to be trusted: rolled out on record {i}, it {said}; {remedy}",
+        stacklevel=3,
+    )
+
+
 @dataclass(frozen=True)
 class Choice:
     """The chosen model, its index among those tried, and the results of each: thresholds, terms,
@@ -228,7 +302,7 @@ class Choice:
 
     model: ReducedModel
     index: int
-    tried: list[dict[str, Any]]
+    tried: list[dict[str, Any]] = field(repr=False)
 
 
 def choose(
@@ -241,8 +315,8 @@ def choose(
 
     Every equation has its own threshold (all combinations that differ in their terms are rolled
     out), or all the same with `each` off, for models that are slow to roll out. The error of a
-    combination is the mean over the records of the states' worst NRMSE. Raises `ValueError`, with
-    the time, when all rollouts diverge.
+    combination is the mean over the records of the states' worst NRMSE. Warns as `fit` does, of the
+    validation records. Raises `ValueError`, with the time, when all rollouts diverge.
     """
     fits: dict[str, dict[tuple[str, ...], tuple[float, Equation]]] = {
         target: {} for target in problem.regressions
@@ -265,7 +339,7 @@ def choose(
     scale = np.max(
         [problem.scale, *(np.abs(one.columns(problem.states)).max(0) for one in validation)], axis=0
     )
-    problem, tried, models, last = replace(problem, scale=scale), [], [], ""
+    problem, tried, models, every, last = replace(problem, scale=scale), [], [], [], ""
     for option in options:
         model = build(
             problem, {target: equation for target, (_, equation) in option.items()}, feedback
@@ -274,6 +348,7 @@ def choose(
         diverged = [str(one.rollout) for one in scores if one.rollout.diverged_at is not None]
         last = diverged[0] if diverged else last
         models.append(model)
+        every.append(scores)
         tried.append(
             {
                 "thresholds": {
@@ -291,6 +366,7 @@ def choose(
         )
     good = [i for i, row in enumerate(tried) if row["nrmse"] <= slack * best]
     chosen = min(good, key=lambda i: (tried[i]["terms"], tried[i]["nrmse"]))
+    _warn_of_misses(models[chosen], validation, every[chosen])
     return Choice(models[chosen], chosen, tried)
 
 

@@ -136,8 +136,8 @@ class Held(nn.Module):
         return torch.lerp(self.u[i - 1], self.u[i], fraction.clamp(0.0, 1.0))
 
 
-@dataclass(frozen=True)
-class Rollout:
+@dataclass(frozen=True, repr=False)
+class Rollout(Shown):
     """States y (T, states) at t (T,) [s], NaN from `diverged_at` [s] on if it diverged; wall time
     [s]."""
 
@@ -145,6 +145,10 @@ class Rollout:
     y: np.ndarray
     diverged_at: float | None
     wall_s: float
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        rows = [("samples", f"{len(self.t)}, {self.t[0]:g} to {self.t[-1]:g} s")]
+        return f"Rollout: {self}", [*rows, ("time", f"{1e3 * self.wall_s:.3g} ms")]
 
     def __str__(self) -> str:
         return (

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
-from torchsoft.channels import MEASURED
-from torchsoft.reduced.ode import ALIASES
+from torchsoft.display import Shown, amount, suggestion
+from torchsoft.reduced.ode import ALIASES, symbol
 from torchsoft.solve.trajectory import Trajectory
 
 STATES = ("x_C", "theta", "x_Br", "v_C", "omega", "v_Br")
@@ -16,14 +17,27 @@ KINEMATICS = {"x_C": "v_C", "theta": "omega", "x_Br": "v_Br"}
 VARIABLES = (*STATES, "F_x", "x_d", "x_d_dot")
 """What a record may hold."""
 
+ALIKE = 1e-9
+"""Starts [m] that differ by no more are the same."""
 
-@dataclass(frozen=True)
-class Record:
+
+@dataclass(frozen=True, repr=False)
+class Record(Shown):
     """One motion: times t (T,) [s], equally spaced, and series (T,) by variable, SI units,
     positions from their start."""
 
     t: np.ndarray
     series: dict[str, np.ndarray]
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        title = (
+            f"Record: {self.t[0]:g} to {self.t[-1]:g} s, {len(self.t)} samples, one every "
+            f"{1e3 * self.step:.4g} ms"
+        )
+        return title, [
+            (name, f"{x.min():.4g} to {amount(float(x.max()), symbol(name)[1])}")
+            for name, x in self.series.items()
+        ]
 
     @property
     def step(self) -> float:
@@ -45,20 +59,27 @@ class Record:
 
 
 def record(
-    source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: float | None = None
-) -> Record:
-    """A record of a `Trajectory`, or of series by their names in a dataset (an `xarray.Dataset` of
-    one trajectory or an item of `torchsoft.datasets.Trajectories`) at times t [s].
+    source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: float | None = None,
+    disc: str = "disc", bracket: str = "bracket", measured: str | None = None,
+) -> Record:  # fmt: skip
+    """A record of a run of any rig, or of series by their names in a dataset of the paper's rig (an
+    `xarray.Dataset` of one trajectory or an item of `torchsoft.datasets.Trajectories`) at times t
+    [s].
+
+    disc, bracket: names of the two bodies in the run. F_x is the sum of efforts on the bracket's x,
+    x_d the set-point of the loop that pushes it, if there is only one and it measures an x.
 
     Samples before `begin` [s] are left out, and positions and angle counted from the first one
-    kept; x_d from the disc's. What the source lacks the record lacks. Raises `ValueError` for times
-    that are not equally spaced, for a value that is not finite, naming the series, and for a source
-    without any of them, such as the run of a rig that is not the paper's.
+    kept; x_d from where the coordinate starts that its loop measures. A run knows this coordinate;
+    of series, `measured` names it, "x_C" or "x_Br", where these start at different places. What the
+    source lacks the record lacks. Raises `ValueError` for times that are not equally spaced, for a
+    value that is not finite, naming the series, for a body that is not in the run, for a set-point
+    of an unknown coordinate, and for a source without any of the series.
     """
     if isinstance(source, Trajectory):
-        t = source.t if t is None else t
-        # another rig may call by these names what is something else
-        source = source.channels if all(name in source for name in MEASURED) else {}
+        t = source.t.detach() if t is None else t
+        source, own = _of_run(source, disc, bracket)
+        measured = measured or own
     times = np.asarray(source["time"] if t is None else t, dtype=float)
     keep = times >= (times[0] if begin is None else begin)
     if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
@@ -79,13 +100,64 @@ def record(
     if not series:
         known = ", ".join(dict.fromkeys(channels.values()))
         raise ValueError(
-            f"`source` has none of {known}; take a run of `SoftGrasp`, or give series by these "
-            "names"
+            f"`source` has none of {known}; take a run, or give series by these names, as in "
+            '{"x_C": data["x_disc"], ...}'
         )
     origin = {name: float(series[name][0]) for name in ("x_C", "theta", "x_Br") if name in series}
-    if "x_d" in series and "x_C" in origin:
-        origin["x_d"] = origin["x_C"]
+    if "x_d" in series:
+        origin["x_d"] = _start(source, keep, origin, measured)
     return Record(times[keep], {name: x - origin.get(name, 0.0) for name, x in series.items()})
+
+
+def _start(
+    source: Mapping[Any, Any], keep: np.ndarray, origin: Mapping[str, float], measured: str | None
+) -> float:
+    """Where the coordinate starts that the loop of x_d measures [m]."""
+    if measured is not None:
+        if measured not in source:
+            raise ValueError(f"`measured` = {measured!r} is not in `source`; give its series too")
+        return float(np.asarray(source[measured], dtype=float)[keep][0])
+    starts = {name: origin[name] for name in ("x_C", "x_Br") if name in origin}
+    if not starts or max(starts.values()) - min(starts.values()) > ALIKE:
+        where = " and ".join(f"{name} at {x:.9g} m" for name, x in starts.items())
+        raise ValueError(
+            f"x_d is counted from where the coordinate starts that its loop measures, but "
+            f"{where or 'neither x_C nor x_Br'} may be it; give `measured`, as in "
+            'measured="x_Br", or leave x_d out'
+        )
+    return next(iter(starts.values()))
+
+
+def _of_run(run: Trajectory, disc: str, bracket: str) -> tuple[dict[str, np.ndarray], str | None]:
+    """Series of a run by their names in a dataset, and the one that the loop of x_d measures."""
+    setup, state = run.setup, run.state
+    for field, name in (("disc", disc), ("bracket", bracket)):
+        if name not in setup.bodies:
+            raise ValueError(
+                f"`{field}` = {name!r} is no body of the run; "
+                f"{suggestion(name, setup.bodies, 'its bodies are')}: give the name of the body "
+                + ("that rolls" if field == "disc" else "that carries the other pad")
+            )
+    out = {
+        "x_C": state.pose[disc][:, 0],
+        "theta": state.pose[disc][:, 2],
+        "x_Br": state.pose[bracket][:, 0],
+        "v_x": state.velocity[disc][:, 0],
+        "omega": state.velocity[disc][:, 2],
+        "v_x_Br": state.velocity[bracket][:, 0],
+    }
+    pushing = [one for one in setup.actuators.values() if one.pushes == f"{bracket}.x"]
+    if pushing:
+        out["F_x"] = torch.stack([run[one.channel] for one in pushing]).sum(0)
+    loops = [loop for one in pushing for loop in one.follows.items()]
+    measured = None
+    if len(loops) == 1 and loops[0][0].endswith(".x"):
+        coordinate, signal = loops[0]
+        body = coordinate.removesuffix(".x")
+        measured = {disc: "x_C", bracket: "x_Br"}.get(body, coordinate)
+        out |= {measured: state.pose[body][:, 0]}
+        out |= {"x_d": run[signal], "x_d_dot": run[f"{signal}_dot"]}
+    return {name: x.detach().numpy() for name, x in out.items()}, measured
 
 
 def noisy(source: Record, level: float, seed: int) -> Record:
