@@ -131,7 +131,7 @@ def mobilised(axes: Axes, run: Trajectory) -> None:
     """How much of the friction cone is used: sum of |friction| over mu_s times that of the normal
     forces."""
     for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
-        t = timeline(axes, "|friction| / cone [%]", run)
+        t = timeline(axes, "share of the cone [%]", run)
         mu, normal = run.setup.contacts[name].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
         share = force[..., 1].abs().sum(-1) / (mu * normal)
         share = torch.where(normal > 1e-9, share, torch.nan)
@@ -173,7 +173,7 @@ def stresses(axes: Axes, run: Trajectory) -> None:
     for (name, pad), colour in zip(run.setup.pads.items(), COLOURS * len(run.setup.pads)):
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
         peak = 1e-3 * von_mises(pad.stress(pad.strain(whole))).max(-1)
-        timeline(axes, "von Mises, elastic [kPa]", run)
+        timeline(axes, "von Mises,\nelastic [kPa]", run)
         axes.plot(run.t.numpy()[rows], peak, color=colour, label=f"pad {name}")
     axes.set_ylim(0, None)
     legend_above(axes)
@@ -216,7 +216,7 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
     """Forces along one contact at an instant, with the cone."""
     forces_on(axes, run.setup, instant, contact)
     if not len(instant.near(contact)):
-        axes.set(xticks=[], yticks=[], xlabel="no point touches")
+        axes.set(xticks=[], yticks=[], ylim=(-1, 1), xlabel="no point touches")
         return
     name = run.setup.contacts[contact].pad
     level = along_surface(run.setup.pads[name], instant.base[name])[0] > 0.999
