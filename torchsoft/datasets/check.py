@@ -201,7 +201,8 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     table = data[[*names, *by, "failed"]].to_dataframe()[[*names, *by, "failed"]].reset_index()
     table["split"] = table["split"].where(table["failed"] == 0, "failed")
     fig = Figure(figsize=(13, 11.6 / columns * -(-count // columns)), layout="constrained")
-    fig.suptitle(f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed")
+    title = f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed"
+    fig.suptitle(title, x=0.01, ha="left")
     panels = fig.subplots(-(-count // columns), columns, squeeze=False).ravel()
     for ax, x, y in zip(panels, names, [*names[1:], names[0]]):
         for name, some in table.groupby("split"):
@@ -215,8 +216,9 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
         ax.set_axis_off()
     counts = table.groupby(by).size()
     (counts.unstack() if len(by) > 1 else counts).plot.bar(
-        stacked=True, ax=panels[len(names)], ylabel="trajectories [1]", legend=False
-    )
+        stacked=True, ax=panels[len(names)], ylabel="trajectories [1]", legend=False,
+        color=[f"C{i}" for i in range(table["split"].nunique())],
+    )  # fmt: skip
     sound = table[table["failed"] == 0]
     some = (sound.groupby("kind").head(MOST) if "kind" in by else sound.head(MOST)).index
     for ax, name in zip(panels[len(names) + 1 :], moving(data, config)):

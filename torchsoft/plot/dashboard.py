@@ -149,10 +149,9 @@ def points(axes: Axes, run: Trajectory) -> None:
     for (name, state), colour in zip(run.contact_state.items(), COLOURS * len(run.force)):
         t = timeline(axes, "contact points", run)
         touching, slipping = (state != 0).sum(-1).numpy(), (state == SLIPPING).sum(-1).numpy()
-        axes.step(t, touching, where="mid", color=colour, label=f"{name}: touch")
-        axes.fill_between(
-            t, 0, slipping, step="mid", color=colour, alpha=0.45, lw=0, label=f"{name}: slip"
-        )
+        axes.step(t, touching, where="mid", color=colour, label=name)
+        axes.fill_between(t, 0, slipping, step="mid", color=colour, alpha=0.45, lw=0)
+    axes.fill_between([], [], color=INK, alpha=0.45, lw=0, label="of these slip")
     if any(bool((state < 0).any()) for state in run.contact_state.values()):
         axes.set_title("slip not known: the rig has changed since", fontsize="small", loc="right")
     axes.set_ylim(0, None)

@@ -46,8 +46,8 @@ def packed(values: Array) -> dict[str, Any]:
     low, high = float(np.min(values, initial=np.inf)), float(np.max(values, initial=-np.inf))
     if not values.size:
         low = high = 0.0
-    step = (high - low) / LEVELS or 1.0
-    codes = np.round((values - low) / step).astype("<u2")
+    step = (high - low) / LEVELS
+    codes = np.round((values - low) / (step or 1.0)).astype("<u2")
     return {"low": low, "step": step, "codes": encoded(codes), "shape": list(values.shape)}
 
 
