@@ -302,8 +302,8 @@ def test_a_loaded_run_has_the_same_mesh(done: Done, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("speed", "text"),
-    [(1.0, ""), (2.517, ", 2.5 times as fast"), (0.1, ", 10 times slower"),
-     (123.0, ", 120 times as fast")],
+    [(1.0, ""), (2.517, "\n2.5 times as fast"), (0.1, "\n10 times slower"),
+     (123.0, "\n120 times as fast")],
 )  # fmt: skip
 def test_a_video_says_how_fast_it_is(speed: float, text: str) -> None:
     assert pace(speed) == text

@@ -217,7 +217,7 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     counts = table.groupby(by).size()
     (counts.unstack() if len(by) > 1 else counts).plot.bar(
         stacked=True, ax=panels[len(names)], ylabel="trajectories [1]", legend=False,
-        color=[f"C{i}" for i in range(table["split"].nunique())],
+        color=[f"C{i}" for i in range(len(set(table["split"])))],
     )  # fmt: skip
     sound = table[table["failed"] == 0]
     some = (sound.groupby("kind").head(MOST) if "kind" in by else sound.head(MOST)).index

@@ -59,7 +59,7 @@ def pace(speed: float) -> str:
     if abs(speed - 1) < 0.01:
         return ""
     times = float(f"{max(speed, 1 / speed):.2g}")
-    return f", {times:g} times {'as fast' if speed > 1 else 'slower'}"
+    return f"\n{times:g} times {'as fast' if speed > 1 else 'slower'}"
 
 
 def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:

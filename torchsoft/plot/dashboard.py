@@ -306,8 +306,8 @@ def dashboard(
         outer = figure.add_gridspec(len(parts), height_ratios=[sum(part) for part in parts])
         lines = [
             (grid, i)
-            for cell, part in zip(outer, parts)
-            for grid in [cell.subgridspec(len(part), columns, height_ratios=part)]
+            for k, part in enumerate(parts)
+            for grid in [outer[k].subgridspec(len(part), columns, height_ratios=part)]
             for i in range(len(part))
         ]
         if pictured:

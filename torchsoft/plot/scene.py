@@ -195,13 +195,15 @@ class Scene:
     """The artists of one picture on `axes`; `show` puts the `moving` ones, in drawing order, where
     another instant has them.
 
-    The mesh is the real one, in finer lines where it is dense. With `curves` = (mm per N, scale bar in N) the contact forces stand behind the pads, normal force
-    red, friction blue. `stress` [kPa] is the one that the darkest colour stands for; pads are plain
-    without it. `size` scales markers and lines.
+    The mesh is the real one, in finer lines where it is dense. With `curves` = (mm per N, scale bar
+    in N) the contact forces stand behind the pads, normal force red, friction blue. `stress` [kPa]
+    is the one that the darkest colour stands for; pads are plain without it. `size` scales markers
+    and lines.
     """
 
     def __init__(
-        self, axes: Axes, setup: Setup, *, curves: tuple[float, float] | None = None, stress: float | None = None, size: float = 1.0,
+        self, axes: Axes, setup: Setup, *, curves: tuple[float, float] | None = None,
+        stress: float | None = None, size: float = 1.0,
     ) -> None:  # fmt: skip
         self.setup, self.curves = setup, curves
         self.thickness = plates(setup)
@@ -246,9 +248,7 @@ class Scene:
         for k in setup.contacts:
             for state, (_, marker, colour) in STATES.items():
                 ms = size * (2.0 if state == SEPARATED else 3.6 if state == SLIPPING else 2.8)
-                (self.states[k, state],) = axes.plot(
-                    [], [], marker, color=colour, ms=ms, mew=0
-                )
+                (self.states[k, state],) = axes.plot([], [], marker, color=colour, ms=ms, mew=0)
         for k in setup.contacts if curves else ():
             self.friction[k] = Polygon(
                 np.zeros((3, 2)), facecolor=FRICTION, edgecolor=FRICTION, alpha=0.75, lw=0.8 * size
