@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from conftest import coarse
 from PIL import Image
 
 from torchsoft import Trajectory, simulate
-from torchsoft.plot.player import frame_rows, player
+from torchsoft.plot.player import charts, frame_rows, packed, player
 from torchsoft.scenario import grasp_and_roll
 
 SEEN = "return [...document.querySelectorAll('.chart span')].map(x => x.textContent)"
@@ -90,6 +91,21 @@ def test_charts_follow_the_slider(page: Page, run: Trajectory) -> None:
         row = run.at(time)
         assert shown["actual"] == pytest.approx(1e3 * float(run["y_Br"][row]), rel=1e-3)
         assert shown["set-point"] == pytest.approx(1e3 * float(run["y_d"][row]), rel=1e-3)
+
+
+@pytest.mark.parametrize("values", [[0.5, 0.5], [3e-12, 100.0, -2.0], [0.0, 5e-11]])
+def test_what_a_file_does_not_resolve_is_nothing(page: Page, values: list[float]) -> None:
+    step = np.ptp(values) / 65535
+    unpacked = page.run("return [...unpack(arguments[0])]", packed(np.array(values)))
+    assert unpacked == pytest.approx([x if abs(x) > step else 0.0 for x in values], abs=step)
+    assert (0.0 in unpacked) == (min(map(abs, values)) < step)
+
+
+def test_forces_of_nothing_are_none(run: Trajectory) -> None:
+    still = replace(run, force={k: x * torch.tensor([1.0, 1e-13]) for k, x in run.force.items()})
+    series = {one["name"]: one["series"] for one in charts(still)[1:]}
+    assert all(one["values"]["step"] == one["values"]["low"] == 0 for one in series["friction"])
+    assert all(one["values"]["step"] > 0 for one in series["normal force"])
 
 
 def test_a_point_tells_its_forces(page: Page, run: Trajectory) -> None:

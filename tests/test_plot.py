@@ -33,10 +33,11 @@ from torchsoft import (
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.setup import von_mises
 from torchsoft.plot import figures
-from torchsoft.plot.animation import animate
-from torchsoft.plot.dashboard import dashboard, energy_groups, panels
+from torchsoft.plot.animation import animate, pace
+from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
 from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
-from torchsoft.plot.scene import instants, straight_up
+from torchsoft.plot.figures import Look
+from torchsoft.plot.scene import Scene, instants, straight_up
 from torchsoft.scenario import grasp_and_roll
 
 Done = tuple[SoftGrasp, Trajectory]
@@ -264,6 +265,50 @@ def test_a_dashboard_that_there_is_not_is_refused(
         dashboard(done[1], **how)
 
 
+@pytest.mark.parametrize("look", ["screen", "page"])
+@pytest.mark.parametrize("rig", ["done", "held"])
+def test_legends_stand_above_the_curves(
+    rig: str, look: Look, request: pytest.FixtureRequest
+) -> None:
+    figure = dashboard(request.getfixturevalue(rig)[1], look=look)
+    FigureCanvasAgg(figure).draw()
+    legends = [(axes, one) for axes in figure.axes if (one := axes.get_legend())]
+    assert len(legends) > 6
+    for axes, legend in legends:
+        top = axes.transData.transform((0.0, axes.dataLim.y1))[1]
+        assert legend.get_window_extent().y0 > top - 3.0, axes.get_title(loc="left")
+
+
+def test_ripples_are_explained_in_a_whole_dashboard_only(
+    done: Done, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchsoft.plot.dashboard.ripples", lambda run: True)
+    assert dashboard(done[1]).get_supxlabel() == RIPPLE
+    assert not dashboard(done[1], only=["scene", "disc.y"]).get_supxlabel()
+    assert not dashboard(done[1], look="page").get_supxlabel()
+
+
+def test_a_loaded_run_has_the_same_mesh(done: Done, tmp_path: Path) -> None:
+    done[1].save(tmp_path / "run.nc")
+    drawn = []
+    for run in (done[1], Trajectory.load(tmp_path / "run.nc")):
+        scene = Scene(Figure().subplots(), run.setup)
+        scene.show(instants(run, [0.1])[0])
+        drawn.append(np.array(scene.layers["L"].get_segments()))
+    np.testing.assert_allclose(*drawn, atol=1e-9)
+    across, along = run.setup.pads["L"].mesh.elements_y, run.setup.pads["L"].mesh.elements_x
+    assert len(drawn[0]) == along * (across + 1) + across * (along + 1)
+
+
+@pytest.mark.parametrize(
+    ("speed", "text"),
+    [(1.0, ""), (2.517, "\n2.5 times as fast"), (0.1, "\n10 times slower"),
+     (123.0, "\n120 times as fast")],
+)  # fmt: skip
+def test_a_video_says_how_fast_it_is(speed: float, text: str) -> None:
+    assert pace(speed) == text
+
+
 def test_save_writes_the_whole_file_or_none(done: Done, tmp_path: Path) -> None:
     figures.save(dashboard(done[1], only=["F_y"]), tmp_path / "moment.png", dpi=50)
     assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
@@ -291,6 +336,7 @@ def test_animation_moves(done: Done, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["run.gif"]
     with Image.open(tmp_path / "run.gif") as gif:
         assert gif.n_frames == 4
+        assert gif.info["duration"] == 80
         pictures = []
         for i in (0, 3):
             gif.seek(i)

@@ -419,6 +419,8 @@ def test_tables_leave_out_what_is_empty_and_escape_the_rest() -> None:
     cells = [attributes for tag, attributes in page.tags if tag == "td"]
     assert [one["class"] for one in cells] == ["", "n", "weak", "n"]
     assert cells[0]["data-label"] == "<h>"
+    words = Page(table(["name", "if"], [["a", "2 points"], ["b", "they had"], ["c", "it were"]]))
+    assert {one["class"] for tag, one in words.tags if tag in ("th", "td")} == {""}
 
 
 @pytest.mark.parametrize(

@@ -199,28 +199,33 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     if config.rig is None:
         ranged["grasp_depth"] = config.grasp_depth
     by = [name for name in ("kind", "split") if name in data]
-    names, rows = list(ranged), -(-len(ranged) // 4)
+    names = list(ranged)
+    count = len(names) + 1 + len(MOTIONS)
+    columns = min((4, 3, 5), key=lambda n: -count % n)  # with the fewest empty cells
     table = data[[*names, *by, "failed"]].to_dataframe()[[*names, *by, "failed"]].reset_index()
     table["split"] = table["split"].where(table["failed"] == 0, "failed")
-    fig = Figure(figsize=(13, 2.9 * (rows + 1)), layout="constrained")
-    fig.suptitle(f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed")
-    panels = fig.subplots(rows + 1, 4, squeeze=False)
-    for ax, x, y in zip(panels.flat, names, [*names[1:], names[0]]):
+    fig = Figure(figsize=(13, 11.6 / columns * -(-count // columns)), layout="constrained")
+    title = f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed"
+    fig.suptitle(title, x=0.01, ha="left")
+    panels = fig.subplots(-(-count // columns), columns, squeeze=False).ravel()
+    for ax, x, y in zip(panels, names, [*names[1:], names[0]]):
         for name, some in table.groupby("split"):
-            ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4)
+            ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4, label=name)
         label, other = (
             f"{name} [{data[name].units}]".replace("_over_", " over\n") for name in (x, y)
         )
         ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
-    for ax in panels.flat[len(names) : -4]:
+    fig.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
+    for ax in panels[count:]:
         ax.set_axis_off()
     counts = table.groupby(by).size()
     (counts.unstack() if len(by) > 1 else counts).plot.bar(
-        stacked=True, ax=panels[-1, 0], ylabel="trajectories [1]"
-    )
+        stacked=True, ax=panels[len(names)], ylabel="trajectories [1]", legend=False,
+        color=[f"C{i}" for i in range(len(set(table["split"])))],
+    )  # fmt: skip
     sound = table[table["failed"] == 0]
     some = (sound.groupby("kind").head(MOST) if "kind" in by else sound.head(MOST)).index
-    for ax, name in zip(panels[-1, 1:], moving(data, config)):
+    for ax, name in zip(panels[len(names) + 1 :], moving(data, config)):
         ax.plot(data.time, data[name][some].T, lw=0.7)
         ax.set(xlabel="time [s]", ylabel=f"{name} [{data[name].units}]")
     for ax in fig.axes:

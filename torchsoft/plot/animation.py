@@ -17,7 +17,7 @@ from torchsoft.display import suggestion
 from torchsoft.files import replacing
 from torchsoft.physics.mesh import Array
 from torchsoft.plot.dashboard import curves, liveliest
-from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
+from torchsoft.plot.figures import ACTUAL, DESIRED, SIZES, STYLE, stress_bar, timeline
 from torchsoft.plot.scene import (
     DISC,
     FRICTION,
@@ -34,7 +34,8 @@ from torchsoft.plot.scene import (
 )
 from torchsoft.solve.trajectory import Trajectory
 
-FRAMES_PER_SECOND = 12
+FRAMES_PER_SECOND = 12.5
+"""A pause of GIF is a multiple of 10 ms."""
 
 Picture = NDArray[np.uint8]
 
@@ -53,6 +54,14 @@ def frame_times(run: Trajectory, frames: int, slow: float) -> Array:
     )
 
 
+def pace(speed: float) -> str:
+    """How fast time is shown, where that is not as fast as it went by."""
+    if abs(speed - 1) < 0.01:
+        return ""
+    times = float(f"{max(speed, 1 / speed):.2g}")
+    return f"\n{times:g} times {'as fast' if speed > 1 else 'slower'}"
+
+
 def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and a coordinate over time under
     it. The axes are drawn once; per picture only what moves."""
@@ -67,11 +76,13 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> 
         )
         canvas = FigureCanvasAgg(figure)
         whole, strip = figure.subplots(2, 1, height_ratios=(figure.get_figheight() - 1.26, 1.26))
-        scene = Scene(whole, setup, columns=5, curves=scale, stress=largest_stress(shown))
+        stress = largest_stress(shown)
+        scene = Scene(whole, setup, curves=scale, stress=stress)
+        stress_bar(figure, whole, stress, SIZES["screen"])
         whole.set(xlim=x_limits, ylim=y_limits, xlabel="x [mm]", ylabel="y [mm]", title=title)
         scene.scale_bar(whole)
         whole.grid(False)
-        figure.legend(handles=keys(setup, shown), loc="outside lower center", ncols=3)
+        figure.legend(handles=keys(setup, shown), loc="outside lower center", ncols=5)
         t = timeline(strip, curve.label, run)
         strip.set_xlabel("time [s]")
         if curve.setpoint is not None:
@@ -89,10 +100,10 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> 
         artist.set_animated(True)
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)
-    for instant in shown:
+    for instant, speed in zip(shown, np.diff(times, prepend=2 * times[0] - times[1])):
         scene.show(instant)
         cursor.set_data([instant.time], [curve.values[run.at(instant.time)]])
-        clock.set_text(f"t = {instant.time:6.3f} s")
+        clock.set_text(f"t = {instant.time:6.3f} s{pace(speed * FRAMES_PER_SECOND)}")
         canvas.restore_region(background)
         for artist in moving:
             assert artist.axes is not None

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from torchsoft.display import suggestion
 from torchsoft.physics.mesh import Array
@@ -24,6 +25,7 @@ from torchsoft.plot.figures import (
     DESIRED,
     Look,
     forces_on,
+    legend_above,
     letter,
     looking,
     new_figure,
@@ -105,7 +107,7 @@ def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
         axes.plot(t, curve.setpoint, color=DESIRED, lw=3, label="set-point")
     axes.plot(t, curve.values, color=ACTUAL, lw=1.1, label="actual")
     if curve.setpoint is not None:
-        axes.legend()
+        legend_above(axes)
 
 
 def contact_forces(axes: Axes, run: Trajectory) -> None:
@@ -113,7 +115,7 @@ def contact_forces(axes: Axes, run: Trajectory) -> None:
     for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
         t = timeline(axes, "normal force [N]", run)
         axes.plot(t, force[..., 0].sum(-1).detach().numpy(), color=colour, label=name)
-    axes.legend(ncols=2, fontsize="x-small")
+    legend_above(axes)
 
 
 def friction(axes: Axes, run: Trajectory) -> None:
@@ -122,14 +124,14 @@ def friction(axes: Axes, run: Trajectory) -> None:
         total = force[..., 1].sum(-1).detach().numpy()
         axes.plot(timeline(axes, "friction [N]", run), total, color=colour, label=name)
     axes.axhline(0, color=INK, lw=0.5, zorder=1)
-    axes.legend(ncols=2, fontsize="x-small")
+    legend_above(axes)
 
 
 def mobilised(axes: Axes, run: Trajectory) -> None:
     """How much of the friction cone is used: sum of |friction| over mu_s times that of the normal
     forces."""
     for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
-        t = timeline(axes, "|friction| / cone [%]", run)
+        t = timeline(axes, "share of the cone [%]", run)
         mu, normal = run.setup.contacts[name].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
         share = force[..., 1].abs().sum(-1) / (mu * normal)
         share = torch.where(normal > 1e-9, share, torch.nan)
@@ -139,7 +141,7 @@ def mobilised(axes: Axes, run: Trajectory) -> None:
         axes.plot(t, 100 * share.detach().numpy(), color=colour, label=label)
     axes.axhline(100, color=INK, lw=0.8, ls=":")
     axes.set_ylim(0, max(108.0, 1.04 * axes.dataLim.y1))
-    axes.legend(fontsize="x-small")
+    legend_above(axes)
 
 
 def points(axes: Axes, run: Trajectory) -> None:
@@ -147,20 +149,20 @@ def points(axes: Axes, run: Trajectory) -> None:
     for (name, state), colour in zip(run.contact_state.items(), COLOURS * len(run.force)):
         t = timeline(axes, "contact points", run)
         touching, slipping = (state != 0).sum(-1).numpy(), (state == SLIPPING).sum(-1).numpy()
-        axes.step(t, touching, where="mid", color=colour, label=f"{name}: touch")
-        axes.fill_between(
-            t, 0, slipping, step="mid", color=colour, alpha=0.45, lw=0, label=f"{name}: slip"
-        )
+        axes.step(t, touching, where="mid", color=colour, label=name)
+        axes.fill_between(t, 0, slipping, step="mid", color=colour, alpha=0.45, lw=0)
+    axes.fill_between([], [], color=INK, alpha=0.45, lw=0, label="of these slip")
     if any(bool((state < 0).any()) for state in run.contact_state.values()):
         axes.set_title("slip not known: the rig has changed since", fontsize="small", loc="right")
     axes.set_ylim(0, None)
-    axes.legend(ncols=2, fontsize="x-small")
+    axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
+    legend_above(axes)
 
 
 def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
     """What an actuator pushes with."""
     scale, unit = (MM, "N mm") if one.unit == "N.m" else (1.0, "N")
-    t = timeline(axes, f"{one.channel} on {one.pushes} [{unit}]", run)
+    t = timeline(axes, f"on {one.pushes} [{unit}]", run)
     axes.plot(t, scale * run[one.channel].detach().numpy(), color=ACTUAL)
 
 
@@ -170,10 +172,10 @@ def stresses(axes: Axes, run: Trajectory) -> None:
     for (name, pad), colour in zip(run.setup.pads.items(), COLOURS * len(run.setup.pads)):
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
         peak = 1e-3 * von_mises(pad.stress(pad.strain(whole))).max(-1)
-        timeline(axes, "von Mises, elastic [kPa]", run)
+        timeline(axes, "von Mises,\nelastic [kPa]", run)
         axes.plot(run.t.numpy()[rows], peak, color=colour, label=f"pad {name}")
     axes.set_ylim(0, None)
-    axes.legend(ncols=2, fontsize="x-small")
+    legend_above(axes)
 
 
 def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
@@ -189,10 +191,10 @@ def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
         ("stored in pads", taken(stored, "strain_"), "#2171b5"),
         ("in contact springs", taken(stored, "normal_springs") + taken(stored, "tangential"),
          "#9ecae1"),
-        ("kinetic", taken(stored, ""), "#deebf7"),
+        ("kinetic", taken(stored, ""), "#08306b"),
         ("dissipated in pads", taken(lost, "pad_"), "#d94801"),
         ("by slip", taken(lost, "slip"), "#fdae6b"),
-        ("by dashpots", taken(lost, ""), "#fee6ce"),
+        ("by dashpots", taken(lost, ""), "#7f2704"),
     ]  # fmt: skip
     return groups
 
@@ -204,21 +206,21 @@ def energies(axes: Axes, run: Trajectory) -> None:
     axes.stackplot(t, *parts, labels=labels, colors=colours, lw=0)
     start = MM * sum(float(value[0].detach()) for value in run.energy.values())
     supplied = MM * sum((x.detach().numpy() for x in run.supplied.values()), np.zeros(len(t)))
-    axes.plot(t, start + supplied, color=INK, ls=(0, (4, 2)), label="at the start + supplied")
+    axes.plot(t, start + supplied, color=INK, ls=(0, (4, 2)), label="start + supplied")
     axes.set_ylim(0, None)
-    axes.legend(
-        *(one[::-1] for one in axes.get_legend_handles_labels()), fontsize="x-small",
-        frameon=True, framealpha=0.85, edgecolor="none",
-    )  # fmt: skip
+    legend_above(axes)
 
 
 def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
     """Forces along one contact at an instant, with the cone."""
     forces_on(axes, run.setup, instant, contact)
+    if not len(instant.near(contact)):
+        axes.set(xticks=[], yticks=[], ylim=(-1, 1), xlabel="no point touches")
+        return
     name = run.setup.contacts[contact].pad
     level = along_surface(run.setup.pads[name], instant.base[name])[0] > 0.999
     axes.set_xlabel("x [mm]" if level else "along the surface [mm]")
-    axes.legend(fontsize="x-small")
+    legend_above(axes)
 
 
 def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
@@ -290,39 +292,49 @@ def dashboard(
             [instant]
         )
         if pictured:
-            tall = min((high - low) / (right - left), 1.1) * 0.86 * width * span + 0.5
+            share = 0.86 if columns > 1 else 0.73
+            tall = min((high - low) / (right - left), 1.1) * share * width * span + 0.5
             beside = min(len(contacts), len(wanted), round(tall / each)) if columns > 1 else 0
         top = max(1, beside) if pictured else 0
         rows = -(-(len(wanted) - beside) // columns)
         heading = (title or "Run") if size.titled else ""
         figure = new_figure(heading, width * columns, tall + rows * each + 0.06 * size.font)
         heights = [*[tall / max(top, 1)] * top, *[each] * rows]
-        grid = figure.add_gridspec(top + rows, columns, height_ratios=heights)
+        # Rows under the scene are as if it had no colour bar, but a column has one left edge.
+        split = top if columns > 1 else 0
+        parts = [part for part in (heights[:split], heights[split:]) if part]
+        outer = figure.add_gridspec(len(parts), height_ratios=[sum(part) for part in parts])
+        lines = [
+            (grid, i)
+            for k, part in enumerate(parts)
+            for grid in [outer[k].subgridspec(len(part), columns, height_ratios=part)]
+            for i in range(len(part))
+        ]
         if pictured:
-            whole = figure.add_subplot(grid[:top, :span])
-            scene = Scene(
-                whole, run.setup, columns=5, curves=curves_, stress=stress, size=0.1 * size.font
-            )
+            whole = figure.add_subplot(lines[0][0][:top, :span])
+            scene = Scene(whole, run.setup, curves=curves_, stress=stress, size=0.1 * size.font)
             scene.show(instant)
             whole.set(
                 xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]",
                 title=f"a) t = {instant.time:g} s",
             )  # fmt: skip
             whole.grid(False)
+            whole.set_anchor("W")
             if contacts:
                 scene.scale_bar(whole)
             stress_bar(figure, [whole], stress, size)
             handles = keys(run.setup, [instant])
             figure.legend(handles=handles, loc="outside upper right", ncols=5 if columns > 1 else 2)
-        if ripples(run):
+        if size.titled and not only and ripples(run):
             figure.supxlabel(RIPPLE, fontsize="small", color="#666666")
         for i, name in enumerate(wanted):
             k = i - beside
-            place = grid[i, -1] if k < 0 else grid[top + k // columns, k % columns]
-            axes = figure.add_subplot(place)
+            grid, row = lines[i if k < 0 else top + k // columns]
+            first = columns - 1 if k < 0 else k % columns
+            end = None if i == len(wanted) - 1 else first + 1  # the last takes what is left
+            axes = figure.add_subplot(grid[row, first:end])
             drawn[name](axes)
             axes.set_title(f"{letter(i + pictured)} {name}")
             if not axes.get_xlabel():
                 axes.set_xlabel("time [s]")
-        figure.align_ylabels()
     return figure

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
-from matplotlib import rc_context
+from matplotlib import rc_context, rcParams
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -129,6 +129,21 @@ def timeline(axes: Axes, label: str, run: Trajectory) -> NDArray[np.float64]:
     return t
 
 
+def legend_above(axes: Axes) -> None:
+    """A legend in room that is made for it above what is drawn."""
+    room, count = axes.get_window_extent(), len(axes.get_legend_handles_labels()[1])
+    for rows in range(1, count + 1):
+        legend = axes.legend(
+            loc="upper left", ncols=-(-count // rows), fontsize="x-small", borderaxespad=0.0,
+            handlelength=1.5, columnspacing=1.2,
+        )  # fmt: skip
+        box = legend.get_window_extent()
+        if box.width <= room.width:
+            break
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, low + (high - low) / (1.0 - min(0.6, box.height / room.height)))
+
+
 def letter(i: int) -> str:
     """Of a panel."""
     return f"{'abcdefghijklmnopqrstuvwxyz'[i % 26]})"
@@ -153,7 +168,7 @@ def forces_on(axes: Axes, setup: Setup, instant: Instant, contact: str) -> None:
         cone = mu * force[:, 0]
         axes.fill_between(x, -cone, cone, color=FRICTION, alpha=0.14, lw=0)
         axes.plot(x, cone, ":", color=FRICTION, lw=0.8)
-        axes.plot(x, -cone, ":", color=FRICTION, lw=0.8, label=f"cone, {mu:g} x normal force")
+        axes.plot(x, -cone, ":", color=FRICTION, lw=0.8, label=f"cone, mu_s = {mu:g}")
     axes.axhline(0, color=INK, lw=0.6)
     axes.plot(x, force[:, 0], color=NORMAL, label="normal force")
     axes.plot(x, force[:, 1], color=FRICTION, label="friction")
@@ -161,15 +176,15 @@ def forces_on(axes: Axes, setup: Setup, instant: Instant, contact: str) -> None:
         for column in (0, 1):
             rows = state == kind
             axes.plot(
-                x[rows], force[rows, column], marker, color=colour, ms=4, mec="white", mew=0.3,
-                ls="none",
+                x[rows], force[rows, column], marker, color=colour, ls="none", mew=0,
+                ms=0.35 * rcParams["font.size"],
             )  # fmt: skip
     axes.set_ylabel("force [N]")
 
 
 def close_up(axes: Axes, setup: Setup, instant: Instant, contact: str, stress: float) -> None:
     """The deformed pad under one contact, and the body on it."""
-    Scene(axes, setup, columns=1, stress=stress).show(instant)
+    Scene(axes, setup, stress=stress).show(instant)
     touched = instant.points[contact][instant.force[contact][:, 0] > 0]
     where = touched if len(touched) else instant.points[contact]
     x, y = where.mean(0)
@@ -196,7 +211,7 @@ def force_distribution(
         figure = new_figure(heading, width, height)
         grid = figure.add_gridspec(rows, columns)
         whole = figure.add_subplot(grid[:, 0] if wide else grid[0, 0])
-        scene = Scene(whole, setup, columns=2, stress=stress, size=0.1 * size.font)
+        scene = Scene(whole, setup, stress=stress, size=0.1 * size.font)
         scene.show(instant)
         x_limits, y_limits = scene.limits([instant])
         whole.set(xlim=x_limits, ylim=y_limits, title="a) bodies and pads", xlabel="x [mm]")
@@ -249,7 +264,7 @@ def snapshots(
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for i, (axes, instant) in enumerate(zip(grid.flat, shown)):
             scene = Scene(
-                axes, setup, columns=5, curves=curves, stress=stress,
+                axes, setup, curves=curves, stress=stress,
                 size=0.1 * size.font * min(1.0, width / columns / 4.0),
             )  # fmt: skip
             scene.show(instant)

@@ -46,8 +46,8 @@ def packed(values: Array) -> dict[str, Any]:
     low, high = float(np.min(values, initial=np.inf)), float(np.max(values, initial=-np.inf))
     if not values.size:
         low = high = 0.0
-    step = (high - low) / LEVELS or 1.0
-    codes = np.round((values - low) / step).astype("<u2")
+    step = (high - low) / LEVELS
+    codes = np.round((values - low) / (step or 1.0)).astype("<u2")
     return {"low": low, "step": step, "codes": encoded(codes), "shape": list(values.shape)}
 
 
@@ -112,15 +112,17 @@ def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
 
 
 def charts(run: Trajectory) -> list[dict[str, Any]]:
-    """Groups of curves over time, each group in one unit."""
+    """Groups of curves over time, each group in one unit; forces of less than a billionth of the
+    largest are none."""
     rows = np.unique(np.linspace(0, len(run.t) - 1, CHART_SAMPLES).round().astype(int))
     t = run.t.numpy()[rows].round(9).tolist()
     out: list[dict[str, Any]] = []
 
-    def group(name: str, unit: str, lines: list[tuple[str, Array, str]]) -> None:
+    def group(name: str, unit: str, lines: list[tuple[str, Array, str]], least: float = 0) -> None:
         series = [
-            {"name": one, "colour": colour, "values": packed(np.nan_to_num(values[rows]))}
+            {"name": one, "colour": colour, "values": packed(np.where(abs(x) > least, x, 0.0))}
             for one, values, colour in lines
+            for x in [np.nan_to_num(values[rows])]
         ]
         out.append({"name": name, "unit": unit, "series": series})
 
@@ -132,14 +134,16 @@ def charts(run: Trajectory) -> list[dict[str, Any]]:
         group(name, unit.rstrip("]"), lines)
     forces = list(zip(run.force.items(), COLOURS * len(run.force)))
     if forces:
+        least = 1e-9 * max(float(x[..., 0].detach().sum(-1).max()) for x in run.force.values())
         for kind, i in (("normal force", 0), ("friction", 1)):
-            group(kind, "N", [(k, x[..., i].sum(-1).detach().numpy(), c) for (k, x), c in forces])
+            sums = [(k, x[..., i].sum(-1).detach().numpy(), c) for (k, x), c in forces]
+            group(kind, "N", sums, least)
         share = []
         for (key, force), colour in forces:
             mu, normal = run.setup.contacts[key].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
             part = 100 * force[..., 1].abs().sum(-1) / (mu * normal).clamp(min=1e-9)
             share.append((key, part.where(normal > 1e-9, 0.0).detach().numpy(), colour))
-        group("friction in its cone", "%", share)
+        group("friction in its cone", "%", share, 1e-7)
         states = list(zip(run.contact_state.items(), COLOURS * len(run.force)))
         for word, of in (("points in contact", lambda s: s != 0), ("slipping", lambda s: s == 2)):
             group(

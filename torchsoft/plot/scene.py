@@ -5,7 +5,7 @@ Figures and animation share it. Everything on axes is in millimetres and newtons
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -195,17 +195,17 @@ class Scene:
     """The artists of one picture on `axes`; `show` puts the `moving` ones, in drawing order, where
     another instant has them.
 
-    `columns` is the spacing, in elements, of the vertical mesh lines; every layer is drawn. With
-    `curves` = (mm per N, scale bar in N) the contact forces stand behind the pads, normal force
-    red, friction blue. `stress` [kPa] is the one that the darkest colour stands for; pads are plain
-    without it. `size` scales markers and lines.
+    The mesh is the real one, in finer lines where it is dense. With `curves` = (mm per N, scale bar
+    in N) the contact forces stand behind the pads, normal force red, friction blue. `stress` [kPa]
+    is the one that the darkest colour stands for; pads are plain without it. `size` scales markers
+    and lines.
     """
 
     def __init__(
-        self, axes: Axes, setup: Setup, *, columns: int = 5,
-        curves: tuple[float, float] | None = None, stress: float | None = None, size: float = 1.0,
+        self, axes: Axes, setup: Setup, *, curves: tuple[float, float] | None = None,
+        stress: float | None = None, size: float = 1.0,
     ) -> None:  # fmt: skip
-        self.setup, self.columns, self.curves = setup, columns, curves
+        self.setup, self.curves = setup, curves
         self.thickness = plates(setup)
         self.shapes = {
             name: MM * body.outline
@@ -217,7 +217,7 @@ class Scene:
             names: Sequence[str], face: str, edge: str, width: float
         ) -> dict[str, Polygon]:
             out = {
-                k: Polygon(np.zeros((3, 2)), facecolor=face, edgecolor=edge, lw=size * width)
+                k: Polygon(np.zeros((3, 2)), fc=face, ec=edge, lw=size * width, joinstyle="round")
                 for k in names
             }
             for polygon in out.values():
@@ -227,16 +227,18 @@ class Scene:
         self.plates = polygons(
             [name for name, thick in self.thickness.items() if thick], STEEL, INK, 0.6
         )
-        self.outlines = polygons(list(setup.pads), PAD, LAYER, 0.6)
         self.fields, self.layers = {}, {}
-        for k in setup.pads:
+        for k, pad in setup.pads.items():
+            colours: dict[str, Any] = {"facecolors": PAD}
             if stress:
-                self.fields[k] = PolyCollection(
-                    [], cmap=STRESS, norm=Normalize(0.0, stress), lw=0.3, edgecolors="face"
-                )
-                axes.add_collection(self.fields[k], autolim=False)
-            self.layers[k] = LineCollection([], colors=LAYER, linewidths=0.35 * size, alpha=0.6)
-            axes.add_collection(self.layers[k], autolim=False)
+                colours = {"cmap": STRESS, "norm": Normalize(0.0, stress)}
+            self.fields[k] = PolyCollection([], lw=0.3, edgecolors="face", **colours)
+            side = MM * float(np.median(np.ptp(pad.mesh.nodes[pad.mesh.sides], 1).max(-1)))
+            width = 0.35 * size * min(1.0, side / unit(setup))
+            self.layers[k] = LineCollection([], colors=LAYER, linewidths=width, alpha=0.6)
+            for collection in (self.fields[k], self.layers[k]):
+                axes.add_collection(collection, autolim=False)
+        self.outlines = polygons(list(setup.pads), "none", LAYER, 0.9)
         self.bodies = polygons(list(self.shapes), DISC, INK, 1.0)
         self.spokes, self.hubs, self.friction, self.normal = {}, {}, {}, {}
         for k in self.shapes:
@@ -246,9 +248,7 @@ class Scene:
         for k in setup.contacts:
             for state, (_, marker, colour) in STATES.items():
                 ms = size * (2.0 if state == SEPARATED else 3.6 if state == SLIPPING else 2.8)
-                (self.states[k, state],) = axes.plot(
-                    [], [], marker, color=colour, ms=ms, mec="white", mew=0.25 * size
-                )
+                (self.states[k, state],) = axes.plot([], [], marker, color=colour, ms=ms, mew=0)
         for k in setup.contacts if curves else ():
             self.friction[k] = Polygon(
                 np.zeros((3, 2)), facecolor=FRICTION, edgecolor=FRICTION, alpha=0.75, lw=0.8 * size
@@ -259,7 +259,7 @@ class Scene:
             axes.add_patch(self.normal[k])
             axes.add_patch(self.friction[k])
         groups = (
-            self.plates, self.outlines, self.fields, self.layers, self.bodies, self.spokes,
+            self.plates, self.fields, self.layers, self.outlines, self.bodies, self.spokes,
             self.hubs, self.normal, self.friction, self.states,
         )  # fmt: skip
         self.moving: list[Artist] = [artist for group in groups for artist in group.values()]
@@ -270,9 +270,9 @@ class Scene:
         for k, nodes in instant.mesh.items():
             mesh = self.setup.pads[k].mesh
             self.outlines[k].set_xy(nodes[mesh.outline])
-            self.layers[k].set_segments([nodes[line] for line in mesh.lines(self.columns)])
-            if k in self.fields:
-                self.fields[k].set_verts(nodes[mesh.elements])
+            self.layers[k].set_segments(nodes[mesh.sides])
+            self.fields[k].set_verts(nodes[mesh.elements])
+            if self.fields[k].norm.scaled():
                 self.fields[k].set_array(instant.stress[k])
         for k, plate in self.plates.items():
             plate.set_xy(self.behind(instant, k, 0.0, self.thickness[k]))

@@ -94,13 +94,14 @@ def picture(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str = "") -> str:
-    """Numbers to the right, but for the first column; columns without anything in them are left
+    """Columns of numbers to the right, but for the first; columns without anything in them are left
     out."""
     kept = [i for i in range(len(head)) if any(text_of(row[i]) for row in rows)]
-    numeric = {i for i in kept[1:] if any(kind_of(row[i]) == "n" for row in rows)}
+    filled = {i: [kind_of(row[i]) for row in rows if text_of(row[i])] for i in kept}
+    numeric = {i for i in kept[1:] if 2 * filled[i].count("n") > len(filled[i])}
 
     def cell(i: int, value: Cell) -> str:
-        kind = "" if i == kept[0] and isinstance(value, str) else kind_of(value)
+        kind = "" if i not in numeric and isinstance(value, str) else kind_of(value)
         return f'<td class="{kind}" data-label="{escape(head[i])}">{escape(text_of(value))}</td>'
 
     top = "".join(

@@ -104,10 +104,6 @@ class PadMesh(Mesh):
     def space(self) -> Array:
         return np.array([[0.0, -self.length], [self.length, self.length]])
 
-    def lines(self, columns: int) -> list[Index]:
-        number = self.grid
-        return [*number.T, *number[::columns], number[-1]]
-
 
 FaceRadius = Annotated[
     float,

@@ -175,11 +175,10 @@ class Mesh:
         """Numbers of the nodes around the pad, anticlockwise."""
         return around(self.elements)
 
-    def lines(self, columns: int) -> list[Index]:
-        """Chains of nodes to draw: the elements' sides, or less of them where `columns` elements
-        along the face are one."""
-        sides = np.sort(edges(self.elements), 1)
-        return list(np.unique(sides, axis=0))
+    @cached_property
+    def sides(self) -> Index:
+        """Nodes (sides, 2) of the elements' sides, each once."""
+        return np.unique(np.sort(edges(self.elements), 1), axis=0)
 
 
 class FreeMesh(Mesh):
