@@ -282,7 +282,7 @@ def _warn_of_misses(
     elif wrong:
         remedy = (
             f"its `feedback` makes {', '.join(wrong)}: give the gains of the rig, on the "
-            "coordinate that its loop measures"
+            "coordinate that its loop measures, and count x_d from where this one starts"
         )
     else:
         remedy = (
