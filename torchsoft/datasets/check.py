@@ -199,8 +199,8 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     if config.rig is None:
         ranged["grasp_depth"] = config.grasp_depth
     by = [name for name in ("kind", "split") if name in data]
-    names = list(ranged)
-    count = len(names) + 1 + len(MOTIONS)
+    names, series = list(ranged), moving(data, config)
+    count = len(names) + 1 + len(series)
     columns = min((4, 3, 5), key=lambda n: -count % n)  # with the fewest empty cells
     table = data[[*names, *by, "failed"]].to_dataframe()[[*names, *by, "failed"]].reset_index()
     table["split"] = table["split"].where(table["failed"] == 0, "failed")
@@ -225,7 +225,7 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     )  # fmt: skip
     sound = table[table["failed"] == 0]
     some = (sound.groupby("kind").head(MOST) if "kind" in by else sound.head(MOST)).index
-    for ax, name in zip(panels[len(names) + 1 :], moving(data, config)):
+    for ax, name in zip(panels[len(names) + 1 :], series):
         ax.plot(data.time, data[name][some].T, lw=0.7)
         ax.set(xlabel="time [s]", ylabel=f"{name} [{data[name].units}]")
     for ax in fig.axes:
@@ -234,8 +234,8 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
 
 
 def moving(data: xr.Dataset, config: Config) -> list[str]:
-    """Names of the three series that the picture shows: of a rig file the liveliest, each over its
-    own largest value."""
+    """Names of the series, three at the most, that the picture shows: of a rig file the liveliest,
+    each over its own largest value."""
     if config.rig is None:
         return list(MOTIONS)
     names = list(config.subject.signals)
