@@ -243,7 +243,7 @@ def distributions(rolled: Mapping[str, Rolled], moments: Sequence[float], title:
     )
     for (top, *below), (name, one) in zip(grid.T, rolled.items()):
         (instant,) = instants(one.run, moments[len(moments) // 2 : len(moments) // 2 + 1])
-        Scene(top, one.run.setup, columns=4).show(instant)
+        Scene(top, one.run.setup).show(instant)
         x, y = instant.pose["disc"][:2]
         top.set(xlim=(x - 26, x + 26), ylim=(y - 30, y + 30), title=name)
         top.set_axis_off()
