@@ -34,16 +34,12 @@ motion = CATALOGUE["light shaking"].model_copy(update={"duration": 1.2})
 sensors = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
 truth = {"contact.friction.mu": 0.7, "contact.friction.fall": 0.05}
 plain = begin(motion, p).rig
-
-
-def grasp(mu: float, fall: float) -> SoftGrasp:
-    return SoftGrasp(plain.settings, plain.reference, friction=Pressed(mu, fall))
-
-
-made = record("bench", begin(motion, p), grasp(*truth.values()), sensors)
+laws = Pressed(*truth.values()), Pressed(mu=0.5, fall=0.02)  # of the bench, and where to begin
+bench, rig = (SoftGrasp(plain.settings, plain.reference, friction=law) for law in laws)
+made = record("bench", begin(motion, p), bench, sensors)
 
 # a recording is a rig with the reference that it followed, and samples (times, values) by channel
-recording = Recording("bench", grasp(mu=0.5, fall=0.02), made.samples)
+recording = Recording("bench", rig, made.samples)
 problem = Problem([recording], sensors, {name: Unknown() for name in truth})
 result = identify(problem, rtol=1e-4, assumptions="trusted")
 print(result.table())
