@@ -31,7 +31,7 @@ lint: $(STAMP)
 	$(BIN)/basedpyright
 	$(BIN)/codespell
 
-# chapters and gallery executed, about four minutes on one core; readable offline
+# chapters and gallery executed, two to four minutes on one core; readable offline
 DOCS ?= out/docs
 docs: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going --quiet docs $(DOCS)

@@ -24,7 +24,10 @@ from torchsoft.sysid import (
     load_answer,
     record,
 )
+from torchsoft.sysid.assumptions import assumptions
 from torchsoft.sysid.measured import load
+from torchsoft.sysid.prediction import Frozen
+from torchsoft.sysid.refits import since
 from torchsoft.sysid.rig_recordings import vocabulary
 
 RIG = Path(__file__).parents[1] / "rigs" / "two_fingers.toml"
@@ -112,6 +115,20 @@ def test_a_recorded_signal_takes_the_place_of_the_files_motion(folder: Path) -> 
     assert float(rig.follow(at)[0, 0, 0]) == pytest.approx(-23.9e-3)
     motion = coarse().build().rig.reference["right_close"]
     assert torch.equal(rig.reference["right_close"](at)[0], motion(at)[0])
+
+
+def test_the_time_before_the_first_sample_is_an_assumption(folder: Path) -> None:
+    """Said otherwise in both directions, on the steps of the fit with others before them."""
+    (stated,) = load([folder / "run.csv"], folder / "fit.toml").problem.recordings
+    (other,) = [one for one in assumptions([stated], set()) if one.name == "lead"]
+    made = other.vary(stated)
+    assert (stated.start.lead, made.start.lead) == (0.0, 0.2)
+    (back,) = [one for one in assumptions([made], set()) if one.name == "lead"]
+    assert back.vary(made).start.lead == 0.0
+    knots = np.array([0.0, 4e-3, 0.01])
+    earlier = since(Frozen(knots), -5e-3).knots
+    assert earlier.tolist() == pytest.approx([-5e-3, -3e-3, -1e-3, 0.0, 4e-3, 0.01])
+    assert np.array_equal(since(Frozen(earlier), 0.0).knots, knots)
 
 
 def test_a_trajectory_file_of_the_rig_is_a_recording(folder: Path, run: Trajectory) -> None:

@@ -56,9 +56,9 @@ def frame_times(run: Trajectory, frames: int, slow: float) -> Array:
 
 def pace(speed: float) -> str:
     """How fast time is shown, where that is not as fast as it went by."""
-    if abs(speed - 1) < 0.01:
-        return ""
     times = float(f"{max(speed, 1 / speed):.2g}")
+    if times == 1:
+        return ""
     return f"\n{times:g} times {'as fast' if speed > 1 else 'slower'}"
 
 
