@@ -169,7 +169,7 @@ def runs(config: Config, url: str, split: str, count: int) -> Runs:
         columns = [one[name].values + sd * draws.standard_normal(one.sizes["time"])
                    for name, sd in NOISE.items()]  # fmt: skip
         measured.append(torch.from_numpy(np.stack(columns, -1)))
-    return Runs(torch.from_numpy(data["time"].values), references, measured)
+    return Runs(torch.tensor(data["time"].values), references, measured)
 
 
 class Residual:
