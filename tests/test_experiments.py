@@ -366,6 +366,7 @@ def test_a_policy_becomes_a_controller(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_learn_policy_smoke(tmp_path: Path) -> None:
     module = experiment("learn_policy")
     module.main(module.Config(out=tmp_path, smoke=True))
