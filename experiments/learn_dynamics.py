@@ -27,11 +27,11 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-import torchsoft.envs
 from torchsoft import Profile, Reference, SmoothSlip, simulate
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.config import Config as Dataset
 from torchsoft.datasets.generate import Serial, generate
+from torchsoft.envs import RIG
 from torchsoft.experiment import at_the_points, markdown, options, write
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.written import to_toml
@@ -108,10 +108,9 @@ def true_mu(law: SmoothSlip, v: Tensor) -> Tensor:
 
 
 def rig_file() -> RigFile:
-    ready = RigFile.from_toml(Path(torchsoft.envs.__file__).with_name("reorient.toml"))
     slip = {"kind": "smooth", "mu_s": 0.8, "mu_k": 0.35, "v_s": 50e-3}
     carried = {"kind": "profile", "times": TIMES, "values": [0.0, 0.0, 0.0, 0.0]}
-    return ready.override(
+    return RigFile.from_toml(RIG).override(
         bodies={"disc": {"mass": 1.0, "start": {"y": "rest"}}},
         laws={"dry": {"friction": slip}},
         motion={f"{jaw}_x": carried for jaw in JAWS},

@@ -34,9 +34,8 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
-import torchsoft.envs
 from torchsoft import simulate
-from torchsoft.envs import RigEnv, reorient
+from torchsoft.envs import RIG, RigEnv, reorient
 from torchsoft.envs.dynamics import limits
 from torchsoft.experiment import markdown, options, timed, write
 from torchsoft.rigs.build import RigFile
@@ -46,7 +45,7 @@ from torchsoft.solve.progress import SimulationFailed
 GAINS = {"Kp": 2e3, "Kd": 60.0}
 """Of the loops of both jaws [N/m, N.s/m]: soft ones, which pushes move."""
 
-READY = RigFile.from_toml(Path(torchsoft.envs.__file__).with_name("reorient.toml"))
+READY = RigFile.from_toml(RIG)
 
 FORCES = {"push_x": (-14.0, 14.0), "push_theta": (-0.15, 0.15)}
 """Peaks of what pushes the disc [N] and turns it [N.m]."""
@@ -122,6 +121,11 @@ class Training:
         self._begin, self._next = process_time(), 0
         self._bar = tqdm(total=round(config.seconds), desc=f"{method} {seed}", unit="s")
 
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return process_time() - self._begin >= self.config.seconds
+
     def over(self, samples: int, act: Callable[[np.ndarray], np.ndarray]) -> bool:
         """Evaluate where it is time to; whether the time is up."""
         now = process_time() - self._begin
@@ -130,8 +134,9 @@ class Training:
         if over or now >= self._next * self.config.seconds / self.config.evaluations:
             mean = float(np.mean([episode(self.env, act, 1000 + i)
                                   for i in range(self.config.episodes)]))  # fmt: skip
-            for kept, x in zip(("samples", "seconds", "returns"), (samples, now, mean)):
-                getattr(self.history, kept).append(x)
+            self.history.samples.append(samples)
+            self.history.seconds.append(now)
+            self.history.returns.append(mean)
             self._bar.set_postfix_str(f"return {mean:.2f}")
             self._next += 1
             self._begin = process_time() - now
@@ -286,7 +291,7 @@ def by_evolution(config: Config, seed: int) -> tuple[History, nn.Module]:
             acts = acting(load(policy, one))
             costs.append(-float(np.mean([episode(env, acts, k) for k in seeds])))
             samples += len(seeds) * env.limit
-            if process_time() - training._begin > config.seconds:
+            if training.late:
                 break
         if len(costs) < len(weights):
             continue
@@ -379,7 +384,7 @@ def in_engine(config: Config, policy: nn.Module) -> dict[str, Any]:
     return {"missed_rad": missed, "run_s": float(np.median(seconds))}
 
 
-def run(config: Config) -> dict[str, Any]:
+def run(config: Config) -> None:
     if config.smoke:
         config = replace(config, seconds=3.0, seeds=1, evaluations=1, episodes=1)
     config.out.mkdir(parents=True, exist_ok=True)
@@ -392,8 +397,7 @@ def run(config: Config) -> dict[str, Any]:
                 exported(config, policy)
                 content["deployed"] = in_engine(config, policy)
             content |= {"trainings": [asdict(one) for one in every], "reached": reached(every)}
-            write(config, content, {"learn_policy": figure(every)})
-    return content | {"table": table(every, content)}
+            write(config, content, {"learn_policy": figure(every)}, table(every, content))
 
 
 def reached(every: Sequence[History]) -> dict[str, Any]:
@@ -454,10 +458,5 @@ def figure(every: Sequence[History]) -> Figure:
     return fig
 
 
-def main(config: Config) -> None:
-    content = run(config)
-    print(content["table"])
-
-
 if __name__ == "__main__":
-    main(options(Config, __doc__))
+    run(options(Config, __doc__))

@@ -3,7 +3,6 @@
 import importlib
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -23,7 +22,7 @@ from torchsoft.envs.view import View
 from torchsoft.physics.motion import Lines, Reference
 from torchsoft.rigs.build import RigFile
 
-FILE = RigFile.from_toml(Path(torchsoft.envs.__file__).with_name("reorient.toml"))
+FILE = RigFile.from_toml(torchsoft.envs.RIG)
 TURN = np.array([0.4, -0.4, 0.2], np.float32)
 
 Make = Callable[..., RigEnv]

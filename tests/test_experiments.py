@@ -369,7 +369,7 @@ def test_a_policy_becomes_a_controller(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_learn_policy_smoke(tmp_path: Path) -> None:
     module = experiment("learn_policy")
-    module.main(module.Config(out=tmp_path, smoke=True))
+    module.run(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads((tmp_path / "summary.json").read_text())
     assert {one["method"] for one in numbers["trainings"]} == set(module.METHODS)
     assert all(x < 2 for part in numbers["deployed"]["missed_rad"].values() for x in part)

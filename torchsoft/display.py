@@ -1,6 +1,6 @@
 """What objects show of themselves at a prompt and in a notebook, and near names for wrong ones."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import SequenceMatcher
 from html import escape
 
@@ -78,3 +78,9 @@ class Shown:
             for name, text in rows
         )
         return f"<div><b>{escape(title)}</b><table>{cells}</table></div>"
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)

@@ -2,7 +2,7 @@
 figures."""
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Rig
+from torchsoft.display import markdown
 from torchsoft.files import replacing, write_json
 from torchsoft.plot.figures import save
 from torchsoft.threads import parallel_map
@@ -87,12 +88,6 @@ def at_the_points(rig: Rig, t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         )
         speeds.append(at.gamma_dot.abs())
     return torch.cat(depths, -1), torch.cat(speeds, -1)
-
-
-def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
 def numbers(title: str, rows: Mapping[str, Mapping[str, float]], digits: int = 4) -> str:

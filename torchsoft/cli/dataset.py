@@ -127,14 +127,15 @@ def make(options: argparse.Namespace) -> int:
         print(told, file=sys.stderr)
         return 130
     made = sum(len(config.rows(shard)) for shard in mine.shards(config))
-    if elsewhere := generate.unfinished(config, options.out, mine):
+    left = generate.unfinished(config, options.out)
+    if elsewhere := [shard for shard in left if shard in mine.shards(config)]:
         say(f"another process is making shards {listed(elsewhere)}")
         made -= sum(len(config.rows(shard)) for shard in elsewhere)
     say(
         f"{made} trajectories in {options.out}; {bad} of those made now failed, each with its "
         "reason"
     )
-    if left := generate.unfinished(config, options.out):
+    if left:
         say(f"of the whole set {len(left)} of {config.shards} shards are left: {listed(left)}")
     return 0
 

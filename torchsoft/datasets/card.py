@@ -12,6 +12,7 @@ from torchsoft.datasets.files import CARD, Manifest, read_bytes, store_errors, w
 from torchsoft.datasets.reader import Vouched
 from torchsoft.datasets.schema import variables
 from torchsoft.datasets.subject import SPLITS
+from torchsoft.display import markdown
 from torchsoft.tables import line
 
 UNSTATED = "Not stated: say it here and at the top before others are given the data."
@@ -121,7 +122,5 @@ def arrays(config: Config) -> Iterable[tuple[str, ...]]:
 
 
 def table(heading: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    """A table in Markdown."""
-    lines = [heading, ("---",) * len(heading), *rows]
-    cells = ([cell.replace("|", "/") for cell in one] for one in lines)
-    return "\n".join(f"| {' | '.join(one)} |" for one in cells)
+    """A table in Markdown, whatever its cells hold."""
+    return markdown(heading, ([cell.replace("|", "/") for cell in one] for one in rows))

@@ -155,7 +155,7 @@ def generate(
     """
     mine = part.shards(config)
     store, design = open_or_create(url, config), points(config)
-    left, failed = unfinished(config, url, part)[::-1], 0
+    left, failed = [shard for shard in store.unfinished() if shard in mine][::-1], 0
     running = dict[Future[tuple[int, int]], int]()
     total = sum(len(config.rows(shard)) for shard in mine)
     finished = total - sum(len(config.rows(shard)) for shard in left)

@@ -34,7 +34,8 @@ def job_array(path: Path, url: str, parts: int) -> str:
     """The script for `sbatch`. Raises `ValueError` for more parts than shards, and where nothing is
     left to be made."""
     config = Config.from_toml(path)
-    left = [i for i in range(1, parts + 1) if unfinished(config, url, Part(i, parts))]
+    lacking = set(unfinished(config, url))
+    left = [i for i in range(1, parts + 1) if lacking & set(Part(i, parts).shards(config))]
     if parts < 1 or not left:
         raise ValueError(
             f"--parts should be 1 or more, not {parts}" if parts < 1

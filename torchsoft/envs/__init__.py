@@ -19,11 +19,15 @@ from torchsoft.envs.vector import RigVectorEnv  # noqa: E402
 __all__ = ["Dynamics", "Goal", "Moment", "RigEnv", "RigVectorEnv", "Transition", "reorient"]
 
 
+RIG = Path(__file__).with_name("reorient.toml")
+"""The rig file of the ready environment."""
+
+
 def reorient(**changes: Any) -> RigEnv:
     """The environment "torchsoft/Reorient-v0"; `changes` are other arguments of `RigEnv`."""
     jaws = ("lower", "upper")
     stated: dict[str, Any] = {
-        "rig": Path(__file__).with_name("reorient.toml"),
+        "rig": RIG,
         "actions": {"lower_x": (-12e-3, 12e-3), "upper_x": (-12e-3, 12e-3), "grip": (-20.0, -6.0)},
         "observations": {
             "x_disc": (-10e-3, 10e-3), "theta_disc": (-1.0, 1.0), "omega_disc": (-3.0, 3.0),

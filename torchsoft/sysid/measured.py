@@ -387,19 +387,17 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     stated = read_config(config) if stated is None else stated
     entries, tables = sources(data, config, stated), dict[str, Tables]()
     file, columns = None, PAPER
-    if stated.rig is None:
-        try:
+    try:
+        if stated.rig is None:
             columns = PAPER.renamed(stated.columns)
-        except ValueError as error:
-            raise ValueError(f"{config}: {error}") from None
-    else:
-        try:
+        else:
             file = RigFile.from_toml(config.parent / stated.rig)
             columns = vocabulary(file.assemble(), stated.columns)
-        except ValueError as error:
-            raise ValueError(f"{config}, rig: {error}") from None
-        except OSError as error:
-            raise ValueError(f"{config}, rig: {stated.rig}: {error.strerror}") from None
+    except ValueError as error:
+        where = config if stated.rig is None else f"{config}, rig"
+        raise ValueError(f"{where}: {error}") from None
+    except OSError as error:
+        raise ValueError(f"{config}, rig: {stated.rig}: {error.strerror}") from None
     for name, (entry, paths) in entries.items():
         try:
             constants = entry.missing.over(stated.missing)

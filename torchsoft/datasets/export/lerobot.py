@@ -5,7 +5,6 @@ the state, and forces at the contact points observations of their own. Numbers t
 columns of the episodes.
 """
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from torchsoft.datasets.export.source import Source
 from torchsoft.extras import needed
+from torchsoft.files import write_json
 
 VERSION = "v3.0"
 CHUNK, SIZE = 1000, 100
@@ -90,8 +90,8 @@ def write(source: Source, out: Path) -> str:
         "splits": {name: f"{a}:{b}" for name, a, b in zip(source.splits, ends, ends[1:])},
         "data_path": f"data/{PLACE}", "video_path": None, "features": features,
     }  # fmt: skip
-    put(out / "meta" / "info.json", info)
-    put(out / "meta" / "stats.json", together(episodes, features))
+    write_json(out / "meta" / "info.json", info)
+    write_json(out / "meta" / "stats.json", together(episodes, features))
     return f"{len(order)} episodes, whose actions are {', '.join(named['action'])}"
 
 
@@ -155,8 +155,3 @@ def together(episodes: list[dict[str, Any]], features: dict[str, Any]) -> dict[s
         out[key] = {what: one.tolist() for what, one in found.items()}
         out[key]["count"] = of["count"].sum(0).tolist()
     return out
-
-
-def put(path: Path, content: Any) -> None:
-    """Write JSON."""
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
