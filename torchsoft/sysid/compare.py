@@ -299,9 +299,12 @@ def fitted(
         plan = default_plan(problem, runner, rtol, which, starts)
     if not plan or list(plan[-1].recordings) != list(which):
         raise ValueError(f"the last stage of the plan of `{name}` must fit {', '.join(which)}")
-    fit, _ = run_plan(
+    end = run_plan(
         problem, runner, plan, problem.coordinates.start, label=f"{name} ", progress=progress
     )
+    if end.lost is not None:  # laws are compared by the same tolerance
+        raise end.lost
+    fit = end.fit
     assert fit.at is not None
     free = np.isin(problem.coordinates.labels, plan[-1].free)
     declared, given = [c for c, s in problem.sensors.items() if s.colour == "ar"], problem.noise

@@ -123,10 +123,11 @@ class How(NamedTuple):
 
 def conclude(
     coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How,
-    findings: list[str], began: float, progress: bool,
+    findings: list[str], asked: float, began: float, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
     """The result, from the fit of the last stage with the noise that was found; `findings` are
-    sentences on the recordings themselves, `began` is on the clock [s]."""
+    sentences on the recordings and the plan, `asked` is the tolerance of the whole plan, `began` is
+    on the clock [s]."""
     problem, fit = coloured.problem, coloured.fit
     c = problem.coordinates
     free, start = np.isin(c.labels, stage.free), clock.perf_counter()
@@ -205,7 +206,7 @@ def conclude(
         },
         made_by={
             "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol,
-            "rtol_asked": stage.rtol, "acknowledged": list(how.acknowledged),
+            "rtol_asked": asked, "acknowledged": list(how.acknowledged),
             "untried": list(checked.untried) if checked is not None else [],
             "candidates": list(checked.candidates) if checked is not None else [],
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
@@ -239,7 +240,7 @@ def tested_assumptions(
     found = check_assumptions(
         plain, end.x, finer, free, which, end.rtol, doubtful=doubtful,
         explain=how.settings.assumptions == "explained", loss=how.loss, workers=runner.workers,
-        journal=runner.folder, progress=progress,
+        journal=runner.folder, progress=progress, own=end.steps,
     )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
@@ -376,7 +377,7 @@ def identify(
     with explained(findings):
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
-        fit, stages = run_plan(
+        end = run_plan(
             problem,
             runner,
             plan,
@@ -388,13 +389,16 @@ def identify(
         )
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
-        coloured = with_its_noise(problem, runner, plan[-1], fit, loss, method, bar)
-    stages += [
-        stage_entry("with the noise that was found", plan[-1], plan[-1].rtol, one, before)
+        coloured = with_its_noise(problem, runner, end.stage, end.fit, loss, method, bar)
+    stages = end.entries + [
+        stage_entry("with the noise that was found", end.stage, end.stage.rtol, one, before)
         for one in coloured.fits
     ]
     how = How(fitted, tuple(heldout), tuple(acknowledged), settings)
-    return conclude(coloured, runner, plan[-1], stages, how, findings, began, progress)
+    findings += end.notices
+    return conclude(
+        coloured, runner, end.stage, stages, how, findings, plan[-1].rtol, began, progress
+    )
 
 
 def explain(problem: Problem, **how: Any) -> IdentificationResult:

@@ -8,7 +8,7 @@ in the beginning, and the last stage takes the full one.
 """
 
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -32,6 +32,7 @@ from torchsoft.sysid.fit import (
     shift,
     standard_deviations,
 )
+from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
@@ -184,24 +185,58 @@ def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
         yield notify
 
 
+class PlanEnd(NamedTuple):
+    """End of a plan: the fit of the last stage that could begin, that stage, the result's entries
+    on all stages, and why the stage after it could not begin."""
+
+    fit: Fit
+    stage: Stage
+    entries: list[dict[str, Any]]
+    lost: Unreachable | None = None
+
+    @property
+    def notices(self) -> list[str]:
+        """A sentence where a finer stage could not begin."""
+        if self.lost is None:
+            return []
+        return [
+            f"the fit ended by rtol = {self.stage.rtol:g}: by a finer tolerance {self.lost}; the "
+            "model may lack something that drives its parameters to where it has no solution"
+        ]
+
+
 def run_plan(
     problem: Problem, runner: Runner, plan: Sequence[Stage], x: Array, *, loss: Loss = "linear",
     method: Method = "gauss_newton", seed: int = 0, label: str = "", progress: bool = False,
     notify: Notify | None = None,
-) -> tuple[Fit, list[dict[str, Any]]]:  # fmt: skip
-    """The fit of the last stage, each begun where the one before it ended, the first at x, and the
-    result's entries on the stages. Raises `Unreachable` where a stage cannot be simulated, and
-    `ValueError` for a plan without stages."""
-    fit, entries = None, list[dict[str, Any]]()
+) -> PlanEnd:  # fmt: skip
+    """Fit stage after stage, each from the end of the one before, the first from x.
+
+    A stage that cannot be simulated where the one before it ended, and repeats it by a finer
+    tolerance, ends the plan. Raises `Unreachable` where another stage cannot be simulated, and
+    `ValueError` for a plan without stages.
+    """
+    end: PlanEnd | None = None
     for number, stage in enumerate(plan):
         began = clock.perf_counter()
-        with progress_bar(f"{label}{number + 1}/{len(plan)} {stage.name}", progress) as bar:
-            fit = run_stage(problem, runner, stage, x, loss, method, seed + number, notify or bar)
-        x = fit.x
-        entries.append(stage_entry(stage.name, stage, stage.rtol, fit, began))
-    if fit is None:
+        try:
+            with progress_bar(f"{label}{number + 1}/{len(plan)} {stage.name}", progress) as bar:
+                fit = run_stage(
+                    problem, runner, stage, end.fit.x if end is not None else x, loss, method,
+                    seed + number, notify or bar,
+                )  # fmt: skip
+        except Unreachable as lost:
+            if end is None or (stage.recordings, stage.free) != (
+                end.stage.recordings,
+                end.stage.free,
+            ):
+                raise
+            return end._replace(lost=lost)
+        entry = stage_entry(stage.name, stage, stage.rtol, fit, began)
+        end = PlanEnd(fit, stage, [*end.entries, entry] if end is not None else [entry])
+    if end is None:
         raise ValueError("`plan` has no stages")
-    return fit, entries
+    return end
 
 
 def run_stage(
@@ -341,7 +376,8 @@ class Settled(NamedTuple):
     `at` where these could not be had; and whether the fit is `at_rest`: with steps chosen anew no
     coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
     whether the fit has converged). `rough` names the coordinates that would move although steps do
-    not matter: samples are not smooth in them."""
+    not matter: samples are not smooth in them. `steps` are those of `at` where steps chosen anew
+    have no run."""
 
     x: Array
     at: Residuals
@@ -351,6 +387,7 @@ class Settled(NamedTuple):
     finer: Residuals
     at_rest: bool
     rough: tuple[str, ...] = ()
+    steps: Mapping[str, Frozen] | None = None
 
 
 def settle(
@@ -389,7 +426,11 @@ def settle(
     while True:
         fresh, steps = problem.freeze(runner, x, which, rtol)
         if fresh.lost:
-            return Settled(x, at, rtol, None, fits, at, at_rest=False)
+            own = fits[-1][1].steps if fits else fit.steps
+            return Settled(
+                x, at, rtol, None, fits, at, at_rest=False,
+                steps=own if isinstance(own, Mapping) else None,
+            )  # fmt: skip
         end = fresh._replace(J=at.J)
         at_rest = settled(problem, x, end, free) if tightenings else fit.converged
         if rounds and not at_rest:

@@ -1,6 +1,6 @@
 """Problems with one assumption otherwise: its effect on residuals, and fits repeated with it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -43,7 +43,7 @@ class End(NamedTuple):
     free: NDArray[np.bool_]
     which: tuple[str, ...]
     base: Residuals
-    steps: dict[str, Frozen]
+    steps: Mapping[str, Frozen]
     rtol: float
     workers: int
     journal: Path | None
@@ -57,10 +57,13 @@ class End(NamedTuple):
 
 def ended(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
-    rtol: float, workers: int, journal: Path | None,
+    rtol: float, workers: int, journal: Path | None, own: Mapping[str, Frozen] | None = None,
 ) -> End:  # fmt: skip
     """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the
-    variations: `USUAL`, or that of the fit, if runs are lost with it."""
+    variations: `USUAL`, or that of the fit, if runs are lost with it; or with `at`, by its `own`
+    steps, where no others have a run."""
+    if own is not None:
+        return End(x, at, free, tuple(which), at, own, rtol, workers, journal)
     runner = Runner(problem.recordings, workers, journal)
     usual = max(rtol, USUAL)
     base, steps = problem.freeze(runner, x, which, usual)
@@ -169,8 +172,8 @@ def refit(
     it cannot begin.
 
     It begins where the fit ended; ratios that ended at a bound are looked for again over all of
-    their range. With another law or number, and a misfit above `FAR`, it begins where the first fit
-    began as well, and the better end counts.
+    their range. With anything but a sensor otherwise, and a misfit above `FAR`, it begins where the
+    first fit began as well, and the better end counts.
     """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):
@@ -187,16 +190,19 @@ def refit(
     def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
         """The fit of the last stage, if none is lost."""
         with suppress(Unreachable):
-            yield run_plan(other, runner, plan, x, loss=loss, notify=notify)[0]
+            yield run_plan(other, runner, plan, x, loss=loss, notify=notify).fit
 
     fits = [
         *carried_out(
             [Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x
         )
     ]
-    if one is not None and one.kind in ("law", "known") and end.far:
+    if one is not None and one.kind != "sensor" and end.far:
         with suppress(Unreachable):
             plan = default_plan(other, runner, end.rtol, end.which)
             if set(plan[-1].free) == set(labels):
                 fits += carried_out(plan, c.start)
+    if one is None and not fits:  # it stays where it ended
+        chi2 = float(np.mean(end.base.r**2))
+        fits = [Fit(end.x, chi2, 0, False, end.steps, end.base._replace(J=end.at.J))]
     return Refit(other, min(fits, key=lambda fit: fit.chi2), free) if fits else None

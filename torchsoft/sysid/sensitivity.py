@@ -25,7 +25,7 @@ from tqdm import tqdm
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
 from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
-from torchsoft.sysid.prediction import FailedRun, Signals
+from torchsoft.sysid.prediction import FailedRun, Frozen, Signals
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, extended
 from torchsoft.sysid.refits import End, Refit, difference, ended, refit
@@ -177,14 +177,15 @@ def check_assumptions(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
     rtol: float, *, doubtful: bool = False, explain: bool = False, loss: Loss = "linear",
     workers: int = 1, journal: Path | None = None, progress: bool = False,
+    own: Mapping[str, Frozen] | None = None,
 ) -> Checked:  # fmt: skip
     """Tests of the assumptions at the estimates x (n,), to first order, where `at` holds residuals
-    and Jacobian of the recordings `which`.
+    and Jacobian of the recordings `which`, by the fit's `own` steps where no others have a run.
 
     With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other,
     until one explains the misfit: a test to first order says little where a fit has run far off.
     """
-    end = ended(problem, x, at, free, which, rtol, workers, journal)
+    end = ended(problem, x, at, free, which, rtol, workers, journal, own)
     candidates: list[Variation] = []
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
