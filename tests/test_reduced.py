@@ -1,6 +1,7 @@
 """Reduced models: known equations recovered, all routes through one list of terms equal, divergence
 and bad data reported."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,9 @@ from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
 from torchsoft import Profile, Reference, press, simulate
+from torchsoft.cli import main
 from torchsoft.physics.statics import BuiltRig
-from torchsoft.reduced.fit import Recipe, assemble, choose, fit, score
+from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, score
 from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics, polynomials, variable
@@ -350,6 +352,41 @@ def test_bodies_of_a_record_have_any_names(beside: Trajectory) -> None:
     assert np.array_equal(one.series["v_Br"], run["v_x_upper"].numpy())
     assert "x_d" not in one.series
     assert ready.rig.actuators["turn_upper"].pushes == "upper.x"
+
+
+def test_the_law_of_the_loop_is_found(motions: list[Record]) -> None:
+    assert loop(motions)["F_x"] == pytest.approx(LAW["F_x"], rel=1e-6)
+    shaken = np.random.default_rng(0).standard_normal(len(motions[0].t))
+    with pytest.raises(ValueError, match=r"F_x is no PD law of x_d: .* N of .* N are left"):
+        loop([replace(motions[0], series=motions[0].series | {"F_x": shaken})])
+
+
+def test_saved_runs_are_reduced_by_a_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Small waves about a settled grasp; the last run is predicted."""
+    files = []
+    for seed in range(2):
+        phases = np.random.default_rng(seed).uniform(0, 6, 10).tolist()
+        waves = [{"amplitude": 3e-6, "frequency": float(f), "phase": phase}
+                 for f, phase in zip(np.geomspace(3, 120, 10), phases)]  # fmt: skip
+        x_d = {"kind": "sines", "since": 0.6, "until": 1.2, "components": waves}
+        outputs = {"duration": 1.1, "interval": 2.5e-4, "snapshots": []}
+        ready = template("t").override(motion={"x_d": x_d}, outputs=outputs).build()
+        files.append(str(tmp_path / f"{seed}.nc"))
+        simulate(ready.rig, ready.t, y0=ready.y0, rtol=1e-4).save(files[-1])
+    command = ["reduce", *files, "--begin", "0.6", "--radius", "0.0194"]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "reduced.json").read_text())
+    assert max(summary["nrmse"].values()) < 0.02
+    assert summary["feedback"]["F_x"]["x_Br"] == pytest.approx(-1e5, rel=1e-3)
+    assert summary["held_out"] == files[1]
+    assert "Score: error at most" in capsys.readouterr().out
+    refused = {"--held-out": ["reduce", files[0]], "--threshold": [*command, "--threshold", "2"],
+               "--radius": [*command, "--radius", "-1"]}  # fmt: skip
+    for said, wrong in refused.items():
+        assert main([*wrong, "--out", str(tmp_path / "other")]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_a_fit_that_misses_its_record_says_why(motions: list[Record]) -> None:

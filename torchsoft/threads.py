@@ -27,20 +27,30 @@ _entering = threading.Lock()
 
 
 @contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """torch on one thread: on a busy core its threads wait for each other, and arrays here are
+    small."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
 def single_threaded() -> Iterator[None]:
     """torch and the linear algebra libraries on one thread each, until everybody who asked for it
     is done.
 
     Sums taken by more threads round differently, and contacts that stick amplify it.
     """
-    threads = torch.get_num_threads()
     with _entering:
         _single.append(threadpool_limits(1) if not _single else None)
-    torch.set_num_threads(1)
     try:
-        yield
+        with one_torch_thread():
+            yield
     finally:
-        torch.set_num_threads(threads)
         with _entering:
             if len(_single) == 1:
                 _single[0].restore_original_limits()

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 
-from torchsoft.cli import dataset, design, identify, material, plan, plot, rigs
+from torchsoft.cli import dataset, design, identify, material, plan, plot, reduce, rigs
 from torchsoft.cli.results import failed, say
 
 GRACE = 1.5
@@ -64,11 +64,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"torchsoft {version('torchsoft')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (rigs, plan, identify, design, material, dataset, plot):
+    for group in (rigs, plan, identify, design, material, dataset, reduce, plot):
         group.add_commands(commands)
     for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    # before torch is imported: its threads wait for each other where a core is busy
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(given)
     options.command = shlex.join(

@@ -1,12 +1,12 @@
 """Reduced models: sparse equations of the disc's and the bracket's motion, recovered from runs of
 the full model."""
 
-from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, rollout_of, score
+from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, noisy, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics, polynomials
 
 __all__ = [
     "Choice", "Recipe", "Record", "ReducedModel", "assemble", "choose", "fit", "friction", "joined",
-    "mechanics", "noisy", "polynomials", "record", "rolling_radius", "rollout_of", "score",
+    "loop", "mechanics", "noisy", "polynomials", "record", "rolling_radius", "rollout_of", "score",
 ]  # fmt: skip

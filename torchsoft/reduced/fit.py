@@ -208,6 +208,28 @@ def fit(
     return model
 
 
+def loop(records: Sequence[Record]) -> dict[str, dict[str, float]]:
+    """The PD law of F_x, by least squares over records, on the coordinate that it follows best;
+    `feedback` of `fit`. Raises `ValueError` where F_x is no such law of x_d."""
+    best: tuple[float, dict[str, float]] = np.inf, {}
+    (F,) = np.concatenate([one.columns(["F_x"]) for one in records]).T
+    for x, v in (("x_C", "v_C"), ("x_Br", "v_Br")):
+        x_d, own, rate_d, rate = np.concatenate(
+            [one.columns(["x_d", x, "x_d_dot", v]) for one in records]
+        ).T
+        errors = np.column_stack((x_d - own, rate_d - rate))
+        (K, D), *_ = np.linalg.lstsq(errors, F, rcond=None)
+        left = float(np.sqrt(np.mean((F - errors @ (K, D)) ** 2)))
+        if left < best[0]:
+            best = left, {"x_d": float(K), "x_d_dot": float(D), x: -float(K), v: -float(D)}
+    if best[0] > LAW_OFF * F.std():
+        raise ValueError(
+            f"F_x is no PD law of x_d: {amount(best[0], 'N')} of {amount(float(F.std()), 'N')} are "
+            "left; give `feedback` to `fit`"
+        )
+    return {"F_x": best[1]}
+
+
 @dataclass(frozen=True, repr=False)
 class Score(Shown):
     """A rollout against its record: root mean square error by state, over the record's range and

@@ -33,6 +33,7 @@ from torchsoft.rigs.parts import (
     TaxelsTable,
 )
 from torchsoft.tables import LISTED, from_toml, line
+from torchsoft.threads import single_threaded
 
 M = TypeVar("M")
 
@@ -421,6 +422,7 @@ class RigFile(Group):
         last = ["inertia" if name == "own_inertia" else name for name in rest]
         return ".".join([group, part, *last] if part else [group])
 
+    @single_threaded()
     @torch.no_grad()
     def build(self) -> BuiltRig[Rig]:
         """What the file describes, ready for `simulate(rig, t, y0=y0)`.

@@ -23,6 +23,7 @@ from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.geometry import Scene, Surface, collision, nodes, tied
 from torchsoft.rigs.motion import CsvTable
 from torchsoft.solve.ledger import COMPRESSED
+from torchsoft.threads import single_threaded
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
 """How far a set-point may be from its coordinate at the start without a warning."""
@@ -34,6 +35,7 @@ OUTPUTS_PER_PERIOD = 4
 """Outputs that a period of a motion needs at the least."""
 
 
+@single_threaded()
 def check(file: RigFile) -> list[Diagnostic]:
     """Findings on a rig file, errors first. Takes some seconds."""
     try:

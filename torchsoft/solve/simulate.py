@@ -30,6 +30,7 @@ from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.system import independent
 from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import Stats, Trajectory, channels, units
+from torchsoft.threads import one_torch_thread
 
 Route = Literal["none", "discrete", "forward"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch
@@ -53,6 +54,7 @@ class Interrupted(KeyboardInterrupt):
         self.trajectory = trajectory
 
 
+@one_torch_thread()
 def simulate(
     rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,

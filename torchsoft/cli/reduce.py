@@ -1,0 +1,79 @@
+"""Reduced models: sparse equations from runs that were saved."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from torchsoft.cli.results import add_out, say, try_folder
+
+REDUCE = """\
+Which sparse equations do saved runs of a rig obey?
+
+RUN.nc are runs of a body that rolls between two pads, written by `torchsoft run`: small waves about
+a settled grasp, sampled every 0.25 ms (docs: Reduced models). Terms are those of mechanics with the
+rolling radius --radius, or that of the first run; the loop of F_x is fitted from its set-point. The
+last run, or --held-out, is predicted and not fitted. Writes reduced.json: equations, coefficients,
+and the error of the prediction; the exit status is 1 where that is no better than a constant."""
+
+
+def add_commands(commands: Any) -> None:
+    """The command that finds reduced models."""
+    one = commands.add_parser(
+        "reduce", help="find sparse equations of saved runs", description=REDUCE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument("files", type=Path, nargs="+", metavar="RUN.nc", help="runs")
+    one.add_argument("--held-out", type=Path, metavar="RUN.nc", help="run that is predicted")
+    one.add_argument("--begin", type=float, help="time of the first sample taken [s]")
+    one.add_argument("--radius", type=float, help="rolling radius [m]")
+    one.add_argument("--disc", default="disc", help="body that rolls (%(default)s)")
+    one.add_argument("--bracket", default="bracket", help="body of the other pad (%(default)s)")
+    said = "least part of a rate that a term must account for (%(default)s)"
+    one.add_argument("--threshold", type=float, default=0.05, help=said)
+    add_out(one, default=Path("out/reduced"), help="folder for the result (%(default)s)")
+    one.set_defaults(run=reduce)
+
+
+def reduce(options: argparse.Namespace) -> int:
+    """Fit the runs, and predict the one held out."""
+    from torchsoft.files import write_json
+    from torchsoft.reduced import (
+        Recipe,
+        assemble,
+        fit,
+        loop,
+        mechanics,
+        record,
+        rolling_radius,
+        score,
+    )  # fmt: skip
+    from torchsoft.reduced.fit import GROSS
+    from torchsoft.solve.trajectory import Trajectory
+
+    *fitted, last = [*options.files, *([options.held_out] if options.held_out else [])]
+    if not fitted:
+        raise ValueError("one run is fitted and none is left to predict; give another, --held-out")
+    if not 0 < options.threshold < 1:
+        raise ValueError(f"--threshold must lie between 0 and 1; it is {options.threshold:g}")
+    if options.radius is not None and not options.radius > 0:
+        raise ValueError(f"--radius must be positive [m]; it is {options.radius:g}")
+    names: dict[str, Any] = {"disc": options.disc, "bracket": options.bracket}
+    records = [
+        record(Trajectory.load(file), begin=options.begin, **names) for file in (*fitted, last)
+    ]
+    try_folder(options.out, options.force)
+    radius = options.radius or rolling_radius(records[:1])
+    recipe = Recipe(threshold=options.threshold, width=0.004, window=0.3)
+    model = fit(assemble(records[:-1], mechanics(radius), recipe), recipe, loop(records[:-1]))
+    predicted = score(model, records[-1])
+    say(f"{model}\n{predicted}")
+    errors = None if predicted.rollout.diverged_at is not None else predicted.nrmse
+    summary = {
+        "equations": model.text(), "coefficients": model.coefficient_table(),
+        "feedback": model.feedback, "rolling_radius": radius, "threshold": options.threshold,
+        "fitted": [str(file) for file in fitted], "held_out": str(last), "nrmse": errors,
+        "diverged_at": predicted.rollout.diverged_at,
+    }  # fmt: skip
+    write_json(options.out / "reduced.json", summary)
+    say(f"written to {options.out / 'reduced.json'}")
+    return int(errors is None or max(predicted.over_deviation.values()) > GROSS)
