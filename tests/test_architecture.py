@@ -42,7 +42,7 @@ FLOWS = {
     "rigs": """
         fields parts control motion geometry build places course balance check written goal run .
     """,
-    "cli": "results rigs plan identify design material dataset plot .",
+    "cli": "results rigs plan identify design material dataset reduce plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
     """,
