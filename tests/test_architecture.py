@@ -129,7 +129,7 @@ def test_physics_does_not_know_how_it_is_solved() -> None:
         own, others = layer(name, ""), {layer(other, "") for other in imports(path)}
         if own in ("physics", "codegen"):
             assert others <= (
-                {"physics", "quantity", "csvfile", "files", "display"}
+                {"physics", "quantity", "csvfile", "files", "display", "threads"}
                 if own == "physics"
                 else {"codegen"}
             ), name
