@@ -32,6 +32,7 @@ from torchsoft.sysid.fit import (
     standard_deviations,
 )
 from torchsoft.sysid.plan import default_plan, sobol, tie_ratios, visible
+from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.runs import Runner
 
@@ -376,6 +377,36 @@ def test_data_out_of_reach_name_the_recording() -> None:
     )  # so soft that the loop is unstable
     with pytest.raises(Unreachable, match=r"recording `strokes`: .* t = .* s"):
         identify(problem, plan=[Stage("all", ("strokes",), ("pad.E",), 1e-3)])
+
+
+def test_a_plan_ends_where_a_finer_stage_cannot_begin(
+    strokes: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fit is kept, says so, and is tested on its own steps."""
+    freeze, first = Problem.freeze, iter([True])
+
+    def failing(*given: Any) -> Any:
+        at, steps = freeze(*given)
+        lost = {} if next(first, False) else {"strokes": FailedRun("at t = 0.5 s: no", 0.5)}
+        return at._replace(lost=lost), steps
+
+    monkeypatch.setattr(Problem, "freeze", failing)
+    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=0.8e6)})
+    plan = [Stage(f"by {rtol}", ("strokes",), ("pad.E",), rtol) for rtol in (1e-3, 1e-4)]
+    answer = identify(problem, plan=plan)
+    assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.05)
+    assert answer.made_by["rtol"] == 1e-3
+    assert answer.made_by["rtol_asked"] == 1e-4
+    assert not answer.converged
+    assert any("the fit ended by rtol = 0.001: by a finer tolerance" in s for s in answer.notices)
+    tested = {one.name: one.unchecked for one in answer.assumptions}
+    assert not tested["mesh"]
+    assert not tested["clock of the set-points"]
+    assert "disc.mass" in tested
+    other = [plan[0], replace(plan[1], free=())]
+    first = iter([True])
+    with pytest.raises(Unreachable, match=r"recording `strokes`: at t = 0.5 s: no"):
+        identify(problem, plan=other)
 
 
 @pytest.mark.parametrize(
