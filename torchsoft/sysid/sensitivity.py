@@ -53,6 +53,9 @@ MOST = 24
 RIVAL = 0.3
 """Part of the gain to first order of what explains a misfit from which a suspect is its rival."""
 
+NEARLY = 0.99
+"""Part of a misfit above the noise that a suspect takes away where few others need to be tried."""
+
 BESIDES = 3
 """Things that are looked for besides the likeliest suspect."""
 
@@ -225,7 +228,8 @@ def new_fits(
     checks: dict[str, AssumptionTest], progress: bool,
 ) -> Iterator[Variation]:  # fmt: skip
     """Repeats the fit with one suspect after the other, whose `checks` it replaces. Once one
-    explains the misfit, those that are worth much less to first order are left out."""
+    explains the misfit, or `NEARLY` all of it, those that are worth much less to first order are
+    left out."""
     first, count = dict(checks), len(candidates)
     with quiet(), tqdm(total=count + 1, unit="fit", disable=not progress) as bar:
 
@@ -247,7 +251,7 @@ def new_fits(
                 checks[one.name] = replace(found, amount=one.amount)
             bar.update()
             yield one
-            if judge.explained([checks[one.name]]):
+            if judge.nearly(checks[one.name]):
                 enough = max(enough, RIVAL * first[one.name].gain)
 
 
@@ -306,6 +310,11 @@ class Judge:
         """Whether the data favour something with which residuals are no larger than the noise."""
         left = min((one.left for one in checks if one.suspected), default=np.inf)
         return float(stats.chi2.sf(left, self.dof)) > LEVEL
+
+    def nearly(self, one: AssumptionTest) -> bool:
+        """Whether a new fit with a suspect leaves next to nothing above the noise."""
+        above = max(self.square - self.dof, 0.0)
+        return self.explained([one]) or (one.refitted and one.gain > NEARLY * above > 0.0)
 
     def unchecked(self, one: Assumption, reason: str) -> AssumptionTest:
         return assumption_test(one, left=self.square, unchecked=reason)
