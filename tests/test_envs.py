@@ -25,8 +25,6 @@ from torchsoft.rigs.build import RigFile
 FILE = RigFile.from_toml(torchsoft.envs.RIG)
 TURN = np.array([0.4, -0.4, 0.2], np.float32)
 
-Make = Callable[..., RigEnv]
-
 
 @pytest.fixture(scope="module")
 def ready() -> Iterator[RigEnv]:

@@ -383,11 +383,3 @@ def test_knots_with_a_graph_receive_their_gradient() -> None:
         slopes.append(torch.autograd.grad(value, leaf)[0])
     assert torch.allclose(slopes[0], slopes[1] * f64(1.0, 2.0), rtol=1e-9)
     assert float(slopes[0].abs().min()) > 0
-
-
-def test_feedback_on_the_diagonal_is_two_loops() -> None:
-    runs = [
-        simulate(rig, times(END, 5), y0=y0, step=1e-3)
-        for rig, y0 in (RIGS["loops"](), RIGS["loops by feedback"]())
-    ]
-    assert torch.allclose(runs[0].y, runs[1].y, rtol=0, atol=1e-9)

@@ -65,7 +65,6 @@ TRUTH = {
     "contact.mu_s": 0.5,
     "contact.mu_k": 0.4,
 }
-TRUE = BASE.override(TRUTH)
 FOUR = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
 
 
