@@ -6,10 +6,8 @@ import json
 import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +50,6 @@ def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
         f"{{{slow}}}"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-
-
-def test_all_names_are_there() -> None:
-    import torchsoft
-
-    assert all(hasattr(torchsoft, name) for name in dir(torchsoft))
-    assert {"Rig", "simulate", "simulate_batch", "Trajectory"} < set(dir(torchsoft))
 
 
 def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
@@ -304,45 +295,6 @@ def test_options_come_before_the_configuration(
     assert str(out / "answer.json") in text
     assert "contact.K_n" in text
     assert err == ""
-
-
-@pytest.mark.slow
-def test_an_interrupted_command_continues_and_ends_the_same(
-    answered: tuple[Path, list[str]], capsys: Any
-) -> None:
-    folder, files = answered
-    out = folder / "again"
-    command = ["identify", *files, "--out", str(out), "--no-progress"]
-    # test runners may ignore SIGINT, which a child inherits
-    code = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        f"from torchsoft.cli import main; sys.exit(main({command!r}))"
-    )
-    child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-    began = time.monotonic()
-    while (
-        len(list(out.glob("unfinished/*.run"))) < 3
-        and child.poll() is None
-        and time.monotonic() - began < 120
-    ):
-        time.sleep(0.02)
-    child.send_signal(signal.SIGINT)
-    _, message = child.communicate(timeout=60)
-    assert child.returncode == 130, message
-    assert "the same command continues" in message
-    assert "Traceback" not in message
-    kept = len(list(out.glob("unfinished/*.run")))
-    assert kept >= 3
-    assert not (out / "answer.json").exists()
-
-    assert main(command) == 0
-    assert "contact.K_n" in capsys.readouterr().out
-    assert not (out / "unfinished").exists()
-    first, second = (
-        json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again")
-    )
-    assert second["estimates"] == first["estimates"]
-    assert second["cost"]["remembered"] >= first["cost"]["remembered"] + kept - 1
 
 
 def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder: Path, capsys: Any) -> None:

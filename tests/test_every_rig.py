@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import f64, times
+from conftest import RUBBER, f64, times
 from rig_tester import (
     Start,
     assert_compiled_is_the_module,
@@ -54,7 +54,6 @@ from torchsoft.physics.extensions import extend, extensions
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.statics import standing
 
-RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 MESH = PadMesh(60e-3, 4.59e-3, 30, 2)
 R = 19.37e-3
 END = 0.01

@@ -14,7 +14,9 @@ Window = tuple[SoftGrasp, Tensor, float]
 """A model, its initial state (size,), and how long it runs [s]."""
 
 
-def window(duration: float, velocity: tuple[float, float] = (0.0, 0.0), **changes: object) -> Window:
+def window(
+    duration: float, velocity: tuple[float, float] = (0.0, 0.0), **changes: object
+) -> Window:
     model = coarse(**changes)
     return model, grasped(model, velocity), duration
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, RUBBER
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd import gradcheck
@@ -37,14 +37,13 @@ from torchsoft.physics.material import KINDS, Material, retarded
 from torchsoft.plot.diagram import graph_of
 from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify
 
-COMMON = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 MATERIALS: dict[str, Callable[[], Material]] = {
-    "kelvin_voigt": lambda: KelvinVoigt(**COMMON, tau=0.01),
-    "standard_linear_solid": lambda: StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02,
+    "kelvin_voigt": lambda: KelvinVoigt(**RUBBER, tau=0.01),
+    "standard_linear_solid": lambda: StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.02,
     tau_instant=1e-3),
-    "generalised_kelvin": lambda: GeneralisedKelvin(**COMMON, J=[0.3, 0.2, 0.1],
+    "generalised_kelvin": lambda: GeneralisedKelvin(**RUBBER, J=[0.3, 0.2, 0.1],
     tau=[4e-3, 0.02, 0.3], tau_instant=1e-3), "prony": lambda: Prony(
-        **COMMON, moduli=[3e5, 2e5, 1e5, 5e4, 5e4], tau=[3e-3, 0.01, 0.1, 0.5, 4.0],
+        **RUBBER, moduli=[3e5, 2e5, 1e5, 5e4, 5e4], tau=[3e-3, 0.01, 0.1, 0.5, 4.0],
         tau_instant=1e-3
     ),
 }  # fmt: skip
@@ -84,7 +83,7 @@ def test_a_relaxation_series_is_its_chain_exactly(name: str) -> None:
     """Compliance times modulus is one at every frequency, and retardation times interlace with
     relaxation times."""
     moduli, tau = SERIES[name]
-    solid = Prony(**COMMON, moduli=moduli, tau=tau, tau_instant=1e-9)
+    solid = Prony(**RUBBER, moduli=moduli, tau=tau, tau_instant=1e-9)
     J, late = retarded(solid.series()[0] / solid.E, solid.series()[1])
     omega = torch.logspace(-8, 8, 65, dtype=torch.float64)
     compliance = (J[0] + (J[1:] / (1 + 1j * omega[:, None] * late)).sum(-1)) / solid.E
@@ -109,9 +108,9 @@ def test_the_conversion_is_differentiable(name: str) -> None:
 
 @torch.no_grad()
 def test_one_relaxation_time_is_the_standard_linear_solid() -> None:
-    solid = Prony(**COMMON, moduli=[7.5e5], tau=[0.01])
-    like = StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02)
-    other = GeneralisedKelvin(**COMMON, J=[0.5], tau=[0.02])
+    solid = Prony(**RUBBER, moduli=[7.5e5], tau=[0.01])
+    like = StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.02)
+    other = GeneralisedKelvin(**RUBBER, J=[0.5], tau=[0.02])
     for one in (solid, other):
         for mine, its in zip(one.chain(), like.chain()):
             assert torch.allclose(mine, its, rtol=1e-14, atol=0)
@@ -231,7 +230,7 @@ def test_every_coefficient_of_a_series_is_identified() -> None:
     values = {"E": 7.5e5, "E_1": 5e5, "tau_1": 5e-3, "E_2": 3e5, "tau_2": 0.1}
 
     def solid(E: float, E_1: float, tau_1: float, E_2: float, tau_2: float) -> Prony:
-        return Prony(**(COMMON | {"E": E}), moduli=[E_1, E_2], tau=[tau_1, tau_2])
+        return Prony(**(RUBBER | {"E": E}), moduli=[E_1, E_2], tau=[tau_1, tau_2])
 
     rig, y0 = punch(solid(**values), force=1.0)
     y = simulate(rig, t, y0=y0, rtol=1e-7)["y_punch"].detach().numpy()

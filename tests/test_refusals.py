@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, f64, grasped, random_state, times
+from conftest import COARSE, RUBBER, coarse, f64, grasped, random_state, times
 from torch import Tensor, nn
 from torchdiffeq import odeint
 
@@ -70,7 +70,6 @@ def resting(**parts: Any) -> Tensor:
 # parts
 # ----------------------------------------------------------------------
 
-RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 ROUND = np.arange(24) * np.pi / 12
 CIRCLE = 20e-3 * np.stack((np.cos(ROUND), np.sin(ROUND)), -1)
 TRIANGLE = [[-12e-3, -9e-3], [19e-3, -9e-3], [-12e-3, 18e-3]]

@@ -76,10 +76,6 @@ def test_parameters_have_the_names_of_the_settings() -> None:
             is model.parameter(module_name)
             is model.get_parameter(module_name)
         )
-    with pytest.raises(
-        ValueError, match=r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"
-    ):
-        model.parameter("pad.Young")
     rolling = SoftGrasp(Parameters().override({"contact.friction": "coulomb"}))
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
         rolling.parameter("contact.v_s")

@@ -42,6 +42,11 @@ def coarse(file: RigFile, **groups: dict[str, Any]) -> RigFile:
     return file.override(pads=pads).override(**groups)
 
 
+def ready_rig(name: str) -> RigFile:
+    """One of the ready rigs."""
+    return RigFile.from_toml(READY[0].with_name(f"{name}.toml"))
+
+
 def shorter(file: RigFile, duration: float) -> RigFile:
     return file.override(outputs={"duration": duration, "snapshots": (), "frames": 3})
 
@@ -90,7 +95,7 @@ def test_the_papers_rig_is_soft_grasp() -> None:
     model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
     manipulation = grasp_and_roll(model, grasp_force=80.0)
     top = float(model.unpack(manipulation.y0).pose["bracket"][1])
-    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    file = coarse(ready_rig("paper"))
     file = changed(file, bodies__bracket__start__y=top, motion__F_ff__values=(0.0, -80.0))
     ready = file.build()
     assert torch.allclose(ready.y0, manipulation.y0, rtol=0, atol=1e-11)
@@ -112,7 +117,7 @@ def test_the_papers_rig_is_soft_grasp() -> None:
 def test_a_drop_is_not_missed() -> None:
     """Steps chosen by tolerance would be through the pad; the first touch is where free fall
     says."""
-    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
+    file = coarse(ready_rig("drop"))
     file = changed(shorter(file, 0.3), outputs__interval=1e-3)
     run = running.carry_out(file).trajectory
     y, force = run["y_ellipse"], run.force["ground"][..., 0].sum(-1)
@@ -137,7 +142,7 @@ def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:
     """The leading mode is that of the paper's own equilibrium: the friction-free grasp."""
     changes = {"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3}
     leading = complex(loop_modes(SoftGrasp(Parameters().override(changes)))[0])
-    paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    paper = coarse(ready_rig("paper"))
     (found,) = check(changed(paper, materials__rubber__tau=1e-3))
     assert found.severity == "error"
     assert found.where == "actuators.x"
@@ -160,7 +165,7 @@ def test_modes_are_those_of_the_whole_state() -> None:
 
 def test_steps_are_held_against_the_modes() -> None:
     """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
-    paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    paper = coarse(ready_rig("paper"))
     paper = changed(paper, materials__rubber__tau=2e-3)
     sentences = [
         [one.message for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)
@@ -172,7 +177,7 @@ def test_steps_are_held_against_the_modes() -> None:
 
 def test_a_body_that_flies_is_told_of_coarse_steps() -> None:
     file = coarse(
-        RigFile.from_toml(next(path for path in READY if path.stem == "drop")),
+        ready_rig("drop"),
         solver={"step": 0.05},
     )
     assert any("a body comes flying and may be through a pad" in one.message for one in check(file))
@@ -249,7 +254,7 @@ def test_a_recorded_motion_that_cannot_be_is_named(
 def test_what_two_pads_grip_is_taken_along() -> None:
     """The estimate before a run: fingertips go around a box that they hold, and the box with them;
     the run agrees."""
-    file = RigFile.from_toml(next(path for path in READY if path.stem == "fingertips"))
+    file = ready_rig("fingertips")
     estimate = Estimate(file, file.build())
     for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
         box = estimate(time)["box"]
@@ -325,7 +330,7 @@ def test_a_body_rests_where_nothing_accelerates_it(inertial: bool) -> None:
 
 @torch.no_grad()
 def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate() -> None:
-    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
+    file = coarse(ready_rig("drop"))
     rig = file.build().rig
     pose = {"ellipse": torch.tensor([60.2e-3, 30e-3, 0.1], dtype=torch.float64)}
     found = resting(rig, pose)["ellipse"]

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, grasped, times
+from conftest import COARSE, coarse, grasped, times, towards
 
 from torchsoft import (
     Parameters,
@@ -60,11 +60,7 @@ def test_a_disc_rolled_off_the_pad_is_reported() -> None:
     ended."""
     model = coarse()
     y0 = grasped(model)
-    beyond = Reference(
-        x_d=Profile([0.0, 1.0], [0.06, 0.13]),
-        y_d=model.reference["y_d"],
-        F_ff=model.reference["F_ff"],
-    )
+    beyond = towards(model, Profile([0.0, 1.0], [0.06, 0.13]))
     with pytest.raises(SimulationFailed, match="contact reached the end of a pad") as caught:
         simulate(model, times(1.0, 101), y0=y0, reference=beyond)
     run = caught.value.trajectory

@@ -4,11 +4,11 @@ met."""
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, grasped, times
+from conftest import coarse, grasped, times, towards
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import Reference, SimulationFailed, SoftGrasp, Trajectory, simulate
+from torchsoft import SimulationFailed, SoftGrasp, Trajectory, simulate
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.grid import given_steps
@@ -118,11 +118,6 @@ def test_outputs_lie_within_their_steps_however_these_differ() -> None:
     (plan,) = given_steps(t, knots)
     assert plan.out_step.tolist() == [0, 0, 1, 1, 2]
     assert plan.out_part.tolist() == pytest.approx([0.5, 1.0, 0.05, 1.0, 1.0])
-
-
-def towards(model: SoftGrasp, x_d: nn.Module) -> Reference:
-    """The model's reference with another horizontal set-point."""
-    return Reference(**{name: model.reference[name] for name in model.signals} | {"x_d": x_d})
 
 
 class Wave(nn.Module):
