@@ -118,5 +118,5 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(params=["massless", "inertial"])
-def fidelity(request: pytest.FixtureRequest) -> str:
+def fidelity(request):
     return request.param

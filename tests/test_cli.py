@@ -8,8 +8,6 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +29,7 @@ def rows(count: int) -> Table:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """The working directory, with the first 0.3 s of the example in data.csv and their
     configuration in rig.toml."""
     write(tmp_path / "data.csv", rows(62))
@@ -43,7 +41,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     "code", ["import torchsoft", "from torchsoft.cli import main; main(['--help'])"]
 )
-def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
+def test_neither_an_import_nor_help_waits_for_torch(code):
     slow = "'torch', 'scipy', 'numba', 'matplotlib', 'xarray'"
     code = (
         f"import sys\ntry: {code}\nexcept SystemExit: pass\nassert not sys.modules.keys() & "
@@ -52,7 +50,7 @@ def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
+def test_help_names_every_command_argument_and_option(capsys):
     for arguments, words in (
         (["--help"], ("identify", "material")),
         (["material", "--help"], ("fit", "presets")),
@@ -87,9 +85,7 @@ def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
         (["identify", "rig.toml", "--rtol", "fast"], "invalid float value: 'fast'"),
     ],
 )
-def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(
-    arguments: list[str], message: str, capsys: Any
-) -> None:
+def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments, message, capsys):
     with pytest.raises(SystemExit) as end:
         main(arguments)
     assert end.value.code == 2
@@ -161,7 +157,7 @@ ERRORS: dict[str, tuple[list[str], str]] = {
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: Any) -> None:
+def test_an_error_is_one_line_and_ends_with_2(folder, name, capsys):
     (folder / "folder.csv").mkdir()
     contents = {
         "picture.csv": b"\x89PNG\r\n\x1a\n", "empty.csv": b"",
@@ -182,7 +178,7 @@ def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: A
     assert sorted(folder.rglob("*")) == before  # nothing is left behind
 
 
-def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder: Path) -> None:
+def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder):
     (folder / "µ.toml").write_text(CONFIG.replace("contact.K_n", "contact.µ"), encoding="utf-8")
     command = [sys.executable, "-m", "torchsoft", "identify", "data.csv", "µ.toml"]
     environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -192,7 +188,7 @@ def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder: Path) -> N
     assert ended.stderr.count(b"\n") == 1
 
 
-def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, capsys: Any) -> None:
+def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder, capsys):
     mine = folder / "mine"
     mine.mkdir()
     for name in ("a.pickle", "b.partial"):
@@ -207,9 +203,7 @@ def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, c
 
 
 @pytest.mark.slow
-def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
-    folder: Path, capsys: Any
-) -> None:
+def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder, capsys):
     table = rows(122)
     for column in (X_D, X_C, 8):
         scale(column, 1.0, -0.3)(table)
@@ -239,7 +233,7 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
 
 
 @pytest.fixture(scope="module")
-def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+def answered(tmp_path_factory):
     """The command, carried out in this process; its folder and its data."""
     folder = tmp_path_factory.mktemp("command")
     (folder / "rig.toml").write_text(f'{CONFIG}assumptions = "trusted"\n')
@@ -248,7 +242,7 @@ def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]
     return folder, files
 
 
-def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
+def test_it_writes_answer_and_page(answered):
     out = answered[0] / "out"
     assert sorted(path.name for path in out.iterdir()) == ["answer.json", "report.html"]
     answer = json.loads((out / "answer.json").read_text())
@@ -266,9 +260,7 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
 
 
 @pytest.mark.slow
-def test_options_come_before_the_configuration(
-    answered: tuple[Path, list[str]], capsys: Any
-) -> None:
+def test_options_come_before_the_configuration(answered, capsys):
     folder, files = answered
     out, kept = folder / "coarser", folder / "kept"
     command = [
@@ -297,7 +289,7 @@ def test_options_come_before_the_configuration(
     assert err == ""
 
 
-def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder: Path, capsys: Any) -> None:
+def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder, capsys):
     flipped = rows(62)
     scale(F_Y, -1.0)(flipped)
     write(folder / "data.csv", flipped)
@@ -311,7 +303,7 @@ def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder: Path, c
 
 
 @pytest.mark.slow
-def test_competing_laws_are_compared(folder: Path, capsys: Any) -> None:
+def test_competing_laws_are_compared(folder, capsys):
     laws = '[compare.coulomb]\nsettings.contact.friction = "coulomb"\n'
     (folder / "rig.toml").write_text(f"{CONFIG}{laws}")
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 0

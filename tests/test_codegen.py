@@ -540,7 +540,7 @@ def test_arrays_of_another_kind_are_refused_when_numba_compiles():
         _repeat(1.5, np.ones((3, 2)), np.ones(12), np.ones((3, 2)), np.ones((3, 2, 2)), 1)
 
 
-def test_a_captured_tensor_with_a_gradient_is_refused() -> None:
+def test_a_captured_tensor_with_a_gradient_is_refused():
     """It would be a constant of the law, and its gradient lost without a word."""
     outside = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     with pytest.raises(

@@ -18,7 +18,7 @@ MODEL = SoftGrasp(Parameters().override(COARSE))
 NAMES = tuple(extensions(MODEL))
 
 
-def test_what_a_rig_may_be_extended_by() -> None:
+def test_what_a_rig_may_be_extended_by():
     assert NAMES == (
         "pads.L.E_ratio", "pads.L.tau_ratio", "pads.U.E_ratio", "pads.U.tau_ratio",
         "pad.slow(0.1 s)", "pad.slow(1 s)", "contact.power", "guides.bracket.x.friction",
@@ -28,7 +28,7 @@ def test_what_a_rig_may_be_extended_by() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_neutral_extension_changes_nothing(name: str) -> None:
+def test_a_neutral_extension_changes_nothing(name):
     model = deepcopy(MODEL)
     manipulation = grasp_and_roll(model)
     t = torch.linspace(0, 0.3, 31, dtype=torch.float64)
@@ -44,7 +44,7 @@ def test_a_neutral_extension_changes_nothing(name: str) -> None:
     assert name not in extensions(model)
 
 
-def test_parts_that_are_shared_are_extended_once() -> None:
+def test_parts_that_are_shared_are_extended_once():
     model = deepcopy(MODEL)
     extend(model, ["contact.power", "pad.slow(1 s)", "gravity_tilt"])
     assert model.contacts["L"].law.power is model.contacts["U"].law.power
@@ -56,7 +56,7 @@ def test_parts_that_are_shared_are_extended_once() -> None:
         extend(model, ["contact.colour"])
 
 
-def test_names_are_those_of_a_rig_file() -> None:
+def test_names_are_those_of_a_rig_file():
     rig = RigFile.from_toml("rigs/two_fingers.toml").assemble()
     groups = {name.partition(".")[0] for name in extensions(rig)}
     assert groups == {"materials", "laws", "pads", "guides", "gravity_tilt"}
@@ -66,7 +66,7 @@ def test_names_are_those_of_a_rig_file() -> None:
         assert rig.parameter(name).item() == 1.0
 
 
-def test_an_extension_may_be_unknown() -> None:
+def test_an_extension_may_be_unknown():
     """With the bounds of its own search, or with those that are given."""
     t = torch.linspace(0.0, 0.1, 11, dtype=torch.float64).numpy()
     recording = Recording("one", deepcopy(MODEL), {"F_y": (t, 0 * t)})

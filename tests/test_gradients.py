@@ -42,7 +42,7 @@ WINDOWS = {
 
 
 @pytest.mark.parametrize("name", WINDOWS)
-def test_gradients_are_the_differences_in_every_regime(name: str) -> None:
+def test_gradients_are_the_differences_in_every_regime(name):
     """And the windows are what they are called."""
     model, y0, duration = WINDOWS[name]()
     run = assert_gradients_exact((model, y0), times(duration, 5), rtol=1e-6)
@@ -57,8 +57,8 @@ def test_gradients_are_the_differences_in_every_regime(name: str) -> None:
 
 
 def test_same_gradient_twice_and_from_checkpoints_to_the_bit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     """Also when every tape is made again from where its segment began, over several segments."""
     model = coarse()
     wanted = [grasped(model, (2e-3, 1e-3)).requires_grad_(), *model.parameters()]
@@ -78,7 +78,7 @@ def test_same_gradient_twice_and_from_checkpoints_to_the_bit(
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
-def test_a_cotangent_that_is_not_finite_is_refused(bad: float) -> None:
+def test_a_cotangent_that_is_not_finite_is_refused(bad):
     model, y0, duration = WINDOWS["stick"]()
     solution = simulate(model, times(duration, 5), y0=y0, step=1e-3, gradient="discrete").y
     cotangent = torch.zeros_like(solution)

@@ -54,7 +54,7 @@ TIGHT = 2e-9
 
 
 @pytest.fixture(params=list(MATERIALS))
-def material(request: pytest.FixtureRequest) -> Material:
+def material(request):
     return MATERIALS[request.param]()
 
 
@@ -79,7 +79,7 @@ SERIES: dict[str, tuple[Sequence[float], Sequence[float]]] = {
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", SERIES)
-def test_a_relaxation_series_is_its_chain_exactly(name: str) -> None:
+def test_a_relaxation_series_is_its_chain_exactly(name):
     """Compliance times modulus is one at every frequency, and retardation times interlace with
     relaxation times."""
     moduli, tau = SERIES[name]
@@ -95,7 +95,7 @@ def test_a_relaxation_series_is_its_chain_exactly(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["one", "unsorted", "ten decades"])
-def test_the_conversion_is_differentiable(name: str) -> None:
+def test_the_conversion_is_differentiable(name):
     """In logarithms of moduli and times, against differences."""
     moduli, tau = (torch.tensor(x, dtype=torch.float64) for x in SERIES[name])
 
@@ -107,7 +107,7 @@ def test_the_conversion_is_differentiable(name: str) -> None:
 
 
 @torch.no_grad()
-def test_one_relaxation_time_is_the_standard_linear_solid() -> None:
+def test_one_relaxation_time_is_the_standard_linear_solid():
     solid = Prony(**RUBBER, moduli=[7.5e5], tau=[0.01])
     like = StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.02)
     other = GeneralisedKelvin(**RUBBER, J=[0.5], tau=[0.02])
@@ -117,7 +117,7 @@ def test_one_relaxation_time_is_the_standard_linear_solid() -> None:
 
 
 @torch.no_grad()
-def test_creep_and_complex_modulus_have_their_limits(material: Material) -> None:
+def test_creep_and_complex_modulus_have_their_limits(material):
     """From nothing to 1/E; the storage modulus from E on grows, and losses are positive."""
     E, ends = material.E.item(), torch.tensor([0.0, 1e6], dtype=torch.float64)
     assert (material.creep(ends) * E).tolist() == pytest.approx([0.0, 1.0], abs=1e-12)
@@ -202,7 +202,7 @@ def closed(run: Trajectory, found: Tensor, expected: Tensor) -> None:
 
 
 @torch.no_grad()
-def test_creep_under_a_held_force_is_the_closed_form(material: Material) -> None:
+def test_creep_under_a_held_force_is_the_closed_form(material):
     rig, y0 = punch(material, force=1.0)
     run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
     closed(
@@ -213,7 +213,7 @@ def test_creep_under_a_held_force_is_the_closed_form(material: Material) -> None
 
 
 @torch.no_grad()
-def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Material) -> None:
+def test_relaxation_under_a_held_indentation_is_the_closed_form(material):
     rig, y0 = punch(material, depth=5e-5)
     run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
     J, tau = material.chain()
@@ -224,7 +224,7 @@ def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Materi
     )
 
 
-def test_every_coefficient_of_a_series_is_identified() -> None:
+def test_every_coefficient_of_a_series_is_identified():
     """From the punch's height under a held force, without noise, from starts a third away."""
     t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0.5, 120, dtype=torch.float64)))
     values = {"E": 7.5e5, "E_1": 5e5, "tau_1": 5e-3, "E_2": 3e5, "tau_2": 0.1}
@@ -253,7 +253,7 @@ STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
 
 
 @torch.no_grad()
-def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
+def test_the_graph_has_the_fields_of_the_chain(material):
     labels = {
         data["label"] for _, data in graph_of(SoftGrasp(STABLE, material=material)).nodes(data=True)
     }
@@ -266,7 +266,7 @@ def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
 # ----------------------------------------------------------------------
 
 
-def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
+def test_a_recording_that_begins_before_the_pads_forget_is_named():
     model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
     samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
     with pytest.warns(
@@ -278,5 +278,5 @@ def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
     _ = Recording("slow", model, samples, AtRest(lead=20.0)).start_coordinates
 
 
-def test_every_material_has_a_name_in_files() -> None:
+def test_every_material_has_a_name_in_files():
     assert {name: type(make()) for name, make in MATERIALS.items()} == dict(KINDS)

@@ -37,7 +37,7 @@ def stiffness(mesh: PadMesh, nu: float, E: float = 1.0, all_nodes: bool = True) 
 # ----------------------------------------------------------------------
 
 
-def test_banded_storage_holds_the_whole_matrix() -> None:
+def test_banded_storage_holds_the_whole_matrix():
     mesh = PadMesh(0.02, 4e-3, 7, 3, bonded_sides=True)
     lame_lambda, lame_mu = lame_moduli(1.0, 0.4)
     ab = banded(mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1]))
@@ -92,9 +92,7 @@ def pad_work(nu: float, elements_x: int, elements_y: int) -> float:
 
 # full integration misses at least this share of the work on 1 mm elements; measured 17 and 93 %
 @pytest.mark.parametrize(("nu", "lost_by_full_integration"), [(0.49, 0.15), (0.4999, 0.9)])
-def test_a_nearly_incompressible_layer_does_not_lock(
-    nu: float, lost_by_full_integration: float
-) -> None:
+def test_a_nearly_incompressible_layer_does_not_lock(nu, lost_by_full_integration):
     reference = Layer(nu).work(160, 20, order=2)  # itself good to 3e-4 at nu = 0.4999
     assert (
         abs(pad_work(nu, 40, 4) / reference - 1) < 0.02
@@ -103,7 +101,7 @@ def test_a_nearly_incompressible_layer_does_not_lock(
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.45, 0.49])
-def test_work_converges_with_the_square_of_the_spacing(nu: float) -> None:
+def test_work_converges_with_the_square_of_the_spacing(nu):
     reference = Layer(nu).work(160, 20, order=2)  # good to 1.5e-5 and better
     errors = np.array([abs(pad_work(nu, 20 * k, 2 * k) / reference - 1) for k in (2, 4, 8)])
     order = np.log2(errors[:-1] / errors[1:])

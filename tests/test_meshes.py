@@ -74,7 +74,7 @@ MESHES: dict[str, Callable[[], Mesh]] = {
 
 
 @pytest.fixture(params=MESHES)
-def mesh(request: pytest.FixtureRequest) -> Mesh:
+def mesh(request):
     return MESHES[request.param]()
 
 
@@ -90,7 +90,7 @@ def in_scikit_fem(mesh: Mesh) -> MeshQuad:
     return MeshQuad(mesh.nodes.T, mesh.elements.T)
 
 
-def test_assembly_equals_scikit_fem(mesh: Mesh) -> None:
+def test_assembly_equals_scikit_fem(mesh):
     theirs, element = in_scikit_fem(mesh), ElementVector(ElementQuad1())
     basis = Basis(theirs, element, intorder=2)
     centre = Basis(theirs, element, quadrature=(np.full((2, 1), 0.5), np.ones(1)))
@@ -105,7 +105,7 @@ def test_assembly_equals_scikit_fem(mesh: Mesh) -> None:
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.4999])
-def test_patch_test(mesh: Mesh, nu: float) -> None:
+def test_patch_test(mesh, nu):
     """A linear displacement has a uniform stress: forces only at the boundary, each the stress on
     half of both its sides."""
     gradient = np.array([[0.3, -0.7], [1.1, 0.4]])
@@ -124,7 +124,7 @@ def test_patch_test(mesh: Mesh, nu: float) -> None:
     )
 
 
-def test_only_rigid_motions_cost_no_energy(mesh: Mesh) -> None:
+def test_only_rigid_motions_cost_no_energy(mesh):
     lame_lambda, lame_mu = lame_moduli(1.0, 0.49)
     K = mesh.assemble(
         lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True
@@ -138,7 +138,7 @@ def test_only_rigid_motions_cost_no_energy(mesh: Mesh) -> None:
 # ----------------------------------------------------------------------
 
 
-def test_face_and_base_are_where_they_should_be(mesh: Mesh) -> None:
+def test_face_and_base_are_where_they_should_be(mesh):
     face = mesh.nodes[mesh.face]
     assert np.all(np.diff(face[:, 0]) > 0)  # from left to right
     assert not mesh.bonded[mesh.free].any()
@@ -156,7 +156,7 @@ def test_face_and_base_are_where_they_should_be(mesh: Mesh) -> None:
     assert np.all(low <= mesh.nodes.min(0)) and np.all(mesh.nodes.max(0) <= high)  # noqa: PT018
 
 
-def test_a_curved_block_has_an_arc() -> None:
+def test_a_curved_block_has_an_arc():
     for radius, middle, ends in ((40e-3, 6e-3, None), (-40e-3, 6e-3, None), (np.inf, 6e-3, 6e-3)):
         mesh = CurvedPadMesh(30e-3, 6e-3, 10, 2, radius=radius)
         face = mesh.nodes[mesh.face]
@@ -170,7 +170,7 @@ def test_a_curved_block_has_an_arc() -> None:
             assert face[:, 1] == pytest.approx(np.full(11, ends), abs=1e-15)
 
 
-def test_bonded_edges_have_names() -> None:
+def test_bonded_edges_have_names():
     for edges in (("base",), ("left", "right"), ("base", "left", "right"), ("right",)):
         mesh = CurvedPadMesh(30e-3, 6e-3, 10, 2, bonded_edges=edges)
         x, y = mesh.nodes.T
@@ -178,7 +178,7 @@ def test_bonded_edges_have_names() -> None:
         assert np.array_equal(mesh.bonded, np.any([where[name] for name in edges], axis=0))
 
 
-def test_a_flat_curved_block_is_the_block() -> None:
+def test_a_flat_curved_block_is_the_block():
     plain, curved = PadMesh(30e-3, 6e-3, 10, 2), CurvedPadMesh(30e-3, 6e-3, 10, 2)
     assert np.allclose(plain.nodes, curved.nodes, rtol=0, atol=1e-18)
     pads = [Pad(mesh, rubber()).compliance().detach() for mesh in (plain, curved)]
@@ -187,7 +187,7 @@ def test_a_flat_curved_block_is_the_block() -> None:
     assert np.array_equal(enclosed.bonded, PadMesh(30e-3, 6e-3, 10, 2, bonded_sides=True).bonded)
 
 
-def test_a_fingertip_is_half_a_disc() -> None:
+def test_a_fingertip_is_half_a_disc():
     areas = []
     for around in (8, 16, 32, 64):
         mesh = FingertipMesh(RADIUS, around)
@@ -210,7 +210,7 @@ def test_a_fingertip_is_half_a_disc() -> None:
     assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(np.full(3, 2.0), abs=0.02)
 
 
-def test_refining_divides_every_quadrilateral() -> None:
+def test_refining_divides_every_quadrilateral():
     coarse = trapezium()
     for finer in (2, 3):
         fine = coarse.refined(finer)
@@ -226,7 +226,7 @@ def test_refining_divides_every_quadrilateral() -> None:
     )
 
 
-def test_equal_descriptions_are_one_mesh() -> None:
+def test_equal_descriptions_are_one_mesh():
     for make in MESHES.values():
         assert make() == make()
         assert hash(make()) == hash(make())
@@ -258,7 +258,7 @@ def pressure(x: Array) -> Array:
 
 
 @pytest.mark.parametrize(("nu", "bound"), [(0.3, 2e-3), (0.49, 6e-3)])
-def test_a_fingertip_gives_way_as_in_scikit_fem(nu: float, bound: float) -> None:
+def test_a_fingertip_gives_way_as_in_scikit_fem(nu, bound):
     errors = []
     for around in (16, 32, 64):
         pad = Pad(FingertipMesh(RADIUS, around), KelvinVoigt(1.0, nu, 1.0, 1.0, depth=1.0))
@@ -340,7 +340,7 @@ $EndElements
 """
 
 
-def test_a_mesh_from_a_file(tmp_path: Path) -> None:
+def test_a_mesh_from_a_file(tmp_path):
     tip = FingertipMesh(RADIUS, 8)
     mesh = QuadMesh.read(
         written(tmp_path / "tip.msh", tip), unit="mm", face="skin", bonded=["bone"]
@@ -356,7 +356,7 @@ def test_a_mesh_from_a_file(tmp_path: Path) -> None:
     assert torch.allclose(C, expected, rtol=1e-8, atol=1e-10 * float(expected.abs().max()))
 
 
-def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_no_meshes_are_refused(tmp_path):
     file = tmp_path / "tip.msh"
     tip = FingertipMesh(RADIUS, 8)
     with pytest.raises(FileNotFoundError):

@@ -3,7 +3,6 @@ round-trip."""
 
 import math
 import warnings
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -48,22 +47,20 @@ BAD: list[tuple[list[str], list[object], str]] = [
 
 
 @pytest.mark.parametrize(("names", "values", "words"), BAD)
-def test_impossible_values_are_refused_by_name(
-    names: list[str], values: list[object], words: str
-) -> None:
+def test_impossible_values_are_refused_by_name(names, values, words):
     for name in names:
         for value in values:
             assert f"{name}{words}" in refusal({name: value}), value
 
 
-def test_a_mesh_that_would_not_fit_in_memory_is_refused() -> None:
+def test_a_mesh_that_would_not_fit_in_memory_is_refused():
     assert "pad.elements_x = 40000 by elements_y = 4 take about" in refusal(
         {"pad.elements_x": 40_000}
     )
     assert Parameters().override({"pad.elements_x": 1000}).pad.memory < 1.0
 
 
-def test_the_bounds_of_a_parameter_can_be_asked_for() -> None:
+def test_the_bounds_of_a_parameter_can_be_asked_for():
     model = SoftGrasp()
     for name in NAMES:
         declared = model.quantity(name)
@@ -76,7 +73,7 @@ def test_the_bounds_of_a_parameter_can_be_asked_for() -> None:
                 check(name, value, "here")
 
 
-def test_kinetic_friction_above_static_is_refused() -> None:
+def test_kinetic_friction_above_static_is_refused():
     message = refusal({"contact.mu_k": 0.9})
     assert "contact" in message
     assert "mu_k = 0.9 > mu_s = 0.8" in message
@@ -85,7 +82,7 @@ def test_kinetic_friction_above_static_is_refused() -> None:
     )  # equal is Coulomb's law
 
 
-def test_a_slip_element_without_any_viscosity_is_refused() -> None:
+def test_a_slip_element_without_any_viscosity_is_refused():
     assert "eta + R_t" in refusal({"contact.eta": 0.0, "contact.R_t": 0.0})
     assert "R_t > 0" in refusal({"contact.friction": "coulomb", "contact.R_t": 0.0})
 
@@ -100,7 +97,7 @@ def test_a_slip_element_without_any_viscosity_is_refused() -> None:
         ({"pad.height": 1e-3, "disc.radius": 22.9e-3}, "give way"),
     ],
 )
-def test_a_disc_that_does_not_fit_is_refused(values: dict[str, float], word: str) -> None:
+def test_a_disc_that_does_not_fit_is_refused(values, word):
     message = refusal(values)
     assert "the disc does not fit" in message
     assert word in message
@@ -122,18 +119,18 @@ def test_a_disc_that_does_not_fit_is_refused(values: dict[str, float], word: str
         {"pad.length": 0.06},
     ],
 )
-def test_a_trajectory_that_leaves_the_pad_is_refused(values: dict[str, float]) -> None:
+def test_a_trajectory_that_leaves_the_pad_is_refused(values):
     message = refusal(values)
     assert "leaves the pad" in message
     for name in ("scenario.x_C0", "scenario.travel", "pad.length"):
         assert name in message
 
 
-def test_a_trajectory_that_just_stays_on_the_pad_is_accepted() -> None:
+def test_a_trajectory_that_just_stays_on_the_pad_is_accepted():
     assert Parameters().override({"scenario.travel": -54e-3}).scenario.travel == -54e-3
 
 
-def test_parameters_are_frozen() -> None:
+def test_parameters_are_frozen():
     with pytest.raises(InvalidTable, match="cannot be set"):
         Parameters().pad.E = 1.0
 
@@ -142,7 +139,7 @@ def test_parameters_are_frozen() -> None:
 # ----------------------------------------------------------------------
 
 
-def test_a_slip_law_that_is_not_single_valued_is_warned_about() -> None:
+def test_a_slip_law_that_is_not_single_valued_is_warned_about():
     # (mu_s - mu_k) F_N / v_s = 0.1 * 10 N / 5 mm/s = 200 N.s/m against eta + R_t
     with pytest.warns(UserWarning, match=r"not single-valued.*contact\.v_s"):
         Parameters().override({"contact.eta": 10.0, "contact.R_t": 189.0})
@@ -154,7 +151,7 @@ def test_a_slip_law_that_is_not_single_valued_is_warned_about() -> None:
         Parameters().override({"contact.friction": "coulomb", "contact.R_t": 10.0})  # not its law
 
 
-def test_default_and_paper_like_sets_do_not_warn() -> None:
+def test_default_and_paper_like_sets_do_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert Parameters().contact.K_t == 1.2e5
@@ -166,13 +163,13 @@ def test_default_and_paper_like_sets_do_not_warn() -> None:
 
 
 @pytest.mark.parametrize("name", ["pad.Young", "pad", "pad.", "E", "pads.E", "pad.E.x", ""])
-def test_override_refuses_an_unknown_name(name: str) -> None:
+def test_override_refuses_an_unknown_name(name):
     with pytest.raises(ValueError, match=r"is not a parameter; known names: .*pad\.E") as error:
         Parameters().override({name: 1.0})
     assert f"`{name}`" in str(error.value)
 
 
-def test_table_tells_published_from_assumed() -> None:
+def test_table_tells_published_from_assumed():
     table = Parameters().table()
     published = {name for name, row in table.items() if row["source"] == "published"}
     assert published == {
@@ -188,7 +185,7 @@ def test_table_tells_published_from_assumed() -> None:
     assert all(row["unit"] and row["meaning"] for row in table.values())
 
 
-def test_published_numbers() -> None:
+def test_published_numbers():
     p = Parameters()
     assert p.compression == pytest.approx(1.5e-3, abs=1e-15)
     assert p.scenario.duration == 30.0
@@ -216,7 +213,7 @@ def toml(value: Any) -> str:
 
 
 @given(changes=CHANGES)
-def test_overrides_arrive_in_the_table_and_undo(changes: dict[str, Any]) -> None:
+def test_overrides_arrive_in_the_table_and_undo(changes):
     changed = Parameters().override(changes)
     table, default = changed.table(), Parameters().table()
     for name, row in table.items():
@@ -229,9 +226,7 @@ def test_overrides_arrive_in_the_table_and_undo(changes: dict[str, Any]) -> None
 
 
 @given(changes=CHANGES)
-def test_a_file_holds_the_same_parameters(
-    changes: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_a_file_holds_the_same_parameters(changes, tmp_path_factory):
     changed = Parameters().override(changes)
     lines = [f"{name} = {toml(row['value'])}" for name, row in changed.table().items()]
     path = tmp_path_factory.getbasetemp() / "parameters.toml"
@@ -253,9 +248,7 @@ def test_a_file_holds_the_same_parameters(
         ("[pad]\nE = soft", "line 2"),
     ],
 )
-def test_a_file_that_is_wrong_is_refused_with_its_name(
-    text: str, named: str, tmp_path: Path
-) -> None:
+def test_a_file_that_is_wrong_is_refused_with_its_name(text, named, tmp_path):
     path = tmp_path / "soft.toml"
     path.write_text(text)
     with pytest.raises(ValueError, match=r"soft\.toml") as error:

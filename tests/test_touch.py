@@ -4,7 +4,6 @@ where a point touches down between two outputs."""
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -86,7 +85,7 @@ RUNS: dict[str, tuple[Callable[[], tuple[Rig, Tensor]], list[str], dict[str, Any
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_gradients_of_every_channel_are_the_differences(name: str) -> None:
+def test_gradients_of_every_channel_are_the_differences(name):
     """Of all nodal forces, taxels, loads, moments and centres, each with a weight of its own."""
     make, wanted, how = RUNS[name]
     rig, y0 = make()
@@ -131,7 +130,7 @@ def test_gradients_of_every_channel_are_the_differences(name: str) -> None:
         assert float((slope - by_forward[:, i]).norm()) < near * float(slope.norm()), one
 
 
-def test_channels_are_sums_of_what_is_recorded() -> None:
+def test_channels_are_sums_of_what_is_recorded():
     model, y0 = pressed()
     run = simulate(model, times(0.05, 6), y0=y0)
     normal, shear = run.force["L"].unbind(-1)
@@ -152,7 +151,7 @@ def test_channels_are_sums_of_what_is_recorded() -> None:
     assert enumerated(["a", "b.0", "b.1", "c"]) == "a, b.0 to 1, c"
 
 
-def test_a_taxel_takes_what_a_gaussian_has_inside_it() -> None:
+def test_a_taxel_takes_what_a_gaussian_has_inside_it():
     pad = coarse().pads["L"]
     taxels = Taxels("L", 3e-3, centres=[1e-3, 5e-3], spread=2e-3)
     weights = taxels.weights(pad)
@@ -191,13 +190,13 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_felt_is_refused(case: str) -> None:
+def test_what_cannot_be_felt_is_refused(case):
     make, said = REFUSED[case]
     with pytest.raises(ValueError, match=said):
         make()
 
 
-def test_forces_of_a_batch_have_the_gradients_of_its_runs() -> None:
+def test_forces_of_a_batch_have_the_gradients_of_its_runs():
     model, y0 = pressed()
     values = f64(0.6e6, 0.8e6).requires_grad_()
     t = times(0.05, 6)
@@ -220,7 +219,7 @@ def test_forces_of_a_batch_have_the_gradients_of_its_runs() -> None:
     assert all(len(one.touch_sensitivities) == 40 for one in batch.trajectories if one is not None)
 
 
-def test_stored_energies_have_gradients() -> None:
+def test_stored_energies_have_gradients():
     model, y0 = pressed()
     t = times(0.05, 6)
     run = simulate(model, t, y0=y0, gradient="discrete", tolerance=1e-10, rtol=1e-4)
@@ -236,7 +235,7 @@ def test_stored_energies_have_gradients() -> None:
     assert float(slope) == pytest.approx(0.5 * (ends[0] - ends[1]), rel=1e-5)
 
 
-def test_taxels_are_sensors_of_a_fit() -> None:
+def test_taxels_are_sensors_of_a_fit():
     """Jacobian and gradient of the misfit; an array's sensor stands for its taxels, one with a
     delay and a gain of its own but one."""
     felt = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
@@ -265,7 +264,7 @@ def test_taxels_are_sensors_of_a_fit() -> None:
         Problem([data], SENSORS | {"skin.shear": Sensor(noise=1.0)}, unknowns)
 
 
-def test_taxels_of_a_rig_file_are_columns_of_its_recordings(tmp_path: Path) -> None:
+def test_taxels_of_a_rig_file_are_columns_of_its_recordings(tmp_path):
     skin = {"skin": {"pad": "left_tip", "width": 2e-3, "count": 3, "spread": 5e-4}}
     file = fingers(taxels=skin)
     rig, y0, _ = file.build()

@@ -12,7 +12,6 @@ import torch
 from conftest import RUBBER, coarse, f64, grasp, times
 from torch import nn
 
-from hostile.trial import Tally
 from torchsoft import (
     PD,
     Actuator,
@@ -216,9 +215,7 @@ class Accepted(Exception):
 
 
 @pytest.mark.parametrize("attacks", [of_constructors, of_parts, of_runs, of_values])
-def test_odd_calls_are_refused_with_a_sentence(
-    tally: Callable[[str], Tally], attacks: Callable[[], Iterator[Attack]]
-) -> None:
+def test_odd_calls_are_refused_with_a_sentence(tally, attacks):
     line = tally(f"odd calls {attacks.__name__.replace('_', ' ')}")
     for call, right, odds in attacks():
         for name, values in odds.items():

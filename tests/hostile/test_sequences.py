@@ -33,7 +33,7 @@ from hypothesis.stateful import (
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from hostile.trial import SEED, Tally, count, sentence
+from hostile.trial import SEED, count, sentence
 from torchsoft import (
     Coulomb,
     Profile,
@@ -366,7 +366,7 @@ CHANGED = sorted(set(NAMES.values()) - {"contact.epsilon", "contact.friction.v_s
 """Parameters that operations change."""
 
 
-def test_gradients_after_any_sequence_are_those_of_what_ran(tally: Callable[[str], Tally]) -> None:
+def test_gradients_after_any_sequence_are_those_of_what_ran(tally):
     line, sequences = tally("sequences of model operations, gradients"), count(1000)
     how = settings(
         max_examples=sequences, stateful_step_count=10, database=None, deadline=None,
