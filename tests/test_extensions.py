@@ -27,16 +27,19 @@ def test_what_a_rig_may_be_extended_by():
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_neutral_extension_changes_nothing(name):
-    model = deepcopy(MODEL)
-    manipulation = grasp_and_roll(model)
+@pytest.fixture(scope="module")
+def grasped():
+    """The grasp, run from rest, and its reference."""
+    model = grasp_and_roll(deepcopy(MODEL)).model
     t = torch.linspace(0, 0.3, 31, dtype=torch.float64)
-    before = simulate(model, t, y0=rest(model), reference=manipulation.model.reference)
+    return simulate(model, t, y0=rest(model)), model.reference
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_neutral_extension_changes_nothing(name, grasped):
+    model, (before, reference) = deepcopy(MODEL), grasped
     extend(model, [name])
-    after = simulate(
-        model, t, y0=rest(model), reference=manipulation.model.reference, knots=before.knots
-    )
+    after = simulate(model, before.t, y0=rest(model), reference=reference, knots=before.knots)
     for channel in ("x_C", "y_C", "theta", "F_x", "F_y"):
         moved = (after[channel] - before[channel]).abs().max()
         assert float(moved) <= 1e-8 * float(before[channel].abs().max() + 1e-3), channel

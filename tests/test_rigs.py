@@ -31,6 +31,10 @@ from torchsoft.solve.trajectory import load
 READY = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))
 
 
+ELSEWHERE = "fingertips", "two_fingers", "ellipse"
+"""Ready rigs whose parts other tests run."""
+
+
 def coarse(file: RigFile, **groups: dict[str, Any]) -> RigFile:
     """The rig on a mesh half as fine."""
     pads = {
@@ -67,7 +71,7 @@ def changed(file: RigFile, **values: Any) -> RigFile:
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem == "fingertips"))
+        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in ELSEWHERE))
         for path in READY
     ],
 )

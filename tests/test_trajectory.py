@@ -80,9 +80,7 @@ def test_sensitivities_are_loaded_too(tmp_path):
     assert equal(run.sensitivities, again.sensitivities)
 
 
-@pytest.mark.parametrize(
-    "gone", ["knots", "pose", "mesh_nodes_L", "energy_strain_L", "x_C", "setup"]
-)
+@pytest.mark.parametrize("gone", ["knots", "mesh_nodes_L", "x_C", "setup"])
 def test_a_file_that_lacks_something_is_no_whole_run(done, tmp_path, gone):
     data = done[1].to_xarray()
     if gone == "setup":
