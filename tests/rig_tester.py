@@ -216,7 +216,7 @@ def assert_forces_are_the_modules(rig: Rig, run: Trajectory) -> None:
 
 
 def assert_gradients_exact(
-    start: Start, t: Tensor, rtol: float = 1e-4, bound: float = 2e-6
+    start: Start, t: Tensor, rtol: float = 1e-4, bound: float = 2e-6, centres: bool = False
 ) -> Trajectory:
     """A run whose ledger closes and whose forces are the module's. The discrete adjoint of its
     motion, and that of its forces, loads and moments, by the start, every parameter and every value
@@ -237,8 +237,9 @@ def assert_gradients_exact(
     for (part, _), where in rig.layout.slices.items():
         weights[:, where] *= {"pose": 1e3, "velocity": 10.0}.get(part, 0.0)  # [1/m, s/m]
     touch = Touch(rig)
-    felt = [name for name in touch.expanded([*touch.arrays, *touch.single]) if "centre" not in name]
+    felt = [name for name in touch if centres or "centre" not in name]
     pulls = torch.randn(len(t), len(felt), generator=generator, dtype=torch.float64)
+    pulls *= f64(*({"N": 1.0, "N.m": 50.0, "m": 1e3}[touch.unit(name)] for name in felt))
 
     def run(**how: Any) -> tuple[Trajectory, dict[str, Tensor]]:
         made = simulate(rig, t, y0=y0 + kick * shake, tolerance=NEWTON, **how)
