@@ -28,7 +28,7 @@ def changed(place: tuple[str | int, ...], value: Any) -> Any:
     return tree
 
 
-def test_numbers_that_are_whole_are_numbers() -> None:
+def test_numbers_that_are_whole_are_numbers():
     assert Config.model_validate(changed(("duration",), 1)) == Config.model_validate(SMOKE)
 
 
@@ -73,16 +73,14 @@ def test_numbers_that_are_whole_are_numbers() -> None:
         (("step",), 0.05, "step should be less than or equal to 0.02"),
     ],
 )
-def test_a_mistake_is_blamed_on_its_field(
-    place: tuple[str | int, ...], value: Any, message: str
-) -> None:
+def test_a_mistake_is_blamed_on_its_field(place, value, message):
     with pytest.raises(InvalidTable) as error:
         Config.model_validate(changed(place, value))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_jerks_own_depth_is_tried_too() -> None:
+def test_a_jerks_own_depth_is_tried_too():
     jerk = {
         "kind": "jerk",
         "depth": {"low": 2e-4, "high": 9e-3},
@@ -95,12 +93,12 @@ def test_a_jerks_own_depth_is_tried_too() -> None:
 
 
 @pytest.mark.parametrize("high", [0.4999, 0.3, 0.7e6, 3e-5])
-def test_a_logarithmic_range_does_not_go_beyond_its_ends(high: float) -> None:
+def test_a_logarithmic_range_does_not_go_beyond_its_ends(high):
     r = Range(low=high / 7, high=high, scale="log")
     assert r.low <= r.at(0.0) <= r.at(1e-16) <= r.at(1.0) <= r.high
 
 
-def test_the_command_refuses_in_one_line(tmp_path: Path, capsys: Any) -> None:
+def test_the_command_refuses_in_one_line(tmp_path, capsys):
     path = tmp_path / "set.toml"
     text = (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
     path.write_text(text.replace("trajectories = 8", "trajectories = 1000000"))
@@ -111,7 +109,7 @@ def test_the_command_refuses_in_one_line(tmp_path: Path, capsys: Any) -> None:
     assert not (tmp_path / "set").exists()
 
 
-def test_the_command_takes_no_nonsense_for_workers(capsys: Any) -> None:
+def test_the_command_takes_no_nonsense_for_workers(capsys):
     with pytest.raises(SystemExit) as end:
         main(["set.toml", "--out", "set", "--workers", "-3"])
     assert end.value.code == 2
