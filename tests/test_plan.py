@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hostile.damage import document
 from tqdm import tqdm
 
 from torchsoft import simulate
@@ -31,7 +32,7 @@ FILE = RigFile.from_toml(ROOT / "experiments" / "reorient.toml").override(
     outputs={"duration": 0.6},
 )  # fmt: skip
 BUILT = FILE.build()
-FREE: dict[str, Bounds | tuple[float, float]] = {
+FREE = {
     "left_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
     "right_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
     "right_x": Bounds(low=15e-3, high=25e-3, speed=0.1, after=0.2),
@@ -42,10 +43,12 @@ PLACE = {
     "y": Target(channel="y_object", value=0.0, tolerance=1e-4),
 }
 GOAL = {
-    "free": {name: one.model_dump() for name, one in FREE.items() if isinstance(one, Bounds)},
-    "targets": {k: one.model_dump() for k, one in ({"turn": TURN} | PLACE).items()},
+    "free": {k: one.model_dump(exclude_none=True) for k, one in FREE.items()},
+    "targets": {
+        k: one.model_dump(exclude_none=True) for k, one in ({"turn": TURN} | PLACE).items()
+    },
     "rtol": 1e-3,
-}  # fmt: skip
+}
 
 
 def planned(free: Free = FREE, **how: Any) -> Plan:
@@ -261,22 +264,11 @@ def test_a_start_that_cannot_be_run_is_refused():
 # ----------------------------------------------------------------------
 
 
-def as_toml(goal: dict[str, Any]) -> str:
-    lines = [f"{name} = {value}" for name, value in goal.items() if not isinstance(value, dict)]
-    for field, tables in goal.items():
-        for name, table in tables.items() if isinstance(tables, dict) else ():
-            lines.append(f'[{field}."{name}"]')
-            lines += [
-                f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None
-            ]
-    return "\n".join(lines) + "\n"
-
-
 def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     from torchsoft.rigs.written import to_toml
 
     (tmp_path / "rig.toml").write_text(to_toml(FILE), encoding="utf-8")
-    (tmp_path / "goal.toml").write_text(as_toml(GOAL), encoding="utf-8")
+    (tmp_path / "goal.toml").write_text(document(GOAL), encoding="utf-8")
     files = [str(tmp_path / name) for name in ("rig.toml", "goal.toml")]
     assert main(["plan", *files, "--out", str(tmp_path / "out"), "--no-progress"]) == 0
     assert "Plan: reached" in capsys.readouterr().out
@@ -286,7 +278,7 @@ def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     said = json.loads((tmp_path / "out" / "plan.json").read_text())
     assert said["reached"]
     assert said["made_by"]["rtol"] == 1e-3
-    (tmp_path / "goal.toml").write_text(as_toml(GOAL | {"drws": 3}), encoding="utf-8")
+    (tmp_path / "goal.toml").write_text(document(GOAL | {"drws": 3}), encoding="utf-8")
     assert main(["plan", *files, "--out", str(tmp_path / "out"), "--force"]) == 2
     assert "drws" in capsys.readouterr().err
 
