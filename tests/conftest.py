@@ -4,7 +4,7 @@ import gc
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchsoft import Body, Parameters, Reference, Rig, SoftGrasp, hold, press, register_method
 from torchsoft.paper.equilibrium import holding_force
@@ -15,6 +15,7 @@ register_method()
 torch.set_num_threads(1)
 gc.set_threshold(50_000, 20, 20)
 
+RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
 
@@ -63,6 +64,11 @@ def grasped(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Ten
     return y
 
 
+def towards(model: Rig, x_d: nn.Module) -> Reference:
+    """The model's reference with another horizontal set-point."""
+    return Reference(**{name: model.reference[name] for name in model.signals} | {"x_d": x_d})
+
+
 def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
     """A grasped state (size,) of the paper's rigs shaken about."""
     model = rig if isinstance(rig, SoftGrasp) else rig.fixed()
@@ -95,6 +101,16 @@ def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
     )
 
 
+class Exp(nn.Module):
+    """A positive parameter by its logarithm."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.exp()
+
+    def right_inverse(self, x: Tensor) -> Tensor:
+        return x.log()
+
+
 def pytest_collection_finish() -> None:
     """Keep modules out of garbage collections, which are a twentieth of the time else."""
     gc.collect()
@@ -102,5 +118,5 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(params=["massless", "inertial"])
-def fidelity(request: pytest.FixtureRequest) -> str:
+def fidelity(request):
     return request.param

@@ -10,8 +10,8 @@ import torch
 from conftest import f64, shaken
 from torch import Tensor
 
-from torchsoft import Rig, Trajectory, simulate
-from torchsoft.physics.contact import turned
+from torchsoft import Coulomb, Rig, Trajectory, simulate
+from torchsoft.physics.contact import cross, turned
 from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.solve.kernel.arrays import GAMMA
@@ -200,12 +200,28 @@ def assert_compiled_is_the_module(start: Start, seed: int, h: float = 2e-4) -> N
             )
 
 
+@torch.no_grad()
+def assert_forces_are_the_modules(rig: Rig, run: Trajectory) -> None:
+    """Nodal forces of a run, and the moment of every pad's efforts about the undeformed places of
+    its nodes (Eq. 35)."""
+    for i, t in enumerate(run.t):
+        state = rig.unpack(run.y[i], t=t)
+        graph = rig.evaluate(t, state)
+        for name, face in graph.interfaces.items():
+            assert float((run.force[name][i] - face.out[..., 3:5]).abs().max()) < 1e-8, name
+        for name, pad in rig.pads.items():
+            moment = float((cross(pad.positions) * graph.ports[f"pad_{name}"].effort).sum())
+            recorded = float(run[rig.renamed.get(f"M_{name}", f"M_{name}")][i])
+            assert recorded == pytest.approx(moment, abs=1e-9), name
+
+
 def assert_gradients_exact(
-    start: Start, t: Tensor, rtol: float = 1e-4, bound: float = 2e-6
+    start: Start, t: Tensor, rtol: float = 1e-4, bound: float = 2e-6, centres: bool = False
 ) -> Trajectory:
-    """A run whose ledger closes. The discrete adjoint of its motion, and that of its forces, loads
-    and moments, by the start, every parameter and every value of the reference is the difference
-    along the same steps, and its forward sensitivities are the adjoint.
+    """A run whose ledger closes and whose forces are the module's. The discrete adjoint of its
+    motion, and that of its forces, loads and moments, by the start, every parameter and every value
+    of the reference is the difference along the same steps, and its forward sensitivities are the
+    adjoint.
 
     Differences are taken along one direction, in which all of these weigh alike as far as they
     weigh at all.
@@ -221,8 +237,9 @@ def assert_gradients_exact(
     for (part, _), where in rig.layout.slices.items():
         weights[:, where] *= {"pose": 1e3, "velocity": 10.0}.get(part, 0.0)  # [1/m, s/m]
     touch = Touch(rig)
-    felt = [name for name in touch.expanded([*touch.arrays, *touch.single]) if "centre" not in name]
+    felt = [name for name in touch if centres or "centre" not in name]
     pulls = torch.randn(len(t), len(felt), generator=generator, dtype=torch.float64)
+    pulls *= f64(*({"N": 1.0, "N.m": 50.0, "m": 1e3}[touch.unit(name)] for name in felt))
 
     def run(**how: Any) -> tuple[Trajectory, dict[str, Tensor]]:
         made = simulate(rig, t, y0=y0 + kick * shake, tolerance=NEWTON, **how)
@@ -231,6 +248,8 @@ def assert_gradients_exact(
 
     made, values = run(rtol=rtol, gradient="discrete")
     assert made.energy_residual_rel < 2e-3
+    if not any(isinstance(part, Coulomb) for part in rig.modules()):  # on which side of its jump?
+        assert_forces_are_the_modules(rig, made)
     wanted = [
         name
         for name, p in leaves.items()

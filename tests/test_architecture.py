@@ -101,12 +101,12 @@ def layer(name: str, folder: str) -> str | None:
 
 
 @pytest.mark.parametrize("folder", FLOWS)
-def test_every_module_has_a_layer(folder: str) -> None:
+def test_every_module_has_a_layer(folder):
     assert {layer(name, folder) for name in MODULES} - {None} == set(FLOWS[folder].split())
 
 
 @pytest.mark.parametrize("folder", FLOWS)
-def test_imports_point_upwards(folder: str) -> None:
+def test_imports_point_upwards(folder):
     layers = FLOWS[folder].split()
     for name, path in MODULES.items():
         mine = layer(name, folder)
@@ -119,11 +119,11 @@ def test_imports_point_upwards(folder: str) -> None:
             )
 
 
-def test_no_imports_in_circles() -> None:
+def test_no_imports_in_circles():
     TopologicalSorter({name: imports(path, lazy=False) for name, path in MODULES.items()}).prepare()
 
 
-def test_physics_does_not_know_how_it_is_solved() -> None:
+def test_physics_does_not_know_how_it_is_solved():
     """Nor does code generation know any physics."""
     for name, path in MODULES.items():
         own, others = layer(name, ""), {layer(other, "") for other in imports(path)}
@@ -135,7 +135,7 @@ def test_physics_does_not_know_how_it_is_solved() -> None:
             ), name
 
 
-def test_the_kernels_know_no_law() -> None:
+def test_the_kernels_know_no_law():
     """They call compiled laws by address, and use nothing else of torchsoft; their objects are
     files. Nobody imports them, but for what tables they take and who calls them."""
     own = {name for name in MODULES if layer(name, "solve") == "kernel"}
@@ -148,7 +148,7 @@ def test_the_kernels_know_no_law() -> None:
             assert imports(path) & own <= told, name
 
 
-def test_rigs_are_drawn_in_one_room() -> None:
+def test_rigs_are_drawn_in_one_room():
     """Whatever else they do needs no matplotlib."""
     drawing = {name for name, path in MODULES.items() if layer(name, "") == "rigs" and "plot" in
                {layer(other, "") for other in imports(path)}}  # fmt: skip
@@ -156,7 +156,7 @@ def test_rigs_are_drawn_in_one_room() -> None:
 
 
 @pytest.mark.parametrize("folder", APART)
-def test_applications_do_not_know_each_other(folder: str) -> None:
+def test_applications_do_not_know_each_other(folder):
     used = {
         other
         for name, path in MODULES.items()
@@ -167,7 +167,7 @@ def test_applications_do_not_know_each_other(folder: str) -> None:
     assert not apart & (set(APART) - {folder})
 
 
-def test_files_are_short() -> None:
+def test_files_are_short():
     top = ROOT.parent
     files = MODULES | {path.name: path for path in (top / "experiments").rglob("*.py")}
     for name, path in files.items():
@@ -189,7 +189,7 @@ def opens_text(call: ast.Call) -> bool:
     return name in ("open", "fdopen", "read_text", "write_text") and not low_level and not binary
 
 
-def test_text_names_its_encoding() -> None:
+def test_text_names_its_encoding():
     """Or a file would be read and written otherwise where the terminal knows ASCII only."""
     found = []
     for path in (

@@ -29,7 +29,7 @@ mu_s = f64(0.75, 0.95, 0.85)
 
 
 @pytest.fixture
-def start() -> tuple[SoftGrasp, Tensor]:
+def start():
     model = coarse()
     y0 = grasped(model, (0.02, 0.0))
     return model, torch.stack([y0, y0, y0])
@@ -43,9 +43,7 @@ def alone(model: SoftGrasp, i: int, y0: Tensor, **options: Any) -> Any:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_every_run_is_the_one_it_would_be_alone(
-    start: tuple[SoftGrasp, Tensor], threads: int
-) -> None:
+def test_every_run_is_the_one_it_would_be_alone(start, threads):
     model, y0 = start
     y0[1, model.layout.slices["velocity", "disc"]] = f64(-0.01, 0.0, 0.5)
     batch = simulate_batch(
@@ -65,7 +63,7 @@ def test_every_run_is_the_one_it_would_be_alone(
     assert len(batch) == 3
 
 
-def test_gradients_reach_what_differs_from_run_to_run(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_gradients_reach_what_differs_from_run_to_run(start):
     """The same as of the runs one by one, by parameters of each run, a shared one and the
     starts."""
     model, y0 = start
@@ -94,7 +92,7 @@ def test_gradients_reach_what_differs_from_run_to_run(start: tuple[SoftGrasp, Te
     assert torch.allclose(got[2], by_E, rtol=1e-12, atol=0)
 
 
-def test_sensitivities_are_stacked(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_sensitivities_are_stacked(start):
     model, y0 = start
     wrt = ["contact.K_n", "pad.E"]
     batch = simulate_batch(
@@ -108,7 +106,7 @@ def test_sensitivities_are_stacked(start: tuple[SoftGrasp, Tensor]) -> None:
         _ = simulate_batch(model, T, y0=y0, rtol=1e-3).sensitivities
 
 
-def test_references_times_and_rigs_of_their_own(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_references_times_and_rigs_of_their_own(start):
     """Shorter runs end in NaN behind the mask; frozen steps go in one by one."""
     model, y0 = start
     other = SoftGrasp(model.settings, shape=Circle(20.5e-3), reference=model.reference)
@@ -131,7 +129,7 @@ def test_references_times_and_rigs_of_their_own(start: tuple[SoftGrasp, Tensor])
     assert float((again.y - batch.y)[batch.mask].abs().max()) < 1e-9
 
 
-def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_a_run_that_fails_leaves_the_others_alone(start):
     """One that is lost on its way, with what it did until then, and one whose number is no
     parameter."""
     model, y0 = start
@@ -182,17 +180,15 @@ def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor
         ),
     ],
 )
-def test_what_no_batch_can_be_is_refused(
-    start: tuple[SoftGrasp, Tensor], options: dict[str, Any], match: str
-) -> None:
+def test_what_no_batch_can_be_is_refused(start, options, match):
     model, y0 = start
     with pytest.raises(ValueError, match=match):
         simulate_batch(model, T, y0=y0[0], **options)
 
 
 def test_rigs_of_different_sizes_have_channels_in_common_only(
-    start: tuple[SoftGrasp, Tensor],
-) -> None:
+    start,
+):
     model, y0 = start
     finer = coarse(pad__elements_x=80)
     batch: Batch = simulate_batch([model, finer], T, y0=[y0[0], grasped(finer)], rtol=1e-3)
@@ -201,7 +197,7 @@ def test_rigs_of_different_sizes_have_channels_in_common_only(
         _ = batch.y
 
 
-def test_side_by_side_waits_and_stops() -> None:
+def test_side_by_side_waits_and_stops():
     """Results of every number; grad mode as outside; an exception ends what has not begun."""
     begun: list[int] = []
 

@@ -6,12 +6,8 @@ import json
 import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +29,7 @@ def rows(count: int) -> Table:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """The working directory, with the first 0.3 s of the example in data.csv and their
     configuration in rig.toml."""
     write(tmp_path / "data.csv", rows(62))
@@ -45,7 +41,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     "code", ["import torchsoft", "from torchsoft.cli import main; main(['--help'])"]
 )
-def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
+def test_neither_an_import_nor_help_waits_for_torch(code):
     slow = "'torch', 'scipy', 'numba', 'matplotlib', 'xarray'"
     code = (
         f"import sys\ntry: {code}\nexcept SystemExit: pass\nassert not sys.modules.keys() & "
@@ -54,14 +50,7 @@ def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-def test_all_names_are_there() -> None:
-    import torchsoft
-
-    assert all(hasattr(torchsoft, name) for name in dir(torchsoft))
-    assert {"Rig", "simulate", "simulate_batch", "Trajectory"} < set(dir(torchsoft))
-
-
-def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
+def test_help_names_every_command_argument_and_option(capsys):
     for arguments, words in (
         (["--help"], ("identify", "material")),
         (["material", "--help"], ("fit", "presets")),
@@ -96,9 +85,7 @@ def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
         (["identify", "rig.toml", "--rtol", "fast"], "invalid float value: 'fast'"),
     ],
 )
-def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(
-    arguments: list[str], message: str, capsys: Any
-) -> None:
+def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments, message, capsys):
     with pytest.raises(SystemExit) as end:
         main(arguments)
     assert end.value.code == 2
@@ -130,14 +117,6 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         ["identify", "data.csv", "many.toml"],
         "; take a larger rtol, fewer starts or less data, or say --yes to begin",
     ),
-    "deep": (
-        ["identify", "data.csv", "deep.toml"],
-        "deep.toml is not a TOML file that can be read: its tables are nested too deeply",
-    ),
-    "another encoding": (
-        ["identify", "data.csv", "latin.toml"],
-        "latin.toml is not a TOML file: 'utf-8' codec",
-    ),
     "workers": (
         ["identify", "data.csv", "rig.toml", "--workers", "0"],
         "workers should be greater than or equal to 1, not 0",
@@ -145,10 +124,6 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     "out is a file": (
         ["identify", "data.csv", "rig.toml", "--out", "data.csv"],
         "--out: results cannot be written to data.csv (",
-    ),
-    "material: no such file": (
-        ["material", "fit", "other.csv"],
-        "other.csv: No such file or directory",
     ),
     "material: an area": (
         ["material", "fit", "test.csv", "--area", "1e-5"],
@@ -170,11 +145,10 @@ ERRORS: dict[str, tuple[list[str], str]] = {
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: Any) -> None:
+def test_an_error_is_one_line_and_ends_with_2(folder, name, capsys):
     (folder / "folder.csv").mkdir()
     contents = {
         "picture.csv": b"\x89PNG\r\n\x1a\n", "empty.csv": b"",
-        "deep.toml": b"a = " + b"[" * 20_000, "latin.toml": "a = 'µ'".encode("latin-1"),
         "many.toml": f"{CONFIG}starts = 1_000_000\n".encode(),
     }  # fmt: skip
     for path, content in contents.items():
@@ -191,7 +165,7 @@ def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: A
     assert sorted(folder.rglob("*")) == before  # nothing is left behind
 
 
-def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder: Path) -> None:
+def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder):
     (folder / "µ.toml").write_text(CONFIG.replace("contact.K_n", "contact.µ"), encoding="utf-8")
     command = [sys.executable, "-m", "torchsoft", "identify", "data.csv", "µ.toml"]
     environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -201,7 +175,7 @@ def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder: Path) -> N
     assert ended.stderr.count(b"\n") == 1
 
 
-def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, capsys: Any) -> None:
+def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder, capsys):
     mine = folder / "mine"
     mine.mkdir()
     for name in ("a.pickle", "b.partial"):
@@ -216,9 +190,7 @@ def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, c
 
 
 @pytest.mark.slow
-def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
-    folder: Path, capsys: Any
-) -> None:
+def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder, capsys):
     table = rows(122)
     for column in (X_D, X_C, 8):
         scale(column, 1.0, -0.3)(table)
@@ -248,7 +220,7 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
 
 
 @pytest.fixture(scope="module")
-def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+def answered(tmp_path_factory):
     """The command, carried out in this process; its folder and its data."""
     folder = tmp_path_factory.mktemp("command")
     (folder / "rig.toml").write_text(f'{CONFIG}assumptions = "trusted"\n')
@@ -257,7 +229,7 @@ def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]
     return folder, files
 
 
-def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
+def test_it_writes_answer_and_page(answered):
     out = answered[0] / "out"
     assert sorted(path.name for path in out.iterdir()) == ["answer.json", "report.html"]
     answer = json.loads((out / "answer.json").read_text())
@@ -275,9 +247,7 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
 
 
 @pytest.mark.slow
-def test_options_come_before_the_configuration(
-    answered: tuple[Path, list[str]], capsys: Any
-) -> None:
+def test_options_come_before_the_configuration(answered, capsys):
     folder, files = answered
     out, kept = folder / "coarser", folder / "kept"
     command = [
@@ -306,46 +276,7 @@ def test_options_come_before_the_configuration(
     assert err == ""
 
 
-@pytest.mark.slow
-def test_an_interrupted_command_continues_and_ends_the_same(
-    answered: tuple[Path, list[str]], capsys: Any
-) -> None:
-    folder, files = answered
-    out = folder / "again"
-    command = ["identify", *files, "--out", str(out), "--no-progress"]
-    # test runners may ignore SIGINT, which a child inherits
-    code = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        f"from torchsoft.cli import main; sys.exit(main({command!r}))"
-    )
-    child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-    began = time.monotonic()
-    while (
-        len(list(out.glob("unfinished/*.run"))) < 3
-        and child.poll() is None
-        and time.monotonic() - began < 120
-    ):
-        time.sleep(0.02)
-    child.send_signal(signal.SIGINT)
-    _, message = child.communicate(timeout=60)
-    assert child.returncode == 130, message
-    assert "the same command continues" in message
-    assert "Traceback" not in message
-    kept = len(list(out.glob("unfinished/*.run")))
-    assert kept >= 3
-    assert not (out / "answer.json").exists()
-
-    assert main(command) == 0
-    assert "contact.K_n" in capsys.readouterr().out
-    assert not (out / "unfinished").exists()
-    first, second = (
-        json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again")
-    )
-    assert second["estimates"] == first["estimates"]
-    assert second["cost"]["remembered"] >= first["cost"]["remembered"] + kept - 1
-
-
-def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder: Path, capsys: Any) -> None:
+def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder, capsys):
     flipped = rows(62)
     scale(F_Y, -1.0)(flipped)
     write(folder / "data.csv", flipped)
@@ -359,7 +290,7 @@ def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder: Path, c
 
 
 @pytest.mark.slow
-def test_competing_laws_are_compared(folder: Path, capsys: Any) -> None:
+def test_competing_laws_are_compared(folder, capsys):
     laws = '[compare.coulomb]\nsettings.contact.friction = "coulomb"\n'
     (folder / "rig.toml").write_text(f"{CONFIG}{laws}")
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 0

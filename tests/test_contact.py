@@ -42,7 +42,7 @@ def at(
 
 
 @pytest.mark.parametrize("g_dot", [-0.05, 0.0, 0.02])
-def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot: float) -> None:
+def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot):
     """(eta + R_t) s' = -K_t s: nothing presses, so the spring slips home against the two
     viscosities."""
     got = at(law(), g=-1e-7, g_dot=g_dot, v_T=0.3, s=1e-5)
@@ -51,13 +51,13 @@ def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot: float) 
     assert float(got.gamma_dot) == -float(got.s_dot)
 
 
-def test_a_point_one_epsilon_deep_has_half_its_dashpots() -> None:
+def test_a_point_one_epsilon_deep_has_half_its_dashpots():
     got = at(law(), g=1e-6, g_dot=1e-3, v_T=0.0, s=0.0)
     assert float(got.rho) == 0.5
     assert float(got.F_N) == pytest.approx(K * 1e-6 + R * 1e-3 / 2, rel=1e-14)
 
 
-def test_a_sticking_point_is_a_spring_and_a_dashpot() -> None:
+def test_a_sticking_point_is_a_spring_and_a_dashpot():
     g, v_T, s = 9e-6, 1e-4, 2e-6
     got = at(law(), g=g, g_dot=0.0, v_T=v_T, s=s, weight=2.0)
     assert float(got.rho) == pytest.approx(0.9, rel=1e-15)
@@ -68,7 +68,7 @@ def test_a_sticking_point_is_a_spring_and_a_dashpot() -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_slipping_point_solves_the_quadratic(side: float) -> None:
+def test_a_slipping_point_solves_the_quadratic(side):
     """(eta + R) x = E - (mu_k + (mu_s - mu_k)/(1 + x/v_s)) F_N at F_N = 10 N, E = 12 N: 220 x^2 +
     (2.2 - 7) x - 0.04 = 0."""
     g = 1e-4
@@ -83,7 +83,7 @@ def test_a_slipping_point_solves_the_quadratic(side: float) -> None:
     assert float(got.F_T) == pytest.approx(rho * float(got.e), rel=1e-15)
 
 
-def test_coulomb_slips_with_kinetic_friction() -> None:
+def test_coulomb_slips_with_kinetic_friction():
     contact = law(Coulomb(0.8, 0.5))
     got = at(contact, g=1e-4, g_dot=0.0, v_T=0.0, s=12.0 / (2 * K))
     assert float(got.e) == pytest.approx(5.0, rel=1e-14)
@@ -92,14 +92,14 @@ def test_coulomb_slips_with_kinetic_friction() -> None:
     assert float(stuck.gamma_dot) == 0.0
 
 
-def test_withdrawal_does_not_pull() -> None:
+def test_withdrawal_does_not_pull():
     assert float(at(law(), g=1e-5, g_dot=-0.1, v_T=0.0, s=0.0).F_N) == 0.0
     assert float(at(law(), g=1e-5, g_dot=-1e-3, v_T=0.0, s=0.0).F_N) == pytest.approx(
         1.0 - 0.4 * 10 / 11, rel=1e-14
     )
 
 
-def test_a_stage_acts_through_the_stretch_at_its_end() -> None:
+def test_a_stage_acts_through_the_stretch_at_its_end():
     """The law at a stage equals the instantaneous law at s* + a h s', stick and slip."""
     for v_T in (1e-3, 0.5):
         stage = at(law(), g=5e-5, g_dot=1e-3, v_T=v_T, s=1e-6, stage=6e-4)
@@ -116,7 +116,7 @@ def test_a_stage_acts_through_the_stretch_at_its_end() -> None:
 
 @pytest.mark.parametrize("s", [0.0, 1e-5])
 @pytest.mark.parametrize("friction", [smooth(), Coulomb(0.8, 0.5)])
-def test_forces_are_continuous_at_touch_down(friction: SlipLaw, s: float) -> None:
+def test_forces_are_continuous_at_touch_down(friction, s):
     """They grow from zero no faster than the springs, and the dashpots over epsilon, let them."""
     for g in (1e-9, 1e-11, 1e-13):
         got = at(law(friction), g=g, g_dot=0.2, v_T=0.3, s=s)
@@ -128,7 +128,7 @@ def test_forces_are_continuous_at_touch_down(friction: SlipLaw, s: float) -> Non
         assert abs(float(got.s_dot - apart.s_dot)) <= (g / 1e-6) * (1.0 + steepest * 1e-6 / (R / 2))
 
 
-def test_smooth_slip_begins_continuously_and_coulombs_does_not() -> None:
+def test_smooth_slip_begins_continuously_and_coulombs_does_not():
     F_N, dashpot = f64(10.0), f64(200.0)
     with torch.no_grad():
         for part in (1e-6, 1e-9):
@@ -149,9 +149,7 @@ FORCES, RATES, DEPTHS = st.floats(0.0, 100.0), st.floats(-1.0, 1.0), st.floats(-
 @given(E=FORCES, F_N=FORCES, dashpot=st.floats(1.0, 1e4), mu_k=st.floats(0.0, 1.0),
     extra=st.floats(0.0, 1.0),
        v_s=st.floats(1e-3, 1.0), eta=st.floats(0.0, 100.0))  # fmt: skip
-def test_smooth_slip_satisfies_its_equation(
-    E: float, F_N: float, dashpot: float, mu_k: float, extra: float, v_s: float, eta: float
-) -> None:
+def test_smooth_slip_satisfies_its_equation(E, F_N, dashpot, mu_k, extra, v_s, eta):
     friction = SmoothSlip(mu_k + extra, mu_k, v_s, eta)
     with torch.no_grad():
         x = float(friction(f64(E), f64(F_N), f64(dashpot)))
@@ -175,9 +173,7 @@ def test_smooth_slip_satisfies_its_equation(
     s=st.floats(-1e-3, 1e-3),
     weight=st.sampled_from([0.5, 1.0, 3.0]),
 )
-def test_dissipation_is_never_negative(
-    friction: SlipLaw, g: float, g_dot: float, v_T: float, s: float, weight: float
-) -> None:
+def test_dissipation_is_never_negative(friction, g, g_dot, v_T, s, weight):
     contact = law(friction)
     got = at(contact, g, g_dot, v_T, s, weight=weight)
     with torch.no_grad():
@@ -194,7 +190,7 @@ def test_dissipation_is_never_negative(
 
 
 @given(g=DEPTHS, g_dot=RATES, v_T=RATES, s=st.floats(-1e-3, 1e-3))
-def test_friction_knows_no_direction(g: float, g_dot: float, v_T: float, s: float) -> None:
+def test_friction_knows_no_direction(g, g_dot, v_T, s):
     one, other = at(law(), g, g_dot, v_T, s), at(law(), g, g_dot, -v_T, -s)
     assert torch.equal(one.F_N, other.F_N)
     assert (one.F_T, one.s_dot, one.gamma_dot) == (-other.F_T, -other.s_dot, -other.gamma_dot)
@@ -204,7 +200,7 @@ def test_friction_knows_no_direction(g: float, g_dot: float, v_T: float, s: floa
 # ----------------------------------------------------------------------
 
 
-def test_moving_frame_of_a_circle_by_hand() -> None:
+def test_moving_frame_of_a_circle_by_hand():
     frame = moving_frame(Circle(0.02), f64(0.0, -0.019, 0.012, 0.016).reshape(2, 2), f64(0.3, 0.3))
     assert torch.allclose(frame.n, f64(0.0, -1.0, 0.6, 0.8).reshape(2, 2), rtol=0, atol=1e-15)
     assert torch.allclose(frame.t, f64(1.0, 0.0, -0.8, 0.6).reshape(2, 2), rtol=0, atol=1e-15)

@@ -1,6 +1,5 @@
 """Control laws that see the whole state and give several efforts."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from torchsoft.rigs.written import template, to_toml
 KP, KD = 1.2e5, 440.0
 
 
-def test_coordinates_without_set_points_are_regulated() -> None:
+def test_coordinates_without_set_points_are_regulated():
     law = StateFeedback([[1.0, 10.0, 100.0, 1000.0]])
     efforts = law(torch.tensor([2.0, 3.0]).double(), torch.tensor([0.5, 0.25, 0.5, 0.125]).double())
     assert efforts.item() == pytest.approx(1.5 - 2.5 + 250.0 - 125.0, rel=1e-15)
@@ -43,7 +42,7 @@ def file(**changes: Any) -> RigFile:
     return RigFile.from_tree(tree)
 
 
-def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path: Path) -> None:
+def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path):
     asked = file()
     (tmp_path / "rig.toml").write_text(to_toml(asked), encoding="utf-8")
     read = RigFile.from_toml(tmp_path / "rig.toml")
@@ -59,7 +58,7 @@ def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path: Path) 
         assert torch.allclose(runs[0][name], runs[1][name], rtol=0, atol=1e-7)
 
 
-def test_a_network_of_the_state_in_a_file(tmp_path: Path) -> None:
+def test_a_network_of_the_state_in_a_file(tmp_path):
     """Its weights, with the gain beside it, are what the module says in Python; another size is
     refused."""
     torch.manual_seed(1)
@@ -114,11 +113,11 @@ def test_a_network_of_the_state_in_a_file(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_controllers_that_make_no_sense_are_refused(changes: dict[str, Any], sentence: str) -> None:
+def test_controllers_that_make_no_sense_are_refused(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
         file(**changes)
 
 
-def test_an_unstable_controller_is_found_before_the_run() -> None:
+def test_an_unstable_controller_is_found_before_the_run():
     found = check(file(gain=[[1e5, 0.0, -4000.0, 0.0], [0.0, 1e5, 0.0, 400.0]]))
     assert any(one.severity == "error" and "the rig is unstable" in one.message for one in found)

@@ -5,7 +5,6 @@ import re
 import time
 import tomllib
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import pytest
@@ -25,12 +24,12 @@ SMOKE = tomllib.loads(
 CHEAP, LONG, LARGE = Cost(1e4, 60.0, 0.1), Cost(1e9, 2e5, 0.1), Cost(1e4, 60.0, 1e6)
 
 
-def test_minutes_need_no_word() -> None:
+def test_minutes_need_no_word():
     agree(CHEAP, False, "take less")
 
 
 @pytest.mark.parametrize("price", [LONG, LARGE], ids=["hours", "memory"])
-def test_hours_and_memory_need_the_users_word(price: Cost) -> None:
+def test_hours_and_memory_need_the_users_word(price):
     agree(price, True, "take less")
     with mock.patch("sys.stdin") as keys, mock.patch("sys.stderr") as screen:
         keys.isatty.return_value = False
@@ -46,7 +45,7 @@ def test_hours_and_memory_need_the_users_word(price: Cost) -> None:
         agree(price, False, "take less")
 
 
-def test_times_are_said_in_their_unit() -> None:
+def test_times_are_said_in_their_unit():
     times = {
         0.5: "0.5 seconds",
         80.0: "80 seconds",
@@ -57,7 +56,7 @@ def test_times_are_said_in_their_unit() -> None:
     assert {t: duration(t) for t in times} == times
 
 
-def test_a_step_costs_more_on_a_finer_mesh_and_with_derivatives() -> None:
+def test_a_step_costs_more_on_a_finer_mesh_and_with_derivatives():
     usual = rig_step(SoftGrasp())
     assert 1e-4 < usual < 2e-4
     assert rig_step(SoftGrasp(Parameters().override({"pad.elements_x": 480}))) > 8 * usual
@@ -74,14 +73,14 @@ def test_a_step_costs_more_on_a_finer_mesh_and_with_derivatives() -> None:
         ({"step": 1e-6}, (300.0, 3000.0)),
     ],
 )
-def test_what_a_dataset_costs(change: dict[str, Any], seconds: tuple[float, float]) -> None:
+def test_what_a_dataset_costs(change, seconds):
     price = cost(Config.model_validate(SMOKE | change), 2)
     assert seconds[0] < price.seconds < seconds[1]
     assert price.memory < 1.0
     assert (price.disk > 100.0) == ("trajectories" in change)
 
 
-def test_a_run_that_takes_long_asks_first(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+def test_a_run_that_takes_long_asks_first(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("rig.toml").write_text(
         to_toml(template("t").override(solver={"step": 1e-7}, outputs={"duration": 20.0}))
@@ -94,9 +93,7 @@ def test_a_run_that_takes_long_asks_first(tmp_path: Path, monkeypatch: Any, caps
 
 
 @pytest.mark.parametrize("command", [("check",), ("run", "--out", "out")], ids=["check", "run"])
-def test_a_rig_that_needs_the_machines_memory_asks_first(
-    command: tuple[str, ...], tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_a_rig_that_needs_the_machines_memory_asks_first(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("rig.toml").write_text(
         to_toml(template("t").override(pads={"lower": {"elements_x": 80, "elements_y": 1000}}))
@@ -106,7 +103,7 @@ def test_a_rig_that_needs_the_machines_memory_asks_first(
     assert re.search(r"GiB of memory; .*or say --yes to begin", capsys.readouterr().err)
 
 
-def test_condensing_time_is_that_of_this_machine_within_a_factor() -> None:
+def test_condensing_time_is_that_of_this_machine_within_a_factor():
     """Of meshes far apart in size and shape; also under load."""
     for length, height in ((240, 30), (60, 300)):
         mesh = PadMesh(0.08, 0.01, length, height)

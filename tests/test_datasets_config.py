@@ -28,7 +28,7 @@ def changed(place: tuple[str | int, ...], value: Any) -> Any:
     return tree
 
 
-def test_numbers_that_are_whole_are_numbers() -> None:
+def test_numbers_that_are_whole_are_numbers():
     assert Config.model_validate(changed(("duration",), 1)) == Config.model_validate(SMOKE)
 
 
@@ -36,7 +36,6 @@ def test_numbers_that_are_whole_are_numbers() -> None:
     ("place", "value", "message"),
     [
         (("fixed", "pad.height"), "abc", "fixed.pad.height should be a valid number, not 'abc'"),
-        (("fixed", "pad.height"), True, "fixed.pad.height should be a valid number, not True"),
         (
             ("fixed", "pad.fidelity"),
             "firm",
@@ -46,11 +45,6 @@ def test_numbers_that_are_whole_are_numbers() -> None:
         (("fixed", "pad.height"), 1e-3, "pad.height = 0.001 m"),
         (("fixed", "scenario.travel"), 1e-3, "fixed.scenario.travel has no part in a dataset"),
         (("fixed", "scenario.grasp_time"), 0.9, "scenario.grasp_time = 0.9 s"),
-        (
-            ("parameters", "pad.E", "low"),
-            "1e5",
-            "parameters.pad.E.low should be a valid number, not '1e5'",
-        ),
         (
             ("parameters", "pad.E", "high"),
             1e300,
@@ -62,11 +56,6 @@ def test_numbers_that_are_whole_are_numbers() -> None:
             "parameters.contact.mu_k/contact.mu_s.high must lie in",
         ),
         (("kinds", 0, "kind"), "hop", "kinds.0.kind should be one of"),
-        (
-            ("kinds", 0, "travel", "low"),
-            "far",
-            "kinds.0.travel.low should be a valid number, not 'far'",
-        ),
         (("kinds", 0, "travel", "high"), 1.0, "kinds.0.travel.high = 1.0 m leaves the pad"),
         (
             ("kinds", 1, "stroke_time", "low"),
@@ -81,23 +70,17 @@ def test_numbers_that_are_whole_are_numbers() -> None:
         (("grasp_depth", "high"), 0.02, "grasp_depth.high = 0.02"),
         (("parameters",), {"contact.mu_s": {"low": 0.3, "high": 0.9}}, "contact.mu_s = 0.3"),
         (("duration",), 0.5, "duration"),
-        (("duration",), 1e308, "duration should be less than or equal to"),
         (("step",), 0.05, "step should be less than or equal to 0.02"),
-        (("step",), 1e-9, "step should be greater than or equal to"),
-        (("seed",), 1.5, "seed should be a valid integer, not 1.5"),
-        (("title",), 3, "title should be a valid string, not 3"),
     ],
 )
-def test_a_mistake_is_blamed_on_its_field(
-    place: tuple[str | int, ...], value: Any, message: str
-) -> None:
+def test_a_mistake_is_blamed_on_its_field(place, value, message):
     with pytest.raises(InvalidTable) as error:
         Config.model_validate(changed(place, value))
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_jerks_own_depth_is_tried_too() -> None:
+def test_a_jerks_own_depth_is_tried_too():
     jerk = {
         "kind": "jerk",
         "depth": {"low": 2e-4, "high": 9e-3},
@@ -110,43 +93,23 @@ def test_a_jerks_own_depth_is_tried_too() -> None:
 
 
 @pytest.mark.parametrize("high", [0.4999, 0.3, 0.7e6, 3e-5])
-def test_a_logarithmic_range_does_not_go_beyond_its_ends(high: float) -> None:
+def test_a_logarithmic_range_does_not_go_beyond_its_ends(high):
     r = Range(low=high / 7, high=high, scale="log")
     assert r.low <= r.at(0.0) <= r.at(1e-16) <= r.at(1.0) <= r.high
 
 
-@pytest.mark.parametrize(
-    ("change", "arguments", "status", "message"),
-    [
-        (("trajectories = 8", "trajectories = 1000000"), [], 2, "or say --yes to begin"),
-        (
-            ("trajectories = 8", "trajectories = '8'"),
-            [],
-            2,
-            "trajectories should be a valid integer, not '8'",
-        ),
-        (("title", "\\u0000"), [], 2, "is not a TOML file"),
-    ],
-)
-def test_the_command_refuses_in_one_line(
-    change: tuple[str, str],
-    arguments: list[str],
-    status: int,
-    message: str,
-    tmp_path: Path,
-    capsys: Any,
-) -> None:
+def test_the_command_refuses_in_one_line(tmp_path, capsys):
     path = tmp_path / "set.toml"
     text = (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
-    path.write_text(text.replace(*change))
-    assert main([str(path), "--out", str(tmp_path / "set"), "--workers", "0", *arguments]) == status
+    path.write_text(text.replace("trajectories = 8", "trajectories = 1000000"))
+    assert main([str(path), "--out", str(tmp_path / "set"), "--workers", "0"]) == 2
     said = capsys.readouterr().err
-    assert message in said
+    assert "or say --yes to begin" in said
     assert said.count("\n") == 1
     assert not (tmp_path / "set").exists()
 
 
-def test_the_command_takes_no_nonsense_for_workers(capsys: Any) -> None:
+def test_the_command_takes_no_nonsense_for_workers(capsys):
     with pytest.raises(SystemExit) as end:
         main(["set.toml", "--out", "set", "--workers", "-3"])
     assert end.value.code == 2

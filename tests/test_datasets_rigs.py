@@ -120,7 +120,7 @@ def written(folder: Path, config: str = CONFIG) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Config]:
+def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     config = Config.from_toml(written(folder))
     assert generate(config, str(folder / "set"), Serial(), progress=False) == 0
@@ -139,9 +139,7 @@ def sound(url: Path) -> bool:
     return [one for one in check(str(url)) if "commit" not in one] == []
 
 
-def test_a_trajectory_is_the_run_of_the_rig_file_with_its_numbers(
-    made: tuple[Path, Config], tmp_path: Path
-) -> None:
+def test_a_trajectory_is_the_run_of_the_rig_file_with_its_numbers(made, tmp_path):
     folder, _ = made
     data = open_dataset(str(folder)).load()
     row = data.isel(trajectory=1)
@@ -177,8 +175,8 @@ def test_a_trajectory_is_the_run_of_the_rig_file_with_its_numbers(
 
 
 def test_arrays_have_the_names_of_the_rigs_parts_and_their_units(
-    made: tuple[Path, Config],
-) -> None:
+    made,
+):
     data = xr.open_zarr(made[0])
     assert data.normal_force_below.dims == ("trajectory", "time", "lower_point")
     assert data.displacement_upper.dims == ("trajectory", "time", "upper_point", "axis")
@@ -197,9 +195,7 @@ def test_arrays_have_the_names_of_the_rigs_parts_and_their_units(
     np.testing.assert_allclose(rest, data["bodies.disc.mass"] * 9.81, rtol=2e-3)
 
 
-def test_it_is_sound_and_resumes_to_the_same_bytes_without_the_rig_file(
-    made: tuple[Path, Config], tmp_path: Path
-) -> None:
+def test_it_is_sound_and_resumes_to_the_same_bytes_without_the_rig_file(made, tmp_path):
     """Everything that the rig file names is in the manifest."""
     folder, config = made
     assert sound(folder)
@@ -216,7 +212,7 @@ def test_it_is_sound_and_resumes_to_the_same_bytes_without_the_rig_file(
     assert any("x_disc/c/1/0 is damaged" in one for one in check(str(tmp_path / "set")))
 
 
-def test_another_file_is_another_dataset(tmp_path: Path) -> None:
+def test_another_file_is_another_dataset(tmp_path):
     path = written(tmp_path)
     before = Config.from_toml(path).hash
     (tmp_path / "rigs" / "x_d.csv").write_text("t [s],x [mm]\n0,0\n0.05,0\n0.1,0.3\n")
@@ -226,7 +222,7 @@ def test_another_file_is_another_dataset(tmp_path: Path) -> None:
         Config.from_toml(path)
 
 
-def test_channels_are_chosen_and_points_left_out(tmp_path: Path) -> None:
+def test_channels_are_chosen_and_points_left_out(tmp_path):
     text = 'channels = ["theta_disc", "F_x"]\nnodal = false\n' + CONFIG
     config = Config.from_toml(
         written(tmp_path, text.replace("trajectories = 3", "trajectories = 1"))
@@ -245,7 +241,7 @@ def test_channels_are_chosen_and_points_left_out(tmp_path: Path) -> None:
     assert all(ax.axison and ax.has_data() for ax in drawn.axes)
 
 
-def test_its_price_is_of_the_right_order(made: tuple[Path, Config]) -> None:
+def test_its_price_is_of_the_right_order(made):
     price = cost(made[1], 1)
     assert 0.05 < price.seconds < 10.0
     assert price.memory < 0.1
@@ -316,9 +312,7 @@ def tree(folder: Path) -> Any:
         (("rig",), 3, "rig should be a table, not 3"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_by_its_name(
-    tmp_path: Path, place: tuple[str, ...], value: Any, message: str
-) -> None:
+def test_what_cannot_be_is_refused_by_its_name(tmp_path, place, value, message):
     config = copy.deepcopy(tree(tmp_path))
     inner = config
     for key in place[:-1]:
@@ -330,7 +324,7 @@ def test_what_cannot_be_is_refused_by_its_name(
     assert "\n" not in str(error.value)
 
 
-def test_names_that_two_arrays_would_have_are_refused(tmp_path: Path) -> None:
+def test_names_that_two_arrays_would_have_are_refused(tmp_path):
     config = tree(tmp_path)
     config["rig"]["motion"]["steps"] = config["rig"]["motion"].pop("x_d")
     config["rig"]["actuators"]["x"]["setpoint"] = "steps"
@@ -338,7 +332,7 @@ def test_names_that_two_arrays_would_have_are_refused(tmp_path: Path) -> None:
         Config.model_validate(config)
 
 
-def test_fields_of_a_rig_file_need_one() -> None:
+def test_fields_of_a_rig_file_need_one():
     paper = tomllib.loads(
         (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
     )
@@ -349,7 +343,7 @@ def test_fields_of_a_rig_file_need_one() -> None:
         Config.model_validate(paper)
 
 
-def test_normal_and_chosen_numbers_have_their_distributions() -> None:
+def test_normal_and_chosen_numbers_have_their_distributions():
     u = np.linspace(0, 1, 101)
     one = Normal(mean=2.0, sd=0.5, low=1.0, high=4.5)
     wanted = truncnorm.ppf(u, (1.0 - 2.0) / 0.5, (4.5 - 2.0) / 0.5, loc=2.0, scale=0.5)
@@ -361,7 +355,7 @@ def test_normal_and_chosen_numbers_have_their_distributions() -> None:
 
 @pytest.mark.parametrize("change", [{}, {"pads": {"lower": {"inertial": True}}},
                                     {"bodies": {"disc": {"theta": 0.0}}}])  # fmt: skip
-def test_stores_are_those_of_a_run(tmp_path: Path, change: dict[str, Any]) -> None:
+def test_stores_are_those_of_a_run(tmp_path, change):
     written(tmp_path)
     file = RigFile.from_toml(tmp_path / "rigs" / "pressed.toml").override(**change)
     rig, y0, t = file.build()

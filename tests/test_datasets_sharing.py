@@ -34,7 +34,7 @@ from torchsoft.sysid.columns import read_table
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Config]:
+def made(tmp_path_factory):
     """Three trajectories in two shards, made in two parts."""
     folder = tmp_path_factory.mktemp("sharing")
     config, url = Config.from_toml(written(folder)), str(folder / "set")
@@ -50,21 +50,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Config]:
 
 
 @pytest.fixture(scope="module")
-def data(made: tuple[Path, Config]) -> xr.Dataset:
+def data(made):
     return open_dataset(str(made[0])).load()
 
 
 @pytest.fixture
-def half(made: tuple[Path, Config], tmp_path: Path) -> Path:
+def half(made, tmp_path):
     """The same with its first shard unfinished."""
     shutil.copytree(made[0], tmp_path / "the set")
     (tmp_path / "the set" / "finished" / "0.sha256").unlink()
     return tmp_path / "the set"
 
 
-def test_two_who_make_one_set_at_once_share_the_work(
-    made: tuple[Path, Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_who_make_one_set_at_once_share_the_work(made, tmp_path, monkeypatch):
     """Every trajectory is simulated once, and the set is that of the parts."""
     simulated, url = list[int](), str(tmp_path / "set")
 
@@ -82,7 +80,7 @@ def test_two_who_make_one_set_at_once_share_the_work(
     assert sound(made[0])
 
 
-def test_parts_share_every_shard_out_once(made: tuple[Path, Config]) -> None:
+def test_parts_share_every_shard_out_once(made):
     config = made[1].model_copy(update={"trajectories": 37})
     for of in (1, 2, 5, 19):
         shards = [shard for i in range(of) for shard in Part(i + 1, of).shards(config)]
@@ -93,9 +91,7 @@ def test_parts_share_every_shard_out_once(made: tuple[Path, Config]) -> None:
     assert listed(range(0, 100, 2)).endswith("38, ...")
 
 
-def test_a_shard_is_made_by_one_at_a_time(
-    made: tuple[Path, Config], half: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_a_shard_is_made_by_one_at_a_time(made, half, tmp_path, monkeypatch, capsys):
     """Who comes second leaves it, and says so; its progress is seen by others."""
     store, path = open_or_create(str(half), made[1]), written(tmp_path)
     monkeypatch.setattr(generation, "simulate_task", None)  # nothing is to be made
@@ -114,9 +110,7 @@ def test_a_shard_is_made_by_one_at_a_time(
     assert generation.run_shard(store, 1, None) == (1, 0)
 
 
-def test_the_job_array_makes_its_part(
-    made: tuple[Path, Config], half: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_the_job_array_makes_its_part(made, half, tmp_path, monkeypatch, capsys):
     """What its last line gives the shell is a command that makes the part; made parts are no longer
     in it."""
     folder, asked = tmp_path / "a place", list[Any]()
@@ -150,9 +144,7 @@ def test_the_job_array_makes_its_part(
         main(["dataset", "make", str(path), "--out", str(half), "--part", "3/2"])
 
 
-def test_an_estimate_is_measured_on_the_sets_own_runs(
-    made: tuple[Path, Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_estimate_is_measured_on_the_sets_own_runs(made, tmp_path, monkeypatch):
     """Of what is left; the first run, which loads kernels, does not count."""
     pauses = iter((0.5, *3 * (0.05,)))
     slow = lambda *_: time.sleep(next(pauses)) or {"steps": 7}
@@ -165,7 +157,7 @@ def test_an_estimate_is_measured_on_the_sets_own_runs(
     assert estimate(made[1], str(made[0]), 1).seconds == 0.0
 
 
-def test_the_card_says_what_the_set_holds(made: tuple[Path, Config], tmp_path: Path) -> None:
+def test_the_card_says_what_the_set_holds(made, tmp_path):
     text = (made[0] / "README.md").read_text()
     for said in (
         "license: unknown", "# Pressed", "3 (", "0 failed", "seed 3",
@@ -189,9 +181,7 @@ def test_the_card_says_what_the_set_holds(made: tuple[Path, Config], tmp_path: P
 # ----------------------------------------------------------------------
 
 
-def test_fields_on_the_surface_are_those_of_the_set(
-    made: tuple[Path, Config], data: xr.Dataset, tmp_path: Path
-) -> None:
+def test_fields_on_the_surface_are_those_of_the_set(made, data, tmp_path):
     """In The Well's layout, which its own reader opens where it is installed."""
     out = tmp_path / "well"
     assert "3 trajectories on the surfaces lower, upper" in export(str(made[0]), "the-well", out)
@@ -227,9 +217,7 @@ def test_fields_on_the_surface_are_those_of_the_set(
         assert read[0]["input_fields"].shape == (4, 21, 5)
 
 
-def test_episodes_are_those_of_the_set(
-    made: tuple[Path, Config], data: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_episodes_are_those_of_the_set(made, data, tmp_path, monkeypatch):
     """In LeRobot's layout, which its own reader opens where it is installed."""
     pytest.importorskip("pyarrow")
     out = tmp_path / "robot"
@@ -265,7 +253,7 @@ def test_episodes_are_those_of_the_set(
         assert len(reader.LeRobotDataset("torchsoft/set", root=out)) == 63
 
 
-def test_a_log_is_a_recording(made: tuple[Path, Config], data: xr.Dataset, tmp_path: Path) -> None:
+def test_a_log_is_a_recording(made, data, tmp_path):
     """With the numbers of the set to the last bit; one that is damaged or of others is refused."""
     pytest.importorskip("mcap")
     from torchsoft.solve.mcap import read_log, write_log
@@ -285,7 +273,7 @@ def test_a_log_is_a_recording(made: tuple[Path, Config], data: xr.Dataset, tmp_p
         write_log(tmp_path / "lost.mcap", lost, {})
 
 
-def test_a_run_is_logged_and_read_as_its_file_is(tmp_path: Path) -> None:
+def test_a_run_is_logged_and_read_as_its_file_is(tmp_path):
     """By whoever reads recordings of the paper's rig."""
     pytest.importorskip("mcap")
     from conftest import coarse, grasped, times
@@ -305,9 +293,7 @@ def test_a_run_is_logged_and_read_as_its_file_is(tmp_path: Path) -> None:
             np.testing.assert_array_equal(values, other.values[column])
 
 
-def test_exports_that_are_refused(
-    made: tuple[Path, Config], data: xr.Dataset, half: Path, tmp_path: Path, capsys: Any
-) -> None:
+def test_exports_that_are_refused(made, data, half, tmp_path, capsys):
     command = ["dataset", "export", str(made[0]), "--to", "the-well", "--out"]
     assert main([*command, str(half)]) == 2
     assert "the set is not empty; name a new folder" in capsys.readouterr().err

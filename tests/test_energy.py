@@ -11,7 +11,7 @@ from torchsoft.rigs import RigFile
 from torchsoft.scenario import grasp_and_roll
 
 
-def test_stored_energies_by_hand() -> None:
+def test_stored_energies_by_hand():
     """Springs, spin and translation of a state with one touching node and known velocities."""
     rig = coarse()
     state = rig.unpack(random_state(rig, 2))
@@ -39,7 +39,7 @@ def test_stored_energies_by_hand() -> None:
     )
 
 
-def test_a_run_balances_its_energies_better_with_smaller_steps() -> None:
+def test_a_run_balances_its_energies_better_with_smaller_steps():
     """To 1e-3 of the energy injected at 2 ms over grasp and first stroke, and better at 0.5 ms."""
     manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
     t = torch.linspace(0, 0.6, 61, dtype=torch.float64)
@@ -52,7 +52,7 @@ def test_a_run_balances_its_energies_better_with_smaller_steps() -> None:
     assert residual[2] < 0.5 * residual[0]  # nodes touch and leave all along, so not second order
 
 
-def test_the_energy_residual_of_a_fall_falls_with_the_tolerance() -> None:
+def test_the_energy_residual_of_a_fall_falls_with_the_tolerance():
     """An ellipse in free flight and on a pad, with long steps between outputs."""
     ready = (
         RigFile.from_toml("rigs/drop.toml")

@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -25,11 +25,9 @@ from torchsoft.rigs.build import RigFile
 FILE = RigFile.from_toml(torchsoft.envs.RIG)
 TURN = np.array([0.4, -0.4, 0.2], np.float32)
 
-Make = Callable[..., RigEnv]
-
 
 @pytest.fixture(scope="module")
-def ready() -> Iterator[RigEnv]:
+def ready():
     """One ready environment for everybody; each begins an episode of its own."""
     env = reorient()
     yield env
@@ -41,7 +39,7 @@ def small(**changes: Any) -> RigEnv:
     return reorient(**{"begin": 0.0, "interval": 0.05} | changes)
 
 
-def test_check_env_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_env_passes(monkeypatch):
     """With a window that there is not here."""
     shown: list[Any] = []
     monkeypatch.setattr(View, "show", lambda self, picture: shown.append(picture.shape))
@@ -50,7 +48,7 @@ def test_check_env_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(shown) == {(480, 600, 3)}
 
 
-def test_wrappers_run(ready: RigEnv) -> None:
+def test_wrappers_run(ready):
     env = NormalizeObservation(RecordEpisodeStatistics(TimeLimit(ready, 3)))
     env.reset(seed=0)
     *_, (_, _, _, truncated, info) = [env.step(TURN) for _ in range(3)]
@@ -58,7 +56,7 @@ def test_wrappers_run(ready: RigEnv) -> None:
     assert info["episode"]["l"] == 3
 
 
-def test_an_episode_is_one_run() -> None:
+def test_an_episode_is_one_run():
     """States are handed on: many steps are the one run along the same lines."""
     env = small(rig=FILE.override(solver={"rtol": 1e-6}))
     actions = f64(0.5, -0.3, 0.0, 0.2, 0.1, 1.0, 0.4, -0.5, -1.0).reshape(3, 3)
@@ -81,7 +79,7 @@ def test_an_episode_is_one_run() -> None:
     assert 5.0 * (felt + 1.0) == pytest.approx(taxels, abs=2e-3)
 
 
-def test_any_channel_is_observed() -> None:
+def test_any_channel_is_observed():
     """Signals and efforts too; a reward of one's own sees the run over the interval."""
     seen: list[Trajectory] = []
 
@@ -101,7 +99,7 @@ def test_any_channel_is_observed() -> None:
     assert given == pytest.approx(float(run["theta_disc"][-1]) - 0.4, rel=1e-6)
 
 
-def test_the_reward_is_of_the_goal(ready: RigEnv) -> None:
+def test_the_reward_is_of_the_goal(ready):
     ready.reset(seed=0, options={"target": {"theta": 0.3}})
     before = ready.moment.action
     _, reward, *_, info = ready.step(TURN)
@@ -113,7 +111,7 @@ def test_the_reward_is_of_the_goal(ready: RigEnv) -> None:
     assert info["distance"] == pytest.approx(float(distance.norm()), rel=1e-12)
 
 
-def test_an_episode_is_disturbed() -> None:
+def test_an_episode_is_disturbed():
     """By a peak that a run along the same lines has, and by another one in every episode."""
     push = {"pushes": "disc.x", "feed_forward": "push"}
     file = FILE.override(
@@ -142,7 +140,7 @@ def test_an_episode_is_disturbed() -> None:
     assert env.moment.peaks.tolist() != [[when, peak]]
 
 
-def test_steps_are_judged_like_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_are_judged_like_runs(monkeypatch):
     env = small(judged=True, duration=0.1)
     env.reset(seed=0)
     assert env.step(TURN)[-1]["doubts"] == []
@@ -151,7 +149,7 @@ def test_steps_are_judged_like_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "beyond linear elasticity" in said
 
 
-def test_time_is_limited(ready: RigEnv) -> None:
+def test_time_is_limited(ready):
     env = small(duration=0.1)
     env.reset(seed=0)
     assert [env.step(TURN)[3] for _ in range(2)] == [False, True]
@@ -159,7 +157,7 @@ def test_time_is_limited(ready: RigEnv) -> None:
         env.step(TURN)
 
 
-def test_episodes_end_with_a_sentence() -> None:
+def test_episodes_end_with_a_sentence():
     env = small(bounds={"disc.theta": (-0.01, 0.01)})
     env.reset(seed=0)
     *_, terminated, _, info = env.step(TURN)
@@ -173,7 +171,7 @@ def test_episodes_end_with_a_sentence() -> None:
     assert info["ended"] == "disc was dropped: no contact touches it"
 
 
-def test_a_failing_run_ends_its_episode_only() -> None:
+def test_a_failing_run_ends_its_episode_only():
     far = {"lower_x": (-80e-3, 80e-3), "upper_x": (-80e-3, 80e-3)}
     env = small(actions=far, bounds={}, duration=1.0)
     env.reset(seed=0)
@@ -187,7 +185,7 @@ def test_a_failing_run_ends_its_episode_only() -> None:
     assert not env.step(np.zeros(2, np.float32))[2]
 
 
-def test_seeds_draw_goals_and_parameters() -> None:
+def test_seeds_draw_goals_and_parameters():
     name = "materials.rubber.E"
     env = small(parameters={name: (0.3e6, 0.8e6), "bodies.disc.start.x": (-2e-3, 2e-3)})
     drawn = []
@@ -201,7 +199,7 @@ def test_seeds_draw_goals_and_parameters() -> None:
     assert 0.3e6 <= drawn[0][0] <= 0.8e6
 
 
-def test_starts_that_cannot_be_are_drawn_again() -> None:
+def test_starts_that_cannot_be_are_drawn_again():
     lying = FILE.override(bodies={"disc": {"start": {"y": "rest"}}})
     env = small(rig=lying, parameters={"bodies.disc.start.x": (0.0, 0.05)})
     with pytest.warns(RedrawnStart, match=r"no episode begins with bodies.disc.start.x = 0.0.*pad"):
@@ -218,7 +216,7 @@ def differs(function: Callable[[Tensor], Tensor], x: Tensor, way: Tensor, h: flo
         return float(function(x + h * way) - function(x - h * way)) / (2 * h)
 
 
-def test_gradients_of_a_step(ready: RigEnv) -> None:
+def test_gradients_of_a_step(ready):
     """Of state, observation and reward, by state and actions, against differences on frozen
     knots."""
     dynamics, generator = ready.dynamics, torch.Generator().manual_seed(0)
@@ -244,7 +242,7 @@ def test_gradients_of_a_step(ready: RigEnv) -> None:
         assert float(slope @ way) == pytest.approx(expected, rel=1e-5)
 
 
-def test_parameters_are_read_at_the_begin() -> None:
+def test_parameters_are_read_at_the_begin():
     """By torch and by gymnasium, with their gradient."""
     env = small()
     dynamics, E = env.dynamics, env.dynamics.rig.parameter("materials.rubber.E")
@@ -272,7 +270,7 @@ def test_parameters_are_read_at_the_begin() -> None:
     assert not np.array_equal(seen[0], seen[1])
 
 
-def test_gradient_of_an_episode_by_a_policy(ready: RigEnv) -> None:
+def test_gradient_of_an_episode_by_a_policy(ready):
     dynamics = ready.dynamics
     torch.manual_seed(0)
     policy = nn.Sequential(nn.Linear(dynamics.size, 30), nn.Tanh(), nn.Linear(30, 3), nn.Tanh())
@@ -302,7 +300,7 @@ def test_gradient_of_an_episode_by_a_policy(ready: RigEnv) -> None:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_threads_do_not_change_results(mode: str) -> None:
+def test_threads_do_not_change_results(mode):
     ends = []
     for threads in (1, 2):
         envs = RigVectorEnv([lambda: small(duration=0.1)] * 2, threads=threads, autoreset_mode=mode)
@@ -318,7 +316,7 @@ def test_threads_do_not_change_results(mode: str) -> None:
     assert ("final_obs" in over[4]) == (mode == "SameStep")
 
 
-def test_make_vec_takes_threads() -> None:
+def test_make_vec_takes_threads():
     envs = gymnasium.make_vec("torchsoft/Reorient-v0", 2, vector_kwargs={})
     assert isinstance(envs, RigVectorEnv)
     envs.close()
@@ -352,7 +350,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_makes_no_sense_is_refused(case: str) -> None:
+def test_what_makes_no_sense_is_refused(case):
     changes, sentence = REFUSED[case]
     with pytest.raises(ValueError) as refusal:  # noqa: PT011 -- the sentence is compared
         reorient(**changes)
@@ -367,7 +365,7 @@ def test_what_makes_no_sense_is_refused(case: str) -> None:
         ([0, 0], "must hold 3 numbers, for lower_x, upper_x, grip"),
     ],
 )
-def test_actions_are_checked(ready: RigEnv, action: list[float], sentence: str) -> None:
+def test_actions_are_checked(ready, action, sentence):
     ready.reset(seed=0)
     with pytest.raises(ValueError, match=sentence):
         ready.step(np.array(action, np.float32))
@@ -381,18 +379,18 @@ def test_actions_are_checked(ready: RigEnv, action: list[float], sentence: str) 
         ({"target": {"x": np.inf}}, "`target` must be finite"),
     ],
 )
-def test_options_are_checked(ready: RigEnv, options: dict[str, Any], sentence: str) -> None:
+def test_options_are_checked(ready, options, sentence):
     with pytest.raises(ValueError, match=sentence):
         ready.reset(options=options)
 
 
-def test_gymnasium_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gymnasium_is_asked_for(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchsoft\[learn\]'"):
         importlib.reload(torchsoft.envs)
 
 
-def test_human_needs_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_human_needs_a_window(monkeypatch):
     from matplotlib import pyplot
 
     pyplot.switch_backend("agg")
@@ -412,7 +410,7 @@ def test_human_needs_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pyplot.get_fignums() == []
 
 
-def test_pictures_follow_the_episode() -> None:
+def test_pictures_follow_the_episode():
     env = small(render_mode="rgb_array")
     with pytest.raises(ValueError, match="call `reset` first"):
         env.render()
@@ -424,7 +422,7 @@ def test_pictures_follow_the_episode() -> None:
 
 
 @pytest.mark.slow
-def test_a_library_trains_unchanged() -> None:
+def test_a_library_trains_unchanged():
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 

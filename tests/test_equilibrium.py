@@ -27,7 +27,7 @@ def contact_force(model: SoftGrasp, y: Tensor, which: str) -> Tensor:
 @pytest.mark.parametrize("fidelity", ["massless", "inertial"])
 @pytest.mark.parametrize("at", ["rest", "grasp"])
 @torch.no_grad()
-def test_nothing_but_the_bracket_accelerates(fidelity: str, at: str) -> None:
+def test_nothing_but_the_bracket_accelerates(fidelity, at):
     model = build(pad__fidelity=fidelity)
     y = rest(model) if at == "rest" else press(model, GRASP)
     rate = model.unpack(model(0.0, y))
@@ -47,7 +47,7 @@ def test_nothing_but_the_bracket_accelerates(fidelity: str, at: str) -> None:
 
 
 @torch.no_grad()
-def test_at_rest_the_upper_pad_just_touches_the_disc() -> None:
+def test_at_rest_the_upper_pad_just_touches_the_disc():
     model = build()
     state = model.unpack(rest(model))
     g = model.penetration("U", state)
@@ -63,7 +63,7 @@ def test_at_rest_the_upper_pad_just_touches_the_disc() -> None:
 
 @torch.no_grad()
 @pytest.mark.parametrize("x_C0", [58.1e-3, 59.4e-3, 59.7e-3, 60.1e-3, 60.7e-3, 61e-3])
-def test_a_weightless_disc_between_nodes_rests_on_them(x_C0: float) -> None:
+def test_a_weightless_disc_between_nodes_rests_on_them(x_C0):
     model = build(scenario__gravity=0.0, scenario__x_C0=x_C0)
     state = model.unpack(rest(model))
     assert abs(float(model.penetration("L", state).max())) <= 1e-15
@@ -71,7 +71,7 @@ def test_a_weightless_disc_between_nodes_rests_on_them(x_C0: float) -> None:
 
 
 @torch.no_grad()
-def test_fidelities_agree_and_the_grasp_is_the_papers() -> None:
+def test_fidelities_agree_and_the_grasp_is_the_papers():
     default = {"pad__elements_x": 120, "pad__elements_y": 4}
     massless, inertial = (build(**default, pad__fidelity=kind) for kind in ("massless", "inertial"))
     y = press(massless, GRASP)
@@ -113,7 +113,7 @@ def outcome(model: SoftGrasp, at: str) -> Tensor:
 
 @pytest.mark.parametrize("name", PARAMETERS)
 @pytest.mark.parametrize("at", ["rest", "grasp"])
-def test_derivatives_by_autograd_are_those_by_differences(at: str, name: str) -> None:
+def test_derivatives_by_autograd_are_those_by_differences(at, name):
     value, model = Parameters().table()[name]["value"], build()
     rows = outcome(model, at)
     parameter = model.parameter(name)
@@ -142,7 +142,7 @@ def test_derivatives_by_autograd_are_those_by_differences(at: str, name: str) ->
 # ----------------------------------------------------------------------
 
 
-def test_a_bracket_above_the_sunken_disc_is_refused() -> None:
+def test_a_bracket_above_the_sunken_disc_is_refused():
     model = build()
     with torch.no_grad():
         touching = float(model.unpack(rest(model)).pose["bracket"][1])
@@ -160,15 +160,15 @@ def test_a_bracket_above_the_sunken_disc_is_refused() -> None:
 
 
 def test_no_equilibrium_is_reported_when_newton_does_not_converge(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr("torchsoft.physics.statics.ITERATIONS", 2)
     with pytest.raises(NoEquilibrium, match="no static equilibrium found"):
         press(build(), GRASP)
 
 
 @pytest.mark.parametrize("fidelity", ["massless", "inertial"])
-def test_holding_force_is_what_the_upper_contact_presses_with(fidelity: str) -> None:
+def test_holding_force_is_what_the_upper_contact_presses_with(fidelity):
     model = build(pad__fidelity=fidelity)
     y = press(model, GRASP)
     assert holding_force(model, y) == pytest.approx(

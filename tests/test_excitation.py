@@ -1,8 +1,5 @@
 """Excitations: what cannot be carried out is refused by its field before anything is simulated."""
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 import torch
 
@@ -20,33 +17,28 @@ ROLL = {"kind": "slow_roll"}
         ({"motion": ROLL, "duration": 0.4},
          "duration = 0.4 s leaves no motion: grasp_time = 0.375 s and settle = 0.125 s"),
         ({"motion": {"kind": "chirp"}, "duration": 0.7}, "chirp needs more than 0.3 s after them"),
-        ({"motion": ROLL, "duration": 1e308}, "duration should be less than or equal to 100000"),
         ({"motion": {"kind": "strokes", "stroke_time": 1e-5}, "duration": 9.0},
         "motion.stroke_time = 1e-05 s makes more than"),
         ({"motion": {"kind": "multi_sine", "frequency": [1.0, "2"]}},
          "motion.frequency.1 should be a valid number, not '2'"),
-        ({"motion": ROLL, "depth": True}, "depth should be a valid number, not True"),
-        ({"motion": {"kind": "hop"}}, "motion.kind should be one of"),
         ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}},
          "times of motion.x must increase, but 0.1 s"),
         ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}},
          "duration = 2 s ends before the last knot of the motion, at 2.5 s"),
     ],
 )  # fmt: skip
-def test_an_impossible_excitation_is_refused_by_its_field(
-    tree: dict[str, Any], message: str
-) -> None:
+def test_an_impossible_excitation_is_refused_by_its_field(tree, message):
     with pytest.raises(InvalidTable) as error:
         Excitation.model_validate(tree)
     assert message in str(error.value)
 
 
-def test_lists_stand_for_bands() -> None:
+def test_lists_stand_for_bands():
     shaking = CATALOGUE["shaking"].model_dump(mode="json")
     assert Excitation.model_validate(shaking) == CATALOGUE["shaking"]
 
 
-def test_knots_are_reached_from_the_grasp() -> None:
+def test_knots_are_reached_from_the_grasp():
     """At rest at each, on top of where the grasp ended."""
     knots, p = Knots(x=((0.1, 4e-3), (0.3, -2e-3)), y=((0.2, -1e-4),)), Parameters()
     excitation = Excitation(motion=knots, grasp_time=0.2, settle=0.1, duration=0.8, depth=1e-3)
@@ -64,7 +56,7 @@ def test_knots_are_reached_from_the_grasp() -> None:
 @pytest.mark.parametrize(
     "motion", [Knots(x=((0.1, 4e-3),)), *(one.motion for one in CATALOGUE.values())]
 )
-def test_a_file_holds_an_excitation_to_the_bit(motion: Any, tmp_path: Path) -> None:
+def test_a_file_holds_an_excitation_to_the_bit(motion, tmp_path):
     excitation, path = (
         Excitation(motion=motion, depth=1 / 3e3, duration=3.0),
         tmp_path / "excitation.toml",

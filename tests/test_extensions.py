@@ -18,7 +18,7 @@ MODEL = SoftGrasp(Parameters().override(COARSE))
 NAMES = tuple(extensions(MODEL))
 
 
-def test_what_a_rig_may_be_extended_by() -> None:
+def test_what_a_rig_may_be_extended_by():
     assert NAMES == (
         "pads.L.E_ratio", "pads.L.tau_ratio", "pads.U.E_ratio", "pads.U.tau_ratio",
         "pad.slow(0.1 s)", "pad.slow(1 s)", "contact.power", "guides.bracket.x.friction",
@@ -27,16 +27,19 @@ def test_what_a_rig_may_be_extended_by() -> None:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_neutral_extension_changes_nothing(name: str) -> None:
-    model = deepcopy(MODEL)
-    manipulation = grasp_and_roll(model)
+@pytest.fixture(scope="module")
+def grasped():
+    """The grasp, run from rest, and its reference."""
+    model = grasp_and_roll(deepcopy(MODEL)).model
     t = torch.linspace(0, 0.3, 31, dtype=torch.float64)
-    before = simulate(model, t, y0=rest(model), reference=manipulation.model.reference)
+    return simulate(model, t, y0=rest(model)), model.reference
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_neutral_extension_changes_nothing(name, grasped):
+    model, (before, reference) = deepcopy(MODEL), grasped
     extend(model, [name])
-    after = simulate(
-        model, t, y0=rest(model), reference=manipulation.model.reference, knots=before.knots
-    )
+    after = simulate(model, before.t, y0=rest(model), reference=reference, knots=before.knots)
     for channel in ("x_C", "y_C", "theta", "F_x", "F_y"):
         moved = (after[channel] - before[channel]).abs().max()
         assert float(moved) <= 1e-8 * float(before[channel].abs().max() + 1e-3), channel
@@ -44,7 +47,7 @@ def test_a_neutral_extension_changes_nothing(name: str) -> None:
     assert name not in extensions(model)
 
 
-def test_parts_that_are_shared_are_extended_once() -> None:
+def test_parts_that_are_shared_are_extended_once():
     model = deepcopy(MODEL)
     extend(model, ["contact.power", "pad.slow(1 s)", "gravity_tilt"])
     assert model.contacts["L"].law.power is model.contacts["U"].law.power
@@ -56,7 +59,7 @@ def test_parts_that_are_shared_are_extended_once() -> None:
         extend(model, ["contact.colour"])
 
 
-def test_names_are_those_of_a_rig_file() -> None:
+def test_names_are_those_of_a_rig_file():
     rig = RigFile.from_toml("rigs/two_fingers.toml").assemble()
     groups = {name.partition(".")[0] for name in extensions(rig)}
     assert groups == {"materials", "laws", "pads", "guides", "gravity_tilt"}
@@ -66,7 +69,7 @@ def test_names_are_those_of_a_rig_file() -> None:
         assert rig.parameter(name).item() == 1.0
 
 
-def test_an_extension_may_be_unknown() -> None:
+def test_an_extension_may_be_unknown():
     """With the bounds of its own search, or with those that are given."""
     t = torch.linspace(0.0, 0.1, 11, dtype=torch.float64).numpy()
     recording = Recording("one", deepcopy(MODEL), {"F_y": (t, 0 * t)})

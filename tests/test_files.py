@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +41,7 @@ def fail(path: Path, error: BaseException) -> None:
         raise error
 
 
-def test_a_file_is_replaced_at_the_end(tmp_path: Path) -> None:
+def test_a_file_is_replaced_at_the_end(tmp_path):
     path = tmp_path / "new" / "folder" / "file"
     write(path, b"old")
     with replacing(path) as partial:
@@ -53,7 +52,7 @@ def test_a_file_is_replaced_at_the_end(tmp_path: Path) -> None:
     assert os.listdir(path.parent) == ["file"]
 
 
-def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+def test_a_folder_is_not_replaced_by_a_file(tmp_path):
     with pytest.raises(IsADirectoryError) as refusal:
         write(tmp_path, b"new")
     assert str(refusal.value) == f"{tmp_path} is a folder; name a file, perhaps one in it"
@@ -62,9 +61,7 @@ def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_an_error_leaves_the_old_file_and_nothing_else(
-    tmp_path: Path, error: BaseException
-) -> None:
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path, error):
     path = tmp_path / "file"
     write(path, b"old")
     with pytest.raises(type(error)):
@@ -72,7 +69,7 @@ def test_an_error_leaves_the_old_file_and_nothing_else(
     assert (path.read_bytes(), os.listdir(tmp_path)) == (b"old", ["file"])
 
 
-def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path: Path) -> None:
+def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path):
     """But not the file of one that lives, nor other people's."""
     path = tmp_path / "file"
     assert subprocess.run([sys.executable, "-c", DIE, str(path)], check=False).returncode == 9
@@ -89,9 +86,7 @@ def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path: Path) -> Non
     assert sorted(os.listdir(tmp_path)) == ["file", "file.old.partial", "file.partial"]
 
 
-def test_files_are_flushed_before_they_appear(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_flushed_before_they_appear(tmp_path, monkeypatch):
     """Content first, then the name, then the folder that holds it, new folders in theirs."""
     done: list[str] = []
     flush, rename = os.fsync, Path.replace
@@ -109,7 +104,7 @@ def test_files_are_flushed_before_they_appear(
     assert done == [".", "a", "a/b/file.partial", "replace", "a/b"]
 
 
-def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path):
     path, content = tmp_path / "file", bytes(range(256))
     path.write_bytes(whole := sealed(content))
     assert unsealed(path) == content
@@ -122,7 +117,7 @@ def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -
             unsealed(path)
 
 
-def test_json_takes_numpys_numbers_and_leaves_out_what_is_not_finite(tmp_path: Path) -> None:
+def test_json_takes_numpys_numbers_and_leaves_out_what_is_not_finite(tmp_path):
     content = {
         "a": np.int64(3),
         "b": [np.float64(0.5), np.float32(np.nan), np.bool_(True)],
@@ -148,9 +143,7 @@ def test_json_takes_numpys_numbers_and_leaves_out_what_is_not_finite(tmp_path: P
         (load_answer, "a.json"),
     ],
 )
-def test_only_regular_files_of_a_stated_size_are_read(
-    read: Callable[[Path], object], name: str, tmp_path: Path
-) -> None:
+def test_only_regular_files_of_a_stated_size_are_read(read, name, tmp_path):
     pipe, device, large = (tmp_path / kind / name for kind in ("pipe", "device", "large"))
     for path in (pipe, device, large):
         path.parent.mkdir()
@@ -168,7 +161,7 @@ def test_only_regular_files_of_a_stated_size_are_read(
         assert str(path) in str(refusal.value)
 
 
-def test_an_archive_that_declares_too_many_numbers_is_refused_unread(tmp_path: Path) -> None:
+def test_an_archive_that_declares_too_many_numbers_is_refused_unread(tmp_path):
     path = tmp_path / "law.npz"
     with zipfile.ZipFile(path, "w") as archive, archive.open("0.weight.npy", "w") as member:
         np.lib.format.write_array_header_1_0(
@@ -180,7 +173,7 @@ def test_an_archive_that_declares_too_many_numbers_is_refused_unread(tmp_path: P
         read_network(path, LOOP)
 
 
-def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -190,7 +183,7 @@ def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert refusal.value.filename == str(tmp_path / "summary.json")
 
 
-def test_a_folder_of_other_files_is_not_written_to(tmp_path: Path) -> None:
+def test_a_folder_of_other_files_is_not_written_to(tmp_path):
     other, own = tmp_path / "other", tmp_path / "own"
     other.mkdir()
     (other / "summary.json").write_text("mine")
@@ -204,6 +197,6 @@ def test_a_folder_of_other_files_is_not_written_to(tmp_path: Path) -> None:
         write_json(own / "summary.json", {"torchsoft": "0"})
 
 
-def test_characters_that_a_terminal_obeys_are_escaped() -> None:
+def test_characters_that_a_terminal_obeys_are_escaped():
     assert plain("a\x1b[31mb\u202ec\u200b\nd é µ") == "a\\x1b[31mb\\u202ec\\u200b\nd é µ"
     assert line("a\x07\n b") == "a\\x07 b"

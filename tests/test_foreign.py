@@ -63,7 +63,7 @@ def apart(own: dict[str, np.ndarray]) -> dict[str, float]:
     }
 
 
-def test_it_imports_nothing_of_torchsoft() -> None:
+def test_it_imports_nothing_of_torchsoft():
     for path in Path(foreign.__file__).parent.glob("*.py"):
         tree = ast.parse(path.read_text())
         names = [
@@ -82,7 +82,7 @@ def test_it_imports_nothing_of_torchsoft() -> None:
         }, path
 
 
-def test_pads_are_as_soft() -> None:
+def test_pads_are_as_soft():
     """Kronecker products of bars and an assembly element by element are the same integrals; their
     solves differ by rounding."""
     mesh = PadMesh(OWN.length, OWN.height, OWN.across, OWN.through)
@@ -91,7 +91,7 @@ def test_pads_are_as_soft() -> None:
 
 
 @pytest.mark.slow
-def test_motions_agree_with_equal_assumptions() -> None:
+def test_motions_agree_with_equal_assumptions():
     """Halving the step halves the difference from torchsoft; of two runs extrapolated to no step at
     all, poses are within 1e-4 of their ranges and rates and forces within 1e-3, slip of 0.1 m/s and
     touching and parting nodes included."""
@@ -107,7 +107,7 @@ def test_motions_agree_with_equal_assumptions() -> None:
 
 
 @pytest.mark.parametrize("slipping", [False, True])
-def test_the_literal_law(slipping: bool) -> None:
+def test_the_literal_law(slipping):
     """A spring and a dashpot from the place of first contact; once the force in them has been above
     mu_s F_N, mu_k F_N against the sliding, and the spring goes on stretching."""
     p, h, depth = OWN._replace(literal=True), STEP, 5e-5
@@ -136,7 +136,7 @@ OTHERS = (
 
 
 @pytest.mark.parametrize("differs", OTHERS)
-def test_what_may_differ_makes_a_difference(differs: dict[str, float]) -> None:
+def test_what_may_differ_makes_a_difference(differs):
     """More than sensors of 10 um and 0.1 N overlook."""
     own, other = strange(2 * STEP).channels, strange(2 * STEP, OWN._replace(**differs)).channels
     assert (

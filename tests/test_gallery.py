@@ -57,7 +57,7 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
         for p in PROGRAMS
     ],
 )
-def test_a_program_answers_its_question(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_answers_its_question(program, monkeypatch):
     import matplotlib.pyplot as plt
 
     monkeypatch.setenv("MPLBACKEND", "agg")
@@ -68,7 +68,7 @@ def test_a_program_answers_its_question(program: Path, monkeypatch: pytest.Monke
     assert ANSWERS[program.stem](names)
 
 
-def test_programs_are_short_and_ask_a_question() -> None:
+def test_programs_are_short_and_ask_a_question():
     for program in PROGRAMS:
         text = program.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= LONGEST, program

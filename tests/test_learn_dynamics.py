@@ -1,7 +1,6 @@
 """A friction law written by the user, learned through the compiled stepper, and a surrogate."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
@@ -9,7 +8,7 @@ from conftest import f64
 from test_experiments import experiment
 
 
-def test_the_learned_law_solves_its_own_equation() -> None:
+def test_the_learned_law_solves_its_own_equation():
     """(eta + R) v = E - mu(v) F_N, to the fixed-point sweeps' error, and no slip below the cap."""
     module = experiment("learn_dynamics")
     torch.manual_seed(0)
@@ -24,7 +23,7 @@ def test_the_learned_law_solves_its_own_equation() -> None:
 
 
 @pytest.mark.slow
-def test_a_residual_learns_the_coefficient() -> None:
+def test_a_residual_learns_the_coefficient():
     """From one run that slips throughout: the truth's constant, from another one."""
     module = experiment("learn_dynamics")
     student = module.Residual(0)
@@ -49,7 +48,7 @@ def test_a_residual_learns_the_coefficient() -> None:
 
 
 @pytest.mark.slow
-def test_learn_dynamics_smoke(tmp_path: Path) -> None:
+def test_learn_dynamics_smoke(tmp_path):
     module = experiment("learn_dynamics")
     module.main(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads((tmp_path / "summary.json").read_text())

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, RUBBER
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd import gradcheck
@@ -37,14 +37,13 @@ from torchsoft.physics.material import KINDS, Material, retarded
 from torchsoft.plot.diagram import graph_of
 from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify
 
-COMMON = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 MATERIALS: dict[str, Callable[[], Material]] = {
-    "kelvin_voigt": lambda: KelvinVoigt(**COMMON, tau=0.01),
-    "standard_linear_solid": lambda: StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02,
+    "kelvin_voigt": lambda: KelvinVoigt(**RUBBER, tau=0.01),
+    "standard_linear_solid": lambda: StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.02,
     tau_instant=1e-3),
-    "generalised_kelvin": lambda: GeneralisedKelvin(**COMMON, J=[0.3, 0.2, 0.1],
+    "generalised_kelvin": lambda: GeneralisedKelvin(**RUBBER, J=[0.3, 0.2, 0.1],
     tau=[4e-3, 0.02, 0.3], tau_instant=1e-3), "prony": lambda: Prony(
-        **COMMON, moduli=[3e5, 2e5, 1e5, 5e4, 5e4], tau=[3e-3, 0.01, 0.1, 0.5, 4.0],
+        **RUBBER, moduli=[3e5, 2e5, 1e5, 5e4, 5e4], tau=[3e-3, 0.01, 0.1, 0.5, 4.0],
         tau_instant=1e-3
     ),
 }  # fmt: skip
@@ -55,7 +54,7 @@ TIGHT = 2e-9
 
 
 @pytest.fixture(params=list(MATERIALS))
-def material(request: pytest.FixtureRequest) -> Material:
+def material(request):
     return MATERIALS[request.param]()
 
 
@@ -80,11 +79,11 @@ SERIES: dict[str, tuple[Sequence[float], Sequence[float]]] = {
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", SERIES)
-def test_a_relaxation_series_is_its_chain_exactly(name: str) -> None:
+def test_a_relaxation_series_is_its_chain_exactly(name):
     """Compliance times modulus is one at every frequency, and retardation times interlace with
     relaxation times."""
     moduli, tau = SERIES[name]
-    solid = Prony(**COMMON, moduli=moduli, tau=tau, tau_instant=1e-9)
+    solid = Prony(**RUBBER, moduli=moduli, tau=tau, tau_instant=1e-9)
     J, late = retarded(solid.series()[0] / solid.E, solid.series()[1])
     omega = torch.logspace(-8, 8, 65, dtype=torch.float64)
     compliance = (J[0] + (J[1:] / (1 + 1j * omega[:, None] * late)).sum(-1)) / solid.E
@@ -96,7 +95,7 @@ def test_a_relaxation_series_is_its_chain_exactly(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["one", "unsorted", "ten decades"])
-def test_the_conversion_is_differentiable(name: str) -> None:
+def test_the_conversion_is_differentiable(name):
     """In logarithms of moduli and times, against differences."""
     moduli, tau = (torch.tensor(x, dtype=torch.float64) for x in SERIES[name])
 
@@ -108,17 +107,17 @@ def test_the_conversion_is_differentiable(name: str) -> None:
 
 
 @torch.no_grad()
-def test_one_relaxation_time_is_the_standard_linear_solid() -> None:
-    solid = Prony(**COMMON, moduli=[7.5e5], tau=[0.01])
-    like = StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02)
-    other = GeneralisedKelvin(**COMMON, J=[0.5], tau=[0.02])
+def test_one_relaxation_time_is_the_standard_linear_solid():
+    solid = Prony(**RUBBER, moduli=[7.5e5], tau=[0.01])
+    like = StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.02)
+    other = GeneralisedKelvin(**RUBBER, J=[0.5], tau=[0.02])
     for one in (solid, other):
         for mine, its in zip(one.chain(), like.chain()):
             assert torch.allclose(mine, its, rtol=1e-14, atol=0)
 
 
 @torch.no_grad()
-def test_creep_and_complex_modulus_have_their_limits(material: Material) -> None:
+def test_creep_and_complex_modulus_have_their_limits(material):
     """From nothing to 1/E; the storage modulus from E on grows, and losses are positive."""
     E, ends = material.E.item(), torch.tensor([0.0, 1e6], dtype=torch.float64)
     assert (material.creep(ends) * E).tolist() == pytest.approx([0.0, 1.0], abs=1e-12)
@@ -203,7 +202,7 @@ def closed(run: Trajectory, found: Tensor, expected: Tensor) -> None:
 
 
 @torch.no_grad()
-def test_creep_under_a_held_force_is_the_closed_form(material: Material) -> None:
+def test_creep_under_a_held_force_is_the_closed_form(material):
     rig, y0 = punch(material, force=1.0)
     run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
     closed(
@@ -214,7 +213,7 @@ def test_creep_under_a_held_force_is_the_closed_form(material: Material) -> None
 
 
 @torch.no_grad()
-def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Material) -> None:
+def test_relaxation_under_a_held_indentation_is_the_closed_form(material):
     rig, y0 = punch(material, depth=5e-5)
     run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
     J, tau = material.chain()
@@ -225,13 +224,13 @@ def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Materi
     )
 
 
-def test_every_coefficient_of_a_series_is_identified() -> None:
+def test_every_coefficient_of_a_series_is_identified():
     """From the punch's height under a held force, without noise, from starts a third away."""
     t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0.5, 120, dtype=torch.float64)))
     values = {"E": 7.5e5, "E_1": 5e5, "tau_1": 5e-3, "E_2": 3e5, "tau_2": 0.1}
 
     def solid(E: float, E_1: float, tau_1: float, E_2: float, tau_2: float) -> Prony:
-        return Prony(**(COMMON | {"E": E}), moduli=[E_1, E_2], tau=[tau_1, tau_2])
+        return Prony(**(RUBBER | {"E": E}), moduli=[E_1, E_2], tau=[tau_1, tau_2])
 
     rig, y0 = punch(solid(**values), force=1.0)
     y = simulate(rig, t, y0=y0, rtol=1e-7)["y_punch"].detach().numpy()
@@ -254,7 +253,7 @@ STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
 
 
 @torch.no_grad()
-def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
+def test_the_graph_has_the_fields_of_the_chain(material):
     labels = {
         data["label"] for _, data in graph_of(SoftGrasp(STABLE, material=material)).nodes(data=True)
     }
@@ -267,7 +266,7 @@ def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
 # ----------------------------------------------------------------------
 
 
-def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
+def test_a_recording_that_begins_before_the_pads_forget_is_named():
     model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
     samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
     with pytest.warns(
@@ -279,5 +278,5 @@ def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
     _ = Recording("slow", model, samples, AtRest(lead=20.0)).start_coordinates
 
 
-def test_every_material_has_a_name_in_files() -> None:
+def test_every_material_has_a_name_in_files():
     assert {name: type(make()) for name, make in MATERIALS.items()} == dict(KINDS)

@@ -30,7 +30,7 @@ from torchsoft import (
     PadMesh,
     QuadMesh,
 )
-from torchsoft.physics.mesh import Array, Mesh, lame_moduli
+from torchsoft.physics.mesh import Array, Mesh, banded, lame_moduli
 
 ROUNDING = 1e-12
 """Relative to the largest entry: two assemblies of the same integrals, in another order of
@@ -74,7 +74,7 @@ MESHES: dict[str, Callable[[], Mesh]] = {
 
 
 @pytest.fixture(params=MESHES)
-def mesh(request: pytest.FixtureRequest) -> Mesh:
+def mesh(request):
     return MESHES[request.param]()
 
 
@@ -90,7 +90,7 @@ def in_scikit_fem(mesh: Mesh) -> MeshQuad:
     return MeshQuad(mesh.nodes.T, mesh.elements.T)
 
 
-def test_assembly_equals_scikit_fem(mesh: Mesh) -> None:
+def test_assembly_equals_scikit_fem(mesh):
     theirs, element = in_scikit_fem(mesh), ElementVector(ElementQuad1())
     basis = Basis(theirs, element, intorder=2)
     centre = Basis(theirs, element, quadrature=(np.full((2, 1), 0.5), np.ones(1)))
@@ -105,7 +105,7 @@ def test_assembly_equals_scikit_fem(mesh: Mesh) -> None:
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.4999])
-def test_patch_test(mesh: Mesh, nu: float) -> None:
+def test_patch_test(mesh, nu):
     """A linear displacement has a uniform stress: forces only at the boundary, each the stress on
     half of both its sides."""
     gradient = np.array([[0.3, -0.7], [1.1, 0.4]])
@@ -124,7 +124,7 @@ def test_patch_test(mesh: Mesh, nu: float) -> None:
     )
 
 
-def test_only_rigid_motions_cost_no_energy(mesh: Mesh) -> None:
+def test_only_rigid_motions_cost_no_energy(mesh):
     lame_lambda, lame_mu = lame_moduli(1.0, 0.49)
     K = mesh.assemble(
         lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True
@@ -138,7 +138,7 @@ def test_only_rigid_motions_cost_no_energy(mesh: Mesh) -> None:
 # ----------------------------------------------------------------------
 
 
-def test_face_and_base_are_where_they_should_be(mesh: Mesh) -> None:
+def test_face_and_base_are_where_they_should_be(mesh):
     face = mesh.nodes[mesh.face]
     assert np.all(np.diff(face[:, 0]) > 0)  # from left to right
     assert not mesh.bonded[mesh.free].any()
@@ -156,7 +156,7 @@ def test_face_and_base_are_where_they_should_be(mesh: Mesh) -> None:
     assert np.all(low <= mesh.nodes.min(0)) and np.all(mesh.nodes.max(0) <= high)  # noqa: PT018
 
 
-def test_a_curved_block_has_an_arc() -> None:
+def test_a_curved_block_has_an_arc():
     for radius, middle, ends in ((40e-3, 6e-3, None), (-40e-3, 6e-3, None), (np.inf, 6e-3, 6e-3)):
         mesh = CurvedPadMesh(30e-3, 6e-3, 10, 2, radius=radius)
         face = mesh.nodes[mesh.face]
@@ -170,7 +170,7 @@ def test_a_curved_block_has_an_arc() -> None:
             assert face[:, 1] == pytest.approx(np.full(11, ends), abs=1e-15)
 
 
-def test_bonded_edges_have_names() -> None:
+def test_bonded_edges_have_names():
     for edges in (("base",), ("left", "right"), ("base", "left", "right"), ("right",)):
         mesh = CurvedPadMesh(30e-3, 6e-3, 10, 2, bonded_edges=edges)
         x, y = mesh.nodes.T
@@ -178,7 +178,7 @@ def test_bonded_edges_have_names() -> None:
         assert np.array_equal(mesh.bonded, np.any([where[name] for name in edges], axis=0))
 
 
-def test_a_flat_curved_block_is_the_block() -> None:
+def test_a_flat_curved_block_is_the_block():
     plain, curved = PadMesh(30e-3, 6e-3, 10, 2), CurvedPadMesh(30e-3, 6e-3, 10, 2)
     assert np.allclose(plain.nodes, curved.nodes, rtol=0, atol=1e-18)
     pads = [Pad(mesh, rubber()).compliance().detach() for mesh in (plain, curved)]
@@ -187,7 +187,7 @@ def test_a_flat_curved_block_is_the_block() -> None:
     assert np.array_equal(enclosed.bonded, PadMesh(30e-3, 6e-3, 10, 2, bonded_sides=True).bonded)
 
 
-def test_a_fingertip_is_half_a_disc() -> None:
+def test_a_fingertip_is_half_a_disc():
     areas = []
     for around in (8, 16, 32, 64):
         mesh = FingertipMesh(RADIUS, around)
@@ -210,7 +210,7 @@ def test_a_fingertip_is_half_a_disc() -> None:
     assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(np.full(3, 2.0), abs=0.02)
 
 
-def test_refining_divides_every_quadrilateral() -> None:
+def test_refining_divides_every_quadrilateral():
     coarse = trapezium()
     for finer in (2, 3):
         fine = coarse.refined(finer)
@@ -226,7 +226,7 @@ def test_refining_divides_every_quadrilateral() -> None:
     )
 
 
-def test_equal_descriptions_are_one_mesh() -> None:
+def test_equal_descriptions_are_one_mesh():
     for make in MESHES.values():
         assert make() == make()
         assert hash(make()) == hash(make())
@@ -235,17 +235,33 @@ def test_equal_descriptions_are_one_mesh() -> None:
 # --- how they give way
 # ----------------------------------------------------------------------
 
+LENGTH, HEIGHT = 0.04, 4.59e-3
+
+
+def bump(middle: float, width: float) -> Callable[[Array], Array]:
+    """A smooth pressure [Pa]."""
+    return lambda x: np.exp(-(((x - middle) / width) ** 2))
+
+
+ON_LAYER, ON_TIP = bump(LENGTH / 2, 3e-3), bump(1.1 * RADIUS, 0.3 * RADIUS)
+"""About as wide as the contact of the full grasp and far from the layer's ends; beside the middle
+of a fingertip."""
+
 
 @cache
-def fine_work(nu: float) -> float:
-    """Work of a smooth pressure downwards on a fingertip with E = 1 and unit depth: scikit-fem,
-    quadratic elements."""
-    mesh = FingertipMesh(RADIUS, 96)
-    theirs = in_scikit_fem(mesh).with_boundaries(
-        {"face": lambda x: (x[0] - RADIUS) ** 2 + x[1] ** 2 > (0.999 * RADIUS) ** 2}
+def work(mesh: Mesh, nu: float, pressure: Callable[[Array], Array], order: int) -> float:
+    """Work of a pressure downwards on the face with E = 1 and unit depth: scikit-fem, with full
+    integration of bilinear (order 1) or biquadratic (order 2) elements."""
+    sides = np.sort(np.stack((mesh.face[:-1], mesh.face[1:])), 0)
+    theirs, element = (
+        in_scikit_fem(mesh),
+        ElementVector(ElementQuad1() if order == 1 else ElementQuad2()),
     )
-    basis = Basis(theirs, ElementVector(ElementQuad2()))
-    facets = FacetBasis(theirs, ElementVector(ElementQuad2()), facets="face", intorder=8)
+    face = [k for k, side in enumerate(theirs.facets.T) if (side == sides.T).all(1).any()]
+    basis, facets = (
+        Basis(theirs, element),
+        FacetBasis(theirs, element, facets=np.array(face), intorder=10),
+    )
     lame_lambda, lame_mu = lame_moduli(1.0, nu)
     K = lame_lambda * dilatation.assemble(basis) + lame_mu * shear.assemble(basis)
     f = LinearForm(lambda v, w: -pressure(w.x[0]) * v[1]).assemble(facets)
@@ -253,25 +269,51 @@ def fine_work(nu: float) -> float:
     return float(f @ solve(*condense(K, f, D=held)))
 
 
-def pressure(x: Array) -> Array:
-    return np.exp(-(((x - 1.1 * RADIUS) / (0.3 * RADIUS)) ** 2))
+def pad_work(mesh: Mesh, nu: float, pressure: Callable[[Array], Array]) -> float:
+    """The same by the massless pad, the pressure lumped to its nodes as contact forces are."""
+    pad = Pad(mesh, KelvinVoigt(1.0, nu, 1.0, 1.0, depth=1.0))
+    f = np.zeros((pad.nodes, 2))
+    f[:, 1] = -pressure(pad.positions[:, 0].numpy()) * pad.mesh.tributary
+    return float(f.ravel() @ pad.compliance().detach().numpy() @ f.ravel())
 
 
-@pytest.mark.parametrize(("nu", "bound"), [(0.3, 2e-3), (0.49, 6e-3)])
-def test_a_fingertip_gives_way_as_in_scikit_fem(nu: float, bound: float) -> None:
-    errors = []
-    for around in (16, 32, 64):
-        pad = Pad(FingertipMesh(RADIUS, around), KelvinVoigt(1.0, nu, 1.0, 1.0, depth=1.0))
-        f = np.zeros((pad.nodes, 2))
-        f[:, 1] = -pressure(pad.positions[:, 0].numpy()) * pad.mesh.tributary
-        work = f.ravel() @ pad.compliance().detach().numpy() @ f.ravel()
-        errors.append(abs(work / fine_work(nu) - 1))
+def layer(fineness: int) -> PadMesh:
+    return PadMesh(LENGTH, HEIGHT, 10 * fineness, fineness)
+
+
+# full integration misses at least this share of the work on 1 mm elements; measured 17 and 93 %
+@pytest.mark.parametrize(("nu", "lost"), [(0.49, 0.15), (0.4999, 0.9)])
+def test_a_nearly_incompressible_layer_does_not_lock(nu, lost):
+    reference = work(layer(16), nu, ON_LAYER, 2)  # itself good to 1e-3 at nu = 0.4999
+    assert abs(pad_work(layer(4), nu, ON_LAYER) / reference - 1) < 0.02  # measured 1.4 and 1.5 %
+    assert work(layer(4), nu, ON_LAYER, 1) / reference - 1 < -lost
+
+
+@pytest.mark.parametrize(
+    ("make", "pressure", "nu", "bound"),
+    [
+        (layer, ON_LAYER, 0.3, 1e-3), (layer, ON_LAYER, 0.45, 1e-3), (layer, ON_LAYER, 0.49, 1e-3),
+        (lambda k: FingertipMesh(RADIUS, 4 * k), ON_TIP, 0.3, 2e-3),
+        (lambda k: FingertipMesh(RADIUS, 4 * k), ON_TIP, 0.49, 6e-3),
+    ],
+)  # fmt: skip
+def test_work_converges_with_the_square_of_the_spacing(make, pressure, nu, bound):
+    reference = work(make(24 if pressure is ON_TIP else 20), nu, pressure, 2)
+    errors = np.array([abs(pad_work(make(k), nu, pressure) / reference - 1) for k in (4, 8, 16)])
+    order = np.log2(errors[:-1] / errors[1:])
+    low, high = (1.7, np.inf) if pressure is ON_TIP else (1.9, 2.2)
+    assert np.all((low < order) & (order < high))
     assert errors[-1] < bound
-    assert np.all(np.log2(np.array(errors[:-1]) / errors[1:]) > 1.7)
 
 
-# --- runs
-# ----------------------------------------------------------------------
+def test_banded_storage_holds_the_whole_matrix():
+    mesh = PadMesh(0.02, 4e-3, 7, 3, bonded_sides=True)
+    lame_lambda, lame_mu = lame_moduli(1.0, 0.4)
+    K = mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1])
+    ab = banded(K)
+    n = ab.shape[1]
+    lower = sum(np.diag(ab[k, : n - k], -k) for k in range(len(ab)))
+    assert np.abs(lower + np.tril(lower, -1).T - K).max() < ROUNDING * np.abs(K).max()
 
 
 # --- files
@@ -340,7 +382,7 @@ $EndElements
 """
 
 
-def test_a_mesh_from_a_file(tmp_path: Path) -> None:
+def test_a_mesh_from_a_file(tmp_path):
     tip = FingertipMesh(RADIUS, 8)
     mesh = QuadMesh.read(
         written(tmp_path / "tip.msh", tip), unit="mm", face="skin", bonded=["bone"]
@@ -356,7 +398,7 @@ def test_a_mesh_from_a_file(tmp_path: Path) -> None:
     assert torch.allclose(C, expected, rtol=1e-8, atol=1e-10 * float(expected.abs().max()))
 
 
-def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_no_meshes_are_refused(tmp_path):
     file = tmp_path / "tip.msh"
     tip = FingertipMesh(RADIUS, 8)
     with pytest.raises(FileNotFoundError):

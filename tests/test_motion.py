@@ -9,13 +9,13 @@ from scipy.interpolate import CubicSpline
 from torch.autograd import gradcheck
 
 from torchsoft import Profile, Reference, Sampled, hold
-from torchsoft.physics.motion import Lines, Piecewise, Retimed, Waves, wave
+from torchsoft.physics.motion import Lines, Retimed, Waves, wave
 
 TIMES = [0.0, 0.4, 1.0, 1.5]
 VALUES = [0.06, 0.04, 0.05, 0.01]
 
 
-def test_profile_is_the_papers_seventh_order_polynomial() -> None:
+def test_profile_is_the_papers_seventh_order_polynomial():
     """Ends where it should, at rest with zero acceleration and jerk; peak speed 4.375 mm/s for 20
     mm in 10 s."""
     profile = Profile([0.0, 10.0], [0.06, 0.04])
@@ -35,20 +35,20 @@ def test_profile_is_the_papers_seventh_order_polynomial() -> None:
     assert float(slope) == pytest.approx(float(rate[123]), rel=1e-12)
 
 
-def test_profile_goes_through_its_knots_and_stays_outside_them() -> None:
+def test_profile_goes_through_its_knots_and_stays_outside_them():
     profile = Profile(TIMES, VALUES)
     value, rate = profile(f64(-1.0, *TIMES, 9.0))
     assert value.tolist() == pytest.approx([VALUES[0], *VALUES, VALUES[-1]], abs=1e-16)
     assert torch.equal(rate, torch.zeros_like(rate))
 
 
-def test_lines_interpolate() -> None:
+def test_lines_interpolate():
     signal, t = Lines(TIMES, VALUES), torch.linspace(-0.5, 2.0, 301, dtype=torch.float64)
     np.testing.assert_allclose(signal(t)[0], np.interp(t, TIMES, VALUES), rtol=0, atol=1e-16)
 
 
 @pytest.mark.parametrize("knots", [2, 3, 4])
-def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots: int) -> None:
+def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots):
     signal, spline = (
         Sampled(TIMES[:knots], VALUES[:knots]),
         CubicSpline(TIMES[:knots], VALUES[:knots]),
@@ -62,7 +62,7 @@ def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots: int) -> None:
     assert torch.equal(rate, torch.zeros_like(rate))
 
 
-def test_sampled_stays_the_spline_when_its_knots_are_changed() -> None:
+def test_sampled_stays_the_spline_when_its_knots_are_changed():
     """In place, and by a gradient: that of what is computed by finite differences of the values and
     of the times."""
     signal = Sampled([0.0, 0.1, 0.2, 0.3, 0.4], [1.0, 1.0, 1.0, 1.0, 1.0])
@@ -79,7 +79,7 @@ def test_sampled_stays_the_spline_when_its_knots_are_changed() -> None:
         assert gradcheck(lambda *knots: torch.stack(Sampled(*knots)(f64(0.1, 0.3))), knots)
 
 
-def test_sampled_with_rates_is_hermites_cubic() -> None:
+def test_sampled_with_rates_is_hermites_cubic():
     """x^3 from its values and rates, exactly."""
     knots = f64(0.0, 0.5, 2.0)
     signal = Sampled(knots.tolist(), (knots**3).tolist(), (3 * knots**2).tolist())
@@ -92,14 +92,14 @@ def test_sampled_with_rates_is_hermites_cubic() -> None:
 @pytest.mark.parametrize(
     "signal", [Profile([0.3], [0.05]), Sampled([0.3], [0.05])], ids=["profile", "sampled"]
 )
-def test_one_knot_is_a_constant(signal: Profile) -> None:
+def test_one_knot_is_a_constant(signal):
     value, rate = signal(f64(0.0, 0.3, 1.0))
     assert value.tolist() == [0.05] * 3
     assert rate.tolist() == [0.0] * 3
 
 
 @pytest.mark.parametrize("kind", [Profile, Sampled, Lines])
-def test_signals_by_gradcheck(kind: type[Profile]) -> None:
+def test_signals_by_gradcheck(kind):
     """By the values of the knots, and by time where the signal is smooth."""
     signal = kind([0.0, 0.4, 1.0], [0.06, 0.04, 0.05])
     signal.values.requires_grad_(True)
@@ -111,7 +111,7 @@ def test_signals_by_gradcheck(kind: type[Profile]) -> None:
     assert torch.allclose(slope, signal(inside)[1], rtol=1e-12)
 
 
-def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it() -> None:
+def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it():
     """One knot among numbers, and all knots at once; a plain number is a parameter that is not
     trained."""
     x = f64(0.04)[0].requires_grad_()
@@ -128,7 +128,7 @@ def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it() -> None:
     assert not list(Profile([0.0, 1.0], knots**2).parameters())
 
 
-def test_reference_gives_named_signals_side_by_side() -> None:
+def test_reference_gives_named_signals_side_by_side():
     reference = Reference(x=Profile([0.0, 1.0], [0.0, 1.0]), y=Profile([0.0], [7.0]))
     t = torch.linspace(0, 1, 5, dtype=torch.float64)
     got = reference(t, ("y", "x", "y"))
@@ -149,7 +149,7 @@ def test_reference_gives_named_signals_side_by_side() -> None:
     ],
     ids=["profile", "waves", "sampled", "constant"],
 )
-def test_a_signal_at_other_times(signal: Piecewise) -> None:
+def test_a_signal_at_other_times(signal):
     """All of it moves: knots, waves and their window, given rates."""
     rate, shift = 1.02, -0.03
     moved = Retimed(signal, rate, shift)

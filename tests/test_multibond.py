@@ -8,7 +8,7 @@ from conftest import coarse, random_state
 from torchsoft.physics.multibond import net_efforts, to_dot, topology
 
 
-def test_the_moment_arm_is_the_points_and_not_the_radius() -> None:
+def test_the_moment_arm_is_the_points_and_not_the_radius():
     """The paper's Eq. 5-6 give |d|, not R, in v_T: with R on the flow side alone, power is lost at
     penetrated nodes."""
     model = coarse()
@@ -23,7 +23,7 @@ def test_the_moment_arm_is_the_points_and_not_the_radius() -> None:
 
 
 @torch.no_grad()
-def test_bracket_moment_is_the_bonded_nodes_sum() -> None:
+def test_bracket_moment_is_the_bonded_nodes_sum():
     """Eq. 35: the moment at the constrained rotation is the sum over bonded nodes of r x F, plus
     that of the displacements with the forces on the nodes that move, which linear elasticity leaves
     out."""
@@ -52,7 +52,7 @@ def test_bracket_moment_is_the_bonded_nodes_sum() -> None:
     assert cross(r, F) + cross(u, port.effort) == pytest.approx(moment, rel=1e-9)
 
 
-def test_topology_names_the_rigs_elements() -> None:
+def test_topology_names_the_rigs_elements():
     model = coarse()
     graph = topology(
         model.evaluate(0.0, model.unpack(random_state(model, 0))).ports, model.junctions
@@ -75,7 +75,7 @@ def test_topology_names_the_rigs_elements() -> None:
     assert "style=dashed" in to_dot(graph)
 
 
-def test_sensing_the_bracket_makes_the_horizontal_loop_collocated() -> None:
+def test_sensing_the_bracket_makes_the_horizontal_loop_collocated():
     model = coarse(control__senses="bracket")
     graph = topology(
         model.evaluate(0.0, model.unpack(random_state(model, 0))).ports, model.junctions

@@ -27,7 +27,7 @@ Place = tuple[str, bool]
 
 
 @pytest.fixture(params=["lower", "upper", "enclosed"])
-def place(request: pytest.FixtureRequest) -> Place:
+def place(request):
     """Which pad ("L" or "U"), and whether the bracket holds the upper one's sides."""
     return ("L" if request.param == "lower" else "U"), request.param == "enclosed"
 
@@ -54,7 +54,7 @@ def pad_at(
 # ----------------------------------------------------------------------
 
 
-def test_lumped_masses_are_those_of_the_free_share_of_the_pad(place: Place) -> None:
+def test_lumped_masses_are_those_of_the_free_share_of_the_pad(place):
     pad, p = pad_at(place, inertial=True)
     masses = pad.masses().detach()
     width = p.length * (
@@ -73,7 +73,7 @@ def test_lumped_masses_are_those_of_the_free_share_of_the_pad(place: Place) -> N
 # ----------------------------------------------------------------------
 
 
-def test_pads_stand_where_the_base_is(place: Place) -> None:
+def test_pads_stand_where_the_base_is(place):
     massless, p = pad_at(place, inertial=False)
     inertial, _ = pad_at(place, inertial=True)
     positions = massless.positions.numpy()
@@ -84,7 +84,7 @@ def test_pads_stand_where_the_base_is(place: Place) -> None:
     assert len(positions) == p.elements_x + (-1 if place[1] else 1)
 
 
-def test_condensed_compliance_is_the_surface_block_of_the_full_inverse(place: Place) -> None:
+def test_condensed_compliance_is_the_surface_block_of_the_full_inverse(place):
     massless, p = pad_at(place, inertial=False)
     inertial, _ = pad_at(place, inertial=True)
     nodes, K = world_stiffness(p, place[0])
@@ -104,7 +104,7 @@ def test_condensed_compliance_is_the_surface_block_of_the_full_inverse(place: Pl
     ).max() < SOLVED * scale * len(forces)
 
 
-def test_elastic_force_of_the_inertial_pad_is_the_assembled_stiffness(place: Place) -> None:
+def test_elastic_force_of_the_inertial_pad_is_the_assembled_stiffness(place):
     pad, p = pad_at(place, inertial=True)
     nodes, K = world_stiffness(p, place[0])
     dofs = matching(pad.positions, nodes)
@@ -128,7 +128,7 @@ def elastic_force(pad: Pad, u: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("points", [0, 1, 3])
-def test_contact_points_stand_for_the_whole_surface(place: Place, points: int) -> None:
+def test_contact_points_stand_for_the_whole_surface(place, points):
     """Lengths add up, shape functions to one; Gauss points integrate a cubic along the surface
     exactly from two on."""
     pad, p = pad_at(place, inertial=False, points=points)
@@ -155,7 +155,7 @@ def test_contact_points_stand_for_the_whole_surface(place: Place, points: int) -
 # ----------------------------------------------------------------------
 
 
-def test_compliance_follows_a_change_of_nu() -> None:
+def test_compliance_follows_a_change_of_nu():
     pad, _ = pad_at(("L", False), inertial=False)
     before = pad.compliance().detach().clone()
     with torch.no_grad():
@@ -166,7 +166,7 @@ def test_compliance_follows_a_change_of_nu() -> None:
     assert float((after - before).abs().max()) > 0.01 * float(before.abs().max())
 
 
-def test_compliance_is_symmetric_and_positive(place: Place) -> None:
+def test_compliance_is_symmetric_and_positive(place):
     C = pad_at(place, inertial=False)[0].compliance().detach()
     assert float((C - C.mT).abs().max()) < SOLVED * float(C.abs().max())
     assert float(torch.linalg.eigvalsh((C + C.mT) / 2).min()) > 0

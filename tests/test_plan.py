@@ -2,13 +2,13 @@
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hostile.damage import document
 from tqdm import tqdm
 
 from torchsoft import simulate
@@ -32,7 +32,7 @@ FILE = RigFile.from_toml(ROOT / "experiments" / "reorient.toml").override(
     outputs={"duration": 0.6},
 )  # fmt: skip
 BUILT = FILE.build()
-FREE: dict[str, Bounds | tuple[float, float]] = {
+FREE = {
     "left_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
     "right_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
     "right_x": Bounds(low=15e-3, high=25e-3, speed=0.1, after=0.2),
@@ -43,10 +43,12 @@ PLACE = {
     "y": Target(channel="y_object", value=0.0, tolerance=1e-4),
 }
 GOAL = {
-    "free": {name: one.model_dump() for name, one in FREE.items() if isinstance(one, Bounds)},
-    "targets": {k: one.model_dump() for k, one in ({"turn": TURN} | PLACE).items()},
+    "free": {k: one.model_dump(exclude_none=True) for k, one in FREE.items()},
+    "targets": {
+        k: one.model_dump(exclude_none=True) for k, one in ({"turn": TURN} | PLACE).items()
+    },
     "rtol": 1e-3,
-}  # fmt: skip
+}
 
 
 def planned(free: Free = FREE, **how: Any) -> Plan:
@@ -55,7 +57,7 @@ def planned(free: Free = FREE, **how: Any) -> Plan:
 
 
 @pytest.fixture(scope="module")
-def turned() -> Plan:
+def turned():
     return planned(targets={"turn": TURN} | PLACE)
 
 
@@ -63,7 +65,7 @@ def turned() -> Plan:
 # ----------------------------------------------------------------------
 
 
-def test_slopes_are_the_differences() -> None:
+def test_slopes_are_the_differences():
     """By knots, a gain and a coefficient of friction, of every draw."""
     free = FREE | {"actuators.left_y.Kp": (1e4, 1e5), "laws.dry.K_n": (5e4, 2e5)}
     variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
@@ -92,7 +94,7 @@ def test_slopes_are_the_differences() -> None:
 # ----------------------------------------------------------------------
 
 
-def test_the_target_is_reached_and_the_rig_carries_it_out(turned: Plan) -> None:
+def test_the_target_is_reached_and_the_rig_carries_it_out(turned):
     assert turned.reached
     assert turned.holds == 1.0
     again = simulate(turned.rig, BUILT.t, y0=BUILT.y0, rtol=1e-6)
@@ -102,7 +104,7 @@ def test_the_target_is_reached_and_the_rig_carries_it_out(turned: Plan) -> None:
     assert turned.made_by["looks"] >= len(turned.history)
 
 
-def test_a_limit_is_kept_at_a_price(turned: Plan) -> None:
+def test_a_limit_is_kept_at_a_price(turned):
     """Without the limit the grip falls below it; with it fingers close."""
     low = float(turned.trajectory["F_left_x"][30:].min()) + 1.0
     limits = {"grip": Limit(channel="F_left_x", low=low, since=0.5)}
@@ -113,7 +115,7 @@ def test_a_limit_is_kept_at_a_price(turned: Plan) -> None:
 
 
 @pytest.mark.slow
-def test_an_objective_is_lowered_within_targets() -> None:
+def test_an_objective_is_lowered_within_targets():
     """The least work of a finger that may choose its gain, by the worst of two draws."""
     objective = lambda run: run["F_left_y"].square().mean()
     over = {"laws.dry.K_n": torch.tensor([1e5, 1.1e5])}
@@ -126,13 +128,13 @@ def test_an_objective_is_lowered_within_targets() -> None:
     assert found.value <= found.history[0].value or found.history[0].missed > 0
 
 
-def test_adam_lowers_squared_errors() -> None:
+def test_adam_lowers_squared_errors():
     found = planned(targets={"turn": TURN}, method="adam", iterations=25, rate=0.02)
     assert abs(float(found.errors["turn"][0])) < 0.5 * 20.0  # from 20 tolerances
     assert found.history[-1].missed < found.history[0].missed
 
 
-def test_several_starts_begin_with_the_best() -> None:
+def test_several_starts_begin_with_the_best():
     free = {"left_y": Bounds(low=-6e-3, high=6e-3, speed=0.3, after=0.2)}
     found = planned(free, targets={"turn": TURN}, starts=4, iterations=1)
     assert min(one.missed for one in found.history) < found.history[0].missed
@@ -140,7 +142,7 @@ def test_several_starts_begin_with_the_best() -> None:
         planned({"actuators.left_y.Kp": (0.0, math.inf)}, targets={"turn": TURN}, starts=3)
 
 
-def test_the_best_of_several_starts_has_its_slopes() -> None:
+def test_the_best_of_several_starts_has_its_slopes():
     """Looks without gradient only choose among the starts."""
     free = {"left_y": Bounds(low=-6e-3, high=6e-3, speed=0.3, after=0.2)}
     variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
@@ -151,7 +153,7 @@ def test_the_best_of_several_starts_has_its_slopes() -> None:
     assert np.abs(search.look(search.found.z).slopes[1]).min() > 0
 
 
-def test_a_plan_whose_finer_run_fails_is_not_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_whose_finer_run_fails_is_not_reached(monkeypatch):
     """Nor does the search lose it where a finer one cannot begin."""
     look = Evaluator.look
 
@@ -168,7 +170,7 @@ def test_a_plan_whose_finer_run_fails_is_not_reached(monkeypatch: pytest.MonkeyP
     assert any(text.startswith("by rtol = 1e-05 a run fails") for text in found.notices)
 
 
-def test_what_cannot_be_reached_says_why() -> None:
+def test_what_cannot_be_reached_says_why():
     """A turn by 170 degrees ends where the body leaves a pad; what was found until then is kept."""
     far = TURN.model_copy(update={"value": math.radians(170)})
     found = planned(targets={"turn": far} | PLACE, iterations=10, seconds=20)
@@ -179,8 +181,8 @@ def test_what_cannot_be_reached_says_why() -> None:
 
 
 def test_a_run_that_fails_is_worse_and_an_interrupt_keeps_the_best(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     look, count = Evaluator.look, 0
 
     def failing(self: Evaluator, z: Any, rtol: float | None = None, **how: Any) -> Any:
@@ -200,7 +202,7 @@ def test_a_run_that_fails_is_worse_and_an_interrupt_keeps_the_best(
     assert found.history[-1].missed < found.history[0].missed
 
 
-def test_seconds_end_a_search() -> None:
+def test_seconds_end_a_search():
     found = planned(targets={"turn": TURN} | PLACE, seconds=1e-9)
     assert any("as was asked for" in notice for notice in found.notices)
     assert len(found.history) == 1
@@ -238,12 +240,12 @@ def test_seconds_end_a_search() -> None:
         (lambda: Target(channel="x", value=math.nan, tolerance=1.0), "value"),
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_is_refused(how: Callable[[], Any], message: str) -> None:
+def test_what_makes_no_sense_is_refused(how, message):
     with pytest.raises(ValueError, match=message):
         how()
 
 
-def test_a_start_that_cannot_be_run_is_refused() -> None:
+def test_a_start_that_cannot_be_run_is_refused():
     """A body that nothing holds."""
     slippery = FILE.override(
         laws={"dry": {"friction": {"kind": "smooth", "mu_s": 0.02, "mu_k": 0.02, "v_s": 0.05}}}
@@ -262,24 +264,11 @@ def test_a_start_that_cannot_be_run_is_refused() -> None:
 # ----------------------------------------------------------------------
 
 
-def as_toml(goal: dict[str, Any]) -> str:
-    lines = [f"{name} = {value}" for name, value in goal.items() if not isinstance(value, dict)]
-    for field, tables in goal.items():
-        for name, table in tables.items() if isinstance(tables, dict) else ():
-            lines.append(f'[{field}."{name}"]')
-            lines += [
-                f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None
-            ]
-    return "\n".join(lines) + "\n"
-
-
-def test_the_command_writes_a_rig_file_that_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     from torchsoft.rigs.written import to_toml
 
     (tmp_path / "rig.toml").write_text(to_toml(FILE), encoding="utf-8")
-    (tmp_path / "goal.toml").write_text(as_toml(GOAL), encoding="utf-8")
+    (tmp_path / "goal.toml").write_text(document(GOAL), encoding="utf-8")
     files = [str(tmp_path / name) for name in ("rig.toml", "goal.toml")]
     assert main(["plan", *files, "--out", str(tmp_path / "out"), "--no-progress"]) == 0
     assert "Plan: reached" in capsys.readouterr().out
@@ -289,12 +278,12 @@ def test_the_command_writes_a_rig_file_that_runs(
     said = json.loads((tmp_path / "out" / "plan.json").read_text())
     assert said["reached"]
     assert said["made_by"]["rtol"] == 1e-3
-    (tmp_path / "goal.toml").write_text(as_toml(GOAL | {"drws": 3}), encoding="utf-8")
+    (tmp_path / "goal.toml").write_text(document(GOAL | {"drws": 3}), encoding="utf-8")
     assert main(["plan", *files, "--out", str(tmp_path / "out"), "--force"]) == 2
     assert "drws" in capsys.readouterr().err
 
 
-def test_draws_of_a_goal_begin_with_the_stated_numbers() -> None:
+def test_draws_of_a_goal_begin_with_the_stated_numbers():
     name = "materials.silicone.E"
     goal = Goal.model_validate(GOAL | {"uncertain": {name: {"low": 4e5, "high": 6e5}}})
     over, y0 = drawn(FILE, goal, 3, seed=0)
@@ -305,7 +294,7 @@ def test_draws_of_a_goal_begin_with_the_stated_numbers() -> None:
     assert not torch.equal(y0[0], y0[1])
 
 
-def test_draws_of_an_identification_begin_with_its_estimates() -> None:
+def test_draws_of_an_identification_begin_with_its_estimates():
     name, other = "materials.silicone.E", "laws.dry.K_n"
     goal = Goal.model_validate(GOAL | {"uncertain": {name: {"low": 4e5, "high": 6e5}}})
     over, y0 = drawn(FILE, goal, 2, seed=0, known={other: [2e5, 1.9e5, 2.1e5]})
@@ -318,7 +307,7 @@ def test_draws_of_an_identification_begin_with_its_estimates() -> None:
         plan_file(FILE, goal, {"contact.K_n": [1e5, 1e5]})
 
 
-def test_the_search_scales_an_objective() -> None:
+def test_the_search_scales_an_objective():
     """A plan does not depend on the unit of its objective."""
     ends = []
     for unit in (1.0, 1e3):

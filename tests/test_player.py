@@ -2,18 +2,16 @@
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from browser import MISSING, Page, browser
+from browser import MISSING, browser
 from conftest import coarse
 from PIL import Image
 
-from torchsoft import Trajectory, simulate
+from torchsoft import simulate
 from torchsoft.plot.player import charts, frame_rows, packed, player
 from torchsoft.scenario import grasp_and_roll
 
@@ -28,14 +26,14 @@ return [r.x + q[0], r.y + q[1]]"""
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
+def run():
     model = coarse()
     start = grasp_and_roll(model, grasp_force=80.0)
     return simulate(model, torch.linspace(0, 0.5, 51, dtype=torch.float64), y0=start.y0)
 
 
 @pytest.fixture(scope="module")
-def page(run: Trajectory, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def page(run, tmp_path_factory):
     if MISSING:
         pytest.skip(MISSING)
     path = tmp_path_factory.mktemp("player") / "run.html"
@@ -45,7 +43,7 @@ def page(run: Trajectory, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         yield page
 
 
-def test_the_file_holds_everything(run: Trajectory, tmp_path: Path) -> None:
+def test_the_file_holds_everything(run, tmp_path):
     """And asks for nothing: no address, no module, no other file."""
     run.animate(tmp_path / "run.html", frames=20, title="</script><script>alert(1)</script>")
     text = (tmp_path / "run.html").read_text(encoding="utf-8")
@@ -59,7 +57,7 @@ def test_the_file_holds_everything(run: Trajectory, tmp_path: Path) -> None:
         player(run, tmp_path / "run.html", frames=1)
 
 
-def test_frames_are_denser_where_steps_are_short(run: Trajectory) -> None:
+def test_frames_are_denser_where_steps_are_short(run):
     rows = frame_rows(run, 20)
     assert (rows[0], rows[-1]) == (0, 50)
     assert np.all(np.diff(rows) > 0)
@@ -68,7 +66,7 @@ def test_frames_are_denser_where_steps_are_short(run: Trajectory) -> None:
     assert (t < middle).sum() / middle > (t >= middle).sum() / (0.5 - middle)
 
 
-def test_the_page_opens_without_errors_and_without_a_network(page: Page) -> None:
+def test_the_page_opens_without_errors_and_without_a_network(page):
     assert page.run("return document.title") == "A grasp & </script> more"
     assert [one for one in page.log("browser") if one["level"] == "SEVERE"] == []
     asked = [json.loads(one["message"])["message"] for one in page.log("performance")]
@@ -79,7 +77,7 @@ def test_the_page_opens_without_errors_and_without_a_network(page: Page) -> None
     assert all(url.startswith(("file:", "data:")) for url in urls), urls
 
 
-def test_charts_follow_the_slider(page: Page, run: Trajectory) -> None:
+def test_charts_follow_the_slider(page, run):
     choose = """const s = document.querySelector('.chart select');
     s.value = [...s.options].findIndex(o => o.textContent.startsWith(arguments[0]));
     s.dispatchEvent(new Event('change'))"""
@@ -94,21 +92,21 @@ def test_charts_follow_the_slider(page: Page, run: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("values", [[0.5, 0.5], [3e-12, 100.0, -2.0], [0.0, 5e-11]])
-def test_what_a_file_does_not_resolve_is_nothing(page: Page, values: list[float]) -> None:
+def test_what_a_file_does_not_resolve_is_nothing(page, values):
     step = np.ptp(values) / 65535
     unpacked = page.run("return [...unpack(arguments[0])]", packed(np.array(values)))
     assert unpacked == pytest.approx([x if abs(x) > step else 0.0 for x in values], abs=step)
     assert (0.0 in unpacked) == (min(map(abs, values)) < step)
 
 
-def test_forces_of_nothing_are_none(run: Trajectory) -> None:
+def test_forces_of_nothing_are_none(run):
     still = replace(run, force={k: x * torch.tensor([1.0, 1e-13]) for k, x in run.force.items()})
     series = {one["name"]: one["series"] for one in charts(still)[1:]}
     assert all(one["values"]["step"] == one["values"]["low"] == 0 for one in series["friction"])
     assert all(one["values"]["step"] > 0 for one in series["normal force"])
 
 
-def test_a_point_tells_its_forces(page: Page, run: Trajectory) -> None:
+def test_a_point_tells_its_forces(page, run):
     page.run(SLIDE, 29)
     point = int(run.force["L"][-1, :, 0].argmax())
     x, y = page.run(SPOT, "L", point)
@@ -122,7 +120,7 @@ def test_a_point_tells_its_forces(page: Page, run: Trajectory) -> None:
     assert float(said["cone"]) == pytest.approx(0.8 * normal, rel=1e-3)
 
 
-def test_an_element_tells_its_stress(page: Page, run: Trajectory) -> None:
+def test_an_element_tells_its_stress(page, run):
     page.run(SLIDE, 29)
     middle = """const p = data.pads.L, c = [0, 0], e = arguments[0];
     for (let k = 0; k < 4; k++) { const o = 2 * (frame * p.count + p.elements[4 * e + k]);
@@ -144,7 +142,7 @@ def test_an_element_tells_its_stress(page: Page, run: Trajectory) -> None:
     page.run("document.getElementById('fit').click()")
 
 
-def test_it_plays_zooms_and_switches(page: Page, tmp_path: Path) -> None:
+def test_it_plays_zooms_and_switches(page, tmp_path):
     page.run(SLIDE, 0)
     before = page.run("return view.k")
     turn = {"type": "scroll", "x": 300, "y": 300, "deltaX": 0, "deltaY": -240, "origin": "viewport"}

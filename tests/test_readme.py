@@ -76,7 +76,7 @@ def name(page: Path) -> str:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """A folder with what the repository has, where results do no harm."""
     for one in ("rigs", "examples", "data_gen", "experiments"):
         (tmp_path / one).symlink_to(ROOT / one)
@@ -85,7 +85,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("page", having(lambda p: code(p) and DATASET not in str(p)), ids=name)
-def test_python_runs(page: Path, folder: Path) -> None:
+def test_python_runs(page, folder):
     if "IPython" in code(page):
         pytest.importorskip("IPython")
     names: dict[str, object] = {}
@@ -97,7 +97,7 @@ def test_python_runs(page: Path, folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", having(commands), ids=name)
-def test_commands_run(page: Path, folder: Path) -> None:
+def test_commands_run(page, folder):
     rows = "".join(f"{t / 10},2,{10 + 5 * 0.8**t + 0.1 * (t % 3)}\n" for t in range(60))
     (folder / "relaxation.csv").write_text(f"t [s],strain [%],stress [kPa]\n{rows}")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -115,12 +115,12 @@ def test_commands_run(page: Path, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("page", having(lambda p: blocks(p, "toml")), ids=name)
-def test_toml_is_toml(page: Path) -> None:
+def test_toml_is_toml(page):
     for block in blocks(page, "toml"):
         assert tomllib.loads(block)
 
 
-def test_every_block_is_tried() -> None:
+def test_every_block_is_tried():
     """No other kind of block than those, and no command that only looks like one."""
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
@@ -142,16 +142,16 @@ def test_every_block_is_tried() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         assert target.startswith("http") or (page.parent / target).exists(), target
 
 
-def test_the_readme_is_short() -> None:
+def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= LONGEST
 
 
-def test_messages_are_said() -> None:
+def test_messages_are_said():
     """Every message that the documentation explains is a part of one in the sources."""
     sources = "".join(
         re.sub(r'"\s*\n\s*f?"', "", path.read_text(encoding="utf-8"))
@@ -164,7 +164,7 @@ def test_messages_are_said() -> None:
     assert not [part for part in quoted if part not in sources]
 
 
-def test_the_api_is_documented() -> None:
+def test_the_api_is_documented():
     """Public names of the package, and of its namespaces for users, stand on a page of the API."""
     import torchsoft
     from torchsoft import datasets, envs, plan, reduced, rigs, sysid
@@ -190,7 +190,7 @@ def test_the_api_is_documented() -> None:
 
 
 @pytest.mark.slow
-def test_pages_are_built_without_a_warning(tmp_path: Path) -> None:
+def test_pages_are_built_without_a_warning(tmp_path):
     """Chapters and gallery unexecuted: references, docstrings, tables of contents."""
     pytest.importorskip("sphinx")
     asked = ["-q", "-W", "--keep-going", "-D", "plot_gallery=0", "-D", "nb_execution_mode=off"]

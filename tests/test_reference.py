@@ -3,7 +3,6 @@ their gradients."""
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -49,7 +48,7 @@ def series(run: Trajectory) -> dict[str, Tensor]:
 
 
 @pytest.fixture(scope="module")
-def manipulation() -> tuple[SoftGrasp, Trajectory]:
+def manipulation():
     """The 30 s with the gradient behind them, pads' initial displacements held."""
     made = grasp_and_roll(SoftGrasp(), grasp_force=REFERENCE["manipulation"]["grasp_force"])
     t = torch.linspace(0, 30, 3001, dtype=torch.float64)
@@ -57,7 +56,7 @@ def manipulation() -> tuple[SoftGrasp, Trajectory]:
     return made.model, simulate(made.model, t, y0=y0, step=2e-3, gradient="discrete")
 
 
-def test_the_manipulation_is_the_reference(manipulation: tuple[SoftGrasp, Trajectory]) -> None:
+def test_the_manipulation_is_the_reference(manipulation):
     """Poses, rates, efforts, sums of nodal forces, energies, dissipation and work at seven
     moments."""
     _, run = manipulation
@@ -76,8 +75,8 @@ def test_the_manipulation_is_the_reference(manipulation: tuple[SoftGrasp, Trajec
 
 
 def test_gradients_of_the_manipulation_are_the_references(
-    manipulation: tuple[SoftGrasp, Trajectory],
-) -> None:
+    manipulation,
+):
     model, run = manipulation
     reference = REFERENCE["gradient_of_theta_10s"]
     names = list(reference["by"])
@@ -91,7 +90,7 @@ def test_gradients_of_the_manipulation_are_the_references(
         ), name
 
 
-def test_light_shaking_is_the_reference() -> None:
+def test_light_shaking_is_the_reference():
     """Nodes touch, leave and slip all along; the angle's derivatives by one pass forward, with
     those of the start."""
     reference = REFERENCE["light_shaking"]
@@ -140,22 +139,29 @@ def test_light_shaking_is_the_reference() -> None:
         assert gradient == pytest.approx(reference["theta_end_by"][name], rel=RELATIVE), name
 
 
-@pytest.mark.parametrize(
-    ("case", "changes"), [
-        pytest.param("default", {}, marks=pytest.mark.slow), ("E = 60e3", {"pad.E": 60e3})
-    ],
-)  # fmt: skip
-def test_statics_and_loop_modes_are_the_references(case: str, changes: dict[str, Any]) -> None:
-    expected, model = REFERENCE["statics"][case], SoftGrasp(Parameters().override(changes))
-    with torch.no_grad():
-        y = press(model, model.settings.scenario.y_Br_grasp)
-        assert float(model.unpack(rest(model)).pose["disc"][1]) == pytest.approx(
-            expected["rest_y_C"], abs=1e-12
-        )
-        assert float(model.unpack(y).pose["disc"][1]) == pytest.approx(
-            expected["press_y_C"], abs=1e-12
-        )
+CASES = {"default": {}, "E = 60e3": {"pad.E": 60e3}}
+
+
+@pytest.fixture(params=CASES)
+def case(request):
+    """The model, and what the reference says of it."""
+    model = SoftGrasp(Parameters().override(CASES[request.param]))
+    return model, REFERENCE["statics"][request.param]
+
+
+@torch.no_grad()
+def test_statics_are_the_references(case):
+    model, expected = case
+    y = press(model, model.settings.scenario.y_Br_grasp)
+    for name, state in (("rest_y_C", rest(model)), ("press_y_C", y)):
+        height = float(model.unpack(state).pose["disc"][1])
+        assert height == pytest.approx(expected[name], abs=1e-12)
     assert holding_force(model, y) == pytest.approx(expected["holding_force"], rel=1e-9)
+
+
+@pytest.mark.slow
+def test_loop_modes_are_the_references(case):
+    model, expected = case
     modes = loop_modes(model)
     assert int((modes.abs() < NEUTRAL).sum()) == expected["neutral_modes"]
     creep = (modes + 1 / model.settings.pad.tau).abs() < 1e-3  # of nodes clear of the disc

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, f64, grasped, random_state, times
+from conftest import COARSE, RUBBER, coarse, f64, grasped, random_state, times
 from torch import Tensor, nn
 from torchdiffeq import odeint
 
@@ -70,7 +70,6 @@ def resting(**parts: Any) -> Tensor:
 # parts
 # ----------------------------------------------------------------------
 
-RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 ROUND = np.arange(24) * np.pi / 12
 CIRCLE = 20e-3 * np.stack((np.cos(ROUND), np.sin(ROUND)), -1)
 TRIANGLE = [[-12e-3, -9e-3], [19e-3, -9e-3], [-12e-3, 18e-3]]
@@ -428,13 +427,13 @@ PARTS: list[tuple[Call, str]] = [
 
 
 @pytest.mark.parametrize("row", range(len(PARTS)))
-def test_a_part_or_call_that_is_none_is_refused(row: int) -> None:
+def test_a_part_or_call_that_is_none_is_refused(row):
     call, sentence = PARTS[row]
     with pytest.raises(REFUSALS, match=sentence):
         call()
 
 
-def test_a_coupled_law_is_refused_after_its_pointwise_twin() -> None:
+def test_a_coupled_law_is_refused_after_its_pointwise_twin():
     """For one point both have the same expression, which is compiled already."""
     model = SoftGrasp(coarse().settings, friction=rated(lambda N: N, eta=9.0))
     simulate(model, T, y0=rest(model).detach())
@@ -442,7 +441,7 @@ def test_a_coupled_law_is_refused_after_its_pointwise_twin() -> None:
         slipping(rated(lambda N: N.sum().expand_as(N), eta=9.0))
 
 
-def test_what_only_looks_wrong_passes() -> None:
+def test_what_only_looks_wrong_passes():
     """Two squares that share a corner hang together."""
     corner = quads(
         quads=[QUADS[0], QUADS[3]], points=[*SQUARES, [5.0, 5.0]], face=[[5, 8]], bonded=[[0, 3]]
@@ -530,13 +529,13 @@ RUNS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.fixture(scope="module")
-def start() -> tuple[SoftGrasp, Tensor]:
+def start():
     model = coarse()
     return model, grasped(model)
 
 
 @pytest.mark.parametrize("row", range(len(RUNS)))
-def test_a_run_that_is_none_is_refused(row: int, start: tuple[SoftGrasp, Tensor]) -> None:
+def test_a_run_that_is_none_is_refused(row, start):
     changes, sentence = RUNS[row]
     with pytest.raises(ValueError, match=sentence):
         simulate(**{"rig": start[0], "t": T, "y0": start[1]} | changes)
@@ -585,7 +584,7 @@ SPOILT: list[tuple[Callable[[SoftGrasp], object], str]] = [
 
 
 @pytest.mark.parametrize("row", range(len(SPOILT)))
-def test_a_model_that_was_spoilt_is_refused(row: int, start: tuple[SoftGrasp, Tensor]) -> None:
+def test_a_model_that_was_spoilt_is_refused(row, start):
     spoil, sentence = SPOILT[row]
     model = coarse()
     model.reference = hold(x_d=0.06, y_d=0.0486, F_ff=-80.0)
@@ -598,7 +597,7 @@ def test_a_model_that_was_spoilt_is_refused(row: int, start: tuple[SoftGrasp, Te
             verb()
 
 
-def test_another_mode_or_device_of_torch_is_refused(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_another_mode_or_device_of_torch_is_refused(start):
     model, y0 = start
     with (
         torch.device("meta"),
@@ -626,22 +625,22 @@ class Dropping(nn.Module):
 
 
 def test_a_law_in_training_is_refused_after_it_ran_in_evaluation(
-    start: tuple[SoftGrasp, Tensor],
-) -> None:
+    start,
+):
     model = SoftGrasp(coarse().settings, friction=Dropping(), reference=start[0].reference)
     simulate(model.eval(), T, y0=start[1])
     with pytest.raises(TypeError, match="the random operation"):
         simulate(model.train(), T, y0=start[1])
 
 
-def test_a_slip_law_that_supplies_power_is_told_of() -> None:
+def test_a_slip_law_that_supplies_power_is_told_of():
     for right in (SmoothSlip(0.8, 0.7, 5e-3, 10.0), Coulomb(0.8, 0.7)):
         assert check_slip("c", right, 500.0) == ""
     for wrong in (lambda E, F_N, R: 1.5 * E / R, lambda E, F_N, R: E - F_N):
         assert "must be from 0 to the effort" in check_slip("c", wrong, 500.0)
 
 
-def test_compiled_rates_refuse_what_they_cannot_give(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_compiled_rates_refuse_what_they_cannot_give(start):
     """Inertial pads, and states at which there are no forces; they go on after that."""
     with pytest.raises(NotImplementedError, match="inertial pads"):
         Rates(coarse(pad__fidelity="inertial"))

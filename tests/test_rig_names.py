@@ -55,7 +55,7 @@ def values(rig: Rig) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("rig", [*(path.stem for path in RIGS), "controllers", "series"])
-def test_every_number_that_a_rig_is_made_with_has_its_name(rig: str) -> None:
+def test_every_number_that_a_rig_is_made_with_has_its_name(rig):
     """Each number of the file is changed in turn: what changes in the rig is called the same."""
     file = opened(rig)
     before, seen = values(file.assemble()), set[str]()
@@ -77,7 +77,7 @@ def test_every_number_that_a_rig_is_made_with_has_its_name(rig: str) -> None:
     assert len(seen) > 10
 
 
-def test_a_gain_is_differentiated_and_set_by_its_name() -> None:
+def test_a_gain_is_differentiated_and_set_by_its_name():
     name = "controllers.jaw.gain_2_4"
     rig, y0, _ = controlled().build()
     assert rig.parameter(name).item() == 400.0
@@ -96,14 +96,14 @@ def test_a_gain_is_differentiated_and_set_by_its_name() -> None:
     np.testing.assert_allclose(found, slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
 
 
-def test_gains_have_units_and_bounds() -> None:
+def test_gains_have_units_and_bounds():
     rig = controlled(pushes=["bracket.x", "bracket.y"]).assemble()
     for name, unit in (("gain_1_1", "N/m"), ("gain_2_3", "N.s/m")):
         assert (found := rig.quantity(f"controllers.jaw.{name}")) is not None
         assert (found.unit, found.low) == (unit, -1e12)
 
 
-def test_gains_are_unknowns() -> None:
+def test_gains_are_unknowns():
     rig, y0, t = controlled().build()
     at = t.numpy()
     one = Recording("one", rig, {"x_disc": (at, 0 * at)}, Known(y0))
@@ -117,7 +117,7 @@ def test_gains_are_unknowns() -> None:
     assert len(str(refused.value)) < 300
 
 
-def test_weights_of_a_network_are_tensors_by_name(tmp_path: Path) -> None:
+def test_weights_of_a_network_are_tensors_by_name(tmp_path):
     net = nn.Sequential(nn.Linear(8, 3), nn.Tanh(), nn.Linear(3, 2)).double()
     weights = {name: value.detach().numpy() for name, value in net.state_dict().items()}
     np.savez(tmp_path / "law.npz", **weights)
@@ -140,6 +140,6 @@ def test_weights_of_a_network_are_tensors_by_name(tmp_path: Path) -> None:
         ({"gains_1_1": 1.0}, "`gains_1_1` is not known here; did you mean `gain`"),
     ],
 )
-def test_an_entry_that_is_not_there_is_refused(settings: dict[str, float], words: str) -> None:
+def test_an_entry_that_is_not_there_is_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         controlled().override(controllers={"jaw": settings})

@@ -31,6 +31,10 @@ from torchsoft.solve.trajectory import load
 READY = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))
 
 
+ELSEWHERE = "fingertips", "two_fingers", "ellipse"
+"""Ready rigs whose parts other tests run."""
+
+
 def coarse(file: RigFile, **groups: dict[str, Any]) -> RigFile:
     """The rig on a mesh half as fine."""
     pads = {
@@ -40,6 +44,11 @@ def coarse(file: RigFile, **groups: dict[str, Any]) -> RigFile:
         for name, pad in file.pads.items()
     }
     return file.override(pads=pads).override(**groups)
+
+
+def ready_rig(name: str) -> RigFile:
+    """One of the ready rigs."""
+    return RigFile.from_toml(READY[0].with_name(f"{name}.toml"))
 
 
 def shorter(file: RigFile, duration: float) -> RigFile:
@@ -62,11 +71,11 @@ def changed(file: RigFile, **values: Any) -> RigFile:
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem == "fingertips"))
+        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in ELSEWHERE))
         for path in READY
     ],
 )
-def test_a_ready_rig_checks_clean_and_runs(path: Path) -> None:
+def test_a_ready_rig_checks_clean_and_runs(path):
     file = coarse(RigFile.from_toml(path))
     assert [str(one) for one in check(file) if one.severity != "note"] == []
     done = running.carry_out(shorter(file, 0.1))
@@ -77,7 +86,7 @@ def test_a_ready_rig_checks_clean_and_runs(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
-def test_a_ready_rig_runs_to_its_end(path: Path) -> None:
+def test_a_ready_rig_runs_to_its_end(path):
     file = RigFile.from_toml(path)
     assert [str(one) for one in check(file) if one.severity != "note"] == []
     done = running.carry_out(file)
@@ -85,12 +94,12 @@ def test_a_ready_rig_runs_to_its_end(path: Path) -> None:
     assert done.trajectory.energy_residual_rel < 1e-3
 
 
-def test_the_papers_rig_is_soft_grasp() -> None:
+def test_the_papers_rig_is_soft_grasp():
     """The same start to rounding, and from the same start the same bits."""
     model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
     manipulation = grasp_and_roll(model, grasp_force=80.0)
     top = float(model.unpack(manipulation.y0).pose["bracket"][1])
-    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    file = coarse(ready_rig("paper"))
     file = changed(file, bodies__bracket__start__y=top, motion__F_ff__values=(0.0, -80.0))
     ready = file.build()
     assert torch.allclose(ready.y0, manipulation.y0, rtol=0, atol=1e-11)
@@ -109,10 +118,10 @@ def test_the_papers_rig_is_soft_grasp() -> None:
         assert torch.equal(runs[0][own], runs[1][other])
 
 
-def test_a_drop_is_not_missed() -> None:
+def test_a_drop_is_not_missed():
     """Steps chosen by tolerance would be through the pad; the first touch is where free fall
     says."""
-    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
+    file = coarse(ready_rig("drop"))
     file = changed(shorter(file, 0.3), outputs__interval=1e-3)
     run = running.carry_out(file).trajectory
     y, force = run["y_ellipse"], run.force["ground"][..., 0].sum(-1)
@@ -133,11 +142,11 @@ STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "rad
 
 
 @pytest.mark.slow
-def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:
+def test_a_loop_is_unstable_as_the_papers_modes_say():
     """The leading mode is that of the paper's own equilibrium: the friction-free grasp."""
     changes = {"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3}
     leading = complex(loop_modes(SoftGrasp(Parameters().override(changes)))[0])
-    paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    paper = coarse(ready_rig("paper"))
     (found,) = check(changed(paper, materials__rubber__tau=1e-3))
     assert found.severity == "error"
     assert found.where == "actuators.x"
@@ -147,7 +156,7 @@ def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:
     assert float(words[2].rstrip("j")) == pytest.approx(abs(leading.imag), rel=0.05)
 
 
-def test_modes_are_those_of_the_whole_state() -> None:
+def test_modes_are_those_of_the_whole_state():
     """What is left out where nothing touches decides nothing."""
     model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
     y = press(model, model.settings.scenario.y_Br_grasp)
@@ -158,9 +167,9 @@ def test_modes_are_those_of_the_whole_state() -> None:
     assert float(whole.real.max()) == pytest.approx(float(some.real.max()), abs=0.05)
 
 
-def test_steps_are_held_against_the_modes() -> None:
+def test_steps_are_held_against_the_modes():
     """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
-    paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    paper = coarse(ready_rig("paper"))
     paper = changed(paper, materials__rubber__tau=2e-3)
     sentences = [
         [one.message for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)
@@ -170,9 +179,9 @@ def test_steps_are_held_against_the_modes() -> None:
     ] == [False, True]
 
 
-def test_a_body_that_flies_is_told_of_coarse_steps() -> None:
+def test_a_body_that_flies_is_told_of_coarse_steps():
     file = coarse(
-        RigFile.from_toml(next(path for path in READY if path.stem == "drop")),
+        ready_rig("drop"),
         solver={"step": 0.05},
     )
     assert any("a body comes flying and may be through a pad" in one.message for one in check(file))
@@ -192,7 +201,7 @@ def motion(
     return lambda t: float(signal(torch.tensor(t, dtype=torch.float64))[0].detach())
 
 
-def test_motions_go_through_what_they_are_given(tmp_path: Path) -> None:
+def test_motions_go_through_what_they_are_given(tmp_path):
     (tmp_path / "x.csv").write_text(
         "\ufefft [ms], note [mm], x_d [mm]\n0,7,1\n500,,2\n1000,7,4\n", encoding="utf-8"
     )
@@ -221,20 +230,16 @@ def test_motions_go_through_what_they_are_given(tmp_path: Path) -> None:
     [
         ("t [s],x_d [mm]\n0,0\n1,1\n", r"x\.csv ends at 1 s, but the run lasts until 2 s"),
         ("t [s],x [mm]\n0,0\n1,1\n", r"x\.csv has no column `x_d \[m\]`; it has `t`, `x`"),
-        ("t [s],x_d\n0,0\n1,1\n", r"row 1, column `x_d` has no unit: write `x_d \[m\]`"),
         (
             "t [s],x_d [N]\n0,0\n1,1\n",
             r"row 1, column `x_d` cannot be in 'N'; it can be in m, cm, mm",
         ),
-        ("t [s],x_d [mm]\n0,0\n1,one\n", r"row 3, column `x_d`: 'one' is not a finite number"),
         ("t [s],x_d [mm]\n0,0\n1,\n", r"row 3, column `x_d` is empty"),
         ("t [s],x_d [mm]\n1,0\n0,1\n", r"row 3, column `t`: 0 s follows 1 s; times must increase"),
         ("t [s],x_d [mm]\n0,0\n", r"has 1 rows of numbers"),
     ],
 )
-def test_a_recorded_motion_that_cannot_be_is_named(
-    tmp_path: Path, text: str, sentence: str
-) -> None:
+def test_a_recorded_motion_that_cannot_be_is_named(tmp_path, text, sentence):
     (tmp_path / "x.csv").write_text(text, encoding="utf-8")
     file = changed(
         coarse(template("t")), motion__x_d={"kind": "csv", "file": "x.csv", "column": "x_d"}
@@ -246,10 +251,10 @@ def test_a_recorded_motion_that_cannot_be_is_named(
     assert re.search(sentence, first.message), first.message
 
 
-def test_what_two_pads_grip_is_taken_along() -> None:
+def test_what_two_pads_grip_is_taken_along():
     """The estimate before a run: fingertips go around a box that they hold, and the box with them;
     the run agrees."""
-    file = RigFile.from_toml(next(path for path in READY if path.stem == "fingertips"))
+    file = ready_rig("fingertips")
     estimate = Estimate(file, file.build())
     for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
         box = estimate(time)["box"]
@@ -257,7 +262,7 @@ def test_what_two_pads_grip_is_taken_along() -> None:
     assert estimate(0.5)["box"][1] < 22e-3  # not lifted yet
 
 
-def test_driven_jaws_carry_a_disc() -> None:
+def test_driven_jaws_carry_a_disc():
     """Coordinates driven in x, y and theta, without a loop; the pads settle around a start that is
     a grasp."""
     jaw = {"x": "driven", "y": "driven", "theta": "driven"}
@@ -280,7 +285,7 @@ def test_driven_jaws_carry_a_disc() -> None:
     assert "drive_bracket" in run.supplied
 
 
-def test_orientation_is_controlled_through_another_body() -> None:
+def test_orientation_is_controlled_through_another_body():
     """A loop that measures the disc's angle and pushes the bracket sideways; the other way round it
     is unstable."""
     loop = {
@@ -314,7 +319,7 @@ def test_orientation_is_controlled_through_another_body() -> None:
 
 
 @pytest.mark.parametrize("inertial", [False, True])
-def test_a_body_rests_where_nothing_accelerates_it(inertial: bool) -> None:
+def test_a_body_rests_where_nothing_accelerates_it(inertial):
     file = coarse(template("t"), pads={"lower": {"inertial": inertial}})
     ready = file.build()
     rate = ready.rig.unpack(ready.rig(0.0, ready.y0)).velocity["disc"]
@@ -324,8 +329,8 @@ def test_a_body_rests_where_nothing_accelerates_it(inertial: bool) -> None:
 
 
 @torch.no_grad()
-def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate() -> None:
-    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
+def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate():
+    file = coarse(ready_rig("drop"))
     rig = file.build().rig
     pose = {"ellipse": torch.tensor([60.2e-3, 30e-3, 0.1], dtype=torch.float64)}
     found = resting(rig, pose)["ellipse"]
@@ -334,7 +339,7 @@ def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate() 
     assert float(found[2]) == pytest.approx(0.0, abs=1e-6)  # on its broad side
 
 
-def test_the_estimate_by_statics_is_where_the_run_ends() -> None:
+def test_the_estimate_by_statics_is_where_the_run_ends():
     file = coarse(template("t"))
     ready = file.build()
     expected = Estimate(file, ready).balanced(0.45)
@@ -348,15 +353,13 @@ def test_the_estimate_by_statics_is_where_the_run_ends() -> None:
 
 
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
-def test_what_is_written_is_what_was_read(path: Path) -> None:
+def test_what_is_written_is_what_was_read(path):
     file = RigFile.from_toml(path)
     again = RigFile.from_tree(tomllib.loads(to_toml(file)))
     assert again.model_dump() == file.model_dump()
 
 
-def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(
-    tmp_path: Path, capsys: Any
-) -> None:
+def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(tmp_path, capsys):
     path = tmp_path / "mine.toml"
     assert main(["init", str(path.with_suffix(""))]) == 0
     text = path.read_text(encoding="utf-8")
@@ -380,8 +383,8 @@ def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(
     ],
 )
 def test_the_file_to_start_from_has_the_name_that_was_asked_for(
-    name: str, file: str, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+    name, file, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert main(["init", name]) == 0
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / file]
@@ -394,9 +397,7 @@ def test_the_file_to_start_from_has_the_name_that_was_asked_for(
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/", "a/..", ".toml", "/"])
-def test_a_name_that_is_no_files_is_refused(
-    name: str, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_a_name_that_is_no_files_is_refused(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["init", name]) == 2
     expected = (
@@ -408,14 +409,14 @@ def test_a_name_that_is_no_files_is_refused(
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small(tmp_path_factory):
     """A rig file that runs in no time."""
     path = tmp_path_factory.mktemp("rig") / "small.toml"
     path.write_text(to_toml(shorter(coarse(template("small")), 0.1)), encoding="utf-8")
     return path
 
 
-def test_run_writes_everything(small: Path, tmp_path: Path, capsys: Any) -> None:
+def test_run_writes_everything(small, tmp_path, capsys):
     assert main(["run", str(small), "--out", str(tmp_path / "out"), "--no-progress"]) == 0
     out, err = capsys.readouterr()
     assert "0.1 s simulated" in out
@@ -442,9 +443,7 @@ def test_run_writes_everything(small: Path, tmp_path: Path, capsys: Any) -> None
     )
 
 
-def test_what_is_wrong_is_not_run_unless_it_is_meant(
-    small: Path, tmp_path: Path, capsys: Any
-) -> None:
+def test_what_is_wrong_is_not_run_unless_it_is_meant(small, tmp_path, capsys):
     path = tmp_path / "wrong.toml"
     wrong = changed(RigFile.from_toml(small), bodies__stone=STONE, outputs__video="none")
     path.write_text(to_toml(changed(wrong, outputs__figures=False)), encoding="utf-8")
@@ -460,9 +459,7 @@ def test_what_is_wrong_is_not_run_unless_it_is_meant(
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"trajectory.nc", "summary.json"}
 
 
-def test_where_results_cannot_be_written_nothing_is_run(
-    small: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_where_results_cannot_be_written_nothing_is_run(small, tmp_path, monkeypatch, capsys):
     monkeypatch.delattr(running, "simulate")
     (tmp_path / "taken").write_text("mine", encoding="utf-8")
     for out in (tmp_path / "taken", tmp_path / "taken" / "out"):
@@ -473,9 +470,7 @@ def test_where_results_cannot_be_written_nothing_is_run(
     assert (tmp_path / "taken").read_text(encoding="utf-8") == "mine"
 
 
-def test_an_interruption_keeps_what_was_simulated(
-    small: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_an_interruption_keeps_what_was_simulated(small, tmp_path, monkeypatch, capsys):
     def interrupted(*args: Any, **options: Any) -> None:
         raise Interrupted(simulate(*args, **options))
 
@@ -489,7 +484,7 @@ def test_an_interruption_keeps_what_was_simulated(
     )
 
 
-def test_a_failure_keeps_what_was_simulated(small: Path, tmp_path: Path, capsys: Any) -> None:
+def test_a_failure_keeps_what_was_simulated(small, tmp_path, capsys):
     """A disc thrown off its pad."""
     path = tmp_path / "thrown.toml"
     file = changed(
@@ -508,7 +503,7 @@ def test_a_failure_keeps_what_was_simulated(small: Path, tmp_path: Path, capsys:
     )
 
 
-def test_check_and_run_name_what_cannot_be_read(tmp_path: Path, capsys: Any) -> None:
+def test_check_and_run_name_what_cannot_be_read(tmp_path, capsys):
     (tmp_path / "no.toml").write_text("[[", encoding="utf-8")
     for command in ("check", "run"):
         assert main([command, str(tmp_path / "none.toml")]) == 2

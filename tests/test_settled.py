@@ -1,7 +1,6 @@
 """Pads that have settled around given bodies: at rest by the graph, with exact derivatives, and the
 same bits every time."""
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -64,7 +63,7 @@ def rates(rig: Rig, y: Tensor) -> float:
 
 
 @pytest.mark.parametrize("points", [0, 2])
-def test_pads_settled_around_the_grasp_are_those_of_statics(points: int) -> None:
+def test_pads_settled_around_the_grasp_are_those_of_statics(points):
     model = coarse(contact__points=points)
     y = press(model, HEIGHT).detach()
     assert float((around(model, model.unpack(y)) - y).detach().abs().max()) < 1e-10  # [N]
@@ -72,14 +71,14 @@ def test_pads_settled_around_the_grasp_are_those_of_statics(points: int) -> None
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("build", [coarse, turning])
-def test_no_node_moves(build: Callable[[], Rig], seed: int) -> None:
+def test_no_node_moves(build, seed):
     rig = build()
     y = around(rig, shaken(coarse(), seed))
     assert float(y[rig.layout.slices["pads", "U"]].detach().abs().max()) > 1.0  # [N]
     assert rates(rig, y) < 1e-9
 
 
-def test_derivatives_are_those_of_differences() -> None:
+def test_derivatives_are_those_of_differences():
     """Along one direction of poses, stretches and every kind of parameter each."""
     model = coarse()
     state = shaken(model)
@@ -123,7 +122,7 @@ def test_derivatives_are_those_of_differences() -> None:
             ), name
 
 
-def test_the_same_bits_come_again_from_other_threads_too() -> None:
+def test_the_same_bits_come_again_from_other_threads_too():
     model = coarse()
     state = shaken(model)
     first = around(model, state)
@@ -132,7 +131,7 @@ def test_the_same_bits_come_again_from_other_threads_too() -> None:
             assert torch.equal(first, again)
 
 
-def test_two_bodies_on_one_pad_and_a_chain_of_branches() -> None:
+def test_two_bodies_on_one_pad_and_a_chain_of_branches():
     """Every branch carries the contacts' forces, and a body feels the dent of its neighbour."""
     rubber = StandardLinearSolid(
         E=7.5e5, E_instant=1.5e6, nu=0.45, rho=1100.0, tau=0.01, depth=0.044
@@ -161,7 +160,7 @@ def test_two_bodies_on_one_pad_and_a_chain_of_branches() -> None:
     assert abs(total[0] / total[1] - 1) > 1e-3  # the dents meet
 
 
-def test_refusals() -> None:
+def test_refusals():
     model = coarse()
     state = shaken(model)
     with pytest.raises(NotImplementedError, match="inertial"):

@@ -3,7 +3,6 @@ and each other."""
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +20,6 @@ from torchsoft import (
     Contour,
     Ellipse,
     Parameters,
-    Profile,
-    Reference,
     RoundedBox,
     RoundedPolygon,
     Shape,
@@ -149,7 +146,7 @@ def known(name: str) -> tuple[Shape, Boundary]:
 
 
 @pytest.fixture(params=CASES)
-def case(request: pytest.FixtureRequest) -> tuple[Shape, Boundary]:
+def case(request):
     return known(request.param)
 
 
@@ -177,7 +174,7 @@ def distance(boundary: Boundary, x: Array) -> float:
 
 
 @torch.no_grad()
-def test_distance_is_that_of_the_nearest_point(case: tuple[Shape, Boundary]) -> None:
+def test_distance_is_that_of_the_nearest_point(case):
     """In the band of contacts, and far outside, where a run looks for what may touch."""
     shape, boundary = case
     for band, count in ((BAND, 40), (20e-3, 20)):
@@ -189,7 +186,7 @@ def test_distance_is_that_of_the_nearest_point(case: tuple[Shape, Boundary]) -> 
         assert float((phi - expected)[which].abs().max()) < 1e-9
 
 
-def test_normals_are_the_slopes_of_distances(case: tuple[Shape, Boundary]) -> None:
+def test_normals_are_the_slopes_of_distances(case):
     shape, boundary = case
     x, h = torch.from_numpy(near(boundary, 200, BAND)), 1e-6
     with torch.no_grad():
@@ -216,7 +213,7 @@ def turning(boundary: Boundary, s: Array, h: float = 1e-5) -> tuple[Array, Array
     return np.stack((y, -x), -1) / speed[:, None], (x * bend_y - y * bend_x) / speed**3
 
 
-def test_curvature_is_that_of_the_boundary(case: tuple[Shape, Boundary]) -> None:
+def test_curvature_is_that_of_the_boundary(case):
     shape, boundary = case
     s = 0.013 + np.arange(50) / 50
     normal, expected = turning(boundary, s)
@@ -249,7 +246,7 @@ ROUND = {
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", ROUND)
-def test_full_rounding_is_the_circle(name: str) -> None:
+def test_full_rounding_is_the_circle(name):
     shape, circle = ROUND[name](), Circle(R)
     assert shape.well_posed() == ""
     x = torch.from_numpy(near(superellipse(R, R, 2.0), 300, 2e-3))
@@ -276,7 +273,7 @@ def test_full_rounding_is_the_circle(name: str) -> None:
         ),
     ],
 )
-def test_two_ways_to_one_body(one: Callable[[], Shape], other: Callable[[], Shape]) -> None:
+def test_two_ways_to_one_body(one, other):
     """Whatever the class, the order of the points, and the point that they are given about."""
     one, other = one(), other()
     x = torch.rand(300, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 30e-3
@@ -295,7 +292,7 @@ def test_two_ways_to_one_body(one: Callable[[], Shape], other: Callable[[], Shap
 
 
 @torch.no_grad()
-def test_moments_are_those_of_the_boundary(case: tuple[Shape, Boundary]) -> None:
+def test_moments_are_those_of_the_boundary(case):
     shape, boundary = case
     x = boundary((np.arange(400_000) + 0.5) / 400_000)
     y = np.roll(x, -1, 0)
@@ -305,7 +302,7 @@ def test_moments_are_those_of_the_boundary(case: tuple[Shape, Boundary]) -> None
     assert float(of.centre.abs().max()) < 1e-9
 
 
-def test_moments_by_green_are_those_of_a_disc() -> None:
+def test_moments_by_green_are_those_of_a_disc():
     t = torch.arange(40, dtype=torch.float64) * torch.pi / 20
     circle = torch.stack((t.cos(), t.sin()), -1)
     of = moments(
@@ -316,7 +313,7 @@ def test_moments_by_green_are_those_of_a_disc() -> None:
     assert float(of.gyration) == pytest.approx(0.045, rel=1e-11)
 
 
-def test_a_uniform_body_has_mass_and_inertia_of_its_shape() -> None:
+def test_a_uniform_body_has_mass_and_inertia_of_its_shape():
     body = Body.uniform(RoundedBox(20e-3, 10e-3, 1e-12), density=7800.0, depth=44e-3, theta=0.0)
     mass = body.mass.item()
     assert mass == pytest.approx(7800 * 44e-3 * 40e-3 * 20e-3, rel=1e-12)
@@ -324,12 +321,10 @@ def test_a_uniform_body_has_mass_and_inertia_of_its_shape() -> None:
     assert body.freedom["theta"] == "fixed"
     (slope,) = torch.autograd.grad(body.inertia, body.shape.half_width)
     assert float(slope) == pytest.approx(mass * 2 * 20e-3 / 3, rel=1e-9)
-    with pytest.raises(ValueError, match="`density` must be positive and finite, but is 0"):
-        Body.uniform(Circle(0.02), density=0, depth=0.044)
 
 
 @torch.no_grad()
-def test_support_outline_and_size_are_the_bodys(case: tuple[Shape, Boundary]) -> None:
+def test_support_outline_and_size_are_the_bodys(case):
     shape, boundary = case
     x = torch.from_numpy(boundary(np.arange(100_000) / 100_000))
     angle = torch.linspace(0, 6.2, 40, dtype=torch.float64)
@@ -362,7 +357,7 @@ def shape_of_another(shape: Shape) -> Shape:
 # ----------------------------------------------------------------------
 
 
-def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> None:
+def test_derivatives_are_those_of_differences(case):
     """Of distance and normal by the place and by each of the parameters, along a direction."""
     shape, boundary = case
     generator = torch.Generator().manual_seed(2)
@@ -394,22 +389,11 @@ def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> N
 COARSE = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3})
 
 
-def grasp(model: SoftGrasp, y0: Tensor) -> Reference:
-    """A grasp by 1 mm in 50 ms, then a stroke of the disc by 2 mm."""
-    pose = model.unpack(y0).pose
-    x, top = float(pose["disc"][0]), float(pose["bracket"][1])
-    return Reference(
-        x_d=Profile([0.06, 0.16], [x, x + 2e-3]),
-        y_d=Profile([0.0, 0.05], [top, top - 1e-3]),
-        F_ff=Profile([0.0], [0.0]),
-    )
-
-
 # --- what is refused, and what is said
 # ----------------------------------------------------------------------
 
 
-def test_control_points_that_were_spoilt_are_refused() -> None:
+def test_control_points_that_were_spoilt_are_refused():
     shape = Contour(pear())
     with torch.no_grad():
         shape.control[3] *= 3.0
@@ -418,7 +402,7 @@ def test_control_points_that_were_spoilt_are_refused() -> None:
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
-def test_a_contour_follows_the_spline_through_its_points(tolerance: float) -> None:
+def test_a_contour_follows_the_spline_through_its_points(tolerance):
     shape, closed = Contour(pear(), tolerance=tolerance), np.concatenate((pear(), pear()[:1]))
     way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
     dense = CubicSpline(way, closed, bc_type="periodic")(np.linspace(0, way[-1], 3000))
@@ -428,7 +412,7 @@ def test_a_contour_follows_the_spline_through_its_points(tolerance: float) -> No
     assert off > 0.5 * shape.residual
 
 
-def test_a_contour_from_a_file(tmp_path: Path) -> None:
+def test_a_contour_from_a_file(tmp_path):
     file, points = tmp_path / "pear.csv", pear()
     file.write_text(
         "y [cm], x [mm]\n" + "".join(f"{1e2 * y},{1e3 * x}\n\n" for x, y in points),
@@ -440,23 +424,17 @@ def test_a_contour_from_a_file(tmp_path: Path) -> None:
     for text, match in (
         ("", "row 1: the columns must be `x .mm.` and `y .mm.`, in m, cm or mm, but are none"),
         ("x [mm]\n1\n", "row 1: the columns must be .*, but are x"),
-        ("x,y\n1,2\n", "row 1, column `x` has no unit"),
         ("x [mm],y [in]\n1,2\n", "column `y` cannot be in 'in'; it can be in m, cm, mm"),
         ("x [mm],y [mm],z [mm]\n1,2,3\n", "column `z` is not known: the columns must be"),
-        ("x [mm],y [mm]\n1,2\n3\n", "row 3 has 1 cells, but there are 2 columns"),
-        ("x [mm],y [mm]\n1,nan\n", "row 2, column `y`: 'nan' is not a finite number"),
         ("x [mm],y [mm]\n1,\n", "row 2 has an empty cell"),
         ("x [mm],y [mm]\n1,2\n", r"pear.csv: `points` must be at least 8 places"),
     ):
         file.write_text(text, encoding="utf-8")
         with pytest.raises(ValueError, match=match):
             Contour.from_csv(file)
-    file.write_bytes(b"x [mm],y [mm]\n\xff\xfe")
-    with pytest.raises(ValueError, match="is not a CSV file in UTF-8"):
-        Contour.from_csv(file)
 
 
-def test_a_centre_of_mass_off_the_origin_is_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_centre_of_mass_off_the_origin_is_told(caplog):
     RoundedPolygon(box(20e-3, 9e-3), 2e-3)
     ROUND["contour"]()
     assert caplog.text == ""
@@ -467,7 +445,7 @@ def test_a_centre_of_mass_off_the_origin_is_told(caplog: pytest.LogCaptureFixtur
     )
 
 
-def test_an_object_that_its_pads_would_turn_is_told_of() -> None:
+def test_an_object_that_its_pads_would_turn_is_told_of():
     wedge = RoundedPolygon([[-20e-3, -10e-3], [20e-3, -10e-3], [20e-3, 10e-3], [-20e-3, 0.0]], 2e-3)
     with pytest.warns(
         UserWarning, match=r"held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m"
@@ -475,7 +453,7 @@ def test_an_object_that_its_pads_would_turn_is_told_of() -> None:
         rest(SoftGrasp(COARSE, shape=wedge))
 
 
-def test_a_long_box_rests_on_its_whole_side() -> None:
+def test_a_long_box_rests_on_its_whole_side():
     model = SoftGrasp(COARSE, shape=RoundedBox(30e-3, 5e-3, 1e-3))
     state = model.unpack(rest(model).detach())
     g = model.penetration("L", state)

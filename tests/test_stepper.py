@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, grasped, times
+from conftest import COARSE, coarse, grasped, times, towards
 
 from torchsoft import (
     Parameters,
@@ -21,7 +21,7 @@ from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
 
 
-def test_second_order_on_a_smooth_motion(fidelity: str) -> None:
+def test_second_order_on_a_smooth_motion(fidelity):
     """A grasped disc set moving so gently that no node slips, touches or leaves: observed order >=
     1.8."""
     model = coarse(pad__fidelity=fidelity)
@@ -33,7 +33,7 @@ def test_second_order_on_a_smooth_motion(fidelity: str) -> None:
     assert min(orders) >= 1.8, (errors, orders)
 
 
-def test_same_run_twice_to_the_bit_and_in_two_threads_at_once() -> None:
+def test_same_run_twice_to_the_bit_and_in_two_threads_at_once():
     """Nothing is shared between runs: two models, each simulated alone and beside the other."""
     made = [grasp_and_roll(coarse(pad__E=E), grasp_force=75.0) for E in (0.75e6, 0.7e6)]
     run = lambda m: simulate(m.model, times(0.4, 21), y0=m.y0).y
@@ -44,7 +44,7 @@ def test_same_run_twice_to_the_bit_and_in_two_threads_at_once() -> None:
     assert not torch.equal(*alone)
 
 
-def test_an_unstable_loop_ends_in_an_error_that_says_so() -> None:
+def test_an_unstable_loop_ends_in_an_error_that_says_so():
     """E = 60 kPa, tau = 5 ms with the paper's gains."""
     model = SoftGrasp(Parameters().override(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3}))
     with pytest.raises(
@@ -55,16 +55,12 @@ def test_an_unstable_loop_ends_in_an_error_that_says_so() -> None:
     assert bool(torch.isfinite(caught.value.trajectory.y).all())
 
 
-def test_a_disc_rolled_off_the_pad_is_reported() -> None:
+def test_a_disc_rolled_off_the_pad_is_reported():
     """Only the reference knows the pad's length; a model driven beyond it says where the run
     ended."""
     model = coarse()
     y0 = grasped(model)
-    beyond = Reference(
-        x_d=Profile([0.0, 1.0], [0.06, 0.13]),
-        y_d=model.reference["y_d"],
-        F_ff=model.reference["F_ff"],
-    )
+    beyond = towards(model, Profile([0.0, 1.0], [0.06, 0.13]))
     with pytest.raises(SimulationFailed, match="contact reached the end of a pad") as caught:
         simulate(model, times(1.0, 101), y0=y0, reference=beyond)
     run = caught.value.trajectory
@@ -72,7 +68,7 @@ def test_a_disc_rolled_off_the_pad_is_reported() -> None:
     assert float(run.t[-1]) <= caught.value.time
 
 
-def test_a_step_that_newton_does_not_solve_is_halved() -> None:
+def test_a_step_that_newton_does_not_solve_is_halved():
     """Too few iterations for the hardest steps: those are cut, the others are not, and the run ends
     where it should."""
     model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
@@ -95,7 +91,7 @@ def test_a_step_that_newton_does_not_solve_is_halved() -> None:
     assert off_cut < 1.2 * off_free
 
 
-def test_the_adjoint_follows_halved_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_adjoint_follows_halved_steps(monkeypatch):
     """Where steps were cut, the gradient is still that of the run; differences small enough to cut
     the same steps."""
     model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)

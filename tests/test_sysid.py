@@ -4,7 +4,6 @@ resuming."""
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -65,18 +64,17 @@ TRUTH = {
     "contact.mu_s": 0.5,
     "contact.mu_k": 0.4,
 }
-TRUE = BASE.override(TRUTH)
 FOUR = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
 
 
 @pytest.fixture(scope="module")
-def strokes() -> Recording:
+def strokes():
     """Without noise, of parameters up to a half away from the nominal ones."""
     return record("strokes", begin(STROKES, BASE), TRUTH, SENSORS, noise=0.0)
 
 
 @pytest.fixture(scope="module")
-def shake() -> Recording:
+def shake():
     return record("shake", begin(SHAKE, BASE), TRUTH, SENSORS, noise=0.0)
 
 
@@ -124,7 +122,7 @@ def check_derivatives(
 
 
 @pytest.mark.parametrize("fidelity", ["massless", pytest.param("inertial", marks=pytest.mark.slow)])
-def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) -> None:
+def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity):
     """The starting displacements are held, also where a pad's elasticity changes."""
     p = BASE.override({"pad.fidelity": fidelity})
     short = Excitation(
@@ -137,9 +135,7 @@ def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) 
 
 
 @pytest.mark.slow
-def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(
-    strokes: Recording, shake: Recording
-) -> None:
+def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes, shake):
     answer = identify(Problem([strokes, shake], SENSORS, four()), heldout=["shake"], **TRUSTED)
     for name in FOUR:
         e = answer[name]
@@ -155,7 +151,7 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(
     assert content["cost"]["jacobians"] > 0
 
 
-def test_the_adjoint_route_ends_where_gauss_newton_does(strokes: Recording) -> None:
+def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
     problem = Problem(
         [strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6), "pad.tau": Unknown()} | rest_known()
     )
@@ -179,7 +175,7 @@ def rest_known() -> dict[str, Unknown]:
     return {name: known(name) for name in ("contact.K_n", "contact.mu_s", "contact.mu_k")}
 
 
-def test_what_the_data_do_not_determine_is_not_a_number() -> None:
+def test_what_the_data_do_not_determine_is_not_a_number():
     gentle = Excitation(motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.65, **GRASP)
     data = record("gentle", begin(gentle, BASE), {}, SENSORS, seed=1)
     answer = identify(
@@ -202,7 +198,7 @@ def test_what_the_data_do_not_determine_is_not_a_number() -> None:
     assert "not identifiable" in answer.table()
 
 
-def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes: Recording) -> None:
+def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes):
     t, theta = strokes.samples["theta"]
     late = np.interp(t - 1.5e-3, t, theta) + 2e-3
     samples = strokes.samples | {
@@ -218,7 +214,7 @@ def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes: Rec
     assert answer["delay of theta"].value == pytest.approx(1.5e-3, abs=1e-4)
 
 
-def test_a_regular_grid_between_the_samples_changes_nothing(strokes: Recording) -> None:
+def test_a_regular_grid_between_the_samples_changes_nothing(strokes):
     problem = Problem([strokes], SENSORS, four())
     runner = Runner(problem.recordings)
     exact = problem.residuals(runner, problem.coordinates.start, ["strokes"], 1e-5).r
@@ -228,7 +224,7 @@ def test_a_regular_grid_between_the_samples_changes_nothing(strokes: Recording) 
 
 
 @pytest.fixture(scope="module")
-def shaking() -> Recording:
+def shaking():
     """Hard, by fine steps, without noise."""
     hard = Excitation(
         motion=MultiSine(amplitude_x=4e-3, amplitude_y=2e-4, frequency=(10, 40)),
@@ -238,7 +234,7 @@ def shaking() -> Recording:
     return record("shaking", begin(hard, BASE), {}, SENSORS, rtol=1e-7, noise=0.0)
 
 
-def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Recording) -> None:
+def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking):
     problem = Problem([shaking], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()})
     plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 8e-3)]
     coarse = identify(problem, plan=plan, tightenings=0, **TRUSTED)
@@ -260,7 +256,7 @@ def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Rec
     )
 
 
-def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest() -> None:
+def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest():
     """Two that correlate, the second held where the misfit still falls: the first is where it is
     least, beside it."""
     J, x = np.array([[1.0, 0.9], [0.0, 0.3], [0.2, 0.1]]), np.array([0.0, 1.0])
@@ -278,7 +274,7 @@ def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest() -> None:
     assert abs(newton_step(wider, x, Residuals(r, J, {}), np.array([True, True]))).min() > 0.5
 
 
-def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes: Recording) -> None:
+def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes):
     """From a start so far off that the steps chosen there are the wrong ones in the end."""
     unknowns = {name: Unknown(nominal=0.4 * TRUTH[name]) for name in FOUR} | {
         "contact.mu_k": known("contact.mu_k")
@@ -294,9 +290,7 @@ def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes: Recording) -
         assert abs(np.log(e.last / TRUTH[name])) < e.relative_sd, name
 
 
-def test_interrupted_it_continues_and_ends_the_same(
-    strokes: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_it_continues_and_ends_the_same(strokes, tmp_path, monkeypatch):
     problem = Problem(
         [strokes], SENSORS, {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()
     )
@@ -322,7 +316,7 @@ def test_interrupted_it_continues_and_ends_the_same(
     assert third.cost["remembered"] == third.cost["simulations"] + third.cost["jacobians"]
 
 
-def test_threads_give_the_same_residuals(strokes: Recording, shake: Recording) -> None:
+def test_threads_give_the_same_residuals(strokes, shake):
     problem = Problem([strokes, shake], SENSORS, four())
     one, two = (
         problem.residuals(
@@ -335,7 +329,7 @@ def test_threads_give_the_same_residuals(strokes: Recording, shake: Recording) -
     np.testing.assert_array_equal(one.J, two.J)
 
 
-def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes: Recording) -> None:
+def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes):
     one, (t, y) = {"pad.E": Unknown()}, strokes.samples["x_C"]
 
     def problem(
@@ -369,7 +363,7 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes: Recording) -
 
 
 @pytest.mark.slow
-def test_data_out_of_reach_name_the_recording() -> None:
+def test_data_out_of_reach_name_the_recording():
     about_disc = STROKES.model_copy(update={"senses": "disc", "x_C0": 60e-3})
     data = record("strokes", begin(about_disc, BASE), {}, SENSORS)
     problem = Problem(
@@ -429,14 +423,12 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(
         ({"rtol": 1e-7, "plan": []}, "^`starts` and `rtol` are those of the default plan"),
     ],
 )  # fmt: skip
-def test_what_a_fit_cannot_honour_is_refused_before_it(
-    strokes: Recording, how: dict[str, Any], message: str
-) -> None:
+def test_what_a_fit_cannot_honour_is_refused_before_it(strokes, how, message):
     with pytest.raises(ValueError, match=message):
         identify(Problem([strokes], SENSORS, four()), **how)
 
 
-def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes: Recording) -> None:
+def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes):
     problem = Problem(
         [strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known()
     )
@@ -451,9 +443,7 @@ def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes: Recor
     assert answer["pad.E"].last == pytest.approx(TRUTH["pad.E"], rel=0.05)
 
 
-def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(
-    strokes: Recording, shake: Recording
-) -> None:
+def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(strokes, shake):
     unknowns = four(
         **{"contact.mu_k": Unknown(ratio_to="contact.mu_s", nominal=0.7, low=0.3, high=1.0)}
     )
@@ -475,7 +465,7 @@ def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(
     )
 
 
-def test_visible_drops_what_cannot_be_separated_from_the_others() -> None:
+def test_visible_drops_what_cannot_be_separated_from_the_others():
     a = np.random.default_rng(0).standard_normal((50, 1))
     J = np.hstack((100 * a, 100 * a + 1e-6, 40 * np.random.default_rng(1).standard_normal((50, 1))))
     assert visible(J, np.ones(3, bool)).sum() == 2
@@ -483,7 +473,7 @@ def test_visible_drops_what_cannot_be_separated_from_the_others() -> None:
     assert standard_deviations(np.eye(2) * 10.0) == pytest.approx([0.1, 0.1])
 
 
-def test_catalogue_begins_at_rest_and_can_be_written_down() -> None:
+def test_catalogue_begins_at_rest_and_can_be_written_down():
     for name, excitation in CATALOGUE.items():
         assert Excitation.model_validate_json(excitation.model_dump_json()) == excitation, name
         model, y0, _ = begin(excitation, BASE, grasp_force=10.0)
@@ -494,7 +484,7 @@ def test_catalogue_begins_at_rest_and_can_be_written_down() -> None:
             assert model(0.0, y0)[model.layout.slices["velocity", "disc"]][1].abs() < 1e-6, name
 
 
-def test_a_sampled_set_point_follows_the_profile_it_was_taken_from() -> None:
+def test_a_sampled_set_point_follows_the_profile_it_was_taken_from():
     profile = Profile([0.0, 0.3, 0.8], [0.0, 1e-2, -5e-3])
     t = torch.linspace(0, 0.8, 161, dtype=torch.float64)
     between = torch.linspace(0.0, 0.8, 777, dtype=torch.float64)

@@ -28,7 +28,7 @@ def sensors(colour: str = "white") -> dict[str, Sensor]:
 
 
 @pytest.fixture(scope="module")
-def exact() -> Recording:
+def exact():
     return record("strokes", begin(STROKES, BASE), TRUTH, sensors(), rtol=1e-6, noise=0.0)
 
 
@@ -52,7 +52,7 @@ def problem(recording: Recording, colour: str = "white") -> Problem:
     )
 
 
-def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact: Recording) -> None:
+def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact):
     white = identify(problem(noisy(exact, 0, None)), plan=[STAGE], assumptions="trusted")
     found = identify(problem(noisy(exact, 0, AR)), plan=[STAGE], assumptions="trusted")
     declared = identify(problem(noisy(exact, 0, AR), "ar"), plan=[STAGE], assumptions="trusted")
@@ -74,7 +74,7 @@ def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact: Recordi
     assert found["pad.tau"].relative_sd > 1.3 * white["pad.tau"].relative_sd
 
 
-def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact: Recording) -> None:
+def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact):
     """Rows whitened at once, and again from other noise; the gradient of half their squares."""
     gaps = {
         c: (np.delete(t, slice(20, 30)), np.delete(y, slice(20, 30)))
@@ -97,7 +97,7 @@ def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact: Recording) -> 
     np.testing.assert_allclose(gradient, other.J.T @ other.r, rtol=1e-8)
 
 
-def test_a_robust_loss_sees_through_outliers(exact: Recording) -> None:
+def test_a_robust_loss_sees_through_outliers(exact):
     """Every twentieth sample is off by twenty standard deviations: least squares says so, and a
     robust loss is as exact as the rest of the samples allow."""
     bad = problem(noisy(exact, 2, None, outliers=0.05))

@@ -6,7 +6,6 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 from conftest import COARSE
@@ -53,14 +52,14 @@ def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGra
 
 
 @pytest.fixture(scope="module")
-def jerks() -> Recording:
+def jerks():
     """Without noise, of the true law; the recording's own model has other numbers."""
     planned = begin(JERKS, BASE)
     planned = planned._replace(rig=rig(planned.rig.settings, planned.rig.reference))
     return record("jerks", planned, TRUTH | {"pad.E": 0.9e6}, SENSORS, noise=0.0)
 
 
-def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> None:
+def test_its_parameters_are_found_beside_those_of_the_pads(jerks):
     problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, "pad.E")})
     plan = [Stage("all", ("jerks",), problem.coordinates.labels, 1e-6)]
     answer = identify(
@@ -75,20 +74,20 @@ def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> 
     assert answer["contact.friction.alpha"].unit == ""
 
 
-def test_its_derivatives_by_both_routes_are_those_of_differences(jerks: Recording) -> None:
+def test_its_derivatives_by_both_routes_are_those_of_differences(jerks):
     slack = {"contact.friction.beta": Unknown(scale="linear", nominal=1.0, low=0.0, high=100.0)}
     ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}
     problem = Problem([jerks], SENSORS, {"contact.friction.alpha": Unknown()} | slack | ratio)
     check_derivatives(problem, problem.coordinates.start, 3e-5, 2e-4)
 
 
-def test_it_can_be_sent_to_another_process(jerks: Recording) -> None:
+def test_it_can_be_sent_to_another_process(jerks):
     there = pickle.loads(pickle.dumps(jerks))
     assert isinstance(there.begin().rig.contacts["L"].law.friction, Viscous)
     assert there.fingerprint == jerks.fingerprint
 
 
-def test_only_what_the_model_has_can_be_identified(jerks: Recording) -> None:
+def test_only_what_the_model_has_can_be_identified(jerks):
     assert {*TRUTH, "pad.E", "control.R_99", "disc.radius"} <= set(jerks.parameters)
     for name in ("contact.mu_s", "contact.friction.gamma"):
         with pytest.raises(
@@ -110,7 +109,7 @@ def plain(settings: Parameters, reference: Reference, law: SlipLaw = frictionles
     return SoftGrasp(settings, reference, friction=law)
 
 
-def test_a_checkpoint_of_another_law_is_not_read(jerks: Recording, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_law_is_not_read(jerks, tmp_path):
     """Neither of other numbers, nor of another function, nor of a changed one."""
     builds = [rig, SoftGrasp, partial(rig, alpha=0.61), plain]
     for number, text in enumerate(("E / R", "E / (2 * R)")):

@@ -1,19 +1,17 @@
 """The journal of an identification: data with checksums, to the bit, in a folder of its own."""
 
-import os
 import pickle
 import struct
 import threading
 import time
 from collections.abc import Callable
-from hashlib import sha256
-from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from hostile.damage import Trap, archive, forged, objects
 
 from torchsoft.sysid import runs
 from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction
@@ -69,21 +67,6 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
     assert journal(tmp_path, "b").recall(RUN) is None
 
 
-class Trap:
-    """Makes a folder when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return os.mkdir, (str(self.path),)
-
-
-def forged(name: bytes, content: bytes) -> bytes:
-    """With the checksum that the journal would write."""
-    return sha256(name + content).digest() + content
-
-
 DAMAGES: dict[str, Callable[[bytes, bytes, Trap], bytes]] = {
     "empty": lambda name, content, trap: b"",
     "cut": lambda name, content, trap: content[:-1],
@@ -92,30 +75,14 @@ DAMAGES: dict[str, Callable[[bytes, bytes, Trap], bytes]] = {
     "a pickle with a checksum": lambda name, content, trap: forged(name, pickle.dumps(trap)),
     "an object array with a checksum": lambda name, content, trap: forged(name, objects(trap)),
     "another archive with a checksum": lambda name, content, trap: forged(
-        name, other_archive(kind=np.asarray("Path"))
+        name, archive(kind=np.asarray("Path"))
     ),
-    "a kind that is no name": lambda name, content, trap: forged(
-        name, other_archive(kind=np.ones(3))
-    ),
-    "no fields": lambda name, content, trap: forged(
-        name, other_archive(kind=np.asarray("Prediction"))
-    ),
+    "a kind that is no name": lambda name, content, trap: forged(name, archive(kind=np.ones(3))),
+    "no fields": lambda name, content, trap: forged(name, archive(kind=np.asarray("Prediction"))),
     "unknown fields": lambda name, content, trap: forged(
-        name, other_archive(kind=np.asarray("Prediction"), path=np.ones(2))
+        name, archive(kind=np.asarray("Prediction"), path=np.ones(2))
     ),
 }
-
-
-def other_archive(**arrays: Any) -> bytes:
-    out = BytesIO()
-    np.savez(out, **arrays)
-    return out.getvalue()
-
-
-def objects(trap: Trap) -> bytes:
-    held = np.empty(1, dtype=object)
-    held[0] = trap
-    return other_archive(kind=np.asarray("Prediction"), t=held)
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

@@ -28,7 +28,7 @@ def made(noise: Autoregression, m: int, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("phi", PROCESSES.values(), ids=PROCESSES)
 @pytest.mark.parametrize("kept", [1.0, 0.9, 0.5])
-def test_whitening_is_that_of_the_dense_covariance(phi: tuple[float, ...], kept: float) -> None:
+def test_whitening_is_that_of_the_dense_covariance(phi, kept):
     """To rounding, with gaps."""
     noise = Autoregression(phi, 0.7, H)
     at = np.sort(np.random.default_rng(1).permutation(400)[: int(400 * kept)])
@@ -39,7 +39,7 @@ def test_whitening_is_that_of_the_dense_covariance(phi: tuple[float, ...], kept:
     assert W.nnz < 12 * len(at)
 
 
-def test_a_half_empty_grid_looks_back_as_far_as_the_memory_goes() -> None:
+def test_a_half_empty_grid_looks_back_as_far_as_the_memory_goes():
     """Every other sample never makes a run of two; what is left out does not matter."""
     noise, at = Autoregression((1.6, -0.8), 1.0, H), np.concatenate(([0, 1], np.arange(2, 1200, 2)))
     W = noise.whitener(at * H)
@@ -48,7 +48,7 @@ def test_a_half_empty_grid_looks_back_as_far_as_the_memory_goes() -> None:
     np.testing.assert_allclose(W @ K @ W.T, np.eye(len(at)), atol=1e-9)
 
 
-def test_autocovariance_of_known_processes() -> None:
+def test_autocovariance_of_known_processes():
     np.testing.assert_allclose(
         Autoregression((0.9,), 2.0, H).autocovariance(5), 4 / 0.19 * 0.9 ** np.arange(5)
     )
@@ -65,7 +65,7 @@ def test_autocovariance_of_known_processes() -> None:
     assert Autoregression((0.5,), 1.0, H).at_least(1.0).scale == 1.0
 
 
-def test_off_a_grid_noise_decays_with_time() -> None:
+def test_off_a_grid_noise_decays_with_time():
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.uniform(0.3, 1.7, 300)) * H
     noise = Autoregression.stated((0.9,), H)
@@ -81,7 +81,7 @@ def test_off_a_grid_noise_decays_with_time() -> None:
     assert fit_noise([(t, rng.standard_normal(300))]).noise.order == 0
 
 
-def test_what_grows_is_refused() -> None:
+def test_what_grows_is_refused():
     with pytest.raises(ValueError, match="not stationary"):
         Autoregression((1.0,), 1.0, H)
     with pytest.raises(ValueError, match="not stationary"):
@@ -97,9 +97,7 @@ def test_what_grows_is_refused() -> None:
 
 @pytest.mark.parametrize("kept", [1.0, 0.9])
 @pytest.mark.parametrize("phi", [(), *PROCESSES.values()], ids=["white", *PROCESSES])
-def test_order_and_coefficients_are_found_over_several_recordings(
-    phi: tuple[float, ...], kept: float
-) -> None:
+def test_order_and_coefficients_are_found_over_several_recordings(phi, kept):
     rng, noise = np.random.default_rng(3), Autoregression(phi, 1.3, H)
     series = []
     for m in (600, 900, 700):
@@ -120,7 +118,7 @@ def test_order_and_coefficients_are_found_over_several_recordings(
     assert -1.0 < true - found.scores[len(phi)].deviance < stats.chi2.isf(1e-3, len(phi) + 1)
 
 
-def test_recordings_at_half_the_rate_take_part() -> None:
+def test_recordings_at_half_the_rate_take_part():
     rng, noise = np.random.default_rng(0), Autoregression((1.6, -0.8), 1.0, H)
     t = np.arange(1000) * H
     found = fit_noise([(t, made(noise, 1000, rng)), (t[::2], made(noise, 1000, rng)[::2])])
@@ -129,7 +127,7 @@ def test_recordings_at_half_the_rate_take_part() -> None:
     assert spacing(np.delete(t, [5, 6, 300])) == pytest.approx(H)
 
 
-def test_so_many_samples_tell_the_level() -> None:
+def test_so_many_samples_tell_the_level():
     """The variance of the sample variance, by Monte Carlo."""
     noise, rng = Autoregression.stated((0.9,), H), np.random.default_rng(0)
     squares = [np.mean(made(noise, 400, rng) ** 2) for _ in range(2000)]
@@ -137,7 +135,7 @@ def test_so_many_samples_tell_the_level() -> None:
     assert Autoregression((), 1.0, H).effective(400) == 400
 
 
-def test_intervals_keep_their_coverage_under_coloured_noise() -> None:
+def test_intervals_keep_their_coverage_under_coloured_noise():
     """A linear model of three slow signals; white intervals would hold the truth in about half the
     cases."""
     rng, t, z = np.random.default_rng(0), np.arange(400) * H, {"found": [], "ignored": []}
@@ -158,7 +156,7 @@ def test_intervals_keep_their_coverage_under_coloured_noise() -> None:
 
 
 @pytest.mark.parametrize("loss", ROBUST)
-def test_losses_are_scipys(loss: Loss) -> None:
+def test_losses_are_scipys(loss):
     z = np.linspace(0.0, 9.0, 200)
     h = 1e-6
     near = np.abs(z - 1) > 0.05  # of Huber's kink
@@ -186,7 +184,7 @@ def test_losses_are_scipys(loss: Loss) -> None:
 
 @pytest.mark.parametrize("loss", ROBUST)
 @pytest.mark.parametrize("bad", [0.0, 0.1])
-def test_robust_covariance_is_that_of_many_fits(loss: Loss, bad: float) -> None:
+def test_robust_covariance_is_that_of_many_fits(loss, bad):
     """With Gaussian noise, at the efficiency that its reach was made for; and with one outlier in
     ten, ten times as large."""
     rng = np.random.default_rng(0)
@@ -214,7 +212,7 @@ def test_robust_covariance_is_that_of_many_fits(loss: Loss, bad: float) -> None:
         assert np.mean(plain**2) / np.mean(ends**2) == pytest.approx(EFFICIENCY, abs=0.03)
 
 
-def test_robust_covariance_of_what_nothing_holds_is_refused() -> None:
+def test_robust_covariance_of_what_nothing_holds_is_refused():
     r = np.full(40, 50.0)
     with pytest.raises(ValueError, match="holds on to nothing"):
         covariance(np.ones((40, 1)), r, "cauchy")

@@ -58,12 +58,12 @@ FAULTY = {
 
 
 @pytest.fixture(scope="module")
-def strokes() -> Recording:
+def strokes():
     return record("strokes", begin(STROKES, BASE), {"pad.E": 0.9e6}, FAULTY)
 
 
 @pytest.mark.slow
-def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None:
+def test_every_kind_of_coordinate_has_its_derivative(strokes):
     """Of parameters, a place of the disc, and of everything that a sensor may have; by differences,
     and by the adjoint."""
     moved = replace(strokes, name="moved", start=AtRest(position_sd=1e-4))
@@ -95,7 +95,7 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None
     check_derivatives(problem, x, 1e-3, 2e-5, adjoint=1e-9)
 
 
-def test_a_prior_is_one_more_measurement(strokes: Recording) -> None:
+def test_a_prior_is_one_more_measurement(strokes):
     prior = Prior(median=7e5, sd=0.02, kind="log-normal")
     problem = Problem([strokes], {"x_C": Sensor(noise=1e-2)}, {"pad.E": Unknown(prior=prior)})
     answer = identify(
@@ -112,14 +112,12 @@ def test_a_prior_is_one_more_measurement(strokes: Recording) -> None:
         ("x_C", Sensor(noise=1e-3, inertia=0.1), "not the force of an actuator"),
     ],
 )
-def test_what_a_channel_cannot_have_is_refused(
-    strokes: Recording, channel: str, sensor: Sensor, sentence: str
-) -> None:
+def test_what_a_channel_cannot_have_is_refused(strokes, channel, sensor, sentence):
     with pytest.raises(ValueError, match=rf"sensors\.{channel}\..*{sentence}"):
         Problem([strokes], {channel: sensor}, {"pad.E": Unknown()})
 
 
-def test_tables_that_make_no_sense_are_refused() -> None:
+def test_tables_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match=r"low = 2\.0 must be below high = 1\.0"):
         Sensor(noise=1.0, low=2.0, high=1.0)
     with pytest.raises(ValueError, match="log-normal prior needs median > 0"):
@@ -129,7 +127,7 @@ def test_tables_that_make_no_sense_are_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def jaws() -> Rig:
+def jaws():
     """A disc between two driven pads, without controllers."""
     mesh, names = (
         PadMesh(length=60e-3, height=4.59e-3, elements_x=30, elements_y=2),
@@ -159,7 +157,7 @@ def jaws() -> Rig:
     )
 
 
-def test_another_rig_is_identified_by_its_own_names(jaws: Rig) -> None:
+def test_another_rig_is_identified_by_its_own_names(jaws):
     y0 = torch.zeros(jaws.layout.size, dtype=torch.float64)
     y0[jaws.layout.slices["pose", "disc"]] = torch.tensor(
         [3e-4, 23.94e-3, 0.0], dtype=torch.float64
@@ -193,7 +191,7 @@ def test_another_rig_is_identified_by_its_own_names(jaws: Rig) -> None:
         Problem([replace(data, start=AtRest())], sensors, unknowns)
 
 
-def test_saturated_samples_have_tobins_likelihood() -> None:
+def test_saturated_samples_have_tobins_likelihood():
     """An amplitude, of which a sensor cuts a third off: its likelihood is that of the normal
     distribution function, and with many seeds errors are standard normal."""
     t, limit, noise = np.arange(200) * 5e-3, 0.9, 0.1
@@ -225,7 +223,7 @@ def test_saturated_samples_have_tobins_likelihood() -> None:
     assert not slope.any()
 
 
-def test_saturated_samples_cannot_have_coloured_noise(strokes: Recording) -> None:
+def test_saturated_samples_cannot_have_coloured_noise(strokes):
     sensors = {"F_x": Sensor(noise=0.1, high=float(strokes.samples["F_x"][1].max()), colour="ar")}
     with pytest.raises(
         ValueError, match=r"sensors\.F_x: in `strokes` samples are at its `low` or `high`"
@@ -233,7 +231,7 @@ def test_saturated_samples_cannot_have_coloured_noise(strokes: Recording) -> Non
         Problem([strokes], sensors, {"pad.E": Unknown()})
 
 
-def test_what_saturation_has_changed_is_not_judged(strokes: Recording) -> None:
+def test_what_saturation_has_changed_is_not_judged(strokes):
     """Noise as stated and a sensor that is saturated most of the time: residuals near its range's
     end are not normal, those well inside are; and one far from the prediction counts wherever it
     is."""

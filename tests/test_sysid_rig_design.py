@@ -54,7 +54,7 @@ theta_d = {{low = -0.5, high = 0.5, speed = 30.0, after = 0.4}}
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("design")
     (folder / "fit.toml").write_text(PLAN, encoding="utf-8")
     asked = ["design", str(folder / "fit.toml"), "--out", str(folder / "out"), "--no-progress"]
@@ -62,7 +62,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_candidates_are_ranked_by_what_they_tell(out: Path) -> None:
+def test_candidates_are_ranked_by_what_they_tell(out):
     """The deviations are those of the Fisher matrix; a motion that cannot be made comes last."""
     first, second, last = json.loads((out / "out" / "design.json").read_text())["candidates"]
     assert (first["name"], second["name"], last["name"]) == ("twist", AS_STATED, "far")
@@ -80,7 +80,7 @@ def test_candidates_are_ranked_by_what_they_tell(out: Path) -> None:
     assert list(first["deviations"].values()) == pytest.approx(wanted.tolist(), rel=1e-6)
 
 
-def test_the_designed_motion_is_a_rig_file_that_runs(out: Path) -> None:
+def test_the_designed_motion_is_a_rig_file_that_runs(out):
     file = RigFile.from_toml(out / "out" / "motion.toml")
     written = json.loads((out / "out" / "design.json").read_text())
     motion: Any = file.motion["theta_d"]
@@ -99,7 +99,7 @@ def test_the_designed_motion_is_a_rig_file_that_runs(out: Path) -> None:
     assert followed.tolist() == pytest.approx([motion.values[1], motion.values[3]])
 
 
-def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path: Path) -> None:
+def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
     column = {"kind": "csv", "file": "x.csv", "column": "x"}
     (tmp_path / "x.csv").write_text("t [s],x [m]\n0,0\n1,0.001\n", encoding="utf-8")
     file = RigFile.from_toml(RIG)
@@ -126,9 +126,7 @@ def replaced(old: str, new: str) -> Callable[[str], str]:
         ),
     ],
 )  # fmt: skip
-def test_what_cannot_be_designed_is_refused(
-    tmp_path: Path, change: Callable[[str], str], words: str, capsys: Any
-) -> None:
+def test_what_cannot_be_designed_is_refused(tmp_path, change, words, capsys):
     (tmp_path / "fit.toml").write_text(change(PLAN), encoding="utf-8")
     asked = ["design", str(tmp_path / "fit.toml"), "--out", str(tmp_path / "o"), "--no-progress"]
     assert main(asked) == 2

@@ -14,7 +14,6 @@ from torchsoft import simulate
 from torchsoft.cli import main
 from torchsoft.physics.motion import Sampled
 from torchsoft.rigs.build import RigFile
-from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid import (
     Problem,
     Sensor,
@@ -59,7 +58,7 @@ def coarse(**groups: Any) -> RigFile:
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
+def run():
     """The truth: the fingers close and lift the disc."""
     rig, y0, _ = coarse(
         materials={"silicone": {"E": TRUTH["materials.silicone.E"]}},
@@ -69,7 +68,7 @@ def run() -> Trajectory:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, run: Trajectory) -> Path:
+def folder(tmp_path, run):
     """The rig's file, a recording, and what is to be found."""
     noise = np.random.default_rng(1)
     (tmp_path / "rig.toml").write_text(RIG.read_text(encoding="utf-8"), encoding="utf-8")
@@ -81,7 +80,7 @@ def folder(tmp_path: Path, run: Trajectory) -> Path:
     return tmp_path
 
 
-def test_numbers_of_a_rig_file_are_found_by_their_names(folder: Path) -> None:
+def test_numbers_of_a_rig_file_are_found_by_their_names(folder):
     case = load([folder / "run.csv"], folder / "fit.toml")
     result = identify(case.problem, **case.config.fit.model_dump() | {"assumptions": "trusted"})
     for one in result.estimates:
@@ -90,7 +89,7 @@ def test_numbers_of_a_rig_file_are_found_by_their_names(folder: Path) -> None:
     assert result.chi2 == pytest.approx(1.0, abs=0.15)
 
 
-def test_parameters_have_the_names_of_their_tables() -> None:
+def test_parameters_have_the_names_of_their_tables():
     rig, y0, _ = coarse().build()
     assert rig.parameter("materials.silicone.E") is rig.pads["left_tip"].material.E
     assert rig.parameter("laws.dry.friction.mu_s") is rig.contacts["left"].law.friction.mu_s
@@ -104,7 +103,7 @@ def test_parameters_have_the_names_of_their_tables() -> None:
     assert torch.equal(by.sensitivities, own.sensitivities)  # pyright: ignore[reportArgumentType]
 
 
-def test_a_recorded_signal_takes_the_place_of_the_files_motion(folder: Path) -> None:
+def test_a_recorded_signal_takes_the_place_of_the_files_motion(folder):
     rows = (folder / "run.csv").read_text(encoding="utf-8").splitlines()
     wave = [f"{row},{-24 + 0.001 * i:.4f}" for i, row in enumerate(rows[1:])]
     text = "\n".join([f"{rows[0]},left_close [mm]", *wave])
@@ -117,7 +116,7 @@ def test_a_recorded_signal_takes_the_place_of_the_files_motion(folder: Path) -> 
     assert torch.equal(rig.reference["right_close"](at)[0], motion(at)[0])
 
 
-def test_the_time_before_the_first_sample_is_an_assumption(folder: Path) -> None:
+def test_the_time_before_the_first_sample_is_an_assumption(folder):
     """Said otherwise in both directions, on the steps of the fit with others before them."""
     (stated,) = load([folder / "run.csv"], folder / "fit.toml").problem.recordings
     (other,) = [one for one in assumptions([stated], set()) if one.name == "lead"]
@@ -131,7 +130,7 @@ def test_the_time_before_the_first_sample_is_an_assumption(folder: Path) -> None
     assert np.array_equal(since(Frozen(earlier), 0.0).knots, knots)
 
 
-def test_a_trajectory_file_of_the_rig_is_a_recording(folder: Path, run: Trajectory) -> None:
+def test_a_trajectory_file_of_the_rig_is_a_recording(folder, run):
     run.save(folder / "run.nc")
     fit = (folder / "fit.toml").read_text(encoding="utf-8").replace('columns.camera = "x_disc"', "")
     (folder / "fit.toml").write_text(fit, encoding="utf-8")
@@ -198,7 +197,7 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_what_a_rig_cannot_be_identified_from_is_refused(folder: Path, case: str) -> None:
+def test_what_a_rig_cannot_be_identified_from_is_refused(folder, case):
     name, change, words = REFUSALS[case]
     text = (folder / name).read_text(encoding="utf-8")
     assert change(text) != text
@@ -207,7 +206,7 @@ def test_what_a_rig_cannot_be_identified_from_is_refused(folder: Path, case: str
         load([folder / "run.csv"], folder / "fit.toml")
 
 
-def test_columns_are_channels_and_signals_with_a_unit() -> None:
+def test_columns_are_channels_and_signals_with_a_unit():
     known = vocabulary(coarse().assemble(), {})
     assert known.units["lean"] == "rad"
     assert known.units["right_lift_dot"] == "m/s"
@@ -221,7 +220,7 @@ PLAN = FIT.replace(
 )
 
 
-def test_a_rehearsal_says_what_an_experiment_would_identify(folder: Path) -> None:
+def test_a_rehearsal_says_what_an_experiment_would_identify(folder):
     """Its recording is a template of the real one: the same configuration takes it."""
     (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
     out = folder / "out"
@@ -260,9 +259,7 @@ def test_a_rehearsal_says_what_an_experiment_would_identify(folder: Path) -> Non
         (replaced("duration = 0.6", "duration = 0"), (), "rehearsal.duration"),
     ],
 )
-def test_what_cannot_be_rehearsed_is_refused(
-    folder: Path, change: Callable[[str], str], more: tuple[str, ...], words: str, capsys: Any
-) -> None:
+def test_what_cannot_be_rehearsed_is_refused(folder, change, more, words, capsys):
     (folder / "plan.toml").write_text(change(PLAN), encoding="utf-8")
     files = [str(folder / name) for name in ("plan.toml", *more)]
     assert main(["rehearse", *files, "--out", str(folder / "out"), "--no-progress"]) == 2
@@ -270,7 +267,7 @@ def test_what_cannot_be_rehearsed_is_refused(
 
 
 @pytest.mark.slow
-def test_a_grasp_in_mid_air_says_that_its_poses_are_to_be_measured() -> None:
+def test_a_grasp_in_mid_air_says_that_its_poses_are_to_be_measured():
     """Contact points touch and slip within the intervals of where it begins: finer steps are not
     tried in vain."""
     sensors = {name: Sensor(noise=sd) for name, sd in SENSORS.items()}

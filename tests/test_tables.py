@@ -1,7 +1,6 @@
 """Tables: refusals are one sentence that names the field, what was given and what is allowed; files
 of TOML are read alike."""
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -67,7 +66,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_refusal_is_one_sentence_that_names_the_field(name: str, tmp_path: Path) -> None:
+def test_a_refusal_is_one_sentence_that_names_the_field(name, tmp_path):
     tree, message = REFUSED[name]
     for make in (lambda: Run(**tree), lambda: Run.model_validate(tree)):
         with pytest.raises(InvalidTable) as error:
@@ -76,30 +75,30 @@ def test_a_refusal_is_one_sentence_that_names_the_field(name: str, tmp_path: Pat
         assert "\n" not in str(error.value)
 
 
-def test_what_is_right_is_taken_as_it_is() -> None:
+def test_what_is_right_is_taken_as_it_is():
     run = Run.model_validate({"step": 2, "motions": [{"kind": "press", "depth": 3}]})
     assert run == Run(step=2.0, motions=(Press(kind="press", depth=3.0),))
     assert isinstance(run.step, float)
     assert Run.model_validate_json(run.model_dump_json()) == run
 
 
-def test_a_table_stays_as_it_was_made() -> None:
+def test_a_table_stays_as_it_was_made():
     with pytest.raises(InvalidTable, match=r"^step cannot be set: a table stays as it was made"):
         Run().step = 2.0
 
 
-def test_json_is_refused_alike() -> None:
+def test_json_is_refused_alike():
     with pytest.raises(InvalidTable, match=r"^step should be greater than 0, not -1"):
         Run.model_validate_json('{"step": -1}')
 
 
-def test_values_are_shown_short() -> None:
+def test_values_are_shown_short():
     assert len(shown("x" * 1000)) < 60
     assert len(shown({str(i): ["y" * 100] * 100 for i in range(100)})) <= 120
     assert "\n" not in shown("a\nb")
 
 
-def test_a_mark_of_order_and_other_ends_of_lines_are_read(tmp_path: Path) -> None:
+def test_a_mark_of_order_and_other_ends_of_lines_are_read(tmp_path):
     path = tmp_path / "run.toml"
     path.write_bytes("\ufeffstep = 2.0 # µ\r\ncount = 3\r\n".encode())
     assert from_toml(path, Run.model_validate) == Run(step=2.0, count=3)
@@ -116,7 +115,7 @@ def test_a_mark_of_order_and_other_ends_of_lines_are_read(tmp_path: Path) -> Non
         (b"step = -1.0", r"run.toml: step should be greater than 0"),
     ],
 )
-def test_a_file_that_cannot_be_read_is_named(content: bytes, message: str, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_named(content, message, tmp_path):
     path = tmp_path / "run.toml"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"run\.toml") as error:
@@ -125,6 +124,6 @@ def test_a_file_that_cannot_be_read_is_named(content: bytes, message: str, tmp_p
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_is_not_there_is_the_systems_error(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_is_the_systems_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_toml(tmp_path / "none.toml")

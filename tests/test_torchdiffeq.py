@@ -3,7 +3,6 @@
 import importlib
 import subprocess
 import sys
-from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
@@ -21,7 +20,7 @@ Rolling = tuple[SoftGrasp, torch.Tensor]
 SOLVERS = importlib.import_module("torchdiffeq._impl.odeint").SOLVERS
 
 
-def test_an_import_leaves_torchdiffeq_alone_and_pysindy_for_later() -> None:
+def test_an_import_leaves_torchdiffeq_alone_and_pysindy_for_later():
     code = (
         "import torchdiffeq; from torchdiffeq._impl.odeint import SOLVERS; before = dict(SOLVERS); "
         "import torchsoft; assert SOLVERS == before; torchsoft.register_method(); assert SOLVERS "
@@ -30,7 +29,7 @@ def test_an_import_leaves_torchdiffeq_alone_and_pysindy_for_later() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_torchdiffeq_runs_the_stepper() -> None:
+def test_torchdiffeq_runs_the_stepper():
     """`odeint(model, y0, t, method="sdirk2")` is `simulate`, sample by sample."""
     model = coarse()
     manipulation = grasp_and_roll(model, grasp_force=75.0)
@@ -45,7 +44,7 @@ def test_torchdiffeq_runs_the_stepper() -> None:
 
 @pytest.mark.parametrize("method", ["rk4", pytest.param("dopri5", marks=pytest.mark.slow)])
 @torch.no_grad()
-def test_explicit_methods_agree(method: str) -> None:
+def test_explicit_methods_agree(method):
     """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window,
     slip included."""
     model = coarse()
@@ -63,7 +62,7 @@ def test_explicit_methods_agree(method: str) -> None:
 
 
 @pytest.fixture
-def solver_of_theirs() -> Iterator[type]:
+def solver_of_theirs():
     """torchdiffeq with a solver of its own under the name, and the stepper registered after it."""
 
     class Theirs:
@@ -92,7 +91,7 @@ def solver_of_theirs() -> Iterator[type]:
     SOLVERS[METHOD] = before
 
 
-def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_theirs: type) -> None:
+def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_theirs):
     """A foreign function is integrated by theirs, a rig by the stepper; registering twice changes
     nothing."""
     assert issubclass(SOLVERS[METHOD], TorchdiffeqSolver)
@@ -108,7 +107,7 @@ def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_their
 
 
 @pytest.fixture(scope="module")
-def rolling() -> Rolling:
+def rolling():
     """A model and two states (2, size) in its grasp."""
     model = coarse()
     manipulation = grasp_and_roll(model, grasp_force=75.0)
@@ -139,7 +138,7 @@ def gradients(
     return start.grad, {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
 
 
-def test_odeint_adjoint_equals_odeint(rolling: Rolling) -> None:
+def test_odeint_adjoint_equals_odeint(rolling):
     """Interval by interval, for a batch of two, every parameter and the initial states."""
     model, y0 = rolling
     y0_bar, bars = gradients(model, y0, odeint)
@@ -149,7 +148,7 @@ def test_odeint_adjoint_equals_odeint(rolling: Rolling) -> None:
         assert float((bar - bars_adjoint[name]).abs().max()) <= 1e-11 * float(bar.abs().max()), name
 
 
-def test_odeint_adjoint_of_a_forgotten_run_says_so(rolling: Rolling) -> None:
+def test_odeint_adjoint_of_a_forgotten_run_says_so(rolling):
     model, y0 = rolling
     t = torch.tensor([0.3, 0.31], dtype=torch.float64)
     y = odeint_adjoint(model, y0[0].clone().requires_grad_(True), t, method=METHOD)
@@ -159,7 +158,7 @@ def test_odeint_adjoint_of_a_forgotten_run_says_so(rolling: Rolling) -> None:
         y.sum().backward()
 
 
-def test_continuous_adjoint_agrees_on_a_short_window(rolling: Rolling) -> None:
+def test_continuous_adjoint_agrees_on_a_short_window(rolling):
     """0.2 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the
     discrete adjoint."""
     model, y0 = rolling

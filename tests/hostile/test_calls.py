@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasp, times
+from conftest import RUBBER, coarse, f64, grasp, times
 from torch import nn
 
-from hostile.trial import Tally
 from torchsoft import (
     PD,
     Actuator,
@@ -67,7 +66,6 @@ Attack = tuple[Callable[..., Any], dict[str, Any], dict[str, list[Any]]]
 # parts
 # ----------------------------------------------------------------------
 
-RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 SERIES = RUBBER | {"tau": [1.0, 2.0]}
 SPRINGS = {"K_n": 1e5, "R_n": 400.0, "K_t": 1e5, "R_t": 400.0, "friction": Coulomb(0.5, 0.4)}
 SLIP = {"mu_s": 0.8, "mu_k": 0.7, "v_s": 0.05, "eta": 10.0}
@@ -217,9 +215,7 @@ class Accepted(Exception):
 
 
 @pytest.mark.parametrize("attacks", [of_constructors, of_parts, of_runs, of_values])
-def test_odd_calls_are_refused_with_a_sentence(
-    tally: Callable[[str], Tally], attacks: Callable[[], Iterator[Attack]]
-) -> None:
+def test_odd_calls_are_refused_with_a_sentence(tally, attacks):
     line = tally(f"odd calls {attacks.__name__.replace('_', ' ')}")
     for call, right, odds in attacks():
         for name, values in odds.items():

@@ -30,7 +30,7 @@ from hostile.damage import (
 )
 from hostile.processes import ended, fork, kernel, restore
 from hostile.specimens import dataset, make, problem, run
-from hostile.trial import LIMIT, Tally, count, random, sentence
+from hostile.trial import LIMIT, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
 from torchsoft.datasets.files import StoreError
@@ -73,7 +73,7 @@ def misread(read: Callable[[], bool], name: str = "") -> str:
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory: Make) -> Specimen:
+def compiled(tmp_path_factory):
     def wrong(path: Path, kind: str) -> str:
         for _ in range(2):
             objects._said.clear()
@@ -114,7 +114,7 @@ class Identified(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def identified(tmp_path_factory: Make) -> Identified:
+def identified(tmp_path_factory):
     recorded, runs, inner = problem(), {}, Journal.keep
 
     def noticed(self: Journal, run: Any, result: Any) -> None:
@@ -129,7 +129,7 @@ def identified(tmp_path_factory: Make) -> Identified:
 
 
 @pytest.fixture(scope="module")
-def checkpoint(identified: Identified) -> Specimen:
+def checkpoint(identified):
     def wrong(path: Path, kind: str) -> str:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
@@ -145,7 +145,7 @@ def checkpoint(identified: Identified) -> Specimen:
 
 
 @pytest.fixture(scope="module")
-def answer(identified: Identified, tmp_path_factory: Make) -> Specimen:
+def answer(identified, tmp_path_factory):
     sound, truth = tmp_path_factory.mktemp("answer"), identified.answer.to_json()
     identified.answer.save(sound / "answer.json")
     read = lambda path: load_answer(path).to_json() == truth
@@ -160,9 +160,7 @@ def bits(answer: IdentificationResult) -> Any:
 
 
 @pytest.mark.filterwarnings("ignore:the checkpoint")
-def test_the_answer_keeps_its_bits(
-    identified: Identified, checkpoint: Specimen, tally: Callable[[str], Tally], tmp_path: Path
-) -> None:
+def test_the_answer_keeps_its_bits(identified, checkpoint, tally, tmp_path):
     """Whatever happened to however many files, and afterwards every file is whole again."""
     line, folder = tally("identifications resumed from damaged checkpoints"), tmp_path / "runs"
     damages = BYTES | GONE | checkpoint.damages
@@ -182,7 +180,7 @@ def test_the_answer_keeps_its_bits(
         line.held(held, f"{number}: {bits(again)}")
 
 
-def test_folders_of_others_are_left_alone(tally: Callable[[str], Tally], tmp_path: Path) -> None:
+def test_folders_of_others_are_left_alone(tally, tmp_path):
     """Refused in one sentence where they are not ours; where they are, what others put in them
     stays."""
     kept = tally("others' files in a checkpoint folder, or in its place")
@@ -208,7 +206,7 @@ def test_folders_of_others_are_left_alone(tally: Callable[[str], Tally], tmp_pat
 
 
 @pytest.fixture(scope="module")
-def generated(tmp_path_factory: Make) -> Specimen:
+def generated(tmp_path_factory):
     """By the check, which never raises, and by either way of reading."""
     place = tmp_path_factory.mktemp("damage")
     make(dataset(place), place / "sound")
@@ -275,7 +273,7 @@ REMADE: Damages = {
 
 
 @pytest.fixture(scope="module")
-def trajectory(tmp_path_factory: Make) -> Specimen:
+def trajectory(tmp_path_factory):
     sound = tmp_path_factory.mktemp("runs")
     run().save(sound / "run.nc")
     truth = load(sound / "run.nc")
@@ -304,9 +302,7 @@ FILES: dict[str, tuple[str, str, int]] = {
 
 
 @pytest.mark.parametrize("files", FILES)
-def test_a_damaged_file_is_noticed(
-    files: str, request: pytest.FixtureRequest, tmp_path: Path, tally: Callable[[str], Tally]
-) -> None:
+def test_a_damaged_file_is_noticed(files, request, tmp_path, tally):
     fixture, pattern, number = FILES[files]
     specimen: Specimen = request.getfixturevalue(fixture)
     line, copy, trap = tally(f"damaged {files}"), tmp_path / "copy", Trap(tmp_path / "executed")

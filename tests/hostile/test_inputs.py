@@ -6,7 +6,6 @@ import re
 import tomllib
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -174,9 +173,7 @@ def bounds(table: Any) -> dict[str, list[Any]]:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("way", "share"), [("values", 1.0), ("text", 0.25), ("bounds", 0.1)])
-def test_a_mutated_table_is_finite_or_refused_by_its_field(
-    kind: str, way: str, share: float, tally: Lines, tmp_path: Path
-) -> None:
+def test_a_mutated_table_is_finite_or_refused_by_its_field(kind, way, share, tally, tmp_path):
     """With one value changed, its text damaged, or many values at their bounds."""
     table, valid, number, follow = KINDS[kind]
     line, rng, trees, ends = tally(f"{kind}: {way}"), random(kind + way), valid(), bounds(table)
@@ -293,7 +290,7 @@ def run_once(case: measured.Case) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     table = cells()
     parts = {"data": table, "third": table, "second": [row[:5] + row[6:10] for row in table]}
     parts["force"] = [[row[0], *row[10:12], "Temp [K]"] for row in table]
@@ -304,7 +301,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("way", "number"), [("values", 4000), ("text", 1000)])
-def test_a_mutated_identification(way: str, number: int, folder: Path, tally: Lines) -> None:
+def test_a_mutated_identification(way, number, folder, tally):
     line, rng, path = tally(f"identifications: {way}"), random(way), folder / "rig.toml"
     load = partial(measured.load, [folder / "data.csv"], path)
     trees = identification(False), identification(True)
@@ -356,7 +353,7 @@ def mutated(table: Table, rng: np.random.Generator) -> tuple[str, Mutant]:
     return csv_text([head, *body], delimiter), Mutant(new=(row, column))
 
 
-def test_a_mutated_table_of_measurements(folder: Path, tally: Lines) -> None:
+def test_a_mutated_table_of_measurements(folder, tally):
     line, rng, table = tally("tables of measurements"), random("cells"), cells()
     path = folder / "data.csv"
     load = partial(measured.load, [path], folder / "rig.toml")
@@ -368,7 +365,7 @@ def test_a_mutated_table_of_measurements(folder: Path, tally: Lines) -> None:
         attack(line, changed, load, run_once if i % 10 == 0 else None)
 
 
-def test_a_long_table_is_read_in_seconds(folder: Path, tally: Lines) -> None:
+def test_a_long_table_is_read_in_seconds(folder, tally):
     """1e5 rows, at the example's 0.2 s: the estimate is of minutes, because dense samples are
     interpolated."""
     line, (head, *body) = tally("long tables"), cells()

@@ -76,7 +76,7 @@ def crash(
 
 
 @pytest.mark.parametrize(("begun", "number"), [("nothing", 270), ("half", 200)])
-def test_generation(begun: str, number: int, memory: Path, tally: Lines) -> None:
+def test_generation(begun, number, memory, tally):
     """From an empty place; and from a folder in which one shard of two is finished and the other
     half written."""
     generate = partial(make, dataset(memory), memory / "place" / "set")
@@ -94,7 +94,7 @@ def test_generation(begun: str, number: int, memory: Path, tally: Lines) -> None
     assert difference(place / "set", tree(memory / "whole")) == ""
 
 
-def test_results(memory: Path, tally: Lines) -> None:
+def test_results(memory, tally):
     """The picture of a check, trajectory files, new and written over, and the answer and the page
     of an identification."""
     make(dataset(memory), memory / "set")
@@ -192,7 +192,7 @@ STOPS: dict[str, tuple[Callable[[Path], Work], int, signal.Signals, int]] = {
 
 
 @pytest.mark.parametrize("stops", STOPS)
-def test_stopped_it_ends_the_same(stops: str, memory: Path, tally: Lines) -> None:
+def test_stopped_it_ends_the_same(stops, memory, tally):
     """Stopped up to three times at any moment, or soon after it went on, and then started again.
     Nothing that it began outlives it; interrupted it says in one line how to go on, and keeps what
     was done."""
@@ -239,7 +239,7 @@ def test_stopped_it_ends_the_same(stops: str, memory: Path, tally: Lines) -> Non
 # ----------------------------------------------------------------------
 
 
-def test_many_at_one_cache(tmp_path: Path, tally: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_at_one_cache(tmp_path, tally, monkeypatch):
     """Processes that compile at once, some of them killed at it: every other has what it needs, and
     nothing is left."""
     line, folder = tally("processes at one cache, a third of them killed"), tmp_path / "kernels"

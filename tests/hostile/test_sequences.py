@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasp, times
+from conftest import Exp, coarse, f64, grasp, times, towards
 from hypothesis import HealthCheck, Phase, seed, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -33,11 +33,10 @@ from hypothesis.stateful import (
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from hostile.trial import SEED, Tally, count, sentence
+from hostile.trial import SEED, count, sentence
 from torchsoft import (
     Coulomb,
     Profile,
-    Reference,
     SimulationFailed,
     SmoothSlip,
     SoftGrasp,
@@ -71,16 +70,6 @@ PART = 0.3
 
 SHARE = 0.7
 """A number that a law below reads from its module."""
-
-
-class Exp(nn.Module):
-    """A positive parameter by its logarithm."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x.exp()
-
-    def right_inverse(self, x: Tensor) -> Tensor:
-        return x.log()
 
 
 class Own(nn.Module):
@@ -290,10 +279,9 @@ class ModelInUse(RuleBasedStateMachine):
 
     @step_by_step
     def change_reference(self) -> None:
-        old = self.model.reference
         x = Profile([0.0, 4e-3], [0.06, 0.06 + 1e-4 * self.rng.standard_normal()])
         x.values.requires_grad_(self.some(True, False))
-        self.model.reference = Reference(x_d=x, y_d=old["y_d"], F_ff=old["F_ff"])
+        self.model.reference = towards(self.model, x)
 
     @step_by_step
     def move_knots(self) -> None:
@@ -378,7 +366,7 @@ CHANGED = sorted(set(NAMES.values()) - {"contact.epsilon", "contact.friction.v_s
 """Parameters that operations change."""
 
 
-def test_gradients_after_any_sequence_are_those_of_what_ran(tally: Callable[[str], Tally]) -> None:
+def test_gradients_after_any_sequence_are_those_of_what_ran(tally):
     line, sequences = tally("sequences of model operations, gradients"), count(1000)
     how = settings(
         max_examples=sequences, stateful_step_count=10, database=None, deadline=None,

@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import tomllib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -53,7 +52,7 @@ def expect(
 
 
 @pytest.fixture(scope="module")
-def rolled() -> str:
+def rolled():
     """What the rolling gives; its kernels are in the package's cache from then on."""
     status, out, err = start("-c", ROLL)
     assert status == 0, err
@@ -61,7 +60,7 @@ def rolled() -> str:
 
 
 @pytest.fixture(scope="module")
-def other_user() -> int:
+def other_user():
     """Another user, where there may be one."""
     if os.getuid() != 0 or shutil.which("setpriv") is None:
         pytest.skip("only root can run programs as another user, with `setpriv`")
@@ -71,16 +70,14 @@ def other_user() -> int:
 
 
 @pytest.fixture
-def package(tmp_path: Path) -> Path:
+def package(tmp_path):
     """A copy of the package without compiled kernels; the folder to import it from."""
     ignored = shutil.ignore_patterns("__pycache__", "objects")
     shutil.copytree(ROOT / "torchsoft", tmp_path / "package" / "torchsoft", ignore=ignored)
     return tmp_path / "package"
 
 
-def test_damaged_kernels_of_the_simulator_are_made_again(
-    tally: Lines, rolled: str, tmp_path: Path
-) -> None:
+def test_damaged_kernels_of_the_simulator_are_made_again(tally, rolled, tmp_path):
     """In a start of its own for every damage; the simulator's own results keep their bits."""
     line, trap = tally("damaged files of the simulator's kernels"), Trap(tmp_path / "executed")
     kinds = BYTES | GONE | FOREIGN
@@ -94,9 +91,7 @@ def test_damaged_kernels_of_the_simulator_are_made_again(
     line.held(not trap.path.exists(), "executed")
 
 
-def test_changed_sources_give_changed_physics(
-    tally: Lines, rolled: str, other_user: int, package: Path, tmp_path: Path
-) -> None:
+def test_changed_sources_give_changed_physics(tally, rolled, other_user, package, tmp_path):
     """Where the package cannot be written, and the kernels of before lie in the user's cache."""
     line, home = tally("upgrades of a package that cannot be written"), tmp_path / "home"
     kept = home / ".cache" / "torchsoft"
@@ -115,7 +110,7 @@ def test_changed_sources_give_changed_physics(
     line.held(len(list(kept.iterdir())) == 2, "the kernels of both are kept, apart")
 
 
-def test_users_without_rights(tally: Lines, rolled: str, other_user: int, package: Path) -> None:
+def test_users_without_rights(tally, rolled, other_user, package):
     """With root's cache they simulate at once; without any they compile, and one line says so."""
     line = tally("users who can write neither the package nor a home")
     nowhere: list[dict[str, str | None]] = [
@@ -133,7 +128,7 @@ def test_users_without_rights(tally: Lines, rolled: str, other_user: int, packag
         expect(line, "-c", ROLL, out=rolled, **user, **where)
 
 
-def test_caches_of_other_users(tally: Lines, other_user: int, tmp_path: Path) -> None:
+def test_caches_of_other_users(tally, other_user, tmp_path):
     """Are not used, and one line says so; those of root and of the package's owner are."""
     line, theirs = tally("caches of other users"), {"TORCHSOFT_CACHE_DIR": str(tmp_path)}
     warned = ".*holds kernels that other users may change, which are not used\n"
@@ -150,7 +145,7 @@ def test_caches_of_other_users(tally: Lines, other_user: int, tmp_path: Path) ->
         expect(line, "-c", TINY, user=other_user, **said, **theirs)
 
 
-def test_full_disk(tally: Lines, tmp_path: Path) -> None:
+def test_full_disk(tally, tmp_path):
     line, disk = tally("full disks"), tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=40k", "none", str(disk)]
@@ -167,7 +162,7 @@ def test_full_disk(tally: Lines, tmp_path: Path) -> None:
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_first_use_in_many_threads(tally: Lines, rolled: str) -> None:
+def test_first_use_in_many_threads(tally, rolled):
     """Kernels and laws are loaded and compiled once, whoever comes first."""
     line = tally("starts whose first runs are at once in eight threads")
     program = f"""{ROLLING}
@@ -224,7 +219,7 @@ COMMANDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """Recordings, configurations, and some that are wrong."""
     rig = tomllib.loads(IDENTIFICATION)
     data = tomllib.loads(sorted((ROOT / "data_gen" / "configs").glob("*.toml"))[2].read_text())
@@ -251,7 +246,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_random_arguments(folder: Path, tally: Lines, capsys: pytest.CaptureFixture[str]) -> None:
+def test_random_arguments(folder, tally, capsys):
     """In this process, with the work itself left out: no traceback, and one line says why."""
     begun = mock.patch.object(identification, "identify", side_effect=RuntimeError("begun"))
     generated = mock.patch.object(generation, "generate", return_value=0)
@@ -279,7 +274,7 @@ def test_random_arguments(folder: Path, tally: Lines, capsys: pytest.CaptureFixt
                 line.call(f"{arguments}", ended, ())
 
 
-def test_commands_as_processes(folder: Path, tally: Lines) -> None:
+def test_commands_as_processes(folder, tally):
     """Nothing is begun, the status is 2, and the last line says why in any locale."""
     line, before = tally("commands as processes"), sorted(os.listdir(folder))
     for i in range(count(42)):
@@ -292,7 +287,7 @@ def test_commands_as_processes(folder: Path, tally: Lines) -> None:
     assert sorted(os.listdir(folder)) == before, "something was begun"
 
 
-def test_terminals_that_know_ascii_only(tally: Lines, tmp_path: Path) -> None:
+def test_terminals_that_know_ascii_only(tally, tmp_path):
     """Files are read and written as ever, and a sign that cannot be shown ends no command."""
     line, out = tally("commands where everything is ASCII"), tmp_path / "ö"
     data, config = tmp_path / "größe µ.csv", tmp_path / "αβ.toml"
