@@ -14,7 +14,6 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.configuration import Config, Rest
-from torchsoft.sysid.criterion import Criterion
 from torchsoft.sysid.design import Design, design
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.planner import Planner
@@ -114,7 +113,7 @@ def choose(
     """
     if stated.rig is None:
         raise ValueError(f'{config}: a design is of the rig of a file: say rig = "FILE.toml"')
-    plan, criterion = stated.design, Criterion(stated.design.criterion)
+    plan = stated.design
     with at_field("settings"):
         file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)
     names = plan.parameters or None
@@ -128,8 +127,8 @@ def choose(
                 raise SimulationFailed(made, 0.0)
             problem = Problem([*recorded, made], stated.sensors, stated.unknowns)
             planner = Planner(
-                problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, criterion, names,
-                plan.rtol, workers,
+                problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, plan.criterion,
+                names, plan.rtol, workers,
             )  # fmt: skip
             x = problem.coordinates.start
             seen = planner.evaluate(np.zeros(0), x)
@@ -145,7 +144,7 @@ def choose(
     found, chosen = None, files[best]
     if plan.bounds:
         found = design(
-            problems[best], best, plan.bounds, limits=plan.limits, criterion=criterion,
+            problems[best], best, plan.bounds, limits=plan.limits, criterion=plan.criterion,
             names=names, iterations=plan.iterations, rtol=plan.rtol, seed=plan.seed,
             workers=workers, progress=progress,
         )  # fmt: skip
