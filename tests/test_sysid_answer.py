@@ -171,16 +171,12 @@ def test_an_answer_says_what_was_asked_for(result: IdentificationResult) -> None
 def test_everything_that_an_answer_can_hold_comes_back(tmp_path: Path) -> None:
     whole = example(IdentificationResult)
     assert all(getattr(whole, one.name) for one in fields(IdentificationResult))
-    assert whole.comparison.series
     whole.save(tmp_path / "answer.json")
     answer = load_answer(tmp_path / "answer.json")
     assert isnan(answer.chi2)
     assert isnan(answer.assumptions[0].favoured_sd)
-    assert answer.comparison is not None
-    assert answer.comparison.series == []  # residuals of laws are left out
     assert answer.to_json() == whole.to_json()
     assert answer.noise == whole.noise
-    assert answer.profiles == whole.profiles
 
 
 def test_a_file_may_be_written_otherwise(path: Path, tmp_path: Path) -> None:

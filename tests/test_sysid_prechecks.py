@@ -242,26 +242,18 @@ def test_nothing_is_said_of_what_is_right(
     assert looked_at(faulty, run, declared) == []
 
 
-def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recording]) -> None:
-    for factor in (0.3, 3.0):
-        gains = {
-            "control.K_98": factor * NOMINAL.control.K_98,
-            "control.R_99": factor * NOMINAL.control.R_99,
-        }
-        one = noted(recordings["rolling"], gains, F_ff=Profile([0.0], [0.0]))
-        pressed = changed(
-            one,
-            F_y=lambda t, F: (
-                F - recordings["rolling"].rig.reference["F_ff"](torch.from_numpy(t))[0].numpy()
-            ),
-        )
-        assert list(loop_findings(pressed, SENSORS, ["control.K_98"])) == []
-        flipped = changed(pressed, F_y=scaled(-1))
-        assert [f.code for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == [
-            "sign of F_y"
-        ]
-    about = noted(recordings["rolling"], {"control.senses": "disc"})
-    assert [f.code for f in loop_findings(about, SENSORS, ["control.K_81"])] == ["control.senses"]
+def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
+    recordings: dict[str, Recording], runs: dict[str, Signals]
+) -> None:
+    flipped = changed(recordings["rolling"], F_y=scaled(-1))
+    assert not list(loop_findings(flipped, SENSORS, ["control.K_98"]))
+    gains = ["control.K_98", "control.R_99", "control.K_81"]
+    for one, code in (
+        (flipped, "sign of F_y"),
+        (noted(recordings["rolling"], {"control.senses": "disc"}), "control.senses"),
+    ):
+        problem = Problem([one], SENSORS, {name: Unknown() for name in gains})
+        assert [f.code for f in precheck(problem, Runner(problem.recordings))] == [code]
 
 
 def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_named(

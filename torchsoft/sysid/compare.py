@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.comparison import Comparison, LawFit, Series, Versus, judged
+from torchsoft.sysid.comparison import Comparison, LawFit, Versus, judged
 from torchsoft.sysid.fit import Unreachable, gauss_newton
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
@@ -368,9 +368,7 @@ def gathered(evidence: Mapping[str, Evidence], heldout: list[str]) -> Comparison
     against = [versus(best, one) for name, one in evidence.items() if name != best.name]
     laws = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
     outcome, law, verdict = judged(laws, against)
-    return Comparison(
-        outcome, law, verdict, laws, against, len(best.fitted.r), heldout, series(evidence)
-    )
+    return Comparison(outcome, law, verdict, laws, against, len(best.fitted.r), heldout)
 
 
 def versus(best: Evidence, other: Evidence) -> Versus:
@@ -421,16 +419,4 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
                 any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
             )
         )  # fmt: skip
-    return out
-
-
-def series(evidence: Mapping[str, Evidence]) -> list[Series]:
-    """Residuals of all laws, side by side."""
-    out = []
-    for part in ("fitted", "heldout"):
-        densities = {name: getattr(one, part) for name, one in evidence.items()}
-        first = next(iter(densities.values()))
-        for one in first.parts if first is not None else ():
-            rows = {name: density.r[one.rows].tolist() for name, density in densities.items()}
-            out.append(Series(one.recording, one.channel, part == "fitted", one.t.tolist(), rows))
     return out

@@ -222,6 +222,7 @@ def design(
             "torchsoft": version("torchsoft"), "criterion": criterion,
             "bounds": {name: one.model_dump() for name, one in bounds.items()},
             "limits": dict(limits or {}), "iterations": search.iteration, "rate": rate,
-            "smoothing": smoothing, "rtol": rtol, "seed": seed, **planner.cost, "wall_s": clock.perf_counter() - began,
+            "smoothing": smoothing, "rtol": rtol, "seed": seed,
+            **planner.cost, "wall_s": clock.perf_counter() - began,
         },
     )  # fmt: skip

@@ -229,8 +229,8 @@ def rms(e: Array) -> float:
 def loop_findings(
     recording: Recording, sensors: Mapping[str, Sensor], unknown: Collection[str] = ()
 ) -> Iterator[Diagnostic]:
-    """Diagnostics on the control loops of a recording whose force and coordinate were measured;
-    `unknown` are the names of unknown parameters."""
+    """Diagnostics on the control loops of a recording whose force and coordinate were measured, and
+    whose gains are not among the parameters that are `unknown`."""
     rig = recording.rig
     tensors = {id(rig.parameter(name)) for name in unknown}
     for name, actuator in rig.actuators.items():
@@ -246,77 +246,63 @@ def loop_findings(
                 f"controller of {F.channel}",
             )  # fmt: skip
         loop = windows(recording, actuator, [F, *coordinates])
-        if loop is None:
+        if loop is None or any(id(p) in tensors for p in actuator.parameters()):
             continue
         body, _, axis = actuator.measured.partition(".")
         rivals = {}
         for other in (one for one in rig.bodies if one != body and actuator.is_loop):
-            rival = windows(
-                recording, actuator, [F, sampled(recording, sensors, f"{other}.{axis}")]
-            )
-            rivals |= {other: rival} if rival is not None else {}
-        free = any(id(p) in tensors for p in actuator.parameters())
-        change = disagreement(rig, loop, body, rivals, free)
+            signals = [F, sampled(recording, sensors, f"{other}.{axis}")]
+            if (rival := windows(recording, actuator, signals)) is not None:
+                rivals[other] = rival
+        change = disagreement(rig, loop, body, rivals)
         if change is not None:
-            e, (force, *others) = rms(loop.F - loop.given()), loop.signals
+            force, *others = loop.signals
             seen = ", ".join([*actuator.setpoints, *(one.channel for one in others)])
             text = (
                 f"{change.clause} (what the controller makes of {seen} differs from "
-                f"{force.channel} by {e:.3g} {actuator.effort_unit} rms, and would by "
-                f"{rms(change.left):.3g})"
+                f"{force.channel} by {rms(loop.F - loop.given()):.3g} {actuator.effort_unit} rms, "
+                f"and would by {rms(change.left):.3g})"
             )
             yield found(change.code, recording, text, change.grave)
 
 
-def disagreement(
-    rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool
-) -> Change | None:
-    """The cause of a disagreement of a loop about a body, if there is one; gains that are `free`
-    may all be larger or smaller."""
-
-    def left(one: Loop, F: Array, feed_forward: float = 1.0) -> Array:
-        given = one.given(feed_forward)
-        gain = max(float(F @ given) / max(float(given @ given), 1e-300), 0.0) if free else 1.0
-        return F - gain * given
-
+def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Change | None:
+    """The cause of a disagreement of a loop about a body, if there is one."""
     F, name, unit, feed = (
         loop.F,
         loop.signals[0].channel,
         loop.actuator.effort_unit,
         loop.actuator.feed_forward,
     )
-    e = left(loop, F)
+    given = loop.given()
+    e = F - given
     white, lasting = (2 * sd + ROUGH * rms(F) for sd in loop.noise)
     if rms(e) <= white:
         return None
     opposite = "looks as if its sign were opposite"
-    changes = [Change(f"sign of {name}", f"{name} {opposite}", left(loop, -F))]
-    changes += [
-        another_sense(rig, loop.actuator, body, other, left(its, its.F))
-        for other, its in rivals.items()
-    ]
-    if not free:
-        changes += [
+    changes = [
+        Change(f"sign of {name}", f"{name} {opposite}", -F - given),
+        *(
+            another_sense(rig, loop.actuator, body, other, its.F - its.given())
+            for other, its in rivals.items()
+        ),
+        *(
             Change(
                 f"unit of {name}",
                 f"{name} looks as if it were in another unit: {words}",
-                left(loop, F / factor),
+                F / factor - given,
             )
             for factor, words in confusions(unit)
-        ]
-        changes += (
-            [Change(f"sign of {feed}", f"{feed} {opposite}", left(loop, F, -1.0))] if feed else []
-        )
+        ),
+    ]
+    if feed:
+        changes.append(Change(f"sign of {feed}", f"{feed} {opposite}", F - loop.given(-1.0)))
     best = min(changes, key=lambda change: rms(change.left))
-    enough = 0.5 * rms(F) if free else max(white, EXPLAINED * min(rms(e), rms(F)))
+    enough = max(white, EXPLAINED * min(rms(e), rms(F)))
     if rms(best.left) <= enough and rms(best.left) < 0.5 * rms(e):
         return best
-    faulty = any(one.faulty for one in loop.signals)
-    if (
-        free
-        or faulty
-        or rms(e) <= (white if feed and not loop.inputs[:, loop.fed].any() else lasting)
-    ):
+    fed = feed and not loop.inputs[:, loop.fed].any()
+    if any(one.faulty for one in loop.signals) or rms(e) <= (white if fed else lasting):
         return None
     slow, began = np.diff(e) / np.sqrt(2), float(e[: max(2, len(e) // 20)].mean())
     if feed and rms(slow) <= max(SLOW * rms(e), white) and abs(began) <= 0.5 * rms(e):
@@ -415,7 +401,7 @@ COARSE = 1.2
 
 def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
     """Readings in steps that the stated noise and resolution leave out."""
-    for name, sensor in sensors.items() if recording.samples else ():
+    for name, sensor in sensors.items():
         if name not in recording.samples:
             continue
         apart = np.diff(np.unique(unsaturated(recording, sensors, name)[1]))
@@ -497,7 +483,8 @@ def another_body(
         for other in others:
             its = channel(rig, f"{other}.{axis}")
             far, there = (apart(recording, sensors, setpoint, its, by) for by in (None, expected))
-            if far is not None and far < SAME and not small(mine) and not small(there):
+            near = any(part is not None and part < APART for part in (mine, there))
+            if far is not None and far < SAME and not near:
                 said = f"{its} follows it to {far:.1%} of its motion"
             elif (
                 mine is not None
@@ -511,10 +498,6 @@ def another_body(
                 continue
             change = another_sense(rig, actuator, body, other, np.zeros(1))
             yield found(change.code, recording, f"{change.clause} ({said})", grave=True)
-
-
-def small(part: float | None) -> bool:
-    return part is not None and part < APART
 
 
 def apart(

@@ -15,7 +15,6 @@ from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton, newton_step
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
-from torchsoft.tables import Number
 from torchsoft.threads import parallel_map, single_threaded
 
 if TYPE_CHECKING:
@@ -372,30 +371,3 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
         {c.labels[k]: [c.all[k].to_value(point.x[k]) for point in points] for k in every},
         (physical[0], physical[1]), straight, o.variance, list(dict.fromkeys(notices)),
     )  # fmt: skip
-
-
-# Summary of a posterior
-
-
-@dataclass(frozen=True)
-class MarginalSummary:
-    """One coordinate's marginal posterior in physical units."""
-
-    label: str
-    mean: Number
-    sd: Number
-    median: Number
-    ci95: tuple[Number, Number]
-    effective: Number
-    r_hat: Number | None
-
-
-@dataclass(frozen=True)
-class PosteriorSummary:
-    """Marginals of posterior draws, what was checked of them, and what a reader must know."""
-
-    method: str
-    draws: int
-    marginals: list[MarginalSummary]
-    checks: dict[str, Number]
-    notices: list[str]

@@ -27,7 +27,6 @@ from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.estimate import (
     ChannelResiduals,
     Contribution,
@@ -40,7 +39,6 @@ from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.profile import PosteriorSummary, Profile
 from torchsoft.sysid.recording import Array, identity
 from torchsoft.sysid.sensitivity import AssumptionTest
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
@@ -141,7 +139,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
 # The result
 
 
-SCHEMA = "torchsoft-answer-4"
+SCHEMA = "torchsoft-answer-5"
 """Name and version of the file's form."""
 
 
@@ -201,9 +199,6 @@ class IdentificationResult(Shown):
     combinations: list[Combination] = field(default_factory=list, repr=False)
     noise: list[ChannelNoise] = field(default_factory=list, repr=False)
     assumptions: list[AssumptionTest] = field(default_factory=list, repr=False)
-    profiles: list[Profile] = field(default_factory=list, repr=False)
-    posterior: PosteriorSummary | None = field(default=None, repr=False)
-    comparison: Comparison | None = field(default=None, repr=False)
     versions: dict[str, str] = field(default_factory=dict, repr=False)
     command: str = ""
     rigs: Annotated[dict[str, Any], Field(exclude=True)] = field(
@@ -363,13 +358,8 @@ class IdentificationResult(Shown):
         return rig
 
     def to_json(self) -> str:
-        """The content of the file. A comparison of laws goes without its residuals."""
-        plain = (
-            replace(self, comparison=replace(self.comparison, series=[]))
-            if self.comparison is not None
-            else self
-        )
-        content = finite(adapter().dump_python(plain, mode="json", by_alias=True))
+        """The content of the file."""
+        content = finite(adapter().dump_python(self, mode="json", by_alias=True))
         return json.dumps(
             {"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False
         )
