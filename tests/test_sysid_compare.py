@@ -213,7 +213,7 @@ def test_a_users_own_law_is_named_where_contacts_slip(
 
 def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another() -> None:
     problems = made(GENTLE, viscous, {"contact.friction.alpha": 0.6})
-    found = compare(problems, plans=plans(problems), again=False)
+    found = compare(problems, plans=plans(problems))
     assert (found.outcome, found.law) == ("cannot tell", None), found.verdict
     assert found.against[0].distance < 4
     assert "cannot tell them apart" in found.verdict

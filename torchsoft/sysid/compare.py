@@ -12,16 +12,15 @@ from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
 from torchsoft.sysid.comparison import Comparison, LawFit, Versus, judged
-from torchsoft.sysid.fit import Unreachable, gauss_newton
+from torchsoft.sysid.fit import Fit, Unreachable, gauss_newton
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
 from torchsoft.sysid.plan import FINER, Stage, default_plan, run_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.residual_tests import (
-    ROUNDS,
     Part,
-    colours,
+    allow_for_colour,
     judge_residuals,
     parts,
     residual_notices,
@@ -199,7 +198,7 @@ CLOSE = 1e-3
 def compare(
     laws: Mapping[str, Problem], *, heldout: Sequence[str] = (),
     plans: Mapping[str, Sequence[Stage]] | None = None, rtol: float = RTOL, starts: int = 1,
-    again: bool = True, workers: int = 1, checkpoint: str | Path | None = None,
+    workers: int = 1, checkpoint: str | Path | None = None,
     progress: bool = False,
 ) -> Comparison:  # fmt: skip
     """Fit every law to the same recordings, and say which one made them, or that the data cannot
@@ -214,9 +213,9 @@ def compare(
     that nobody declared.
 
     Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers`
-    and the folder `checkpoint` are those of `identify`. With `again` every law but the best is
-    fitted once more from where the best one ended, as far as they share coordinates, and the better
-    end is kept: no law is to lose by its start.
+    and the folder `checkpoint` are those of `identify`. Every law but the best is fitted once more
+    from where the best one ended, as far as they share coordinates, and the better end is kept: no
+    law is to lose by its start.
 
     Raises `ValueError` for laws that were not given the same data, and for a law that cannot follow
     the data.
@@ -237,7 +236,7 @@ def compare(
             raise ValueError(f"the law `{name}` cannot follow the recordings: {lost}") from None
         evidence[name] = Evidence(law, runners[name], which, heldout)
     best = most_likely(evidence)
-    for name in (name for name in laws if again and name != best):
+    for name in (name for name in laws if name != best):
         other = refitted(evidence[name].law, evidence[best].law, runners[name], which)
         if other is not None:
             better = Evidence(other, runners[name], which, heldout)
@@ -307,17 +306,15 @@ def fitted(
     fit = end.fit
     assert fit.at is not None
     free = np.isin(problem.coordinates.labels, plan[-1].free)
-    declared, given = [c for c, s in problem.sensors.items() if s.colour == "ar"], problem.noise
-    for _ in range(ROUNDS if declared else 0):
-        found = colours(parts(problem, fit.at.r, which), fit.at.J[:, free], declared)
-        noise = given | {channel: found[channel].noise for channel in declared if channel in found}
-        if not noise:
-            break
-        problem = problem.with_noise(noise)
-        fit = gauss_newton(
-            problem, runner, fit.x, which=which, free=free, steps=fit.steps, tolerance=CLOSE
-        )
-        assert fit.at is not None
+
+    def again(one: Problem, last: Fit, number: int) -> Fit:
+        return gauss_newton(
+            one, runner, last.x, which=which, free=free, steps=last.steps, tolerance=CLOSE,
+            first=last.at,
+        )  # fmt: skip
+
+    if any(sensor.colour == "ar" for sensor in problem.sensors.values()):
+        problem, fit, *_ = allow_for_colour(problem, fit, free, which, again, undeclared=False)
     return FittedLaw(name, problem, fit.x, free, plan[-1].rtol, fit.converged)
 
 

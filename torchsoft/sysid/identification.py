@@ -22,9 +22,7 @@ from torchsoft.sysid.fit import (
     Unreachable,
     chord,
     covariance,
-    descend,
     fisher,
-    gauss_newton,
 )
 from torchsoft.sysid.plan import (
     FINER,
@@ -33,6 +31,7 @@ from torchsoft.sysid.plan import (
     Settled,
     Stage,
     default_plan,
+    on_steps,
     progress_bar,
     run_plan,
     settle,
@@ -435,26 +434,16 @@ def with_its_noise(
     """The fit of the last stage, gone on with whatever noise it leaves: by new Jacobians, then by
     the last one."""
     free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
-    common: dict[str, Any] = {"which": which, "free": free, "steps": fit.steps, "notify": notify}
 
-    def residuals(one: Problem, x: Array) -> Residuals:
-        return one.residuals(runner, x, which, fit.steps, free)
+    def residuals(one: Problem, end: Fit) -> Fit:
+        return end._replace(at=end.at or one.residuals(runner, end.x, which, fit.steps, free))
 
     def refit(one: Problem, last: Fit, number: int) -> Fit:
         if number > 0 and loss == "linear" and last.at is not None:
-            return chord(one, runner, last.x, last.at, **common)
-        if method == "gauss_newton":
-            more: dict[str, Any] = {
-                "evaluations": stage.evaluations,
-                "tolerance": stage.tolerance,
-                "loss": loss,
-            }
-            return gauss_newton(one, runner, last.x, first=last.at, **more, **common)
-        end = descend(
-            one, runner, last.x, method=method, evaluations=4 * stage.evaluations, **common
-        )
-        return end._replace(at=residuals(one, end.x))
+            return chord(
+                one, runner, last.x, last.at, which=which, free=free, steps=fit.steps, notify=notify
+            )
+        end = on_steps(one, runner, stage, last.x, fit.steps, loss, method, notify, last.at)
+        return residuals(one, end)
 
-    return allow_for_colour(
-        problem, fit._replace(at=fit.at or residuals(problem, fit.x)), free, which, refit
-    )
+    return allow_for_colour(problem, residuals(problem, fit), free, which, refit)

@@ -469,22 +469,27 @@ def allow_for_colour(
     free: NDArray[np.bool_],
     which: Sequence[str],
     refit: Callable[[Problem, Fit, int], Fit],
+    undeclared: bool = True,
 ) -> Coloured:
     """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by
     `refit(problem, fit, round)`, from there, while coordinates that are `free` (n,) move.
 
     The fit must have its residuals, with their Jacobian. Where all noise is white nothing is
-    changed.
+    changed. Unless `undeclared` colour is looked for, that of other channels stays as the problem
+    has it.
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
+    given = {} if undeclared else problem.noise
     found, fits = dict[str, NoiseFit](), list[Fit]()
     for number in range(ROUNDS):
         assert fit.at is not None
         now = parts(problem, fit.at.r, which)
         found = colours(now, fit.at.J[:, free], declared)
+        if not undeclared:
+            found = {channel: found[channel] for channel in declared if channel in found}
         if not found and not problem.noise:
             break
-        problem = problem.with_noise({channel: one.noise for channel, one in found.items()})
+        problem = problem.with_noise(given | {name: one.noise for name, one in found.items()})
         at = rewhitened(problem, fit.at, now)
         fit = fit._replace(at=at, chi2=float(np.mean(at.r**2)))
         if settled(problem, fit.x, at, free):
