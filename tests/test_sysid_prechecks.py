@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, paper_settings
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
@@ -19,7 +19,6 @@ from torchsoft.excitation import Excitation, MultiSine, Press, Strokes, begin
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.measured import paper_settings
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prechecks import accepted, findings, loop_findings, precheck, together
 from torchsoft.sysid.prediction import Signals, readout

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE
+from conftest import COARSE, paper_settings
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -42,7 +42,6 @@ from torchsoft.sysid.figures import (
     trace_figure,
 )
 from torchsoft.sysid.fit import Combination
-from torchsoft.sysid.measured import paper_settings
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.report import PAGES, cell, grouped, kept, report, traces

@@ -77,16 +77,6 @@ class Settings(Table):
     tightenings: int = Field(2, ge=0, le=10)
     assumptions: Assumed = "checked"
 
-    @model_validator(mode="before")
-    @classmethod
-    def _has_no_step(cls, given: Any) -> Any:
-        if isinstance(given, dict) and "step" in given:
-            raise ValueError(
-                "there is no `step` any more: tolerances choose the steps; leave it out, or give "
-                f"the relative tolerance `rtol` ({RTOL:g})"
-            )
-        return given
-
     @model_validator(mode="after")
     def _the_method_has_the_loss(self) -> "Settings":
         if self.loss != "linear" and self.method != "gauss_newton":

@@ -6,7 +6,7 @@ field.
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -45,10 +45,9 @@ from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.rig_recordings import (
-    measured_samples,
-    moving,
+    followed,
+    recorded,
     rig_recording,
-    sampled,
     vocabulary,
 )
 from torchsoft.sysid.unknowns import Sensor, Unknown
@@ -129,12 +128,6 @@ def one_by_one(costs: Iterable[Cost]) -> Cost:
     return Cost(
         sum(c.steps for c in every), sum(c.seconds for c in every), max(c.memory for c in every)
     )
-
-
-def paper_settings(recording: Recording) -> Parameters:
-    """Of the paper's rig."""
-    assert isinstance(recording.rig, SoftGrasp)
-    return recording.rig.settings
 
 
 # Recordings and problems
@@ -282,14 +275,6 @@ def check_rest(
         )
 
 
-def read_recording(
-    path: str | Path, name: str, p: Parameters, sensors: dict[str, Sensor]
-) -> Recording:
-    """A recording of one CSV or NetCDF file with the given settings. Raises `ValueError` naming row
-    and column."""
-    return recording(read_tables([Path(path)], (), {}), name, p, sensors)
-
-
 AT_REST, PLAIN = Rest(), KelvinVoigtPads()
 """How a recording begins, and what the pads are made of, where nothing is said."""
 
@@ -307,15 +292,8 @@ def recording(
     check_plausible(tables, p, sensors)
     if isinstance(start, Rest):
         check_rest(tables, p, sensors, start.position_sd)
-    columns, samples = tables.columns, measured_samples(tables, sensors)
-    rates = {f"{name}_dot": columns.get(f"{name}_dot") for name in SETPOINTS}
-    signals = {
-        name: sampled(*columns[name], rates.get(f"{name}_dot")) for name in (*SETPOINTS, "F_ff")
-    }
-    made = Recording(name, rig(p, Reference(**signals), pads), samples)
-    if isinstance(start, Moving):
-        return moving(made, sensors, start)
-    return replace(made, start=AtRest(position_sd=start.position_sd, lead=start.lead))
+    at_rest = AtRest() if isinstance(start, Moving) else AtRest(start.position_sd, lead=start.lead)
+    return recorded(name, rig(p, followed(tables), pads), tables, sensors, start, at_rest)
 
 
 def rig(p: Parameters, reference: Reference, pads: Pads) -> SoftGrasp:

@@ -25,7 +25,7 @@ from torchsoft.sysid.figures import (
     trace_figure,
 )
 from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.prediction import FailedRun, Signals
+from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.result import IdentificationResult
 from torchsoft.sysid.runs import Runner
@@ -213,15 +213,12 @@ def traces(
         if isinstance(run, FailedRun):
             lost[recording.name] = run.reason
             continue
-        signals = Signals(run.t, recording.channels, run.signals, None)
-        for channel, sensor in problem.readouts(x, job.recording).items():
-            t, measured = recording.samples[channel]
-            y, _, _ = sensor.expected(signals, t)
-            r, _ = sensor.residuals(y, measured)
-            white = problem.whitened(recording, channel, r)
-            out.append(
-                Trace(recording.name, channel, recording.units[channel], t, measured, y, r, white)
+        for one in problem.readings(x, job, run):
+            white, unit = (
+                problem.whitened(recording, one.channel, one.r),
+                recording.units[one.channel],
             )
+            out.append(Trace(recording.name, unit, one, white))
     return out, lost
 
 

@@ -276,7 +276,10 @@ class IdentificationResult(Shown):
         `applied_to` says what to do then.
         """
         one = self.recorded(recording)
-        return self._identified(self._rig(one), one)
+        rig = deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()
+        set_parameters(rig, one.identified)
+        self._told(one)
+        return rig
 
     def applied_to(self, rig: Rig, recording: str | None = None) -> Rig:
         """A copy of `rig` with the values that were identified: those of a recording, which is
@@ -298,7 +301,10 @@ class IdentificationResult(Shown):
                 f"this rig is not the one of the fit, so its values may mislead: {line(said, 300)}",
                 stacklevel=2,
             )
-        return self._identified(deepcopy(rig), one)
+        rig = deepcopy(rig)
+        set_parameters(rig, one.identified)
+        self._told(one)
+        return rig
 
     def draws(
         self, count: int, recording: str | None = None, seed: int = 0
@@ -312,15 +318,12 @@ class IdentificationResult(Shown):
         """
         whole("count", count, 1)
         one = self.recorded(recording)
-        told = {e.name for e in self.estimates if e.identifiable and e.kind == "parameter"
-                and e.recording in (None, one.name)}  # fmt: skip
+        told = self._told(one)
         mine = [(i, c) for i, c in enumerate(self.coordinates)
                 if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
         free = [i for i, c in mine if c.name in told]
         if not free:
             raise ValueError("no parameter is identifiable, so that there is nothing to draw")
-        if weak := {c.name: one.identified[c.name] for _, c in mine if c.name not in told}:
-            warnings.warn(undetermined(weak), stacklevel=2)
         x = np.tile(self.x, (1 + count, 1))
         C = np.array(self.covariance, dtype=float)[np.ix_(free, free)]
         rng = np.random.default_rng(seed)
@@ -334,28 +337,21 @@ class IdentificationResult(Shown):
                 values[c.name] = values[c.name] * values.get(c.ratio_to, known_one)
         return values
 
-    def _rig(self, one: RecordedRig) -> Rig:
-        """A rig of its own with the numbers of before the fit."""
-        return deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()
-
-    def _identified(self, rig: Rig, one: RecordedRig) -> Rig:
-        set_parameters(rig, one.identified)
-        weak = [
-            e.name
-            for e in self.estimates
-            if not e.identifiable and e.kind == "parameter" and e.recording in (None, one.name)
+    def _told(self, one: RecordedRig) -> set[str]:
+        """Names of parameters that are identifiable. Warns of the others, those of a held-out
+        recording too."""
+        mine = [
+            e for e in self.estimates if e.kind == "parameter" and e.recording in (None, one.name)
         ]
-        weak += [  # of a recording that was held out
-            c.name
-            for c in self.coordinates
-            if c.fixed
-            and c.kind == "parameter"
-            and c.recording == one.name
-            and not self.unknowns[c.name].fixed
-        ]
+        told, named = {e.name for e in mine if e.identifiable}, {e.name for e in mine}
+        weak = {
+            c.name: one.identified[c.name] for c in self.coordinates
+            if c.kind == "parameter" and c.recording in (None, one.name) and c.name not in told
+            and (c.name in named or not self.unknowns[c.name].fixed)
+        }  # fmt: skip
         if weak:
-            warnings.warn(undetermined({name: one.identified[name] for name in weak}), stacklevel=3)
-        return rig
+            warnings.warn(undetermined(weak), stacklevel=3)
+        return told
 
     def to_json(self) -> str:
         """The content of the file."""
