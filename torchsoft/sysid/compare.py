@@ -235,14 +235,18 @@ def compare(
         except Unreachable as lost:
             raise ValueError(f"the law `{name}` cannot follow the recordings: {lost}") from None
         evidence[name] = Evidence(law, runners[name], which, heldout)
-    best = most_likely(evidence)
+    best = max(evidence, key=lambda name: evidence[name].total)
     for name in (name for name in laws if name != best):
         other = refitted(evidence[name].law, evidence[best].law, runners[name], which)
         if other is not None:
             better = Evidence(other, runners[name], which, heldout)
             if better.fitted.log > evidence[name].fitted.log:
                 evidence[name] = better
-    return gathered(evidence, list(heldout))
+    first = max(evidence.values(), key=lambda one: one.total)
+    against = [versus(first, one) for one in evidence.values() if one is not first]
+    law_list = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
+    samples = len(first.fitted.r)
+    return Comparison(*judged(law_list, against), law_list, against, samples, list(heldout))
 
 
 def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
@@ -354,33 +358,19 @@ def refitted(
     return FittedLaw(law.name, law.problem, fit.x, law.free, law.rtol, fit.converged)
 
 
-def most_likely(evidence: Mapping[str, Evidence]) -> str:
-    """The law with the largest penalised likelihood of all the data."""
-    return max(evidence, key=lambda name: evidence[name].total)
-
-
-def gathered(evidence: Mapping[str, Evidence], heldout: list[str]) -> Comparison:
-    """The answer."""
-    best = evidence[most_likely(evidence)]
-    against = [versus(best, one) for name, one in evidence.items() if name != best.name]
-    laws = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
-    outcome, law, verdict = judged(laws, against)
-    return Comparison(outcome, law, verdict, laws, against, len(best.fitted.r), heldout)
-
-
 def versus(best: Evidence, other: Evidence) -> Versus:
     """The best law against another, by the rule of `torchsoft.sysid.comparison`."""
     fitted, n = ratio(best.fitted, other.fitted), len(best.fitted.r)
     evidence = fitted.log / fitted.inflation
-    log, stated, variance, told, z = fitted.log, fitted.stated, fitted.variance, None, None
+    log, stated, variance, held, z = fitted.log, fitted.stated, fitted.variance, None, None
     if best.heldout is not None and other.heldout is not None:
-        ahead, m = ratio(best.heldout, other.heldout), len(best.heldout.r)
+        ahead = ratio(best.heldout, other.heldout)
         evidence, log = evidence + ahead.log / ahead.inflation, log + ahead.log
         stated, variance = stated + ahead.stated, variance + ahead.variance
-        told, z = (ahead.log / m, ahead.variance**0.5 / m), ahead.z
+        held, z = ahead.log, ahead.z
     evidence -= 0.5 * max(best.parameters - other.parameters, 0) * float(np.log(n))
     return Versus(
-        best.name, other.name, fitted.log, None if told is None else log - fitted.log, told,
+        best.name, other.name, fitted.log, held,
         stated**0.5, variance / stated if stated > 0 else 1.0, evidence,
         log / variance**0.5 if variance > 0 else 0.0, z,
         (best.numerical + other.numerical) / fitted.inflation,

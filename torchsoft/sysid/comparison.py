@@ -89,17 +89,12 @@ class Versus:
     """The best law against another one: logarithms of the likelihood ratios of fitted and of
     held-out samples, the whitened distance D of the predictions, the inflation c of the variance, E
     and z of the rule, z of held-out recordings alone, and how far a tenth of the tolerance changes
-    E.
-
-    `heldout_per_sample` is the difference of the log densities per held-out sample with its
-    standard error.
-    """
+    E."""
 
     best: str
     other: str
     fitted: float
     heldout: float | None
-    heldout_per_sample: tuple[float, float] | None
     distance: float
     inflation: float
     evidence: float

@@ -226,7 +226,6 @@ class Contribution:
     estimate."""
 
     source: str | None
-    rows: int
     shares: dict[str, float]
     without: dict[str, float | None]
 
@@ -259,5 +258,5 @@ def contributions(
             if alone < IDENTIFIABLE and sd[label] > 0:
                 without[label] = alone / sd[label]
         shares = {label: parts[name][label] / total[label] for label in wanted}
-        out.append(Contribution(name, own.stop - own.start, shares, without))
+        out.append(Contribution(name, shares, without))
     return out

@@ -3,8 +3,7 @@
 
 import sys
 import time as clock
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -363,7 +362,7 @@ def identify(
     )
     for look in findings if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
-    with explained(findings):
+    try:
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
         end = run_plan(
@@ -376,6 +375,8 @@ def identify(
             seed=seed,
             progress=progress,
         )
+    except Unreachable as error:  # what looked wrong with the recordings may be behind it
+        raise Unreachable(error.lost, findings) from None
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
         coloured = with_its_noise(problem, runner, end.stage, end.fit, loss, method, bar)
@@ -400,16 +401,6 @@ def explain(problem: Problem, **how: Any) -> IdentificationResult:
     was tried. Raises what `identify` does.
     """
     return identify(problem, **how, assumptions="explained")
-
-
-@contextmanager
-def explained(findings: Sequence[str]) -> Iterator[None]:
-    """Tells whom the model cannot follow the data what looked wrong with the recordings
-    themselves."""
-    try:
-        yield
-    except Unreachable as error:
-        raise Unreachable(error.lost, findings) from None
 
 
 def with_its_noise(

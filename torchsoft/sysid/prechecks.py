@@ -4,8 +4,9 @@ units.
 The law of an actuator is known. So a recording of its force and of the coordinate that it measures
 is held against it without a run: means over windows of time, which need no derivative of measured
 samples, agree within the noise of the sensors. Where they do not, one thing at a time is tried: the
-sign of the force, its unit, the body that the loop senses, the force that is fed forward. Other
-channels are held against a run with the parameters of the start.
+sign of the force, its unit, the force that is fed forward. Whose set-points are those of a loop is
+told by the body that follows them. Other channels are held against a run with the parameters of the
+start.
 """
 
 import math
@@ -20,7 +21,6 @@ from scipy.interpolate import CubicSpline
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.parts import COORDINATES, Actuator
-from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prediction import Prediction, Readout, Signals
@@ -248,13 +248,7 @@ def loop_findings(
         loop = windows(recording, actuator, [F, *coordinates])
         if loop is None or any(id(p) in tensors for p in actuator.parameters()):
             continue
-        body, _, axis = actuator.measured.partition(".")
-        rivals = {}
-        for other in (one for one in rig.bodies if one != body and actuator.is_loop):
-            signals = [F, sampled(recording, sensors, f"{other}.{axis}")]
-            if (rival := windows(recording, actuator, signals)) is not None:
-                rivals[other] = rival
-        change = disagreement(rig, loop, body, rivals)
+        change = disagreement(loop)
         if change is not None:
             force, *others = loop.signals
             seen = ", ".join([*actuator.setpoints, *(one.channel for one in others)])
@@ -266,8 +260,8 @@ def loop_findings(
             yield found(change.code, recording, text, change.grave)
 
 
-def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Change | None:
-    """The cause of a disagreement of a loop about a body, if there is one."""
+def disagreement(loop: Loop) -> Change | None:
+    """The cause of a disagreement of a loop, if there is one."""
     F, name, unit, feed = (
         loop.F,
         loop.signals[0].channel,
@@ -282,10 +276,6 @@ def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) ->
     opposite = "looks as if its sign were opposite"
     changes = [
         Change(f"sign of {name}", f"{name} {opposite}", -F - given),
-        *(
-            another_sense(rig, loop.actuator, body, other, its.F - its.given())
-            for other, its in rivals.items()
-        ),
         *(
             Change(
                 f"unit of {name}",
@@ -318,18 +308,6 @@ def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) ->
         "set-points right?"
     )
     return Change(f"loop of {name}", words, e, grave=False)
-
-
-def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Array) -> Change:
-    """The set-point is that of another body."""
-    axis = actuator.measured.partition(".")[2]
-    paper = isinstance(rig, SoftGrasp) and axis == "x"
-    remedy = f' (say control.senses = "{other}")' if paper else ""
-    clause = (
-        f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
-        f"or are {channel(rig, f'{body}.{axis}')} and {channel(rig, f'{other}.{axis}')} exchanged?"
-    )
-    return Change("control.senses" if paper else f"what {actuator.setpoint} is of", clause, left)
 
 
 MOVES = 5.0
@@ -383,10 +361,10 @@ def findings(
 ) -> list[Diagnostic]:
     """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the
     names of unknown parameters. A recording with an error is not held against the run."""
-    every = [*setpoint_findings(recording, sensors), *loop_findings(recording, sensors, unknown)]
-    every += rounded(recording, sensors)
+    every = [*setpoint_findings(recording, sensors), *rounded(recording, sensors)]
+    every += another_body(recording, sensors, expected)
     if not any(one.severity == "error" for one in every):
-        every += another_body(recording, sensors, expected)
+        every += loop_findings(recording, sensors, unknown)
     if any(one.severity == "error" for one in every):
         return every
     codes = {one.code for one in every}
@@ -496,8 +474,14 @@ def another_body(
                 said = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
             else:
                 continue
-            change = another_sense(rig, actuator, body, other, np.zeros(1))
-            yield found(change.code, recording, f"{change.clause} ({said})", grave=True)
+            paper = isinstance(rig, SoftGrasp) and axis == "x"
+            remedy = f' (say control.senses = "{other}")' if paper else ""
+            code = "control.senses" if paper else f"what {setpoint} is of"
+            text = (
+                f"{setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
+                f"or are {own} and {its} exchanged? ({said})"
+            )
+            yield found(code, recording, text, grave=True)
 
 
 def apart(

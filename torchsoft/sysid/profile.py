@@ -92,6 +92,11 @@ class Optimum:
         """Of the free coordinates, by the Fisher matrix at x."""
         return fisher(self.J)[0]
 
+    def sd(self, i: int) -> float:
+        """Of coordinate number i, as widened as its profile."""
+        inner = int(np.flatnonzero(np.flatnonzero(self.free) == i)[0])
+        return float(np.sqrt(self.covariance[inner, inner] * self.variance))
+
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Of the free coordinates."""
@@ -246,9 +251,8 @@ def walk(o: Optimum, i: int, sign: int) -> Side:
         o.problem.coordinates.labels[i],
         (float(b[i]) for b in o.problem.coordinates.bounds),
     )
-    edge, inner = (high if sign > 0 else low), int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
-    sd = float(np.sqrt(o.covariance[inner, inner] * o.variance))
-    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * sd, (high - low) / 8)
+    edge = high if sign > 0 else low
+    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * o.sd(i), (high - low) / 8)
     points, notices, shorter = list[Point](), list[str](), 0
     while here.rise < RISE and len(points) < POINTS:
         if sign * (edge - here.x[i]) <= 1e-9 * (high - low):
@@ -351,8 +355,7 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
                 f"the {name} end of the profile of {one.label} is uncertain: steps chosen anew "
                 f"there change |r|^2 by {off:.2g}; take a tighter tolerance than rtol = {o.rtol:g}"
             )
-    inner = int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
-    half = float(np.sqrt(o.covariance[inner, inner] * o.variance * RISE))
+    half = RISE**0.5 * o.sd(i)
     wald = o.x[i] - half, o.x[i] + half
     worst = max((abs(e - w) / half for e, w in zip(ends, wald) if e is not None), default=0.0)
     physical = [None if e is None else one.to_value(e) for e in ends]
