@@ -308,7 +308,6 @@ def fitted(
     if end.lost is not None:  # laws are compared by the same tolerance
         raise end.lost
     fit = end.fit
-    assert fit.at is not None
     free = np.isin(problem.coordinates.labels, plan[-1].free)
 
     def again(one: Problem, last: Fit, number: int) -> Fit:

@@ -97,10 +97,10 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
                       fontsize=9, color="#a34400")  # fmt: skip
             continue
         low, value, high = (max(v / s, 1e-6) for v in (e.ci95[0], e.value, e.ci95[1]))
-        axes.plot([low, high], [row, row], color=ACTUAL, lw=2.4, solid_capstyle="butt")
-        axes.plot([low, low, high, high], [row - 0.13, row + 0.13, row + 0.13, row - 0.13], " ")
-        axes.vlines([low, high], row - 0.16, row + 0.16, color=ACTUAL, lw=1.2)
-        axes.plot(value, row, "o", color=ACTUAL, ms=6)
+        axes.errorbar(
+            value, row, xerr=[[value - low], [high - value]], fmt="o", color=ACTUAL, ms=6, lw=2.4,
+            capsize=4, capthick=1.2,
+        )  # fmt: skip
         reach += [low, high]
     axes.set_xscale("log")
     low, high = min(reach) / 1.15, max(reach) * 1.15

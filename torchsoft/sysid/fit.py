@@ -226,15 +226,14 @@ class Unreachable(RuntimeError):
 
 class Fit(NamedTuple):
     """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their
-    number), evaluations, whether it converged, and the residuals there with their Jacobian, if that
-    was computed."""
+    number), evaluations, whether it converged, and the residuals there with their Jacobian."""
 
     x: Array
     chi2: float
     evaluations: int
     converged: bool
     steps: StepsByName
-    at: Residuals | None = None
+    at: Residuals
 
 
 def gauss_newton(
@@ -366,4 +365,5 @@ def descend(
         adam = ProjectedAdam(start, lambda z: np.clip(z, low, high), (0.9, 0.999))
         for _ in range(evaluations):
             adam.step(slope(adam.z)[1], rate)
-    return Fit(best[1], 2 * best[0] / samples, count, count < evaluations, steps)
+    at = problem.residuals(runner, best[1], which, steps, free)
+    return Fit(best[1], 2 * best[0] / samples, count, count < evaluations, steps, at)

@@ -226,9 +226,9 @@ def tested_assumptions(
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
     found = check_assumptions(
-        plain, end.x, finer, free, which, end.rtol, doubtful=doubtful,
-        explain=how.settings.assumptions == "explained", loss=how.loss, workers=runner.workers,
-        journal=runner.folder, progress=progress, own=end.steps,
+        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, doubtful=doubtful,
+        explain=how.settings.assumptions == "explained", loss=how.loss, progress=progress,
+        own=end.steps,
     )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
@@ -416,15 +416,10 @@ def with_its_noise(
     the last one."""
     free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
 
-    def residuals(one: Problem, end: Fit) -> Fit:
-        return end._replace(at=end.at or one.residuals(runner, end.x, which, fit.steps, free))
-
     def refit(one: Problem, last: Fit, number: int) -> Fit:
-        if number > 0 and loss == "linear" and last.at is not None:
-            return chord(
-                one, runner, last.x, last.at, which=which, free=free, steps=fit.steps, notify=notify
-            )
-        end = on_steps(one, runner, stage, last.x, fit.steps, loss, method, notify, last.at)
-        return residuals(one, end)
+        if number > 0 and loss == "linear":
+            common: dict[str, Any] = {"which": which, "free": free, "notify": notify}
+            return chord(one, runner, last.x, last.at, steps=fit.steps, **common)
+        return on_steps(one, runner, stage, last.x, fit.steps, loss, method, notify, last.at)
 
-    return allow_for_colour(problem, residuals(problem, fit), free, which, refit)
+    return allow_for_colour(problem, fit, free, which, refit)

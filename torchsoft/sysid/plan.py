@@ -403,7 +403,7 @@ def settle(
     estimate by more than `STEP_BIAS`, or steps are what keeps the fit from its rest. With none the
     steps are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
-    at = fit.at or problem.residuals(runner, x, which, fit.steps, free)
+    at = fit.at
     rounds = ROUNDS if tightenings else 0
 
     def along(start: Residuals, steps: StepsByName) -> bool:
@@ -416,7 +416,6 @@ def settle(
             end = gauss_newton(
                 problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common
             )
-        assert end.at is not None
         if further := bool((end.x != x).any()):
             fits.append((rtol, end))
             x, at = end.x, end.at

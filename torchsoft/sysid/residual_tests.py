@@ -454,15 +454,13 @@ def allow_for_colour(
     """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by
     `refit(problem, fit, round)`, from there, while coordinates that are `free` (n,) move.
 
-    The fit must have its residuals, with their Jacobian. Where all noise is white nothing is
-    changed. Unless `undeclared` colour is looked for, that of other channels stays as the problem
+    Where all noise is white nothing is changed. Unless `undeclared` colour is looked for, that of other channels stays as the problem
     has it.
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
     given = {} if undeclared else problem.noise
     found, fits = dict[str, NoiseFit](), list[Fit]()
     for number in range(ROUNDS):
-        assert fit.at is not None
         now = parts(problem, fit.at.r, which)
         found = colours(now, fit.at.J[:, free], declared)
         if not undeclared:

@@ -187,6 +187,10 @@ class Runner:
             [] for _ in self.recordings
         ]  # models that no thread is using
 
+    def of(self, recordings: Sequence[Recording]) -> "Runner":
+        """One of other recordings, in as many threads and the same folder."""
+        return Runner(recordings, self.workers, self.folder)
+
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
         out = [self._journal.recall(job) if self._journal is not None else None for job in jobs]

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -174,10 +173,9 @@ class Checked(NamedTuple):
 
 
 def check_assumptions(
-    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
-    rtol: float, *, doubtful: bool = False, explain: bool = False, loss: Loss = "linear",
-    workers: int = 1, journal: Path | None = None, progress: bool = False,
-    own: Mapping[str, Frozen] | None = None,
+    problem: Problem, runner: Runner, x: Array, at: Residuals, free: NDArray[np.bool_],
+    which: Sequence[str], rtol: float, *, doubtful: bool = False, explain: bool = False,
+    loss: Loss = "linear", progress: bool = False, own: Mapping[str, Frozen] | None = None,
 ) -> Checked:  # fmt: skip
     """Tests of the assumptions at the estimates x (n,), to first order, where `at` holds residuals
     and Jacobian of the recordings `which`, by the fit's `own` steps where no others have a run.
@@ -185,16 +183,15 @@ def check_assumptions(
     With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other,
     until one explains the misfit: a test to first order says little where a fit has run far off.
     """
-    end = ended(problem, x, at, free, which, rtol, workers, journal, own)
+    end = ended(problem, runner, x, at, free, which, rtol, own)
     candidates: list[Variation] = []
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
     judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
     untried = [one.name for one in taken if one.vary is not None]
     try:
-        runner = Runner(problem.recordings, workers, journal)
         with quiet():
-            first = columns_of(problem, runner, end, taken)
+            first = columns_of(problem, end, taken)
         judge.columns = {one.name: d for one, d in first if d.any()}
         checks |= {one.name: judge.column(one, d) for one, d in first if d.any()}
         for one in taken:
@@ -365,8 +362,6 @@ class Judge:
         """Of a fit that was repeated with it, beside one that was repeated without; or to first
         order, where the new fit did not come as far."""
         at, before = again.fit.at, as_stated.fit.at
-        assert at is not None
-        assert before is not None
         gain = float(before.r @ before.r - at.r @ at.r)
         if gain <= linear.gain and not again.fit.converged:
             return linear
@@ -436,7 +431,7 @@ def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> flo
 
 
 def columns_of(
-    problem: Problem, runner: Runner, end: End, taken: Sequence[Variation]
+    problem: Problem, end: End, taken: Sequence[Variation]
 ) -> list[tuple[Variation, Array]]:
     """Effects on the residuals of other values of known parameters, of extensions of the rigs, and
     of faults of sensors that are not unknown, to first order: of a run a recording with its
@@ -451,7 +446,7 @@ def columns_of(
         jobs = [
             job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)
         ]
-        runs = Runner(recordings, runner.workers, runner.folder).run(jobs)
+        runs = end.runner.of(recordings).run(jobs)
         if any(isinstance(run, FailedRun) for run in runs):
             return out
         faults = faults_of(problem) if number == 0 else []
