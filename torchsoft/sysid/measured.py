@@ -77,38 +77,20 @@ def cost(
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
     loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
 
-    def runs(recording: Recording) -> list[tuple[float, float, bool]]:
-        """How many at which tolerance, and whether they are differentiated."""
-        first = [(starts * FIRST, loose, True)] if recording is slowest else []
-        stages = [
-            (ALL, loose, True),
-            (FREE, usual, True),
-            (LAST if rtol < usual else 0, rtol, True),
-        ]
-        return [
-            *first,
-            *stages,
-            (1, loose, False),
-            (1, FINER * rtol, False),
-            (CHECKED, usual, False),
-        ]
-
-    descent, steps, seconds = method != "gauss_newton", 0.0, []
+    descent, steps, seconds = method != "gauss_newton", 0.0, list[float]()
     for recording in fitted:
+        first = starts * FIRST if recording is slowest else 0
+        stages = [(first + ALL, loose), (FREE, usual), (LAST if rtol < usual else 0, rtol)]
+        runs = [((4 if descent else 1) * number, by, True) for number, by in stages]
+        runs += [(1, loose, False), (1, FINER * rtol, False), (CHECKED, usual, False)]
+        mine = [c for c in problem.coordinates.all
+                if c.of_the_rig and c.recording in (None, recording.name)]  # fmt: skip
+        more, span = 1 + COLUMN * max(len(mine) - FEW, 0), recording.duration + recording.start.lead
         seconds.append(0.0)
-        mine = [
-            c
-            for c in problem.coordinates.all
-            if c.of_the_rig and c.recording in (None, recording.name)
-        ]
-        more = 1 + COLUMN * max(len(mine) - FEW, 0)
-        for number, by, differentiated in runs(recording):
-            length = (recording.duration + recording.start.lead) * steps_per_second(by) + rows[
-                recording.name
-            ]
-            number *= 4 if descent and differentiated else 1
-            steps += number * length
+        for number, by, differentiated in runs:
+            length = span * steps_per_second(by) + rows[recording.name]
             step = rig_step(recording.rig, differentiated) * (more if differentiated else 1.0)
+            steps += number * length
             seconds[-1] += number * (length * step + RUN)
     matrix = 3 * 8 / 2**30 if descent else 0.0
     memory = sorted(

@@ -454,8 +454,8 @@ def allow_for_colour(
     """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by
     `refit(problem, fit, round)`, from there, while coordinates that are `free` (n,) move.
 
-    Where all noise is white nothing is changed. Unless `undeclared` colour is looked for, that of other channels stays as the problem
-    has it.
+    Where all noise is white nothing is changed. Unless `undeclared` colour is looked for, that of
+    other channels stays as the problem has it.
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
     given = {} if undeclared else problem.noise
