@@ -1,6 +1,7 @@
 """Profile likelihoods: the misfit where one coordinate is held and all others are fitted again."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Self
 
@@ -11,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
 from torchsoft.display import suggestion
-from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton, newton_step
+from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
@@ -155,8 +156,8 @@ STRIDE = 0.5
 POINTS = 12
 """Most points to either side."""
 
-ROUNDS = 5
-"""Most steps of Gauss-Newton to a point."""
+EVALUATIONS = 10
+"""Most evaluations of Gauss-Newton to a point."""
 
 BEYOND = (RISE**0.5 + STRIDE) ** 2
 """Rise above which a point lies too far beyond the end of the interval to tell where that is."""
@@ -165,9 +166,8 @@ SHORTER = 6
 """How often, to either side, a stride is made shorter because a run fails or the rise goes too
 far."""
 
-FITTED = 0.02
-"""What the others may still gain in |r|^2 by another step of Gauss-Newton, which is then taken for
-true."""
+FITTED = 2e-3
+"""Change of |r|^2 with which the fit of the others is done."""
 
 LOWER = 0.1
 """Fall of |r|^2 below the optimum's from which the fit was not at its optimum."""
@@ -299,33 +299,19 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
         x[others] = np.clip(x[others] + tangent * (aim - x[i]), low[others], high[others])
     x[i] = aim
     at = o.residuals(x, derivatives=True)
-    for _ in range(ROUNDS):
-        if at.lost:
-            return None, next(iter(at.lost.values())).reason
-        step, square = newton_step(o.problem, x, at, others), float(at.r @ at.r)
-        predicted = at.r + at.J[:, others] @ step
-        gain = square - float(predicted @ predicted)
-        x = x.copy()
-        if gain < FITTED:
-            x[others] += step
-            return Point(x, (square - gain - o.square) / o.variance, at), ""
-        ahead = x.copy()
-        ahead[others] += step
-        there = o.residuals(ahead, derivatives=True)
-        if (
-            there.lost or there.r @ there.r > square - 0.1 * gain
-        ):  # the Jacobian does not hold as far as that
-            try:
-                ahead = gauss_newton(
-                    o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at,
-                    evaluations=10, tolerance=0.1 * FITTED / square,
-                ).x  # fmt: skip
-            except Unreachable as lost:
-                return None, str(lost)
-            ahead[i] = aim
-            there = o.residuals(ahead, derivatives=True)
-        x, at = ahead, there
-    return None, "the other coordinates could not be fitted there"
+    if others.any() and not at.lost:
+        with suppress(Unreachable):
+            fit = gauss_newton(
+                o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at,
+                evaluations=EVALUATIONS, tolerance=FITTED / max(float(at.r @ at.r), FITTED),
+            )  # fmt: skip
+            if not fit.converged:
+                return None, "the other coordinates could not be fitted there"
+            x, at = fit.x, fit.at
+            x[i] = aim
+    if at.lost:
+        return None, next(iter(at.lost.values())).reason
+    return Point(x, (float(at.r @ at.r) - o.square) / o.variance, at), ""
 
 
 def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
