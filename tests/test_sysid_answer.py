@@ -282,7 +282,7 @@ def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
     out = [e for e in result.estimates if e.recording != "second"]
     answer = replace(result, estimates=out, coordinates=[left_out(c) for c in result.coordinates])
     with pytest.warns(
-        UserWarning, match=r"only where the search ended: contact\.eta = \S+, contact\.R_n = \S+$"
+        UserWarning, match=r"only where the search ended: contact\.R_n = \S+, contact\.eta = \S+$"
     ):
         answer.model("second")
     with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+$"):
@@ -313,6 +313,8 @@ def slippery(problem: Problem, result: IdentificationResult) -> IdentificationRe
         result,
         estimates=found,
         x=x.tolist(),
+        coordinates=list(c.all),
+        unknowns=mine.unknowns,
         recordings=recorded_rigs(mine, x, mine.names),
         rigs=rigs,
     )

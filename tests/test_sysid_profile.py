@@ -1,7 +1,5 @@
 """Profiles against closed forms, and combinations of parameters; both on a rig."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
@@ -98,7 +96,7 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters() -> None:
     assert seen([1, 0, 0]) == []  # K and R are not seen at all
 
 
-def test_profile_and_combination_of_stiffnesses_in_series(tmp_path: Path) -> None:
+def test_profile_and_combination_of_stiffnesses_in_series() -> None:
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in
     series."""
     base = Parameters().override(COARSE)
