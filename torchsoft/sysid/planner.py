@@ -97,12 +97,8 @@ class Planner:
             moves,
             dict(limits),
         )
-        self.recording, self.criterion, self.rtol, self.workers = (
-            problem.recordings[self.k],
-            criterion,
-            rtol,
-            workers,
-        )
+        self.recording, self.rtol, self.workers = problem.recordings[self.k], rtol, workers
+        self.criterion: Optimality = criterion
         self.names, _ = chosen(problem, problem.coordinates.start, names)
         for channel, (low, high) in limits.items():
             if channel not in self.recording.channels or not low < high:

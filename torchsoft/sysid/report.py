@@ -214,11 +214,12 @@ def traces(
             lost[recording.name] = run.reason
             continue
         for one in problem.readings(x, job, run):
-            white, unit = (
-                problem.whitened(recording, one.channel, one.r),
-                recording.units[one.channel],
-            )
-            out.append(Trace(recording.name, unit, one, white))
+            out.append(
+                Trace(
+                    recording.name, one.channel, recording.units[one.channel], one.t, one.measured,
+                    one.expected, one.r, problem.whitened(recording, one.channel, one.r),
+                )
+            )  # fmt: skip
     return out, lost
 
 
