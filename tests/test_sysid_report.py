@@ -34,7 +34,6 @@ from torchsoft.sysid import (
 from torchsoft.sysid import report as sections
 from torchsoft.sysid.estimate import Direction
 from torchsoft.sysid.figures import (
-    contributions_figure,
     correlation_figure,
     direction_name,
     estimates_figure,
@@ -183,7 +182,7 @@ def test_the_page_stands_alone(page: Page) -> None:
         tag for tag, _ in page.tags
     )
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) == 4 + 3 * 3
+    assert len(pictures) == 3 + 3 * 3
     for attributes in pictures:
         source, alt = str(attributes["src"]), str(attributes["alt"])
         kind, _, data = source.partition(",")
@@ -471,7 +470,6 @@ def texts(figure: Figure) -> list[tuple[str, Any]]:
 
 FIGURES: dict[str, Callable[[IdentificationResult, Problem], Figure | None]] = {
     "estimates": lambda answer, _: estimates_figure(answer.estimates),
-    "contributions": lambda answer, _: contributions_figure(answer),
     "correlation": lambda answer, _: correlation_figure(answer),
     "spectrum": lambda answer, _: spectrum_figure(answer),
     "trace": lambda answer, problem: trace_figure(
@@ -504,15 +502,3 @@ def test_no_text_of_a_picture_is_cut_or_overlaps(
                 or its.y1 <= box.y0 + 1
             )
             assert apart, f"{text!r} lies over {other!r}"
-
-
-def test_the_weights_of_all_sources_fill_the_bars(full: IdentificationResult) -> None:
-    figure = contributions_figure(full)
-    assert figure is not None
-    labels = [e.label for e in full.estimates if e.identifiable and e.kind == "parameter"]
-    right: dict[float, float] = {}
-    for bar in figure.axes[0].patches:
-        row = round(bar.get_y() + bar.get_height() / 2)
-        right[row] = max(right.get(row, 0.0), bar.get_x() + bar.get_width())
-    assert right == pytest.approx(dict.fromkeys(range(len(labels)), 1.0))
-    assert contributions_figure(replace(full, contributions=full.contributions[:1])) is None

@@ -338,19 +338,10 @@ def refitted(
             x[i] = one.to_x(float(np.clip(known[one.label], one.low, one.high)))
     if (x == law.x).all():
         return None
+    free = tuple(label for label, one in zip(c.labels, law.free) if one)
     try:
-        first, steps = law.problem.freeze(runner, x, which, law.rtol, law.free)
-        if first.lost:
-            return None
-        fit = gauss_newton(
-            law.problem,
-            runner,
-            x,
-            which=which,
-            free=law.free,
-            steps=steps,
-            tolerance=CLOSE,
-            first=first,
+        fit, _ = run_plan(
+            law.problem, runner, [Stage("again", tuple(which), free, law.rtol, tolerance=CLOSE)], x
         )
     except Unreachable:
         return None

@@ -15,7 +15,6 @@ from matplotlib.ticker import (
     MaxNLocator,
     NullFormatter,
     NullLocator,
-    PercentFormatter,
 )
 
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
@@ -38,12 +37,6 @@ NAME = 24
 
 MOST_NAMES = 3
 """Parts of a direction that its name has room for."""
-
-SOURCES = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#8a6d00")
-"""Colours of recordings, in turn."""
-
-REST = "#bbbbbb"
-"""Colour of the priors, and of recordings that there are no colours left for."""
 
 
 class Trace(NamedTuple):
@@ -176,41 +169,6 @@ def spectrum_figure(result: IdentificationResult) -> Figure:
     axes.spines["left"].set_visible(False)
     axes.grid(False)
     axes.xaxis.set_minor_formatter(NullFormatter())
-    return figure
-
-
-@rc_context(STYLE)
-def contributions_figure(result: IdentificationResult) -> Figure | None:
-    """Weight of every recording, and of the priors, in what is identifiable; None where there is
-    only one source."""
-    labels = [e.label for e in result.estimates if e.identifiable and e.kind == "parameter"]
-    sources = result.contributions
-    if len(sources) < 2 or not labels:
-        return None
-    named = [one for one in sources if one.source is not None][: len(SOURCES)]
-    shares = [
-        (one.source or "", SOURCES[i], [one.shares[label] for label in labels])
-        for i, one in enumerate(named)
-    ]
-    rest = [one for one in sources if one not in named]
-    if rest:
-        name = "priors" if rest[0].source is None else "the others"
-        shares.append((name, REST, [sum(one.shares[label] for one in rest) for label in labels]))
-    figure = Figure(
-        figsize=(WIDTH, 0.8 + 0.42 * len(labels) + 0.2 * len(shares)), layout="constrained"
-    )
-    axes, left = figure.subplots(), np.zeros(len(labels))
-    for name, colour, part in shares:
-        label = f" {literal(name, 60)}"  # matplotlib does not show those that begin with _
-        axes.barh(range(len(labels)), part, left=left, height=0.6, color=colour, label=label)
-        left += part
-    axes.set(xlim=(0, 1), ylim=(len(labels) - 0.4, -0.6))
-    axes.set_yticks(range(len(labels)), [literal(label, NAME) for label in labels])
-    axes.xaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.spines["left"].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    axes.grid(False, axis="y")
-    figure.legend(loc="outside lower left", ncols=1, handlelength=1.0)
     return figure
 
 

@@ -17,7 +17,6 @@ from torchsoft.files import replacing
 from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.figures import (
     Trace,
-    contributions_figure,
     correlation_figure,
     direction_name,
     estimates_figure,
@@ -255,7 +254,7 @@ def page(result: IdentificationResult, drawn: list[Trace], lost: dict[str, str])
             f"{e.label} not identifiable" if e.value is None
             else f"{e.label} {e.value / e.start:.3g} times its start" for e in parameters if e.start
         ],
-        contributions=contributions(result), contributions_figure=contributions_figure(result),
+        contributions=contributions(result) if len(result.contributions) > 1 else [],
         sources=[one.source or "priors" for one in result.contributions],
         combined=[
             *(one.sentence for one in result.combinations),
