@@ -1,5 +1,4 @@
-"""Pictures of an identification: estimates, what recordings told, the Fisher spectrum,
-correlations, residuals."""
+"""Pictures of an identification: estimates, the Fisher spectrum, correlations, residuals."""
 
 from collections.abc import Sequence
 from textwrap import fill, shorten

@@ -1,9 +1,11 @@
 """`identify`: a plan of stages, the tests at their end, and the result with its notices;
 `explain`."""
 
+import platform
 import sys
 import time as clock
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
-from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.estimate import contributions, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.fit import (
     Fit,
     Loss,
@@ -48,7 +50,13 @@ from torchsoft.sysid.residual_tests import (
     residual_notices,
     rewhitened,
 )
-from torchsoft.sysid.result import IdentificationResult, described, undetermined
+from torchsoft.sysid.result import (
+    ChannelNoise,
+    IdentificationResult,
+    recorded_rigs,
+    seen_together,
+    undetermined,
+)
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
 from torchsoft.sysid.suspects import assumption_notices
@@ -58,6 +66,9 @@ from torchsoft.tables import SEED, Table, plain
 RTOL = 1e-5
 """Relative tolerance of the last stage: derivatives are then right to some percent, and estimates
 to a fraction of a standard deviation where sensors are as good as `RIG`."""
+
+PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
+"""Those whose versions a result names."""
 
 Assumed = Literal["checked", "explained", "trusted"]
 """Whether assumptions are tested to first order, tested and followed by new fits that look for a
@@ -202,11 +213,20 @@ def conclude(
             "recordings": {r.name: r.fingerprint for r in problem.recordings},
         },
         covariance=C.tolist(),
-        **described(
-            problem, x, free, at.J, C, how.fitted,
-            tried={channel: one.scores for channel, one in coloured.found.items()},
-            checks=checked.checks if checked is not None else (),
-        ),
+        recordings=recorded_rigs(problem, x, how.fitted), unknowns=dict(problem.unknowns),
+        sensors=dict(problem.sensors),
+        coordinates=[replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
+        contributions=contributions(problem, x, free, at.J, how.fitted),
+        combinations=seen_together(problem, free, C),
+        noise=[
+            ChannelNoise(
+                name, model, list(coloured.found[name].scores) if name in coloured.found else []
+            )
+            for name, model in problem.noise.items()
+        ],
+        assumptions=checked.checks if checked is not None else [],
+        versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
+        rigs={recording.name: recording.rig for recording in problem.recordings},
     )  # fmt: skip
 
 

@@ -6,14 +6,12 @@ content tells a damaged file.
 """
 
 import json
-import platform
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,7 +30,6 @@ from torchsoft.sysid.estimate import (
     Contribution,
     Direction,
     Estimate,
-    contributions,
 )
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.initial_state import PREFIX
@@ -456,31 +453,6 @@ def load_answer(path: str | Path) -> IdentificationResult:
 BLURRED = 0.1
 """Relative standard deviation of a combination of parameters from which it is looked for what the
 data see in its place."""
-
-
-def described(
-    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, C: Array, fitted: Sequence[str],
-    *, tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[AssumptionTest] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n):
-    `problem` has the noise that was found, J (m, n) is the Jacobian of the residuals of the
-    recordings `fitted`, `tried` the orders of noise by channel."""
-    c, tried = problem.coordinates, tried or {}
-    noise = [
-        ChannelNoise(channel, model, list(tried.get(channel, ())))
-        for channel, model in problem.noise.items()
-    ]
-    packages = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
-    return {
-        "recordings": recorded_rigs(problem, x, fitted), "unknowns": dict(problem.unknowns),
-        "sensors": dict(problem.sensors),
-        "coordinates": [replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
-        "contributions": contributions(problem, x, free, J, fitted),
-        "combinations": seen_together(problem, free, C), "noise": noise,
-        "assumptions": list(checks),
-        "versions": {"python": platform.python_version()} | {one: version(one) for one in packages},
-        "rigs": {recording.name: recording.rig for recording in problem.recordings},
-    }  # fmt: skip
 
 
 def seen_together(problem: Problem, free: NDArray[np.bool_], C: Array) -> list[Combination]:
