@@ -340,9 +340,8 @@ def refitted(
         return None
     free = tuple(label for label, one in zip(c.labels, law.free) if one)
     try:
-        fit, _ = run_plan(
-            law.problem, runner, [Stage("again", tuple(which), free, law.rtol, tolerance=CLOSE)], x
-        )
+        stage = Stage("again", tuple(which), free, law.rtol, tolerance=CLOSE)
+        fit = run_plan(law.problem, runner, [stage], x).fit
     except Unreachable:
         return None
     return FittedLaw(law.name, law.problem, fit.x, law.free, law.rtol, fit.converged)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
-from torchsoft.sysid.plan import SCANNED, Stage, default_plan, run_plan
+from torchsoft.sysid.plan import SCANNED, USUAL, Stage, default_plan, run_plan
 from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import Problem, Residuals, check_value
 from torchsoft.sysid.recording import Array, Recording
