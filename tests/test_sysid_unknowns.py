@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.sysid.unknowns import Coordinates, Prior, Unknown
+from torchsoft.sysid.estimate import nuisance_unit
+from torchsoft.sysid.unknowns import NUISANCES, Coordinate, Coordinates, Prior, Unknown
 from torchsoft.tables import InvalidTable
 
 RIG = SoftGrasp()
@@ -128,3 +129,15 @@ def test_friction_coefficients_may_both_be_free_where_they_cannot_cross() -> Non
 def test_text_is_no_number(field: str) -> None:
     with pytest.raises(InvalidTable, match=f"^{field} should be a valid number, not '1e5'$"):
         Unknown.model_validate({field: "1e5"})
+
+
+def test_every_fault_of_a_sensor_has_a_unit() -> None:
+    problem: Any = SimpleNamespace(unit=lambda channel: "rad")
+    found = {
+        kind: nuisance_unit(Coordinate("theta", kind, None, 0.0, -1.0, 1.0), problem)
+        for kind in NUISANCES
+    }
+    assert found == {
+        "bias": "rad", "delay": "s", "gain": "1", "drift": "rad/s", "misalignment": "rad",
+        "inertia": "kg", "clock": "1",
+    }  # fmt: skip
