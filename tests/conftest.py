@@ -1,6 +1,7 @@
 """Shared rigs and states: at rest, in the grasp, rolling, and at random."""
 
 import gc
+from typing import Any
 
 import pytest
 import torch
@@ -37,6 +38,12 @@ def turning(**changes: object) -> Rig:
     )  # fmt: skip
     rig.fixed = lambda: model  # the same rig with a bracket that does not turn
     return rig
+
+
+def paper_settings(recording: Any) -> Parameters:
+    """Of a recording of the paper's rig."""
+    assert isinstance(recording.rig, SoftGrasp)
+    return recording.rig.settings
 
 
 def times(end: float, n: int) -> Tensor:

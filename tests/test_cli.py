@@ -283,7 +283,7 @@ def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder, capsys)
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
     message = capsys.readouterr().err
     assert message.startswith(
-        "torchsoft: error: recording `data`: F_y looks as if its sign were opposite ("
+        "torchsoft: error: recording `data`: F_y looks as if its sign were opposite: "
     )
     assert message.endswith('; if it is so, say acknowledged = ["sign of F_y"]\n')
     assert not (folder / "out" / "answer.json").exists()

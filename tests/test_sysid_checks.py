@@ -28,7 +28,7 @@ from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import extended
-from torchsoft.sysid.refits import AMOUNTS, difference, ended, refit, varied
+from torchsoft.sysid.refits import AMOUNTS, End, difference, refit, varied
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
@@ -73,7 +73,7 @@ def checked(
     x = np.array(answer.x)
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
     return check_assumptions(
-        problem, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain
+        problem, runner, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain
     )
 
 
@@ -243,7 +243,8 @@ def test_what_no_test_explains_has_candidates(
     """Nothing is fitted again: a notice says what `explain` would try."""
     problem, x, at = far_off
     free = problem.coordinates.free
-    found = check_assumptions(problem, x, at, free, problem.names, RTOL, doubtful=True)
+    runner = Runner(problem.recordings)
+    found = check_assumptions(problem, runner, x, at, free, problem.names, RTOL, doubtful=True)
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
     assert any(": `explain` fits again with each of " in text for text in assumption_notices(found))
@@ -254,7 +255,9 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     far_off: tuple[Problem, np.ndarray, Residuals],
 ) -> None:
     problem, x, at = far_off
-    end = ended(problem, x, at, problem.coordinates.free, problem.names, RTOL, 1, None)
+    runner = Runner(problem.recordings)
+    base, steps = problem.freeze(runner, x, problem.names, RTOL)
+    end = End(x, at, problem.coordinates.free, problem.names, base, steps, RTOL, runner)
     law = next(
         one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction"
     )

@@ -19,7 +19,6 @@ from torchsoft.excitation import Excitation, Roll, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Density, compare, density, ratio, versus
 from torchsoft.sysid.comparison import LawFit, judged
-from torchsoft.sysid.figures import plot
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import Part
 
@@ -101,7 +100,6 @@ def test_heldout_recordings_count_and_may_contradict() -> None:
     both = versus(law("a", r, held=held), law("b", r + apart(3.0), held=held + apart(8.0)))
     assert both.evidence - alone.evidence == pytest.approx(both.heldout, rel=0.2)
     assert both.heldout is not None
-    assert both.heldout_per_sample == pytest.approx((both.heldout / 300, 8.0 / 300), rel=0.2)
     assert alone.doubts
     assert not both.doubts
     torn = versus(law("a", r, held=held + apart(8.0)), law("b", r + apart(20.0), held=held))
@@ -199,26 +197,22 @@ def stroke() -> dict[str, Problem]:
     return made(STROKE, viscous, {"contact.friction.alpha": 0.55})
 
 
-def test_a_users_own_law_is_named_where_contacts_slip(stroke: dict[str, Problem]) -> None:
+def test_a_users_own_law_is_named_where_contacts_slip(
+    stroke: dict[str, Problem], tmp_path: Path
+) -> None:
     found = compare(stroke, plans=plans(stroke))
     assert (found.outcome, found.law) == ("law", "viscous"), found.verdict
     assert found["viscous"].weight > 0.999 > found["viscous"].p > 1e-3
     assert found["viscous"].estimates["contact.friction.alpha"] == pytest.approx(0.55, rel=0.02)
     assert found["smooth"].bic - found["viscous"].bic > 20
-    content = json.loads(found.to_json())
-    assert content["law"] == "viscous"
-    assert len(content["series"][0]["residuals"]["smooth"]) == len(content["series"][0]["t"])
+    found.save(tmp_path / "comparison.json")
+    assert json.loads((tmp_path / "comparison.json").read_text())["law"] == "viscous"
     assert found.table().count("\n") == 2
-    assert len(plot(found).axes) == 2
-    with pytest.raises(ValueError, match="was not compared with `coulomb`, but with smooth"):
-        plot(found, "coulomb")
-    with pytest.raises(ValueError, match="kept without its residuals"):
-        plot(replace(found, series=[]))
 
 
 def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another() -> None:
     problems = made(GENTLE, viscous, {"contact.friction.alpha": 0.6})
-    found = compare(problems, plans=plans(problems), again=False)
+    found = compare(problems, plans=plans(problems))
     assert (found.outcome, found.law) == ("cannot tell", None), found.verdict
     assert found.against[0].distance < 4
     assert "cannot tell them apart" in found.verdict

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
+from conftest import paper_settings
 
 from torchsoft import Parameters, Trajectory, simulate
 from torchsoft.channels import CHANNELS
@@ -28,8 +29,7 @@ from torchsoft.sysid.measured import (
     cost,
     known_parameters,
     load,
-    paper_settings,
-    read_recording,
+    recording,
     stem,
 )
 
@@ -66,6 +66,10 @@ def example() -> Table:
     """Cells of the first 0.3 s of the example, with its heading."""
     with (EXAMPLE / "rolling.csv").open(newline="") as file:
         return list(csv.reader(file))[:62]
+
+
+def read_recording(path: Path, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
+    return recording(read_tables([path], (), {}), name, p, sensors)
 
 
 def write(path: Path, table: Table) -> Path:

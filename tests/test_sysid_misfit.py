@@ -65,7 +65,6 @@ class Case:
         x = np.linalg.lstsq(J, y, rcond=None)[0]
         parts = [
             Part(*one[:4], raw=raw - j @ x, reading=one[4], noise=self.assumed,
-            found=self.assumed is not None,
                  whitened=(lambda rows: rows) if w is None else w.__matmul__)
             for one, raw, j, w in zip(known, rows, columns, W)
         ]  # fmt: skip

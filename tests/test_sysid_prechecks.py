@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, paper_settings
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
@@ -19,9 +19,8 @@ from torchsoft.excitation import Excitation, MultiSine, Press, Strokes, begin
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.measured import paper_settings
 from torchsoft.sysid.plan import LOOSE
-from torchsoft.sysid.prechecks import accepted, findings, loop_findings, precheck, together
+from torchsoft.sysid.prechecks import accepted, controller_findings, findings, precheck, together
 from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.setpoints import gaps, setpoint_findings
@@ -183,16 +182,12 @@ MISTAKES = {
                                                                            False
     ),
     "its sign": Mistake(
-        "pressing", lambda r: noted(r, F_ff=opposite(r)), "sign of F_ff",
-        "F_ff looks as if its sign were opposite", True
+        "pressing", lambda r: noted(r, F_ff=opposite(r)), "F_ff",
+        "was a force fed forward that F_ff does", False
     ),
     "a zero": Mistake(
         "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x",
-        "zeros, times and set-points right?", False
-    ),
-    "other gains": Mistake(
-        "pressing", lambda r: noted(r, {"control.K_98": 0.7e5, "control.R_99": 900.0}),
-        "loop of F_y", "F_y is not what the controller gives", False,
+        "zeros and set-points right?", False
     ),
 }  # fmt: skip
 
@@ -242,26 +237,19 @@ def test_nothing_is_said_of_what_is_right(
     assert looked_at(faulty, run, declared) == []
 
 
-def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recording]) -> None:
-    for factor in (0.3, 3.0):
-        gains = {
-            "control.K_98": factor * NOMINAL.control.K_98,
-            "control.R_99": factor * NOMINAL.control.R_99,
-        }
-        one = noted(recordings["rolling"], gains, F_ff=Profile([0.0], [0.0]))
-        pressed = changed(
-            one,
-            F_y=lambda t, F: (
-                F - recordings["rolling"].rig.reference["F_ff"](torch.from_numpy(t))[0].numpy()
-            ),
-        )
-        assert list(loop_findings(pressed, SENSORS, ["control.K_98"])) == []
-        flipped = changed(pressed, F_y=scaled(-1))
-        assert [f.code for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == [
-            "sign of F_y"
-        ]
-    about = noted(recordings["rolling"], {"control.senses": "disc"})
-    assert [f.code for f in loop_findings(about, SENSORS, ["control.K_81"])] == ["control.senses"]
+def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
+    recordings: dict[str, Recording],
+) -> None:
+    flipped = changed(recordings["rolling"], F_y=scaled(-1))
+    assert list(controller_findings(flipped, SENSORS))
+    gains = ["control.K_98", "control.R_99", "control.K_81"]
+    assert not list(controller_findings(flipped, SENSORS, gains))
+    for one, code in (
+        (flipped, "sign of F_y"),
+        (noted(recordings["rolling"], {"control.senses": "disc"}), "control.senses"),
+    ):
+        problem = Problem([one], SENSORS, {name: Unknown() for name in gains})
+        assert [f.code for f in precheck(problem, Runner(problem.recordings))] == [code]
 
 
 def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_named(
@@ -278,10 +266,11 @@ def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_
         [loop.measured, "disc.theta"], loop.pushes, both, setpoint=[loop.setpoint]
     )
     same = replace(one, rig=rig)
-    assert not list(loop_findings(same, SENSORS))
-    flipped = changed(same, F_x=scaled(-1))
-    assert [f.code for f in loop_findings(flipped, SENSORS)] == ["sign of F_x"]
-    (note,) = loop_findings(changed(same, theta=None), SENSORS)
+    assert not list(controller_findings(same, SENSORS))
+    more = changed(same, F_x=lambda t, F: F + 20.0)
+    assert [f.code for f in controller_findings(more, SENSORS)] == ["loop of F_x"]
+    assert "F_x is +20 N more, on the average," in next(controller_findings(more, SENSORS)).message
+    (note,) = controller_findings(changed(same, theta=None), SENSORS)
     assert note.severity == "note"
     assert "F_x is not compared with its controller, since theta is not recorded" in note.message
 

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.sysid.unknowns import Coordinates, Prior, Unknown
+from torchsoft.sysid.estimate import nuisance_unit
+from torchsoft.sysid.unknowns import NUISANCES, Coordinate, Coordinates, Prior, Unknown
 
 RIG = SoftGrasp()
 GIVEN = {
@@ -121,3 +122,15 @@ def test_a_search_starts_where_all_rigs_are():
 def test_friction_coefficients_may_both_be_free_where_they_cannot_cross():
     found = coordinates(contact__mu_k={"high": 0.75}, contact__mu_s={"low": 0.75})
     assert (ends(found, "contact.mu_k")[1], ends(found, "contact.mu_s")[0]) == (0.75, 0.75)
+
+
+def test_every_fault_of_a_sensor_has_a_unit():
+    problem: Any = SimpleNamespace(unit=lambda channel: "rad")
+    found = {
+        kind: nuisance_unit(Coordinate("theta", kind, None, 0.0, -1.0, 1.0), problem)
+        for kind in NUISANCES
+    }
+    assert found == {
+        "bias": "rad", "delay": "s", "gain": "1", "drift": "rad/s", "misalignment": "rad",
+        "inertia": "kg", "clock": "1",
+    }  # fmt: skip

@@ -23,7 +23,7 @@ from torchsoft.datasets.generate import cost as dataset_cost
 from torchsoft.datasets.simulation import points, task
 from torchsoft.excitation import Excitation, begin
 from torchsoft.sysid import measured
-from torchsoft.sysid.measured import cost, paper_settings
+from torchsoft.sysid.measured import cost
 from torchsoft.sysid.runs import Runner
 from torchsoft.tables import from_toml
 
@@ -279,7 +279,7 @@ def run_once(case: measured.Case) -> None:
     problem, fit = case.problem, case.config.fit
     expected = cost(problem, fit.rtol, fit.starts, fit.workers, case.config.heldout)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
-    memory = max(paper_settings(r).pad.memory for r in problem.recordings)
+    memory = max(r.rig.settings.pad.memory for r in problem.recordings)
     if memory > SMALL or cost(problem, RTOL, 1, 1).steps > 1e5:
         return
     start, free = problem.coordinates.start, problem.coordinates.free

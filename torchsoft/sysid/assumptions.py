@@ -184,8 +184,15 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         stated = f"bodies were put where they stand {lead:g} s before the first sample (lead)"
         out.append(Variation("lead", "law", stated, f"it were {other:g} s",
                              vary=partial(led, lead=other)))  # fmt: skip
-    if isinstance(rig, SoftGrasp):
-        out += of_the_paper(first, rig, unknown)
+    if isinstance(rig, SoftGrasp):  # what the paper's rig takes for granted besides
+        if isinstance(first.start, AtRest) and "start.disc.x" not in unknown:
+            out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0",
+                f"it began {1e6 * PLACE:g} um further right",
+                                  1e6 * PLACE, "um", vary=placed))  # fmt: skip
+        if isinstance(rig.contacts["L"].law.friction, SmoothSlip):
+            out.append(Variation("Coulomb friction", "law",
+            "slip is smooth (contact.friction = \"smooth\")",
+                                  "it were Coulomb's", vary=coulomb))  # fmt: skip
     pushed = {one.pushes for one in rig.actuators.values()}
     for name, axes in rig.layout.free.items() if isinstance(first.start, Standing) else ():
         if 0 in axes and f"{name}.x" not in pushed:
@@ -215,21 +222,6 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
             out.append(Variation(name, "known", one.stated, one.otherwise, one.amount, one.unit,
             parameter=name, nominal=one.neutral, step=one.amount,
                                   one_sided=one.low == one.neutral, extension=True))  # fmt: skip
-    return out
-
-
-def of_the_paper(recording: Recording, rig: SoftGrasp, unknown: set[str]) -> list[Variation]:
-    """What the paper's rig takes for granted besides."""
-    out, start = [], recording.start
-    if isinstance(start, AtRest) and "start.disc.x" not in unknown:
-        out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0",
-            f"it began {1e6 * PLACE:g} um further right",
-                              1e6 * PLACE, "um", vary=placed))  # fmt: skip
-    law = rig.contacts["L"].law.friction
-    if isinstance(law, SmoothSlip):
-        out.append(Variation("Coulomb friction", "law",
-        "slip is smooth (contact.friction = \"smooth\")",
-                              "it were Coulomb's", vary=coulomb))  # fmt: skip
     return out
 
 
@@ -318,28 +310,33 @@ def coulomb(recording: Recording) -> Recording:
     return with_rig(recording, change)
 
 
+def signals_of(recording: Recording) -> dict[str, nn.Module]:
+    """The signals of a recording's reference by name."""
+    return {name.replace(":", "."): one for name, one in recording.rig.reference.signals.items()}
+
+
 def with_reference(recording: Recording, **signals: nn.Module) -> Recording:
     """The recording with other signals."""
-    known = {name.replace(":", "."): one for name, one in recording.rig.reference.signals.items()}
 
     def change(rig: Rig) -> None:
-        rig.reference = Reference(**(known | signals))
+        rig.reference = Reference(**(signals_of(recording) | signals))
 
     return with_rig(recording, change)
 
 
 def sparser(recording: Recording) -> Recording:
     """Every second set-point left out, and a spline through the others."""
-    signals = {}
-    for name, one in recording.rig.reference.signals.items():
-        if isinstance(one, Sampled) and len(one.times) > 3:
-            signals[name.replace(":", ".")] = Sampled(one.times[::2], one.values[::2])
+    signals = {
+        name: Sampled(one.times[::2], one.values[::2])
+        for name, one in signals_of(recording).items()
+        if isinstance(one, Sampled) and len(one.times) > 3
+    }
     return with_reference(recording, **signals)
 
 
 def retimed(recording: Recording, rate: float, shift: float) -> Recording | None:
     """Every signal at rate * t + shift [s]; None where a signal is not made of polynomials."""
-    signals = {name.replace(":", "."): one for name, one in recording.rig.reference.signals.items()}
+    signals = signals_of(recording)
     known = {name: one for name, one in signals.items() if isinstance(one, Piecewise)}
     if len(known) < len(signals):
         return None

@@ -11,17 +11,16 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.comparison import Comparison, LawFit, Series, Versus, judged
-from torchsoft.sysid.fit import Unreachable, gauss_newton
+from torchsoft.sysid.comparison import Comparison, LawFit, Versus, judged
+from torchsoft.sysid.fit import Fit, Unreachable, gauss_newton
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
 from torchsoft.sysid.plan import FINER, Stage, default_plan, run_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.residual_tests import (
-    ROUNDS,
     Part,
-    colours,
+    allow_for_colour,
     judge_residuals,
     parts,
     residual_notices,
@@ -199,7 +198,7 @@ CLOSE = 1e-3
 def compare(
     laws: Mapping[str, Problem], *, heldout: Sequence[str] = (),
     plans: Mapping[str, Sequence[Stage]] | None = None, rtol: float = RTOL, starts: int = 1,
-    again: bool = True, workers: int = 1, checkpoint: str | Path | None = None,
+    workers: int = 1, checkpoint: str | Path | None = None,
     progress: bool = False,
 ) -> Comparison:  # fmt: skip
     """Fit every law to the same recordings, and say which one made them, or that the data cannot
@@ -214,9 +213,9 @@ def compare(
     that nobody declared.
 
     Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers`
-    and the folder `checkpoint` are those of `identify`. With `again` every law but the best is
-    fitted once more from where the best one ended, as far as they share coordinates, and the better
-    end is kept: no law is to lose by its start.
+    and the folder `checkpoint` are those of `identify`. Every law but the best is fitted once more
+    from where the best one ended, as far as they share coordinates, and the better end is kept: no
+    law is to lose by its start.
 
     Raises `ValueError` for laws that were not given the same data, and for a law that cannot follow
     the data.
@@ -236,14 +235,18 @@ def compare(
         except Unreachable as lost:
             raise ValueError(f"the law `{name}` cannot follow the recordings: {lost}") from None
         evidence[name] = Evidence(law, runners[name], which, heldout)
-    best = most_likely(evidence)
-    for name in (name for name in laws if again and name != best):
+    best = max(evidence, key=lambda name: evidence[name].total)
+    for name in (name for name in laws if name != best):
         other = refitted(evidence[name].law, evidence[best].law, runners[name], which)
         if other is not None:
             better = Evidence(other, runners[name], which, heldout)
             if better.fitted.log > evidence[name].fitted.log:
                 evidence[name] = better
-    return gathered(evidence, list(heldout))
+    first = max(evidence.values(), key=lambda one: one.total)
+    against = [versus(first, one) for one in evidence.values() if one is not first]
+    law_list = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
+    samples = len(first.fitted.r)
+    return Comparison(*judged(law_list, against), law_list, against, samples, list(heldout))
 
 
 def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
@@ -305,19 +308,16 @@ def fitted(
     if end.lost is not None:  # laws are compared by the same tolerance
         raise end.lost
     fit = end.fit
-    assert fit.at is not None
     free = np.isin(problem.coordinates.labels, plan[-1].free)
-    declared, given = [c for c, s in problem.sensors.items() if s.colour == "ar"], problem.noise
-    for _ in range(ROUNDS if declared else 0):
-        found = colours(parts(problem, fit.at.r, which), fit.at.J[:, free], declared)
-        noise = given | {channel: found[channel].noise for channel in declared if channel in found}
-        if not noise:
-            break
-        problem = problem.with_noise(noise)
-        fit = gauss_newton(
-            problem, runner, fit.x, which=which, free=free, steps=fit.steps, tolerance=CLOSE
-        )
-        assert fit.at is not None
+
+    def again(one: Problem, last: Fit, number: int) -> Fit:
+        return gauss_newton(
+            one, runner, last.x, which=which, free=free, steps=last.steps, tolerance=CLOSE,
+            first=last.at,
+        )  # fmt: skip
+
+    if any(sensor.colour == "ar" for sensor in problem.sensors.values()):
+        problem, fit, *_ = allow_for_colour(problem, fit, free, which, again, undeclared=False)
     return FittedLaw(name, problem, fit.x, free, plan[-1].rtol, fit.converged)
 
 
@@ -338,54 +338,28 @@ def refitted(
             x[i] = one.to_x(float(np.clip(known[one.label], one.low, one.high)))
     if (x == law.x).all():
         return None
+    free = tuple(label for label, one in zip(c.labels, law.free) if one)
     try:
-        first, steps = law.problem.freeze(runner, x, which, law.rtol, law.free)
-        if first.lost:
-            return None
-        fit = gauss_newton(
-            law.problem,
-            runner,
-            x,
-            which=which,
-            free=law.free,
-            steps=steps,
-            tolerance=CLOSE,
-            first=first,
-        )
+        stage = Stage("again", tuple(which), free, law.rtol, tolerance=CLOSE)
+        fit = run_plan(law.problem, runner, [stage], x).fit
     except Unreachable:
         return None
     return FittedLaw(law.name, law.problem, fit.x, law.free, law.rtol, fit.converged)
-
-
-def most_likely(evidence: Mapping[str, Evidence]) -> str:
-    """The law with the largest penalised likelihood of all the data."""
-    return max(evidence, key=lambda name: evidence[name].total)
-
-
-def gathered(evidence: Mapping[str, Evidence], heldout: list[str]) -> Comparison:
-    """The answer."""
-    best = evidence[most_likely(evidence)]
-    against = [versus(best, one) for name, one in evidence.items() if name != best.name]
-    laws = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
-    outcome, law, verdict = judged(laws, against)
-    return Comparison(
-        outcome, law, verdict, laws, against, len(best.fitted.r), heldout, series(evidence)
-    )
 
 
 def versus(best: Evidence, other: Evidence) -> Versus:
     """The best law against another, by the rule of `torchsoft.sysid.comparison`."""
     fitted, n = ratio(best.fitted, other.fitted), len(best.fitted.r)
     evidence = fitted.log / fitted.inflation
-    log, stated, variance, told, z = fitted.log, fitted.stated, fitted.variance, None, None
+    log, stated, variance, held, z = fitted.log, fitted.stated, fitted.variance, None, None
     if best.heldout is not None and other.heldout is not None:
-        ahead, m = ratio(best.heldout, other.heldout), len(best.heldout.r)
+        ahead = ratio(best.heldout, other.heldout)
         evidence, log = evidence + ahead.log / ahead.inflation, log + ahead.log
         stated, variance = stated + ahead.stated, variance + ahead.variance
-        told, z = (ahead.log / m, ahead.variance**0.5 / m), ahead.z
+        held, z = ahead.log, ahead.z
     evidence -= 0.5 * max(best.parameters - other.parameters, 0) * float(np.log(n))
     return Versus(
-        best.name, other.name, fitted.log, None if told is None else log - fitted.log, told,
+        best.name, other.name, fitted.log, held,
         stated**0.5, variance / stated if stated > 0 else 1.0, evidence,
         log / variance**0.5 if variance > 0 else 0.0, z,
         (best.numerical + other.numerical) / fitted.inflation,
@@ -421,16 +395,4 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
                 any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
             )
         )  # fmt: skip
-    return out
-
-
-def series(evidence: Mapping[str, Evidence]) -> list[Series]:
-    """Residuals of all laws, side by side."""
-    out = []
-    for part in ("fitted", "heldout"):
-        densities = {name: getattr(one, part) for name, one in evidence.items()}
-        first = next(iter(densities.values()))
-        for one in first.parts if first is not None else ():
-            rows = {name: density.r[one.rows].tolist() for name, density in densities.items()}
-            out.append(Series(one.recording, one.channel, part == "fitted", one.t.tolist(), rows))
     return out

@@ -22,13 +22,12 @@ probability of at most 6e-4, whatever D, and the right one with 95 % from D = 7.
 answer is that the data cannot tell, or that no law fits.
 """
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 from torchsoft.display import suggestion
-from torchsoft.files import finite, replacing
+from torchsoft.files import write_json
 
 EVIDENCE = 5.0
 """Logarithm of Bayes' factor from which evidence is very strong (Kass and Raftery 1995)."""
@@ -90,17 +89,12 @@ class Versus:
     """The best law against another one: logarithms of the likelihood ratios of fitted and of
     held-out samples, the whitened distance D of the predictions, the inflation c of the variance, E
     and z of the rule, z of held-out recordings alone, and how far a tenth of the tolerance changes
-    E.
-
-    `heldout_per_sample` is the difference of the log densities per held-out sample with its
-    standard error.
-    """
+    E."""
 
     best: str
     other: str
     fitted: float
     heldout: float | None
-    heldout_per_sample: tuple[float, float] | None
     distance: float
     inflation: float
     evidence: float
@@ -138,17 +132,6 @@ class Versus:
 
 
 @dataclass(frozen=True)
-class Series:
-    """Whitened residuals (k,) by law of one channel of one recording at times t (k,) [s]."""
-
-    recording: str
-    channel: str
-    fitted: bool
-    t: list[float]
-    residuals: dict[str, list[float]]
-
-
-@dataclass(frozen=True)
 class Comparison:
     """Laws by how well they explain the recordings, the best one first, and the best against every
     other; `law` is the one that the data name, if they name one, and `verdict` says it in plain
@@ -162,7 +145,6 @@ class Comparison:
     against: list[Versus]
     samples: int
     heldout: list[str]
-    series: list[Series] = field(repr=False)
 
     def __getitem__(self, name: str) -> LawFit:
         for one in self.laws:
@@ -173,13 +155,9 @@ class Comparison:
             f"{suggestion(name, [one.name for one in self.laws], 'there are')}"
         )
 
-    def to_json(self) -> str:
-        return json.dumps(finite(asdict(self)), indent=1, allow_nan=False)
-
     def save(self, path: str | Path) -> None:
         """Write the JSON file. It appears whole or not at all."""
-        with replacing(path) as partial:
-            partial.write_text(self.to_json(), encoding="utf-8")
+        write_json(path, asdict(self))
 
     def table(self) -> str:
         """One line a law, differences to the best."""

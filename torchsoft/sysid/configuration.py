@@ -81,10 +81,7 @@ class Missing(Table):
 
     def over(self, other: "Missing") -> dict[str, float]:
         """Those of this table, and of the other where this has none."""
-        both = other.model_dump() | {
-            name: value for name, value in self.model_dump().items() if value is not None
-        }
-        return {name: value for name, value in both.items() if value is not None}
+        return other.model_dump(exclude_none=True) | self.model_dump(exclude_none=True)
 
 
 class KelvinVoigtPads(Table):

@@ -18,57 +18,27 @@ SHARPNESS = 12.0
 """Of the smooth maximum: it exceeds the largest logarithm by ln(parameters) over this at most."""
 
 
-@dataclass(frozen=True)
-class Criterion:
-    """One number for a covariance C (s, s) of parameters' relative errors: the logarithm of a
-    standard deviation, the smaller the better.
+def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
+    """One number for a covariance C (s, s) of parameters' relative errors, the logarithm of a
+    standard deviation, the smaller the better, and its derivative (s, s) by C.
 
     "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root
-    mean square of the standard deviations over `targets` (s,), 1 where there are none; "worst" the
-    largest of them, smoothed. With one parameter the three are the same, and are called
-    c-optimality. Raises `ValueError`.
+    mean square of the standard deviations; "worst" the largest of them, smoothed. With one
+    parameter the three are the same, and are called c-optimality. Raises `ValueError` for another.
     """
-
-    optimality: Optimality = "D"
-    targets: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        if self.optimality not in get_args(Optimality):
-            raise ValueError(
-                f"`optimality` must be one of {', '.join(get_args(Optimality))}, not "
-                f"{self.optimality!r}"
-            )
-        if self.targets is not None and not (
-            np.isfinite(self.targets).all() and np.min(self.targets) > 0
-        ):
-            raise ValueError(
-                f"`targets` must be positive standard deviations, but are {self.targets}"
-            )
-
-    def __call__(self, C: Array) -> tuple[float, Array]:
-        """Its value and derivative (s, s) by C."""
-        if self.optimality == "D":
-            return 0.5 * float(np.linalg.slogdet(C)[1]) / len(C), 0.5 * np.linalg.inv(C) / len(C)
-        scaled = np.diag(C) / np.square(1.0 if self.targets is None else self.targets)
-        if self.optimality == "A":
-            return 0.5 * float(np.log(scaled.mean())), np.diag(
-                0.5 * scaled / np.diag(C) / scaled.sum()
-            )
-        logs = 0.5 * np.log(scaled)
-        parts = np.exp(SHARPNESS * (logs - logs.max()))
-        value = float(logs.max() + np.log(parts.sum()) / SHARPNESS)
-        return value, np.diag(0.5 * parts / parts.sum() / np.diag(C))
-
-    def check(self, names: Sequence[str]) -> None:
-        """Raises `ValueError` unless there is a target for every parameter, or none."""
-        if self.targets is not None and len(self.targets) != len(names):
-            raise ValueError(
-                f"`targets` has {len(self.targets)} standard deviations for the {len(names)} of "
-                f"{names}"
-            )
-
-
-VOLUME = Criterion()
+    if criterion not in get_args(Optimality):
+        raise ValueError(
+            f"`criterion` must be one of {', '.join(get_args(Optimality))}, not {criterion!r}"
+        )
+    if criterion == "D":
+        return 0.5 * float(np.linalg.slogdet(C)[1]) / len(C), 0.5 * np.linalg.inv(C) / len(C)
+    variances = np.diag(C)
+    if criterion == "A":
+        return 0.5 * float(np.log(variances.mean())), 0.5 * np.eye(len(C)) / variances.sum()
+    logs = 0.5 * np.log(variances)
+    parts = np.exp(SHARPNESS * (logs - logs.max()))
+    value = float(logs.max() + np.log(parts.sum()) / SHARPNESS)
+    return value, np.diag(0.5 * parts / parts.sum() / variances)
 
 
 def chosen(
@@ -117,15 +87,15 @@ class Outlook:
 
 def next_recording(
     problem: Problem, x: Array, candidates: Sequence[Recording], *,
-    names: Sequence[str] | None = None, criterion: Criterion = VOLUME, per_second: bool = False,
-    rtol: float = 1e-4, workers: int = 1,
+    names: Sequence[str] | None = None, criterion: Optimality = "D", rtol: float = 1e-4,
+    workers: int = 1,
 ) -> list[Outlook]:  # fmt: skip
     """What should be recorded after the recordings of `problem`, whose coordinates are x (n,), say
     at the end of a fit?
 
     Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The
-    best comes first, by what it takes off the `criterion` of the parameters `names`, or by that per
-    second. A prediction: it holds as far as the model does, and for small errors. Raises
+    best comes first, by what it takes off the `criterion` ("D", "A" or "worst") of the parameters
+    `names`. A prediction: it holds as far as the model does, and for small errors. Raises
     `ValueError` for candidates that do not fit the problem.
     """
     if not candidates:
@@ -141,7 +111,6 @@ def next_recording(
         ),
     )
     names, T = chosen(both, x, names)
-    criterion.check(names)
     runner, priors = Runner(both.recordings, workers), len(c.priors)
     have = both.residuals(runner, x, problem.names, rtol, c.free)
     if have.lost:
@@ -168,6 +137,6 @@ def next_recording(
             continue
         J = np.concatenate((have.J[: len(have.J) - priors], new.J))
         after = covariance(J, [*problem.names, one.name])
-        gain = criterion(T @ C @ T.T)[0] - criterion(T @ after @ T.T)[0]
+        gain = optimality(criterion, T @ C @ T.T)[0] - optimality(criterion, T @ after @ T.T)[0]
         out.append(Outlook(one.name, one.duration, before, deviations(names, T, after), gain))
-    return sorted(out, key=lambda o: (bool(o.lost), -o.gain / (o.seconds if per_second else 1.0)))
+    return sorted(out, key=lambda o: (bool(o.lost), -o.gain))

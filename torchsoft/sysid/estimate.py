@@ -170,25 +170,10 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
     """Unit of a start's coordinate, or of what is wrong with a sensor."""
     if one.kind == "start":
         axis = one.name.split(".")[2]
-        return (
-            "rad/s"
-            if axis == "v_theta"
-            else "m/s"
-            if axis.startswith("v_")
-            else "rad"
-            if axis == "theta"
-            else "m"
-        )
+        return ("rad" if axis.endswith("theta") else "m") + ("/s" if axis.startswith("v_") else "")
     own = problem.unit(one.name)
-    units = {
-        "bias": own,
-        "drift": f"{own}/s",
-        "delay": "s",
-        "gain": "1",
-        "misalignment": "rad",
-        "inertia": "kg",
-    }
-    return units[one.kind]
+    units = {"bias": own, "drift": f"{own}/s", "delay": "s", "misalignment": "rad", "inertia": "kg"}
+    return units.get(one.kind, "1")
 
 
 def directions(labels: list[str], values: Array, vectors: Array) -> list[Direction]:
@@ -199,19 +184,6 @@ def directions(labels: list[str], values: Array, vectors: Array) -> list[Directi
         order = np.argsort(-np.abs(vectors[:, k]))
         parts = {labels[i]: float(vectors[i, k]) for i in order if abs(vectors[i, k]) > 0.2}
         out.append(Direction(sd, sd < IDENTIFIABLE, parts))
-    return out
-
-
-def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str], Array]:
-    """Rows (m, ...) of residuals, or of their Jacobian, by recording and channel, in the order of
-    `Problem.residuals`."""
-    out, at = {}, 0
-    for recording in problem.recordings:
-        for channel in problem.sensors if recording.name in which else ():
-            if channel in recording.samples:
-                n = len(recording.samples[channel][0])
-                out[recording.name, channel] = r[at : at + n]
-                at += n
     return out
 
 
@@ -254,7 +226,6 @@ class Contribution:
     estimate."""
 
     source: str | None
-    rows: int
     shares: dict[str, float]
     without: dict[str, float | None]
 
@@ -265,10 +236,9 @@ def contributions(
     """Of the recordings `fitted`, whose rows the whitened Jacobian J (m, n) at x (n,) has, before
     those of the priors."""
     rows, at = dict[str | None, slice](), 0
-    for (name, _), part in split(problem, J, list(fitted)).items():
-        begin = rows[name].start if name in rows else at
-        at += len(part)
-        rows[name] = slice(begin, at)
+    for name in (name for name in problem.names if name in fitted):
+        rows[name] = slice(at, at + problem.samples([name]))
+        at = rows[name].stop
     if at < len(J):
         rows[None] = slice(at, len(J))
     J = J[:, free]
@@ -288,5 +258,5 @@ def contributions(
             if alone < IDENTIFIABLE and sd[label] > 0:
                 without[label] = alone / sd[label]
         shares = {label: parts[name][label] / total[label] for label in wanted}
-        out.append(Contribution(name, own.stop - own.start, shares, without))
+        out.append(Contribution(name, shares, without))
     return out

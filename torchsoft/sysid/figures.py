@@ -1,5 +1,4 @@
-"""Pictures of an identification: estimates, what recordings told, the Fisher spectrum,
-correlations, profiles, residuals."""
+"""Pictures of an identification: estimates, the Fisher spectrum, correlations, residuals."""
 
 from collections.abc import Sequence
 from textwrap import fill, shorten
@@ -15,15 +14,12 @@ from matplotlib.ticker import (
     MaxNLocator,
     NullFormatter,
     NullLocator,
-    PercentFormatter,
 )
 
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
-from torchsoft.sysid.comparison import Comparison, Series, Versus
 from torchsoft.sysid.design import Design
 from torchsoft.sysid.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
 from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.profile import RISE, Profile
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import LAGS, autocorrelation
 from torchsoft.sysid.result import IdentificationResult
@@ -40,12 +36,6 @@ NAME = 24
 
 MOST_NAMES = 3
 """Parts of a direction that its name has room for."""
-
-SOURCES = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#8a6d00")
-"""Colours of recordings, in turn."""
-
-REST = "#bbbbbb"
-"""Colour of the priors, and of recordings that there are no colours left for."""
 
 
 class Trace(NamedTuple):
@@ -99,10 +89,10 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
                       fontsize=9, color="#a34400")  # fmt: skip
             continue
         low, value, high = (max(v / s, 1e-6) for v in (e.ci95[0], e.value, e.ci95[1]))
-        axes.plot([low, high], [row, row], color=ACTUAL, lw=2.4, solid_capstyle="butt")
-        axes.plot([low, low, high, high], [row - 0.13, row + 0.13, row + 0.13, row - 0.13], " ")
-        axes.vlines([low, high], row - 0.16, row + 0.16, color=ACTUAL, lw=1.2)
-        axes.plot(value, row, "o", color=ACTUAL, ms=6)
+        axes.errorbar(
+            value, row, xerr=[[value - low], [high - value]], fmt="o", color=ACTUAL, ms=6, lw=2.4,
+            capsize=4, capthick=1.2,
+        )  # fmt: skip
         reach += [low, high]
     axes.set_xscale("log")
     low, high = min(reach) / 1.15, max(reach) * 1.15
@@ -182,73 +172,6 @@ def spectrum_figure(result: IdentificationResult) -> Figure:
 
 
 @rc_context(STYLE)
-def contributions_figure(result: IdentificationResult) -> Figure | None:
-    """Weight of every recording, and of the priors, in what is identifiable; None where there is
-    only one source."""
-    labels = [e.label for e in result.estimates if e.identifiable and e.kind == "parameter"]
-    sources = result.contributions
-    if len(sources) < 2 or not labels:
-        return None
-    named = [one for one in sources if one.source is not None][: len(SOURCES)]
-    shares = [
-        (one.source or "", SOURCES[i], [one.shares[label] for label in labels])
-        for i, one in enumerate(named)
-    ]
-    rest = [one for one in sources if one not in named]
-    if rest:
-        name = "priors" if rest[0].source is None else "the others"
-        shares.append((name, REST, [sum(one.shares[label] for one in rest) for label in labels]))
-    figure = Figure(
-        figsize=(WIDTH, 0.8 + 0.42 * len(labels) + 0.2 * len(shares)), layout="constrained"
-    )
-    axes, left = figure.subplots(), np.zeros(len(labels))
-    for name, colour, part in shares:
-        label = f" {literal(name, 60)}"  # matplotlib does not show those that begin with _
-        axes.barh(range(len(labels)), part, left=left, height=0.6, color=colour, label=label)
-        left += part
-    axes.set(xlim=(0, 1), ylim=(len(labels) - 0.4, -0.6))
-    axes.set_yticks(range(len(labels)), [literal(label, NAME) for label in labels])
-    axes.xaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.spines["left"].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    axes.grid(False, axis="y")
-    figure.legend(loc="outside lower left", ncols=1, handlelength=1.0)
-    return figure
-
-
-@rc_context(STYLE)
-def profile_figure(profile: Profile, unit: str) -> Figure:
-    """Rise of the misfit away from the optimum, the others fitted again, beside the parabola of the
-    covariance."""
-    figure = Figure(figsize=(WIDTH, 2.5), layout="constrained")
-    axes, values, best = figure.subplots(), np.array(profile.values), profile.best
-    low, high = profile.ci95
-    shown, scale = SHOWN.get(unit, (unit, 1.0))
-    axes.axvspan(
-        scale * (values[0] if low is None else low),
-        scale * (values[-1] if high is None else high),
-        color="#e8f1f7",
-        lw=0,
-    )
-    axes.axhline(RISE, color="#1d2329", lw=1, ls=(0, (4, 2)))
-    v, (a, b) = np.linspace(values[0], values[-1], 200), profile.wald95
-    log = min(a, values[0]) > 0 and abs(np.log(a * b / best**2)) < 0.01 * np.log(b / a)
-    z = np.log(v / best) / np.log(b / a) if log else (v - best) / (b - a)
-    axes.plot(scale * v, RISE * (2 * z) ** 2, color=DESIRED, lw=1.2, label="covariance")
-    axes.plot(scale * values, profile.rises, "o-", color=ACTUAL, ms=4, label="profile")
-    axes.set(
-        ylim=(0, 1.7 * RISE),
-        xlim=(scale * values[0], scale * values[-1]),
-        xlabel=f"[{shown}]" if shown not in ("", "1") else "",
-    )
-    axes.set_title(literal(f"{profile.label}: rise of the misfit (dashed: 95 %)", 60))
-    axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.yaxis.set_major_locator(MaxNLocator(4))
-    axes.legend(loc="upper center", ncols=2, handlelength=1.2)
-    return figure
-
-
-@rc_context(STYLE)
 def trace_figure(
     trace: Trace, channel: ChannelResiduals | None, noise: Autoregression | None = None
 ) -> Figure:
@@ -295,79 +218,6 @@ def trace_figure(
     for axes in (data, residual, correlation):
         axes.yaxis.set_major_locator(MaxNLocator(5 if axes is data else 3))
     return figure
-
-
-# Comparison of laws
-
-
-MOST = 4
-"""Recordings that are shown, those with most of the evidence first."""
-
-
-@rc_context(STYLE)
-def plot(comparison: Comparison, other: str | None = None) -> Figure:
-    """The evidence against `other` (by default the law next to the best) as it grows along each
-    recording, in all and by the channels that tell most, and both laws' residuals of the channel
-    that tells most. Raises `ValueError` for a law that was not compared with the best, and where
-    the residuals have not been kept."""
-    chosen = [v for v in comparison.against if other in (None, v.other)]
-    if not chosen:
-        raise ValueError(
-            f"the best law was not compared with `{other}`, but with "
-            f"{', '.join(v.other for v in comparison.against)}"
-        )
-    if not comparison.series:
-        raise ValueError(
-            "the comparison was kept without its residuals, so there is nothing to draw: compare "
-            "once more"
-        )
-    versus = min(chosen, key=lambda v: v.evidence)
-    by_recording: dict[str, list[Series]] = {}
-    for one in comparison.series:
-        by_recording.setdefault(one.recording, []).append(one)
-    names = sorted(
-        by_recording, key=lambda name: -sum(growth(s, versus)[-1] for s in by_recording[name])
-    )[:MOST]
-    figure = Figure(figsize=(10.5, 0.9 + 2.6 * len(names)), layout="constrained")
-    figure.suptitle(
-        literal(
-            f"{versus.best} against {versus.other}: {versus.evidence:.3g} nats, z = {versus.z:.2g}"
-        )
-    )
-    for (left, right), name in zip(
-        figure.subplots(len(names), 2, squeeze=False, sharex="row"), names
-    ):
-        told = sorted(by_recording[name], key=lambda s: -abs(growth(s, versus)[-1]))
-        t = np.unique(np.concatenate([s.t for s in told]))
-        left.plot(
-            t, sum(np.interp(t, s.t, growth(s, versus)) for s in told), color="k", lw=2, label="all"
-        )
-        for s in told[:3]:
-            left.plot(s.t, growth(s, versus), lw=1, label=s.channel)
-        held = "" if told[0].fitted else ", held out"
-        left.set_title(literal(f"evidence against {versus.other} in {name}{held} [nats]"))
-        left.legend(loc="upper left")
-        for law, colour in ((versus.other, OTHER), (versus.best, ACTUAL)):
-            right.plot(
-                told[0].t,
-                told[0].residuals[law],
-                ".-",
-                color=colour,
-                lw=0.6,
-                ms=3,
-                label=literal(law),
-            )
-        right.set_title(f"residual over noise in {told[0].channel}")
-        right.legend()
-        for axes in (left, right):
-            axes.set(xlabel="time [s]", xlim=(t[0], t[-1]))
-    return figure
-
-
-def growth(s: Series, versus: Versus) -> np.ndarray:
-    """Evidence up to each sample [nats]."""
-    a, b = (np.array(s.residuals[law]) for law in (versus.best, versus.other))
-    return np.cumsum(0.5 * (b**2 - a**2))
 
 
 # Designed motion

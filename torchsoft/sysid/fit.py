@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, lsq_linear
+from scipy.optimize import least_squares, lsq_linear, minimize
 
+from torchsoft.plan.adam import ProjectedAdam
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
 from torchsoft.sysid.recording import Array
@@ -226,15 +226,14 @@ class Unreachable(RuntimeError):
 
 class Fit(NamedTuple):
     """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their
-    number), evaluations, whether it converged, and the residuals there with their Jacobian, if that
-    was computed."""
+    number), evaluations, whether it converged, and the residuals there with their Jacobian."""
 
     x: Array
     chi2: float
     evaluations: int
     converged: bool
     steps: StepsByName
-    at: Residuals | None = None
+    at: Residuals
 
 
 def gauss_newton(
@@ -334,45 +333,37 @@ def descend(
     steps: StepsByName, method: Literal["lbfgs", "adam"] = "lbfgs", evaluations: int = 100,
     rate: float = 0.05, notify: Notify = lambda chi2: None,
 ) -> Fit:  # fmt: skip
-    """torch's LBFGS (strong Wolfe) or Adam (learning `rate`) on the misfit, bounds kept by a
-    sigmoid; the best point visited.
+    """scipy's L-BFGS-B, or Adam (learning `rate`) projected on the bounds, on the misfit; the best
+    point visited.
 
     For many unknowns: a gradient costs less than one run more, however many there are. For a
     handful `gauss_newton` needs far fewer runs. Raises `Unreachable` where the start cannot be
     simulated.
     """
-    low, high = (torch.from_numpy(b) for b in problem.coordinates.bounds)
-    mask, fraction = torch.from_numpy(free), (torch.from_numpy(x) - low) / (high - low)
-    z = torch.logit(fraction[mask].clamp(1e-6, 1 - 1e-6)).requires_grad_(True)
+    low, high = (bound[free] for bound in problem.coordinates.bounds)
     samples, best, count = problem.samples(which), (np.inf, x), 0
 
-    def coordinates() -> torch.Tensor:
-        return torch.from_numpy(x).masked_scatter(
-            mask, low[mask] + (high - low)[mask] * torch.sigmoid(z)
-        )
-
-    def closure() -> float:
+    def slope(z: Array) -> tuple[float, Array]:
         nonlocal best, count
-        now = coordinates()
-        value, gradient, lost = problem.misfit(runner, now.detach().numpy(), which, steps, free)
+        now = x.copy()
+        now[free] = z
+        value, gradient, lost = problem.misfit(runner, now, which, steps, free)
         if lost and count == 0:
             raise Unreachable(lost)
         count += 1
         if value < best[0]:
-            best = (value, now.detach().numpy().copy())
-        slope = torch.from_numpy(np.nan_to_num(gradient)) / samples
-        (z.grad,) = torch.autograd.grad(now, z, slope)
+            best = value, now
         notify(2 * value / samples)
-        return value / samples if np.isfinite(value) else 1e9
+        return min(value / samples, 1e9), np.nan_to_num(gradient)[free] / samples
 
+    start = np.clip(x[free], low, high)
     if method == "lbfgs":
-        optimiser: Any = torch.optim.LBFGS(
-            [z], max_iter=evaluations, max_eval=evaluations, line_search_fn="strong_wolfe",
-            tolerance_change=1e-12, tolerance_grad=1e-9, history_size=20,
-        )  # fmt: skip
-        optimiser.step(closure)
+        options = {"maxfun": evaluations, "maxcor": 20, "ftol": 1e-12, "gtol": 1e-9}
+        bounds = list(zip(low, high))
+        minimize(slope, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     else:
-        optimiser = torch.optim.Adam([z], lr=rate)
+        adam = ProjectedAdam(start, lambda z: np.clip(z, low, high), (0.9, 0.999))
         for _ in range(evaluations):
-            optimiser.step(closure)
-    return Fit(best[1], 2 * best[0] / samples, count, count < evaluations, steps)
+            adam.step(slope(adam.z)[1], rate)
+    at = problem.residuals(runner, best[1], which, steps, free)
+    return Fit(best[1], 2 * best[0] / samples, count, count < evaluations, steps, at)

@@ -1,10 +1,11 @@
 """`identify`: a plan of stages, the tests at their end, and the result with its notices;
 `explain`."""
 
+import platform
 import sys
 import time as clock
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
-from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.estimate import contributions, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.fit import (
     Fit,
     Loss,
@@ -22,9 +23,7 @@ from torchsoft.sysid.fit import (
     Unreachable,
     chord,
     covariance,
-    descend,
     fisher,
-    gauss_newton,
 )
 from torchsoft.sysid.plan import (
     FINER,
@@ -33,6 +32,7 @@ from torchsoft.sysid.plan import (
     Settled,
     Stage,
     default_plan,
+    on_steps,
     progress_bar,
     run_plan,
     settle,
@@ -50,7 +50,13 @@ from torchsoft.sysid.residual_tests import (
     residual_notices,
     rewhitened,
 )
-from torchsoft.sysid.result import IdentificationResult, described, undetermined
+from torchsoft.sysid.result import (
+    ChannelNoise,
+    IdentificationResult,
+    recorded_rigs,
+    seen_together,
+    undetermined,
+)
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
 from torchsoft.sysid.suspects import assumption_notices
@@ -60,6 +66,9 @@ from torchsoft.tables import SEED, Table, plain
 RTOL = 1e-5
 """Relative tolerance of the last stage: derivatives are then right to some percent, and estimates
 to a fraction of a standard deviation where sensors are as good as `RIG`."""
+
+PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
+"""Those whose versions a result names."""
 
 Assumed = Literal["checked", "explained", "trusted"]
 """Whether assumptions are tested to first order, tested and followed by new fits that look for a
@@ -77,16 +86,6 @@ class Settings(Table):
     seed: int = Field(0, ge=0, le=SEED)
     tightenings: int = Field(2, ge=0, le=10)
     assumptions: Assumed = "checked"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _has_no_step(cls, given: Any) -> Any:
-        if isinstance(given, dict) and "step" in given:
-            raise ValueError(
-                "there is no `step` any more: tolerances choose the steps; leave it out, or give "
-                f"the relative tolerance `rtol` ({RTOL:g})"
-            )
-        return given
 
     @model_validator(mode="after")
     def _the_method_has_the_loss(self) -> "Settings":
@@ -214,11 +213,20 @@ def conclude(
             "recordings": {r.name: r.fingerprint for r in problem.recordings},
         },
         covariance=C.tolist(),
-        **described(
-            problem, x, free, at.J, C, how.fitted,
-            tried={channel: one.scores for channel, one in coloured.found.items()},
-            checks=checked.checks if checked is not None else (),
-        ),
+        recordings=recorded_rigs(problem, x, how.fitted), unknowns=dict(problem.unknowns),
+        sensors=dict(problem.sensors),
+        coordinates=[replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
+        contributions=contributions(problem, x, free, at.J, how.fitted),
+        combinations=seen_together(problem, free, C),
+        noise=[
+            ChannelNoise(
+                name, model, list(coloured.found[name].scores) if name in coloured.found else []
+            )
+            for name, model in problem.noise.items()
+        ],
+        assumptions=checked.checks if checked is not None else [],
+        versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
+        rigs={recording.name: recording.rig for recording in problem.recordings},
     )  # fmt: skip
 
 
@@ -238,9 +246,9 @@ def tested_assumptions(
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
     found = check_assumptions(
-        plain, end.x, finer, free, which, end.rtol, doubtful=doubtful,
-        explain=how.settings.assumptions == "explained", loss=how.loss, workers=runner.workers,
-        journal=runner.folder, progress=progress, own=end.steps,
+        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, doubtful=doubtful,
+        explain=how.settings.assumptions == "explained", loss=how.loss, progress=progress,
+        own=end.steps,
     )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
@@ -374,7 +382,7 @@ def identify(
     )
     for look in findings if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
-    with explained(findings):
+    try:
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
         end = run_plan(
@@ -387,6 +395,8 @@ def identify(
             seed=seed,
             progress=progress,
         )
+    except Unreachable as error:  # what looked wrong with the recordings may be behind it
+        raise Unreachable(error.lost, findings) from None
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
         coloured = with_its_noise(problem, runner, end.stage, end.fit, loss, method, bar)
@@ -413,16 +423,6 @@ def explain(problem: Problem, **how: Any) -> IdentificationResult:
     return identify(problem, **how, assumptions="explained")
 
 
-@contextmanager
-def explained(findings: Sequence[str]) -> Iterator[None]:
-    """Tells whom the model cannot follow the data what looked wrong with the recordings
-    themselves."""
-    try:
-        yield
-    except Unreachable as error:
-        raise Unreachable(error.lost, findings) from None
-
-
 def with_its_noise(
     problem: Problem,
     runner: Runner,
@@ -435,26 +435,11 @@ def with_its_noise(
     """The fit of the last stage, gone on with whatever noise it leaves: by new Jacobians, then by
     the last one."""
     free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
-    common: dict[str, Any] = {"which": which, "free": free, "steps": fit.steps, "notify": notify}
-
-    def residuals(one: Problem, x: Array) -> Residuals:
-        return one.residuals(runner, x, which, fit.steps, free)
 
     def refit(one: Problem, last: Fit, number: int) -> Fit:
-        if number > 0 and loss == "linear" and last.at is not None:
-            return chord(one, runner, last.x, last.at, **common)
-        if method == "gauss_newton":
-            more: dict[str, Any] = {
-                "evaluations": stage.evaluations,
-                "tolerance": stage.tolerance,
-                "loss": loss,
-            }
-            return gauss_newton(one, runner, last.x, first=last.at, **more, **common)
-        end = descend(
-            one, runner, last.x, method=method, evaluations=4 * stage.evaluations, **common
-        )
-        return end._replace(at=residuals(one, end.x))
+        if number > 0 and loss == "linear":
+            common: dict[str, Any] = {"which": which, "free": free, "notify": notify}
+            return chord(one, runner, last.x, last.at, steps=fit.steps, **common)
+        return on_steps(one, runner, stage, last.x, fit.steps, loss, method, notify, last.at)
 
-    return allow_for_colour(
-        problem, fit._replace(at=fit.at or residuals(problem, fit.x)), free, which, refit
-    )
+    return allow_for_colour(problem, fit, free, which, refit)

@@ -6,7 +6,7 @@ field.
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -45,10 +45,9 @@ from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.rig_recordings import (
-    measured_samples,
-    moving,
+    followed,
+    recorded,
     rig_recording,
-    sampled,
     vocabulary,
 )
 from torchsoft.sysid.unknowns import Sensor, Unknown
@@ -78,38 +77,20 @@ def cost(
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
     loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
 
-    def runs(recording: Recording) -> list[tuple[float, float, bool]]:
-        """How many at which tolerance, and whether they are differentiated."""
-        first = [(starts * FIRST, loose, True)] if recording is slowest else []
-        stages = [
-            (ALL, loose, True),
-            (FREE, usual, True),
-            (LAST if rtol < usual else 0, rtol, True),
-        ]
-        return [
-            *first,
-            *stages,
-            (1, loose, False),
-            (1, FINER * rtol, False),
-            (CHECKED, usual, False),
-        ]
-
-    descent, steps, seconds = method != "gauss_newton", 0.0, []
+    descent, steps, seconds = method != "gauss_newton", 0.0, list[float]()
     for recording in fitted:
+        first = starts * FIRST if recording is slowest else 0
+        stages = [(first + ALL, loose), (FREE, usual), (LAST if rtol < usual else 0, rtol)]
+        runs = [((4 if descent else 1) * number, by, True) for number, by in stages]
+        runs += [(1, loose, False), (1, FINER * rtol, False), (CHECKED, usual, False)]
+        mine = [c for c in problem.coordinates.all
+                if c.of_the_rig and c.recording in (None, recording.name)]  # fmt: skip
+        more, span = 1 + COLUMN * max(len(mine) - FEW, 0), recording.duration + recording.start.lead
         seconds.append(0.0)
-        mine = [
-            c
-            for c in problem.coordinates.all
-            if c.of_the_rig and c.recording in (None, recording.name)
-        ]
-        more = 1 + COLUMN * max(len(mine) - FEW, 0)
-        for number, by, differentiated in runs(recording):
-            length = (recording.duration + recording.start.lead) * steps_per_second(by) + rows[
-                recording.name
-            ]
-            number *= 4 if descent and differentiated else 1
-            steps += number * length
+        for number, by, differentiated in runs:
+            length = span * steps_per_second(by) + rows[recording.name]
             step = rig_step(recording.rig, differentiated) * (more if differentiated else 1.0)
+            steps += number * length
             seconds[-1] += number * (length * step + RUN)
     matrix = 3 * 8 / 2**30 if descent else 0.0
     memory = sorted(
@@ -129,12 +110,6 @@ def one_by_one(costs: Iterable[Cost]) -> Cost:
     return Cost(
         sum(c.steps for c in every), sum(c.seconds for c in every), max(c.memory for c in every)
     )
-
-
-def paper_settings(recording: Recording) -> Parameters:
-    """Of the paper's rig."""
-    assert isinstance(recording.rig, SoftGrasp)
-    return recording.rig.settings
 
 
 # Recordings and problems
@@ -282,14 +257,6 @@ def check_rest(
         )
 
 
-def read_recording(
-    path: str | Path, name: str, p: Parameters, sensors: dict[str, Sensor]
-) -> Recording:
-    """A recording of one CSV or NetCDF file with the given settings. Raises `ValueError` naming row
-    and column."""
-    return recording(read_tables([Path(path)], (), {}), name, p, sensors)
-
-
 AT_REST, PLAIN = Rest(), KelvinVoigtPads()
 """How a recording begins, and what the pads are made of, where nothing is said."""
 
@@ -307,15 +274,8 @@ def recording(
     check_plausible(tables, p, sensors)
     if isinstance(start, Rest):
         check_rest(tables, p, sensors, start.position_sd)
-    columns, samples = tables.columns, measured_samples(tables, sensors)
-    rates = {f"{name}_dot": columns.get(f"{name}_dot") for name in SETPOINTS}
-    signals = {
-        name: sampled(*columns[name], rates.get(f"{name}_dot")) for name in (*SETPOINTS, "F_ff")
-    }
-    made = Recording(name, rig(p, Reference(**signals), pads), samples)
-    if isinstance(start, Moving):
-        return moving(made, sensors, start)
-    return replace(made, start=AtRest(position_sd=start.position_sd, lead=start.lead))
+    at_rest = AtRest() if isinstance(start, Moving) else AtRest(start.position_sd, lead=start.lead)
+    return recorded(name, rig(p, followed(tables), pads), tables, sensors, start, at_rest)
 
 
 def rig(p: Parameters, reference: Reference, pads: Pads) -> SoftGrasp:

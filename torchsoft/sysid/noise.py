@@ -199,12 +199,10 @@ def log_det(W: sparse.csr_array) -> float:
 
 @dataclass(frozen=True)
 class Score:
-    """One order that was tried: -2 log likelihood of all samples, and the criteria of Akaike,
-    corrected, and of Bayes."""
+    """One order that was tried: -2 log likelihood of all samples, and the criterion of Bayes."""
 
     order: int
     deviance: float
-    aicc: float
     bic: float
 
 
@@ -247,7 +245,6 @@ def fit_noise(
             Score(
                 len(phi),
                 deviance,
-                deviance + 2 * q * m / max(m - q - 1, 1),
                 deviance + q * np.log(m),
             )
         )

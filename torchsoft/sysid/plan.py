@@ -271,26 +271,7 @@ def run_stage(
             first, steps = problem.freeze(runner, start, stage.recordings, stage.rtol, wanted)
             if first.lost:
                 raise Unreachable(first.lost)
-            common: dict[str, Any] = {
-                "which": stage.recordings,
-                "free": free,
-                "steps": steps,
-                "notify": notify,
-            }
-            if method == "gauss_newton":
-                fit = gauss_newton(
-                    problem, runner, start, evaluations=stage.evaluations,
-                    tolerance=stage.tolerance, loss=loss, first=first, **common,
-                )  # fmt: skip
-            else:
-                fit = descend(
-                    problem,
-                    runner,
-                    start,
-                    method=method,
-                    evaluations=4 * stage.evaluations,
-                    **common,
-                )
+            fit = on_steps(problem, runner, stage, start, steps, loss, method, notify, first)
         except Unreachable as lost:
             failure = failure or lost
             continue
@@ -300,6 +281,24 @@ def run_stage(
         assert failure is not None
         raise failure
     return best
+
+
+def on_steps(
+    problem: Problem, runner: Runner, stage: Stage, x: Array, steps: StepsByName, loss: Loss,
+    method: Method, notify: Notify, first: Residuals | None = None,
+) -> Fit:  # fmt: skip
+    """The fit of a stage from x on steps that are frozen; `first` holds residuals and Jacobian
+    there, if they are known."""
+    common: dict[str, Any] = {
+        "which": stage.recordings, "free": np.isin(problem.coordinates.labels, stage.free),
+        "steps": steps, "notify": notify,
+    }  # fmt: skip
+    if method == "gauss_newton":
+        return gauss_newton(
+            problem, runner, x, evaluations=stage.evaluations, tolerance=stage.tolerance,
+            loss=loss, first=first, **common,
+        )  # fmt: skip
+    return descend(problem, runner, x, method=method, evaluations=4 * stage.evaluations, **common)
 
 
 def scan(
@@ -404,7 +403,7 @@ def settle(
     estimate by more than `STEP_BIAS`, or steps are what keeps the fit from its rest. With none the
     steps are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
-    at = fit.at or problem.residuals(runner, x, which, fit.steps, free)
+    at = fit.at
     rounds = ROUNDS if tightenings else 0
 
     def along(start: Residuals, steps: StepsByName) -> bool:
@@ -417,7 +416,6 @@ def settle(
             end = gauss_newton(
                 problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common
             )
-        assert end.at is not None
         if further := bool((end.x != x).any()):
             fits.append((rtol, end))
             x, at = end.x, end.at

@@ -19,9 +19,9 @@ small change of a parameter changes samples altogether, a motion is refused (`ch
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import copy, deepcopy
+from copy import deepcopy
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from torchsoft.display import suggestion
 from torchsoft.plan.knots import Moves
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.criterion import Criterion, chosen, deviations
+from torchsoft.sysid.criterion import Optimality, chosen, deviations, optimality
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choice, predict, prepared
 from torchsoft.sysid.problem import Problem, Residuals
@@ -89,7 +89,7 @@ class Planner:
 
     def __init__(
         self, problem: Problem, plan: str, moves: Moves, limits: Mapping[str, Range],
-        criterion: Criterion, names: Sequence[str] | None, rtol: float, workers: int,
+        criterion: Optimality, names: Sequence[str] | None, rtol: float, workers: int,
     ) -> None:  # fmt: skip
         self.problem, self.k, self.moves, self.limits = (
             problem,
@@ -97,14 +97,9 @@ class Planner:
             moves,
             dict(limits),
         )
-        self.recording, self.criterion, self.rtol, self.workers = (
-            problem.recordings[self.k],
-            criterion,
-            rtol,
-            workers,
-        )
+        self.recording, self.rtol, self.workers = problem.recordings[self.k], rtol, workers
+        self.criterion: Optimality = criterion
         self.names, _ = chosen(problem, problem.coordinates.start, names)
-        criterion.check(self.names)
         for channel, (low, high) in limits.items():
             if channel not in self.recording.channels or not low < high:
                 raise ValueError(
@@ -122,12 +117,6 @@ class Planner:
             if ch in samples
         ]
         self.cost = Counter({"runs": 0, "gradients": 0})
-
-    def of(self, moves: Moves) -> Self:
-        """The same for motions of other knots; what it costs is counted together."""
-        other = copy(self)
-        other.moves = moves
-        return other
 
     def recorded(self, x: Array) -> Array:
         """A root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError` where
@@ -187,7 +176,8 @@ class Planner:
             if isinstance(given, Frozen)
             else self.errors(z, x, given, at, C, T)
         )
-        value, S = self.criterion(T @ C @ T.T + LEFT**2 * errors.T @ errors / len(errors))
+        spread = T @ C @ T.T + LEFT**2 * errors.T @ errors / len(errors)
+        value, S = optimality(self.criterion, spread)
         reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
         peaks = {name: float(part.max()) for name, part in reached.items()}
         cost = PRICE * sum(

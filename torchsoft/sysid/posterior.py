@@ -5,7 +5,6 @@ The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r,
 A coordinate without a prior is uniform between its bounds.
 """
 
-import json
 import time as clock
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -16,8 +15,8 @@ import numpy as np
 from tqdm import tqdm
 
 from torchsoft.extras import needed
-from torchsoft.files import finite, replacing
-from torchsoft.sysid.profile import CHOSEN_ANEW, MarginalSummary, Optimum, PosteriorSummary
+from torchsoft.files import write_json
+from torchsoft.sysid.profile import CHOSEN_ANEW, Optimum
 from torchsoft.sysid.recording import Array
 from torchsoft.threads import parallel_map, single_threaded
 
@@ -46,6 +45,19 @@ FEWEST = 100
 
 CHECKED = 8
 """Draws that are simulated once more, with steps chosen anew."""
+
+
+@dataclass(frozen=True)
+class MarginalSummary:
+    """One coordinate's marginal posterior in physical units."""
+
+    label: str
+    mean: float
+    sd: float
+    median: float
+    ci95: tuple[float, float]
+    effective: float
+    r_hat: float | None
 
 
 @dataclass(frozen=True)
@@ -86,24 +98,13 @@ class Posterior:
             out.append(MarginalSummary(label, mean, sd, q[1], (q[0], q[2]), effective, r_hat))
         return out
 
-    @property
-    def summary(self) -> PosteriorSummary:
-        """What an `IdentificationResult` holds of it."""
-        return PosteriorSummary(
-            self.method, self.weights.size, self.marginals, self.checks, self.notices
-        )
-
-    def to_json(self) -> str:
+    def save(self, path: str | Path) -> None:
+        """Write the JSON file. It appears whole or not at all."""
         content = asdict(self) | {
             "draws": self.draws.tolist(), "weights": self.weights.tolist(),
             "marginals": [asdict(one) for one in self.marginals],
         }  # fmt: skip
-        return json.dumps(finite(content), allow_nan=False)
-
-    def save(self, path: str | Path) -> None:
-        """Write the JSON file. It appears whole or not at all."""
-        with replacing(path) as partial:
-            partial.write_text(self.to_json(), encoding="utf-8")
+        write_json(path, content)
 
 
 def halves(chains: Array) -> Array:

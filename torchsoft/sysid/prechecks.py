@@ -1,17 +1,15 @@
 """Comparison of recordings with their rig, before any fit: set-points, control loops, signs and
 units.
 
-The law of an actuator is known. So a recording of its force and of the coordinate that it measures
-is held against it without a run: means over windows of time, which need no derivative of measured
-samples, agree within the noise of the sensors. Where they do not, one thing at a time is tried: the
-sign of the force, its unit, the body that the loop senses, the force that is fed forward. Other
-channels are held against a run with the parameters of the start.
+Channels are held against a run with the parameters of the start, which tells signs and units. Whose
+set-points are those of a loop is told by the body that follows them. The law of an actuator is
+known, so the mean of its recorded force is held against what it makes of the coordinates that it
+measures.
 """
 
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,13 +17,12 @@ from scipy.interpolate import CubicSpline
 
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.physics.parts import COORDINATES, Actuator
-from torchsoft.physics.rig import Rig
+from torchsoft.physics.parts import COORDINATES
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prediction import Prediction, Readout, Signals
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import BETWEEN, Array, Recording
+from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.setpoints import channel, found, setpoint_findings
 from torchsoft.sysid.unknowns import Sensor
@@ -88,262 +85,71 @@ def confusions(unit: str) -> list[tuple[float, str]]:
     return over + [(1 / factor, f"{b} taken for {a}") for factor, (a, b) in known.items()]
 
 
-class Signal(NamedTuple):
-    """A channel's samples: times (k,) [s], values (k,), and the sensor."""
-
-    channel: str
-    t: Array
-    y: Array
-    sensor: Sensor
-
-    @property
-    def spacing(self) -> float:
-        return float(np.median(np.diff(self.t)))
-
-    @property
-    def faulty(self) -> bool:
-        """Whether a fault of the sensor is declared that a fit will estimate."""
-        one = self.sensor
-        return any((one.bias, one.delay, one.gain, one.drift))
-
-
-def sampled(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Signal | None:
-    """The samples of a coordinate or a force whose sensor sees nothing else and is never saturated,
-    or None."""
-    own = channel(recording.rig, name)
-    if own not in recording.samples or own not in sensors:
-        return None
-    one, (t, y) = sensors[own], recording.samples[own]
-    clean = one.inertia == 0 and one.misalignment == 0 and not one.saturated(y).any() and len(t) > 3
-    return Signal(own, t, y, one) if clean else None
-
-
-WINDOW = 20e-3
-"""Length [s] of a window, or four samples where that is longer."""
-
 FEWEST = 8
-"""Windows without which nothing is said."""
+"""Samples without which nothing is said of a controller."""
 
 ROUGH = 0.03
-"""Part of the force by which both sides of a loop may differ besides the noise: drives are not
-exact."""
-
-EXPLAINED = 0.15
-"""Part of a disagreement, and of the force, that may be left by its explanation."""
-
-SLOW = 0.3
-"""Part of a disagreement by which it may change from window to window where a force fed forward is
-missing."""
+"""Part of the force by which it may differ from what the controller gives besides the noise: drives
+are not exact."""
 
 
-class Loop(NamedTuple):
-    """Both sides of a loop as means over n windows of a `width` (n,) [s]: the measured force F
-    (n,), and `inputs` (n, k) of the actuator. `signals` are those of the force and of the
-    coordinates."""
-
-    actuator: Actuator
-    F: Array
-    inputs: Array
-    signals: tuple[Signal, ...]
-    width: Array
-
-    @property
-    def fed(self) -> int:
-        """Column of the force fed forward."""
-        return 2 * len(self.actuator.setpoints)
-
-    def given(self, feed_forward: float = 1.0) -> Array:
-        """The effort (n,) of the actuator, with the force fed forward times a factor."""
-        inputs = self.inputs.copy()
-        inputs[:, self.fed] *= feed_forward
-        return self.actuator(torch.from_numpy(inputs)).detach().numpy()
-
-    @property
-    def noise(self) -> tuple[float, float]:
-        """Standard deviation [N] of a mean of the disagreement by white noise, and by noise that
-        outlasts a window."""
-        inputs = torch.from_numpy(self.inputs).requires_grad_(True)
-        (slope,) = torch.autograd.grad(self.actuator(inputs).sum(), inputs)
-        by = slope.numpy()[:, self.fed + 1 :]
-        force, *coordinates = self.signals
-        white, lasting = (
-            force.sensor.noise**2 * force.spacing / self.width,
-            np.full(len(self.width), force.sensor.noise**2),
-        )
-        for one, by_x, by_v in zip(coordinates, by.T[::2], by.T[1::2]):
-            rate = 2 * by_v**2 / self.width**2
-            white = white + one.sensor.noise**2 * (by_x**2 * one.spacing / self.width + rate)
-            lasting = lasting + one.sensor.noise**2 * (by_x**2 + rate)
-        return float(np.sqrt(np.mean(white))), float(np.sqrt(np.mean(lasting)))
+def comparable(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> bool:
+    """Whether a channel has samples of a sensor that sees nothing else and is never saturated."""
+    if name not in recording.samples or name not in sensors:
+        return False
+    one, y = sensors[name], recording.samples[name][1]
+    return one.inertia == 0 and one.misalignment == 0 and not one.saturated(y).any() and len(y) > 3
 
 
-def windows(
-    recording: Recording, actuator: Actuator, signals: Sequence[Signal | None]
-) -> Loop | None:
-    """The loop of the force and the coordinates over windows that all have samples in; None where
-    there are too few."""
-    known = tuple(one for one in signals if one is not None)
-    if len(known) < len(signals):
-        return None
-    length = max(WINDOW, *(4 * one.spacing for one in known))
-    first, last = max(one.t[0] for one in known), min(one.t[-1] for one in known)
-    edges = first + length * np.arange(int(max(last - first, 0.0) / length) + 1)
-    keep = np.logical_and.reduce(
-        [np.diff(np.searchsorted(s.t, edges)) * s.spacing > 0.5 * length for s in known]
-    )
-    if keep.sum() < FEWEST:
-        return None
-    width, t = np.diff(edges)[keep], np.arange(first, last + BETWEEN, BETWEEN)
-    names = [*actuator.setpoints, *([actuator.feed_forward] if actuator.feed_forward else [])]
-    columns = [np.zeros(len(t))]
-    if names:
-        columns = [
-            *recording.rig.reference(torch.from_numpy(t), names).detach().numpy()[..., 0].T,
-            *columns,
-        ]
-    asked = [CubicSpline(t, column) for column in columns[: len(actuator.setpoints)]]
-    force, *coordinates = [CubicSpline(one.t, one.y) for one in known]
-    integrals = [part for one in asked for part in (one.antiderivative(), one)]
-    integrals.append(CubicSpline(t, columns[len(asked)]).antiderivative())
-    integrals += [part for one in coordinates for part in (one.antiderivative(), one)]
-    inputs = np.stack([np.diff(one(edges))[keep] / width for one in integrals], -1)
-    return Loop(
-        actuator, np.diff(force.antiderivative()(edges))[keep] / width, inputs, known, width
-    )
-
-
-class Change(NamedTuple):
-    """One thing that may be otherwise: its code, a clause, the disagreement (n,) [N] that is left,
-    and whether it is grave."""
-
-    code: str
-    clause: str
-    left: Array
-    grave: bool = True
-
-
-def rms(e: Array) -> float:
-    return float(np.sqrt(np.mean(e**2)))
-
-
-def loop_findings(
+def controller_findings(
     recording: Recording, sensors: Mapping[str, Sensor], unknown: Collection[str] = ()
 ) -> Iterator[Diagnostic]:
-    """Diagnostics on the control loops of a recording whose force and coordinate were measured;
-    `unknown` are the names of unknown parameters."""
+    """Diagnostics on forces that their controller does not give on the average, where they and its
+    coordinates were measured by sensors of which no fault is to be estimated, and its gains are not
+    among the parameters that are `unknown`."""
     rig = recording.rig
     tensors = {id(rig.parameter(name)) for name in unknown}
     for name, actuator in rig.actuators.items():
-        F, coordinates = (
-            sampled(recording, sensors, name),
-            [sampled(recording, sensors, x) for x in actuator.measures],
-        )
-        if F is not None and None in coordinates and not actuator.is_loop:
-            missing = channel(rig, actuator.measures[coordinates.index(None)])
+        force, *others = every = [channel(rig, one) for one in (name, *actuator.measures)]
+        lacking = [one for one in every if not comparable(recording, sensors, one)]
+        if lacking and force not in lacking and not actuator.is_loop:
             yield Diagnostic(
-                "note", recording.name, f"recording `{recording.name}`: {F.channel} is not "
-                f"compared with its controller, since {missing} is not recorded",
-                f"controller of {F.channel}",
+                "note", recording.name, f"recording `{recording.name}`: {force} is not compared "
+                f"with its controller, since {lacking[0]} is not recorded",
+                f"controller of {force}",
             )  # fmt: skip
-        loop = windows(recording, actuator, [F, *coordinates])
-        if loop is None:
+        faults = [(s.bias, s.delay, s.gain, s.drift) for s in map(sensors.get, every) if s]
+        if lacking or np.any(faults) or any(id(p) in tensors for p in actuator.parameters()):
             continue
-        body, _, axis = actuator.measured.partition(".")
-        rivals = {}
-        for other in (one for one in rig.bodies if one != body and actuator.is_loop):
-            rival = windows(
-                recording, actuator, [F, sampled(recording, sensors, f"{other}.{axis}")]
-            )
-            rivals |= {other: rival} if rival is not None else {}
-        free = any(id(p) in tensors for p in actuator.parameters())
-        change = disagreement(rig, loop, body, rivals, free)
-        if change is not None:
-            e, (force, *others) = rms(loop.F - loop.given()), loop.signals
-            seen = ", ".join([*actuator.setpoints, *(one.channel for one in others)])
-            text = (
-                f"{change.clause} (what the controller makes of {seen} differs from "
-                f"{force.channel} by {e:.3g} {actuator.effort_unit} rms, and would by "
-                f"{rms(change.left):.3g})"
-            )
-            yield found(change.code, recording, text, change.grave)
-
-
-def disagreement(
-    rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool
-) -> Change | None:
-    """The cause of a disagreement of a loop about a body, if there is one; gains that are `free`
-    may all be larger or smaller."""
-
-    def left(one: Loop, F: Array, feed_forward: float = 1.0) -> Array:
-        given = one.given(feed_forward)
-        gain = max(float(F @ given) / max(float(given @ given), 1e-300), 0.0) if free else 1.0
-        return F - gain * given
-
-    F, name, unit, feed = (
-        loop.F,
-        loop.signals[0].channel,
-        loop.actuator.effort_unit,
-        loop.actuator.feed_forward,
-    )
-    e = left(loop, F)
-    white, lasting = (2 * sd + ROUGH * rms(F) for sd in loop.noise)
-    if rms(e) <= white:
-        return None
-    opposite = "looks as if its sign were opposite"
-    changes = [Change(f"sign of {name}", f"{name} {opposite}", left(loop, -F))]
-    changes += [
-        another_sense(rig, loop.actuator, body, other, left(its, its.F))
-        for other, its in rivals.items()
-    ]
-    if not free:
-        changes += [
-            Change(
-                f"unit of {name}",
-                f"{name} looks as if it were in another unit: {words}",
-                left(loop, F / factor),
-            )
-            for factor, words in confusions(unit)
-        ]
-        changes += (
-            [Change(f"sign of {feed}", f"{feed} {opposite}", left(loop, F, -1.0))] if feed else []
+        t, F = recording.samples[force]
+        for at, _ in (recording.samples[one] for one in others):  # not in a gap
+            reach = 2 * float(np.median(np.diff(at)))
+            near = np.searchsorted(at, t + reach) > np.searchsorted(at, t - reach)
+            t, F = t[near], F[near]
+        if len(t) < FEWEST:
+            continue
+        asked = [part for one in actuator.setpoints for part in rig.reference[one](torch.tensor(t))]
+        feed = actuator.feed_forward
+        fed = rig.reference[feed](torch.tensor(t))[0] if feed else torch.zeros(len(t)).double()
+        splines = [CubicSpline(*recording.samples[one]) for one in others]
+        seen = [torch.from_numpy(s(t, order)) for s in splines for order in (0, 1)]
+        inputs = torch.stack((*asked, fed, *seen), -1).detach().requires_grad_(True)
+        given = actuator(inputs)
+        (slopes,) = torch.autograd.grad(given.sum(), inputs)
+        by = slopes[:, len(asked) + 1 :: 2].square().mean(0).tolist()
+        noise = [sensors[force].noise ** 2]
+        noise += [slope * sensors[one].noise ** 2 for slope, one in zip(by, others)]
+        off = float(np.mean(F - given.detach().numpy()))
+        if abs(off) <= 2 * sum(noise) ** 0.5 + ROUGH * float(np.sqrt(np.mean(F**2))):
+            continue
+        ask = "are its gains, units, zeros and set-points right?"
+        if feed:
+            ask = f"was a force fed forward that {feed} does not have?"
+        text = (
+            f"{force} is {off:+.3g} {actuator.effort_unit} more, on the average, than the "
+            f"controller gives: {ask}"
         )
-    best = min(changes, key=lambda change: rms(change.left))
-    enough = 0.5 * rms(F) if free else max(white, EXPLAINED * min(rms(e), rms(F)))
-    if rms(best.left) <= enough and rms(best.left) < 0.5 * rms(e):
-        return best
-    faulty = any(one.faulty for one in loop.signals)
-    if (
-        free
-        or faulty
-        or rms(e) <= (white if feed and not loop.inputs[:, loop.fed].any() else lasting)
-    ):
-        return None
-    slow, began = np.diff(e) / np.sqrt(2), float(e[: max(2, len(e) // 20)].mean())
-    if feed and rms(slow) <= max(SLOW * rms(e), white) and abs(began) <= 0.5 * rms(e):
-        words = (
-            f"{name} is {float(e.mean()):+.3g} {unit} more, on the average, than the controller "
-            "gives"
-        )
-        return Change(
-            feed, f"{words}: was a force fed forward that {feed} does not have?", slow, grave=False
-        )
-    words = (
-        f"{name} is not what the controller gives: are its gains, units, zeros, times and "
-        "set-points right?"
-    )
-    return Change(f"loop of {name}", words, e, grave=False)
-
-
-def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Array) -> Change:
-    """The set-point is that of another body."""
-    axis = actuator.measured.partition(".")[2]
-    paper = isinstance(rig, SoftGrasp) and axis == "x"
-    remedy = f' (say control.senses = "{other}")' if paper else ""
-    clause = (
-        f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
-        f"or are {channel(rig, f'{body}.{axis}')} and {channel(rig, f'{other}.{axis}')} exchanged?"
-    )
-    return Change("control.senses" if paper else f"what {actuator.setpoint} is of", clause, left)
+        yield found(feed or f"loop of {force}", recording, text)
 
 
 MOVES = 5.0
@@ -397,16 +203,15 @@ def findings(
 ) -> list[Diagnostic]:
     """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the
     names of unknown parameters. A recording with an error is not held against the run."""
-    every = [*setpoint_findings(recording, sensors), *loop_findings(recording, sensors, unknown)]
-    every += rounded(recording, sensors)
-    if not any(one.severity == "error" for one in every):
-        every += another_body(recording, sensors, expected)
-    if any(one.severity == "error" for one in every):
-        return every
-    codes = {one.code for one in every}
-    return every + [
-        one for one in against_run(recording, sensors, expected) if one.code not in codes
-    ]
+    every = [*setpoint_findings(recording, sensors), *rounded(recording, sensors)]
+    every += another_body(recording, sensors, expected)
+    for more in (
+        against_run(recording, sensors, expected),
+        controller_findings(recording, sensors, unknown),
+    ):
+        if not any(one.severity == "error" for one in every):
+            every += more
+    return every
 
 
 COARSE = 1.2
@@ -415,7 +220,7 @@ COARSE = 1.2
 
 def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
     """Readings in steps that the stated noise and resolution leave out."""
-    for name, sensor in sensors.items() if recording.samples else ():
+    for name, sensor in sensors.items():
         if name not in recording.samples:
             continue
         apart = np.diff(np.unique(unsaturated(recording, sensors, name)[1]))
@@ -497,7 +302,8 @@ def another_body(
         for other in others:
             its = channel(rig, f"{other}.{axis}")
             far, there = (apart(recording, sensors, setpoint, its, by) for by in (None, expected))
-            if far is not None and far < SAME and not small(mine) and not small(there):
+            near = any(part is not None and part < APART for part in (mine, there))
+            if far is not None and far < SAME and not near:
                 said = f"{its} follows it to {far:.1%} of its motion"
             elif (
                 mine is not None
@@ -509,12 +315,14 @@ def another_body(
                 said = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
             else:
                 continue
-            change = another_sense(rig, actuator, body, other, np.zeros(1))
-            yield found(change.code, recording, f"{change.clause} ({said})", grave=True)
-
-
-def small(part: float | None) -> bool:
-    return part is not None and part < APART
+            paper = isinstance(rig, SoftGrasp) and axis == "x"
+            remedy = f' (say control.senses = "{other}")' if paper else ""
+            code = "control.senses" if paper else f"what {setpoint} is of"
+            text = (
+                f"{setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
+                f"or are {own} and {its} exchanged? ({said})"
+            )
+            yield found(code, recording, text, grave=True)
 
 
 def apart(

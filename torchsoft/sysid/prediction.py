@@ -232,25 +232,22 @@ Steps = float | Frozen
 
 
 class Prediction(NamedTuple):
-    """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], the number of steps, the
-    signals' derivatives (G, channels, n), if there are any, and the steps' ends `knots` [s] where a
-    tolerance chose them."""
+    """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], their derivatives (G,
+    channels, n), if there are any, and the steps' ends `knots` [s] where a tolerance chose them."""
 
     t: Array
     signals: Array
-    steps: int
     derivatives: Array | None = None
     knots: Array | None = None
 
 
 class Misfit(NamedTuple):
     """Half the sum of squared residuals of one recording, its derivatives by the run's parameters
-    (n,), and by every channel's nuisances (channels, nuisances), and the stepper's steps."""
+    (n,), and by every channel's nuisances (channels, nuisances)."""
 
     loss: float
     parameters: Array
     nuisances: Array
-    steps: int
 
 
 class FailedRun(NamedTuple):
@@ -347,7 +344,6 @@ def predict(
     return Prediction(
         grid.t[rows].numpy(),
         out.together(*keys)[rows].detach().numpy(),
-        out.stats.steps,
         slopes,
         knots,
     )
@@ -374,4 +370,4 @@ def misfit(
         signals, run.wanted, torch.from_numpy(weights), allow_unused=True
     )
     by = np.array([0.0 if g is None else float(g) for g in gradient])
-    return Misfit(loss, by, nuisances, out.stats.steps)
+    return Misfit(loss, by, nuisances)

@@ -2,7 +2,7 @@
 noise."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, NamedTuple
 
@@ -91,6 +91,21 @@ def check_value(recording: Recording, name: str, value: float) -> None:
             rig = deepcopy(recording.rig)
             set_parameters(rig, {name: value})
             check_values(rig)
+
+
+class Reading(NamedTuple):
+    """One channel of a run as its sensor reads it: times (k,) [s], samples, expected readings with
+    their derivatives (k, n) by what the run was differentiated by, and by nuisances; residuals r
+    (k,) over the noise, not whitened, and their derivative by the expected readings."""
+
+    channel: str
+    t: Array
+    measured: Array
+    expected: Array
+    slopes: Array | None
+    by: dict[Nuisance, Array]
+    r: Array
+    weight: Array
 
 
 class Problem:
@@ -299,27 +314,28 @@ class Problem:
 
     def _compare(self, x: Array, job: Job, prediction: Prediction) -> tuple[Array, Array]:
         """Residuals and Jacobian of one recording."""
-        c, recording = self.coordinates, self.recordings[job.recording]
+        c, recording, rs, Js = self.coordinates, self.recordings[job.recording], [], []
         chain = c.jacobian(x, recording.name, job.values)[
             [c.names.index(name) for name in job.names]
         ]
-        signals, rs, Js = (
-            Signals(prediction.t, recording.channels, prediction.signals, prediction.derivatives),
-            [],
-            [],
-        )
+        for one in self.readings(x, job, prediction):
+            J = np.zeros((len(one.t), len(x)))
+            if one.slopes is not None:
+                J += one.slopes @ chain
+            for kind, (_, at) in c.nuisances(x, one.channel, recording.name).items():
+                J[:, at] = one.by[kind] * c.all[at].slope(x[at])
+            rs.append(self.whitened(recording, one.channel, one.r))
+            Js.append(self.whitened(recording, one.channel, one.weight[:, None] * J))
+        return np.concatenate(rs), np.concatenate(Js)
+
+    def readings(self, x: Array, job: Job, run: Prediction) -> Iterator[Reading]:
+        """The sensors of the recording of a job at x (n,), beside its samples."""
+        recording = self.recordings[job.recording]
+        signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
         for channel, one in self.readouts(x, job.recording).items():
             t, measured = recording.samples[channel]
             y, slopes, by = one.expected(signals, t)
-            r, weight = one.residuals(y, measured)
-            J = np.zeros((len(t), len(x)))
-            if slopes is not None:
-                J += slopes @ chain
-            for kind, (_, at) in c.nuisances(x, channel, recording.name).items():
-                J[:, at] = by[kind] * c.all[at].slope(x[at])
-            rs.append(self.whitened(recording, channel, r))
-            Js.append(self.whitened(recording, channel, weight[:, None] * J))
-        return np.concatenate(rs), np.concatenate(Js)
+            yield Reading(channel, t, measured, y, slopes, by, *one.residuals(y, measured))
 
     def misfit(
         self,

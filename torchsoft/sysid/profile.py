@@ -1,6 +1,7 @@
 """Profile likelihoods: the misfit where one coordinate is held and all others are fitted again."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Self
 
@@ -11,11 +12,10 @@ from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
 from torchsoft.display import suggestion
-from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton, newton_step
+from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
-from torchsoft.tables import Number
 from torchsoft.threads import parallel_map, single_threaded
 
 if TYPE_CHECKING:
@@ -93,6 +93,11 @@ class Optimum:
         """Of the free coordinates, by the Fisher matrix at x."""
         return fisher(self.J)[0]
 
+    def sd(self, i: int) -> float:
+        """Of coordinate number i, as widened as its profile."""
+        inner = int(np.flatnonzero(np.flatnonzero(self.free) == i)[0])
+        return float(np.sqrt(self.covariance[inner, inner] * self.variance))
+
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Of the free coordinates."""
@@ -151,8 +156,8 @@ STRIDE = 0.5
 POINTS = 12
 """Most points to either side."""
 
-ROUNDS = 5
-"""Most steps of Gauss-Newton to a point."""
+EVALUATIONS = 10
+"""Most evaluations of Gauss-Newton to a point."""
 
 BEYOND = (RISE**0.5 + STRIDE) ** 2
 """Rise above which a point lies too far beyond the end of the interval to tell where that is."""
@@ -161,9 +166,8 @@ SHORTER = 6
 """How often, to either side, a stride is made shorter because a run fails or the rise goes too
 far."""
 
-FITTED = 0.02
-"""What the others may still gain in |r|^2 by another step of Gauss-Newton, which is then taken for
-true."""
+FITTED = 2e-3
+"""Change of |r|^2 with which the fit of the others is done."""
 
 LOWER = 0.1
 """Fall of |r|^2 below the optimum's from which the fit was not at its optimum."""
@@ -247,9 +251,8 @@ def walk(o: Optimum, i: int, sign: int) -> Side:
         o.problem.coordinates.labels[i],
         (float(b[i]) for b in o.problem.coordinates.bounds),
     )
-    edge, inner = (high if sign > 0 else low), int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
-    sd = float(np.sqrt(o.covariance[inner, inner] * o.variance))
-    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * sd, (high - low) / 8)
+    edge = high if sign > 0 else low
+    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * o.sd(i), (high - low) / 8)
     points, notices, shorter = list[Point](), list[str](), 0
     while here.rise < RISE and len(points) < POINTS:
         if sign * (edge - here.x[i]) <= 1e-9 * (high - low):
@@ -296,33 +299,19 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
         x[others] = np.clip(x[others] + tangent * (aim - x[i]), low[others], high[others])
     x[i] = aim
     at = o.residuals(x, derivatives=True)
-    for _ in range(ROUNDS):
-        if at.lost:
-            return None, next(iter(at.lost.values())).reason
-        step, square = newton_step(o.problem, x, at, others), float(at.r @ at.r)
-        predicted = at.r + at.J[:, others] @ step
-        gain = square - float(predicted @ predicted)
-        x = x.copy()
-        if gain < FITTED:
-            x[others] += step
-            return Point(x, (square - gain - o.square) / o.variance, at), ""
-        ahead = x.copy()
-        ahead[others] += step
-        there = o.residuals(ahead, derivatives=True)
-        if (
-            there.lost or there.r @ there.r > square - 0.1 * gain
-        ):  # the Jacobian does not hold as far as that
-            try:
-                ahead = gauss_newton(
-                    o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at,
-                    evaluations=10, tolerance=0.1 * FITTED / square,
-                ).x  # fmt: skip
-            except Unreachable as lost:
-                return None, str(lost)
-            ahead[i] = aim
-            there = o.residuals(ahead, derivatives=True)
-        x, at = ahead, there
-    return None, "the other coordinates could not be fitted there"
+    if others.any() and not at.lost:
+        with suppress(Unreachable):
+            fit = gauss_newton(
+                o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at,
+                evaluations=EVALUATIONS, tolerance=FITTED / max(float(at.r @ at.r), FITTED),
+            )  # fmt: skip
+            if not fit.converged:
+                return None, "the other coordinates could not be fitted there"
+            x, at = fit.x, fit.at
+            x[i] = aim
+    if at.lost:
+        return None, next(iter(at.lost.values())).reason
+    return Point(x, (float(at.r @ at.r) - o.square) / o.variance, at), ""
 
 
 def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
@@ -352,8 +341,7 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
                 f"the {name} end of the profile of {one.label} is uncertain: steps chosen anew "
                 f"there change |r|^2 by {off:.2g}; take a tighter tolerance than rtol = {o.rtol:g}"
             )
-    inner = int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
-    half = float(np.sqrt(o.covariance[inner, inner] * o.variance * RISE))
+    half = RISE**0.5 * o.sd(i)
     wald = o.x[i] - half, o.x[i] + half
     worst = max((abs(e - w) / half for e, w in zip(ends, wald) if e is not None), default=0.0)
     physical = [None if e is None else one.to_value(e) for e in ends]
@@ -372,30 +360,3 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
         {c.labels[k]: [c.all[k].to_value(point.x[k]) for point in points] for k in every},
         (physical[0], physical[1]), straight, o.variance, list(dict.fromkeys(notices)),
     )  # fmt: skip
-
-
-# Summary of a posterior
-
-
-@dataclass(frozen=True)
-class MarginalSummary:
-    """One coordinate's marginal posterior in physical units."""
-
-    label: str
-    mean: Number
-    sd: Number
-    median: Number
-    ci95: tuple[Number, Number]
-    effective: Number
-    r_hat: Number | None
-
-
-@dataclass(frozen=True)
-class PosteriorSummary:
-    """Marginals of posterior draws, what was checked of them, and what a reader must know."""
-
-    method: str
-    draws: int
-    marginals: list[MarginalSummary]
-    checks: dict[str, Number]
-    notices: list[str]

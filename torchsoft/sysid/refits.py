@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +35,7 @@ HALVINGS = 10
 class End(NamedTuple):
     """A fit in whose place another is held: coordinates x (n,), residuals there, the free
     coordinates (n,), the recordings that were fitted, residuals and steps of runs by the tolerance
-    `rtol`, and how runs are made and kept."""
+    `rtol`, and what makes runs."""
 
     x: Array
     at: Residuals
@@ -45,8 +44,7 @@ class End(NamedTuple):
     base: Residuals
     steps: Mapping[str, Frozen]
     rtol: float
-    workers: int
-    journal: Path | None
+    runner: Runner
 
     @property
     def far(self) -> bool:
@@ -56,22 +54,20 @@ class End(NamedTuple):
 
 
 def ended(
-    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
-    rtol: float, workers: int, journal: Path | None, own: Mapping[str, Frozen] | None = None,
+    problem: Problem, runner: Runner, x: Array, at: Residuals, free: NDArray[np.bool_],
+    which: Sequence[str], rtol: float, own: Mapping[str, Frozen] | None = None,
 ) -> End:  # fmt: skip
     """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the
     variations: `USUAL`, or that of the fit, if runs are lost with it; or with `at`, by its `own`
     steps, where no others have a run."""
     if own is not None:
-        return End(x, at, free, tuple(which), at, own, rtol, workers, journal)
-    runner = Runner(problem.recordings, workers, journal)
+        return End(x, at, free, tuple(which), at, own, rtol, runner)
     usual = max(rtol, USUAL)
     base, steps = problem.freeze(runner, x, which, usual)
     if base.lost and usual > rtol:
+        usual = rtol
         base, steps = problem.freeze(runner, x, which, rtol)
-    else:
-        rtol = usual
-    return End(x, at, free, tuple(which), base, steps, rtol, workers, journal)
+    return End(x, at, free, tuple(which), base, steps, usual, runner)
 
 
 EARLY = 2e-3
@@ -135,7 +131,7 @@ def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None
     other = varied(problem, end.which, one)
     if isinstance(other, str):
         return None, other
-    runner = Runner(other.recordings, end.workers, end.journal)
+    runner = end.runner.of(other.recordings)
     steps = {r.name: since(end.steps[r.name], float(r.times[0] - r.start.lead))
              for r in other.recordings if r.name in end.steps}  # fmt: skip
     got = other.residuals(runner, end.x, end.which, steps)
@@ -185,7 +181,7 @@ def refit(
     stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
     labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
-    runner = Runner(other.recordings, end.workers, end.journal)
+    runner = end.runner.of(other.recordings)
 
     def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
         """The fit of the last stage, if none is lost."""

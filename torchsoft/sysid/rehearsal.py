@@ -3,21 +3,37 @@ builds it, and what would be identified from them shows what the experiment is g
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from torchsoft.files import replacing
+from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
-from torchsoft.sysid.configuration import Config, Entry, Rest
+from torchsoft.sysid.configuration import Beginning, Config, Entry, Rest
 from torchsoft.sysid.initial_state import Standing
+from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.rig_recordings import vocabulary
 from torchsoft.sysid.synthetic import record
 from torchsoft.sysid.unknowns import Unknown
 
 FINER = 0.1
 """Tolerance of the simulated experiment, in parts of the fit's."""
+
+
+def planned(
+    stated: Config, built: BuiltRig[Any], name: str, rtol: float, start: Beginning | None = None,
+    **how: Any,
+) -> Recording:  # fmt: skip
+    """A recording of a rig as a configuration has it planned, from the run that `rtol` makes; `how`
+    is what else `record` takes. Raises `ValueError`, and `SimulationFailed`."""
+    plan, start = stated.rehearsal, start or stated.start
+    if plan.duration is not None:
+        built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
+    at_rest = Standing.of(built.rig, built.y0, start.lead if isinstance(start, Rest) else 0.0)
+    return record(name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **how)
 
 
 def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Path]]:
@@ -38,20 +54,14 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
         name = entry.name or Path(entry.paths[0]).stem
         with at_field("settings"):
             mine = file.override(**stated.settings).override(**entry.settings)
-        planned, start = mine.build(), entry.start or stated.start
-        known = vocabulary(planned.rig, stated.columns)
-        if plan.duration is not None:
-            planned = planned._replace(t=torch.tensor([0.0, plan.duration]).double())
-        lead = start.lead if isinstance(start, Rest) else 0.0
+        built = mine.build()
+        known, rig = vocabulary(built.rig, stated.columns), built.rig
         try:
-            made = record(
-                name, planned, {}, stated.sensors, start=Standing.of(planned.rig, planned.y0, lead),
-                rate=plan.rate, rtol=FINER * stated.fit.rtol, seed=random,
-            )  # fmt: skip
+            made = planned(stated, built, name, FINER * stated.fit.rtol, entry.start, seed=random)
         except ValueError as error:
             raise ValueError(f"{config}: {error}") from None
-        followed = planned.rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
-        columns = {"t": made.times} | dict(zip(planned.rig.signals, followed))
+        followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
+        columns = {"t": made.times} | dict(zip(rig.signals, followed))
         columns |= {channel: y for channel, (_, y) in made.samples.items()}
         headings = {of: heading for heading, of in known.headings.items()}
         head = ",".join(f"{headings.get(one, one)} [{known.units[one]}]" for one in columns)

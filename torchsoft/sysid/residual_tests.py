@@ -47,9 +47,9 @@ FEWEST = 4
 class Part(NamedTuple):
     """One channel of one recording at the fit, without what saturation has changed: times t (m,)
     [s], the rows (m,) of r and J that are its own, the residuals `raw` (m,) over the noise that the
-    sensor states, the `reading` (m,) that the model predicts [unit], the noise that is assumed
-    (white as stated, if None), whether its level was `found` from such residuals, what whitens (m,)
-    or (m, k), and how many samples were `saturated`."""
+    sensor states, the `reading` (m,) that the model predicts [unit], the noise that was found of
+    such residuals (white as stated, if None), what whitens (m,) or (m, k), and how many samples
+    were `saturated`."""
 
     recording: str
     channel: str
@@ -58,7 +58,6 @@ class Part(NamedTuple):
     raw: Array
     reading: Array
     noise: Autoregression | None = None
-    found: bool = False
     whitened: Callable[[Array], Array] = lambda rows: rows
     saturated: int = 0
 
@@ -66,6 +65,9 @@ class Part(NamedTuple):
     def name(self) -> str:
         """As sentences name it."""
         return f"{self.channel} of `{self.recording}`"
+
+    def verdict(self, test: "Test", p: float, size: float, words: str) -> "Verdict":
+        return Verdict(test, self.recording, self.channel, p, size, f"{self.name} {words}")
 
 
 def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
@@ -85,7 +87,7 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
             rows, noise = at + np.arange(len(t)), problem.noise.get(channel)
             at += len(t)
             raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
-            reading, found = predicted(sensor, measured, raw), noise is not None
+            reading = predicted(sensor, measured, raw)
             saturated = int(sensor.saturated(measured).sum())
             if saturated:
                 near = sensor.saturated(reading - CLEAR * sensor.sd) | sensor.saturated(
@@ -105,7 +107,6 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
                     raw,
                     reading,
                     noise,
-                    found,
                     whitened,
                     saturated,
                 )
@@ -184,7 +185,7 @@ def judge_residuals(
     Q, out = Q[:, seen], list[Verdict]()
     sums = [level(part, r, Q, robust) for part in parts]
     out += [verdict for verdict, _, _ in sums]
-    exact = [(square, dof) for part, (_, square, dof) in zip(parts, sums) if not part.found]
+    exact = [(square, dof) for part, (_, square, dof) in zip(parts, sums) if part.noise is None]
     if len(exact) > 1:
         square, dof = (float(sum(some)) for some in zip(*exact))
         words = f"all of them together {(square / dof) ** 0.5:.3g} times, in {dof:.0f} samples"
@@ -228,8 +229,7 @@ def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float,
     Where the noise's level was found from these residuals, so that whitened ones tell nothing, the
     raw ones have it, which are worth `Autoregression.effective` samples (Satterthwaite).
     """
-    raw = part.found and part.noise is not None
-    rows = part.raw if raw else r[part.rows]
+    rows = r[part.rows] if part.noise is None else part.raw
     n = len(rows)
     free = max(1.0 - float(np.sum(Q[part.rows] ** 2)) / n, 1 / n)  # what the fit left of them
     mean, worth = float(rows @ rows) / n, float(n)
@@ -238,16 +238,12 @@ def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float,
             (float(np.median(np.abs(rows))) / float(stats.norm.ppf(0.75))) ** 2,
             MEDIAN * n,
         )
-    if raw and part.noise is not None:
+    if part.noise is not None:
         worth *= part.noise.effective(n) / n
     dof = worth * free
     square, size = mean * worth, float((mean / free) ** 0.5)
-    words = f"{part.name} {size:.3g} times"
-    return (
-        Verdict("level", part.recording, part.channel, two_sided(square, dof), size, words),
-        square,
-        dof,
-    )
+    verdict = part.verdict("level", two_sided(square, dof), size, f"{size:.3g} times")
+    return verdict, square, dof
 
 
 def autocorrelation(r: Array) -> Array:
@@ -275,8 +271,7 @@ def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
 def white(part: Part, r: Array) -> Verdict:
     """Is what was whitened white?"""
     rho, p = whiteness(r[part.rows], part.noise.order if part.noise is not None else 0)
-    words = f"{part.name} (neighbouring samples correlate by {rho:.2f})"
-    return Verdict("white", part.recording, part.channel, p, rho, words)
+    return part.verdict("white", p, rho, f"(neighbouring samples correlate by {rho:.2f})")
 
 
 def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, Array]:
@@ -307,7 +302,7 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
     """Do residuals line up with the reading that the model predicts, as a wrong sensor would make
     them, or with those of the other channels and their rates, as a wrong law would?"""
     out, t = [], part.t
-    y = spline(part)
+    y = CubicSpline(t, part.reading)
     own = {
         "an offset": np.ones(len(t)), "a drift": t - t.mean(),
         "the reading itself, as an error of its gain would be": y(t),
@@ -320,7 +315,7 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
             and other.t[0] <= t[0] + 0.05
             and other.t[-1] >= t[-1] - 0.05
         ):
-            s = spline(other)
+            s = CubicSpline(other.t, other.reading)
             others |= {other.channel: s(t), f"the rate of {other.channel}": s(t, 1)}
             others |= {f"the acceleration of {other.channel}": s(t, 2)}
     for what in (own, others):
@@ -328,14 +323,9 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
             continue
         p, share, alone = explained(part, np.stack(list(what.values()), 1), r, Q)
         likest = list(what)[int(np.argmax(np.abs(alone)))]
-        words = f"{part.name} ({share:.0%} of it, most like {likest})"
-        out.append(Verdict("motion", part.recording, part.channel, p, share, words))
+        words = f"({share:.0%} of it, most like {likest})"
+        out.append(part.verdict("motion", p, share, words))
     return out
-
-
-def spline(part: Part) -> CubicSpline:
-    """The reading between samples."""
-    return CubicSpline(part.t, part.reading)
 
 
 def outliers(part: Part, r: Array) -> Verdict:
@@ -345,25 +335,15 @@ def outliers(part: Part, r: Array) -> Verdict:
     m, at = len(rows), int(np.argmax(np.abs(rows)))
     sd = float(rows.std(ddof=1)) if m > 2 else 0.0
     if m < LAGS or sd == 0:
-        return Verdict(
-            "outliers", part.recording, part.channel, 1.0, 0.0, f"{part.name} (too short to tell)"
-        )
+        return part.verdict("outliers", 1.0, 0.0, "(too short to tell)")
     G = float(np.abs(rows - rows.mean())[at]) / sd
     beyond = (m - 1) ** 2 - m * G**2
     t = G * (m * (m - 2) / beyond) ** 0.5 if beyond > 0 else np.inf
     grubbs = min(1.0, 2 * m * float(stats.t.sf(t, m - 2)))
     tails = float(stats.kurtosistest(rows, alternative="greater").pvalue)
-    words = (
-        f"{part.name} (the largest {abs(rows[at]):.1f} times the noise, at t = {part.t[at]:.4g} s)"
-    )
-    return Verdict(
-        "outliers",
-        part.recording,
-        part.channel,
-        min(1.0, 2 * min(grubbs, tails)),
-        abs(float(rows[at])),
-        words,
-    )
+    largest = abs(float(rows[at]))
+    words = f"(the largest {largest:.1f} times the noise, at t = {part.t[at]:.4g} s)"
+    return part.verdict("outliers", min(1.0, 2 * min(grubbs, tails)), largest, words)
 
 
 def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
@@ -469,22 +449,25 @@ def allow_for_colour(
     free: NDArray[np.bool_],
     which: Sequence[str],
     refit: Callable[[Problem, Fit, int], Fit],
+    undeclared: bool = True,
 ) -> Coloured:
     """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by
     `refit(problem, fit, round)`, from there, while coordinates that are `free` (n,) move.
 
-    The fit must have its residuals, with their Jacobian. Where all noise is white nothing is
-    changed.
+    Where all noise is white nothing is changed. Unless `undeclared` colour is looked for, that of
+    other channels stays as the problem has it.
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
+    given = {} if undeclared else problem.noise
     found, fits = dict[str, NoiseFit](), list[Fit]()
     for number in range(ROUNDS):
-        assert fit.at is not None
         now = parts(problem, fit.at.r, which)
         found = colours(now, fit.at.J[:, free], declared)
+        if not undeclared:
+            found = {channel: found[channel] for channel in declared if channel in found}
         if not found and not problem.noise:
             break
-        problem = problem.with_noise({channel: one.noise for channel, one in found.items()})
+        problem = problem.with_noise(given | {name: one.noise for name, one in found.items()})
         at = rewhitened(problem, fit.at, now)
         fit = fit._replace(at=at, chi2=float(np.mean(at.r**2)))
         if settled(problem, fit.x, at, free):

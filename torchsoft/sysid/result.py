@@ -6,14 +6,12 @@ content tells a damaged file.
 """
 
 import json
-import platform
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,20 +25,17 @@ from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.estimate import (
     ChannelResiduals,
     Contribution,
     Direction,
     Estimate,
-    contributions,
 )
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.profile import PosteriorSummary, Profile
 from torchsoft.sysid.recording import Array, identity
 from torchsoft.sysid.sensitivity import AssumptionTest
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
@@ -141,7 +136,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
 # The result
 
 
-SCHEMA = "torchsoft-answer-4"
+SCHEMA = "torchsoft-answer-5"
 """Name and version of the file's form."""
 
 
@@ -201,9 +196,6 @@ class IdentificationResult(Shown):
     combinations: list[Combination] = field(default_factory=list, repr=False)
     noise: list[ChannelNoise] = field(default_factory=list, repr=False)
     assumptions: list[AssumptionTest] = field(default_factory=list, repr=False)
-    profiles: list[Profile] = field(default_factory=list, repr=False)
-    posterior: PosteriorSummary | None = field(default=None, repr=False)
-    comparison: Comparison | None = field(default=None, repr=False)
     versions: dict[str, str] = field(default_factory=dict, repr=False)
     command: str = ""
     rigs: Annotated[dict[str, Any], Field(exclude=True)] = field(
@@ -281,7 +273,10 @@ class IdentificationResult(Shown):
         `applied_to` says what to do then.
         """
         one = self.recorded(recording)
-        return self._identified(self._rig(one), one)
+        rig = deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()
+        set_parameters(rig, one.identified)
+        self._told(one)
+        return rig
 
     def applied_to(self, rig: Rig, recording: str | None = None) -> Rig:
         """A copy of `rig` with the values that were identified: those of a recording, which is
@@ -303,7 +298,10 @@ class IdentificationResult(Shown):
                 f"this rig is not the one of the fit, so its values may mislead: {line(said, 300)}",
                 stacklevel=2,
             )
-        return self._identified(deepcopy(rig), one)
+        rig = deepcopy(rig)
+        set_parameters(rig, one.identified)
+        self._told(one)
+        return rig
 
     def draws(
         self, count: int, recording: str | None = None, seed: int = 0
@@ -317,15 +315,12 @@ class IdentificationResult(Shown):
         """
         whole("count", count, 1)
         one = self.recorded(recording)
-        told = {e.name for e in self.estimates if e.identifiable and e.kind == "parameter"
-                and e.recording in (None, one.name)}  # fmt: skip
+        told = self._told(one)
         mine = [(i, c) for i, c in enumerate(self.coordinates)
                 if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
         free = [i for i, c in mine if c.name in told]
         if not free:
             raise ValueError("no parameter is identifiable, so that there is nothing to draw")
-        if weak := {c.name: one.identified[c.name] for _, c in mine if c.name not in told}:
-            warnings.warn(undetermined(weak), stacklevel=2)
         x = np.tile(self.x, (1 + count, 1))
         C = np.array(self.covariance, dtype=float)[np.ix_(free, free)]
         rng = np.random.default_rng(seed)
@@ -339,37 +334,25 @@ class IdentificationResult(Shown):
                 values[c.name] = values[c.name] * values.get(c.ratio_to, known_one)
         return values
 
-    def _rig(self, one: RecordedRig) -> Rig:
-        """A rig of its own with the numbers of before the fit."""
-        return deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()
-
-    def _identified(self, rig: Rig, one: RecordedRig) -> Rig:
-        set_parameters(rig, one.identified)
-        weak = [
-            e.name
-            for e in self.estimates
-            if not e.identifiable and e.kind == "parameter" and e.recording in (None, one.name)
+    def _told(self, one: RecordedRig) -> set[str]:
+        """Names of parameters that are identifiable. Warns of the others, those of a held-out
+        recording too."""
+        mine = [
+            e for e in self.estimates if e.kind == "parameter" and e.recording in (None, one.name)
         ]
-        weak += [  # of a recording that was held out
-            c.name
-            for c in self.coordinates
-            if c.fixed
-            and c.kind == "parameter"
-            and c.recording == one.name
-            and not self.unknowns[c.name].fixed
-        ]
+        told, named = {e.name for e in mine if e.identifiable}, {e.name for e in mine}
+        weak = {
+            c.name: one.identified[c.name] for c in self.coordinates
+            if c.kind == "parameter" and c.recording in (None, one.name) and c.name not in told
+            and (c.name in named or not self.unknowns[c.name].fixed)
+        }  # fmt: skip
         if weak:
-            warnings.warn(undetermined({name: one.identified[name] for name in weak}), stacklevel=3)
-        return rig
+            warnings.warn(undetermined(weak), stacklevel=3)
+        return told
 
     def to_json(self) -> str:
-        """The content of the file. A comparison of laws goes without its residuals."""
-        plain = (
-            replace(self, comparison=replace(self.comparison, series=[]))
-            if self.comparison is not None
-            else self
-        )
-        content = finite(adapter().dump_python(plain, mode="json", by_alias=True))
+        """The content of the file."""
+        content = finite(adapter().dump_python(self, mode="json", by_alias=True))
         return json.dumps(
             {"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False
         )
@@ -470,31 +453,6 @@ def load_answer(path: str | Path) -> IdentificationResult:
 BLURRED = 0.1
 """Relative standard deviation of a combination of parameters from which it is looked for what the
 data see in its place."""
-
-
-def described(
-    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, C: Array, fitted: Sequence[str],
-    *, tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[AssumptionTest] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n):
-    `problem` has the noise that was found, J (m, n) is the Jacobian of the residuals of the
-    recordings `fitted`, `tried` the orders of noise by channel."""
-    c, tried = problem.coordinates, tried or {}
-    noise = [
-        ChannelNoise(channel, model, list(tried.get(channel, ())))
-        for channel, model in problem.noise.items()
-    ]
-    packages = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
-    return {
-        "recordings": recorded_rigs(problem, x, fitted), "unknowns": dict(problem.unknowns),
-        "sensors": dict(problem.sensors),
-        "coordinates": [replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
-        "contributions": contributions(problem, x, free, J, fitted),
-        "combinations": seen_together(problem, free, C), "noise": noise,
-        "assumptions": list(checks),
-        "versions": {"python": platform.python_version()} | {one: version(one) for one in packages},
-        "rigs": {recording.name: recording.rig for recording in problem.recordings},
-    }  # fmt: skip
 
 
 def seen_together(problem: Problem, free: NDArray[np.bool_], C: Array) -> list[Combination]:

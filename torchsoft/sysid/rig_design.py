@@ -1,26 +1,23 @@
 """Motions of a rig file for an identification: candidates ranked, and the knots of the best moved
 by gradient, both by one criterion."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from torchsoft.plan.knots import Moves, knots
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid.configuration import Config, Rest
-from torchsoft.sysid.criterion import Criterion
+from torchsoft.sysid.configuration import Config
 from torchsoft.sysid.design import Design, design
-from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.planner import Planner
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
-from torchsoft.sysid.synthetic import record
+from torchsoft.sysid.rehearsal import planned
 from torchsoft.tables import line
 
 AS_STATED = "as stated"
@@ -79,28 +76,6 @@ class Chosen(NamedTuple):
         return out
 
 
-def planned(
-    stated: Config, file: RigFile, name: str, settings: Mapping[str, Any]
-) -> tuple[RigFile, Recording | str]:
-    """The rig file with a candidate's settings, and what would be recorded, without noise, or why
-    it cannot be. Raises `ValueError`."""
-    plan = stated.rehearsal
-    with at_field(f"design.candidates.{name}"):
-        mine = file.override(**settings)
-        built = mine.build()
-    if plan.duration is not None:
-        built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
-    lead = stated.start.lead if isinstance(stated.start, Rest) else 0.0
-    start = Standing.of(built.rig, built.y0, lead)
-    try:
-        return mine, record(
-            name, built, {}, stated.sensors, start=start, rate=plan.rate, rtol=stated.design.rtol,
-            noise=0.0,
-        )  # fmt: skip
-    except SimulationFailed as failure:
-        return mine, str(failure)
-
-
 def choose(
     config: Path, stated: Config, recorded: Sequence[Recording] = (), *, workers: int = 1,
     progress: bool = False,
@@ -114,7 +89,7 @@ def choose(
     """
     if stated.rig is None:
         raise ValueError(f'{config}: a design is of the rig of a file: say rig = "FILE.toml"')
-    plan, criterion = stated.design, Criterion(stated.design.criterion)
+    plan = stated.design
     with at_field("settings"):
         file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)
     names = plan.parameters or None
@@ -122,22 +97,22 @@ def choose(
     problems: dict[str, Problem] = {}
     rated = list[Rated]()
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
-        files[name], made = planned(stated, file, name, settings)
+        with at_field(f"design.candidates.{name}"):
+            files[name] = file.override(**settings)
+            built = files[name].build()
         try:
-            if isinstance(made, str):
-                raise SimulationFailed(made, 0.0)
+            made = planned(stated, built, name, plan.rtol, noise=0.0)
             problem = Problem([*recorded, made], stated.sensors, stated.unknowns)
             planner = Planner(
-                problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, criterion, names,
-                plan.rtol, workers,
+                problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, plan.criterion,
+                names, plan.rtol, workers,
             )  # fmt: skip
             x = problem.coordinates.start
             seen = planner.evaluate(np.zeros(0), x)
             problems[name] = problem
             rated.append(Rated(name, seen.value, planner.deviations(x, seen), seen.peaks))
         except SimulationFailed as failure:
-            why = made if isinstance(made, str) else str(failure)
-            rated.append(Rated(name, np.inf, {}, {}, why))
+            rated.append(Rated(name, np.inf, {}, {}, str(failure)))
     rated.sort(key=lambda one: (one.score, one.value))
     best = rated[0].name
     if best not in problems:
@@ -145,7 +120,7 @@ def choose(
     found, chosen = None, files[best]
     if plan.bounds:
         found = design(
-            problems[best], best, plan.bounds, limits=plan.limits, criterion=criterion,
+            problems[best], best, plan.bounds, limits=plan.limits, criterion=plan.criterion,
             names=names, iterations=plan.iterations, rtol=plan.rtol, seed=plan.seed,
             workers=workers, progress=progress,
         )  # fmt: skip

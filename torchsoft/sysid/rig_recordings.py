@@ -18,7 +18,7 @@ from torchsoft.solve.trajectory import channels, measurable, units
 from torchsoft.sysid.columns import Tables, Vocabulary
 from torchsoft.sysid.configuration import Beginning, Moving
 from torchsoft.sysid.first_samples import estimate_initial_state
-from torchsoft.sysid.initial_state import Standing
+from torchsoft.sysid.initial_state import Standing, Start
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Sensor, by_channel
 
@@ -40,10 +40,18 @@ def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
     return Vocabulary(columns, signals).renamed(headings)
 
 
-def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | None) -> Sampled:
-    """A set-point, with the rate of its column, if there is one."""
-    times, values = torch.tensor(t), torch.tensor(y)
-    return Sampled(times, values, None if rate is None else torch.tensor(rate[1]))
+def followed(tables: Tables, rig: Rig | None = None) -> Reference:
+    """The signals that tables have, with the rates of their columns, if there are any; the others
+    are those of the rig."""
+    columns, signals = tables.columns, {}
+    for name in tables.known.signals:
+        if name in columns:
+            rate = columns.get(f"{name}_dot")
+            times, values = (torch.tensor(column) for column in columns[name])
+            signals[name] = Sampled(times, values, None if rate is None else torch.tensor(rate[1]))
+        elif rig is not None:
+            signals[name] = rig.reference[name]
+    return Reference(**signals)
 
 
 def measured_samples(
@@ -68,8 +76,14 @@ def measured_samples(
     return samples
 
 
-def moving(made: Recording, sensors: Mapping[str, Sensor], start: Moving) -> Recording:
-    """The recording with a start in motion, which its first samples tell."""
+def recorded(
+    name: str, rig: Rig, tables: Tables, sensors: Mapping[str, Sensor], start: Beginning,
+    at_rest: Start,
+) -> Recording:  # fmt: skip
+    """The recording that tables hold, begun at rest, or in motion, which its first samples tell."""
+    made = Recording(name, rig, measured_samples(tables, sensors), at_rest)
+    if not isinstance(start, Moving):
+        return made
     given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
     used = {channel: sensors[channel] for channel in sensors if channel in made.samples}
     return estimate_initial_state(made, used, lead=start.lead, given=given)
@@ -82,19 +96,11 @@ def rig_recording(
     column, or the file's field."""
     rig, y0, _ = file.build()
     sensors = by_channel([rig], sensors)
-    columns, samples = tables.columns, measured_samples(tables, sensors)
     check_clock(file, rig, tables, start)
-    rig.reference = Reference(
-        **{
-            signal: sampled(*columns[signal], columns.get(f"{signal}_dot"))
-            if signal in columns
-            else rig.reference[signal]
-            for signal in rig.signals
-        }
-    )
-    made = Recording(name, rig, samples, Standing.of(rig, y0, start.lead))
+    rig.reference = followed(tables, rig)
+    made = recorded(name, rig, tables, sensors, start, Standing.of(rig, y0, start.lead))
     if isinstance(start, Moving):
-        return moving(made, sensors, start)
+        return made
     if start.position_sd:
         raise ValueError(
             "start.position_sd is of the paper's rig; where the places of bodies are not known, "

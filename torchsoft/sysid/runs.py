@@ -181,11 +181,15 @@ class Runner:
         if workers < 1:
             raise ValueError(f"`workers` must be positive, but is {workers}")
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
-        self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
+        self.simulations = self.jacobians = self.gradients = self.remembered = 0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
         self._idle: list[list[RunContext]] = [
             [] for _ in self.recordings
         ]  # models that no thread is using
+
+    def of(self, recordings: Sequence[Recording]) -> "Runner":
+        """One of other recordings, in as many threads and the same folder."""
+        return Runner(recordings, self.workers, self.folder)
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
@@ -199,7 +203,6 @@ class Runner:
                 lambda k: self._made(jobs[todo[k]]), len(todo), self.workers
             ):
                 out[todo[i]] = result
-                self.steps += result.steps if isinstance(result, Prediction) else 0
         return out
 
     def _made(self, job: Job) -> Any:

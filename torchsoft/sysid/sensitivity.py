@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ from tqdm import tqdm
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
 from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
-from torchsoft.sysid.prediction import FailedRun, Frozen, Signals
+from torchsoft.sysid.prediction import FailedRun, Frozen
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, extended
 from torchsoft.sysid.refits import End, Refit, difference, ended, refit
@@ -177,10 +176,9 @@ class Checked(NamedTuple):
 
 
 def check_assumptions(
-    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
-    rtol: float, *, doubtful: bool = False, explain: bool = False, loss: Loss = "linear",
-    workers: int = 1, journal: Path | None = None, progress: bool = False,
-    own: Mapping[str, Frozen] | None = None,
+    problem: Problem, runner: Runner, x: Array, at: Residuals, free: NDArray[np.bool_],
+    which: Sequence[str], rtol: float, *, doubtful: bool = False, explain: bool = False,
+    loss: Loss = "linear", progress: bool = False, own: Mapping[str, Frozen] | None = None,
 ) -> Checked:  # fmt: skip
     """Tests of the assumptions at the estimates x (n,), to first order, where `at` holds residuals
     and Jacobian of the recordings `which`, by the fit's `own` steps where no others have a run.
@@ -188,24 +186,26 @@ def check_assumptions(
     With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other,
     until one explains the misfit: a test to first order says little where a fit has run far off.
     """
-    end = ended(problem, x, at, free, which, rtol, workers, journal, own)
+    end = ended(problem, runner, x, at, free, which, rtol, own)
     candidates: list[Variation] = []
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
     judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
     untried = [one.name for one in taken if one.vary is not None]
     try:
-        runner = Runner(problem.recordings, workers, journal)
         with quiet():
-            first = columns_of(problem, runner, end, taken)
+            first = columns_of(problem, end, taken)
+        judge.columns = {one.name: d for one, d in first if d.any()}
         checks |= {one.name: judge.column(one, d) for one, d in first if d.any()}
         for one in taken:
             if one.vary is None:
                 continue
             d, reason = difference(problem, end, one)
-            checks[one.name] = judge.unchecked(one, reason) if d is None else judge.column(one, d)
-            if one.kind == "numerical" and d is not None:
-                columns.append(d)
+            if d is None:
+                checks[one.name] = assumption_test(one, left=judge.square, unchecked=reason)
+            else:
+                checks[one.name], judge.columns[one.name] = judge.column(one, d), d
+                columns += [d] if one.kind == "numerical" else []
             untried.remove(one.name)
         unexplained = doubtful and not end.base.lost and not judge.explained(checks.values())
         suspects = {one.name: one for one in (*taken, *(one for one, _ in first))}
@@ -316,9 +316,6 @@ class Judge:
         above = max(self.square - self.dof, 0.0)
         return self.explained([one]) or (one.refitted and one.gain > NEARLY * above > 0.0)
 
-    def unchecked(self, one: Assumption, reason: str) -> AssumptionTest:
-        return assumption_test(one, left=self.square, unchecked=reason)
-
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
         favoured_sd: float, rest: float, after: Array, before: Array, refitted: bool = False,
@@ -348,20 +345,24 @@ class Judge:
             for channel, some in rows.items()
         }
 
-    def column(self, one: Assumption, d: Array) -> AssumptionTest:
-        """Of what a variation adds to the residuals (m,), to first order in its amplitude."""
-        self.columns[one.name] = d
-        across = d - self.Q @ (self.Q.T @ d)
-        size, along = float(across @ across), float(across @ self.r)
+    def column(
+        self, one: Assumption, d: Array, Q: Array | None = None, r: Array | None = None
+    ) -> AssumptionTest:
+        """Of what a variation adds to the residuals (m,), to first order in its amplitude; beside
+        other columns, whose orthonormal basis is Q (m, n), on what they leave, r (m,)."""
+        Q, r = self.Q if Q is None else Q, self.r if r is None else r
+        across = d - Q @ (Q.T @ d)
+        size, along, square = float(across @ across), float(across @ r), float(r @ r)
         moves = -shift(self.J, d) / self.sd
-        if size < 1e-12 * max(float(d @ d), 1e-300) or size == 0.0:
-            return self.made(one, moves, 0.0, self.square, 0.0, float("inf"), 1.0, self.r, self.r)
+        least = 1e-12 if Q is self.Q else 1e-6  # it is what is taken in already
+        if size < least * max(float(d @ d), 1e-300) or size == 0.0:
+            return self.made(one, moves, 0.0, square, 0.0, float("inf"), 1.0, r, r)
         gain, alpha = along**2 / size, -along / size
-        rest = max(1.0, (self.square - gain) / max(self.dof - 1, 1))
-        sd = (max(1.0, self.square / self.dof) / size) ** 0.5
+        rest = max(1.0, (square - gain) / max(self.dof - 1, 1))
+        sd = (max(1.0, square / self.dof) / size) ** 0.5
         return self.made(
-            one, moves, gain, self.square - gain, alpha * one.amount, sd * one.amount, rest,
-            self.r + alpha * across, self.r,
+            one, moves, gain, square - gain, alpha * one.amount, sd * one.amount, rest,
+            r + alpha * across, r,
         )  # fmt: skip
 
     def fit(
@@ -370,8 +371,6 @@ class Judge:
         """Of a fit that was repeated with it, beside one that was repeated without; or to first
         order, where the new fit did not come as far."""
         at, before = again.fit.at, as_stated.fit.at
-        assert at is not None
-        assert before is not None
         gain = float(before.r @ before.r - at.r @ at.r)
         if gain <= linear.gain and not again.fit.converged:
             return linear
@@ -405,31 +404,16 @@ class Judge:
             r = r - J @ shift(J, r)
         left = [one for one in checks if one.name in self.columns and one.name != best.name]
         while left and len(out) < BESIDES:
-            Q, square = np.linalg.qr(J)[0], float(r @ r)
-            tests, taken = [], {}
-            for one in left:
-                d = self.columns[one.name]
-                across = d - Q @ (Q.T @ d)
-                size = float(across @ across)
-                if size <= 1e-6 * float(d @ d):  # it is what is taken in already
-                    continue
-                alpha, gain = -float(across @ r) / size, float(across @ r) ** 2 / size
-                rest = max(1.0, (square - gain) / self.dof)
-                taken[one.name] = r + alpha * across
-                tests.append(
-                    replace(
-                        one, gain=gain, left=square - gain, favoured=alpha * one.amount,
-                        favoured_sd=(rest / size) ** 0.5 * one.amount, significance=gain / rest,
-                        pattern=pattern_of(self.places, taken[one.name], r), refitted=False,
-                        value=one.nominal + alpha * one.step, suspected=None,
-                    )
-                )  # fmt: skip
+            Q = np.linalg.qr(J)[0]
+            tests = [self.column(one, self.columns[one.name], Q, r) for one in left]
             found = max((one for one in tests if one.suspected), key=lambda one: one.gain,
                         default=None)  # fmt: skip
             if found is None:
                 break
             out.append(found)
-            r, J = taken[found.name], np.column_stack((J, self.columns[found.name]))
+            d = self.columns[found.name]
+            r = r + found.favoured / found.amount * (d - Q @ (Q.T @ d))
+            J = np.column_stack((J, d))
             left = [one for one in left if one.name != found.name]
         return tuple(out), r
 
@@ -456,7 +440,7 @@ def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> flo
 
 
 def columns_of(
-    problem: Problem, runner: Runner, end: End, taken: Sequence[Variation]
+    problem: Problem, end: End, taken: Sequence[Variation]
 ) -> list[tuple[Variation, Array]]:
     """Effects on the residuals of other values of known parameters, of extensions of the rigs, and
     of faults of sensors that are not unknown, to first order: of a run a recording with its
@@ -471,26 +455,22 @@ def columns_of(
         jobs = [
             job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)
         ]
-        runs = Runner(recordings, runner.workers, runner.folder).run(jobs)
+        runs = end.runner.of(recordings).run(jobs)
         if any(isinstance(run, FailedRun) for run in runs):
             return out
         faults = faults_of(problem) if number == 0 else []
         blocks = []
         for job, run in zip(jobs, runs):
             recording = problem.recordings[job.recording]
-            signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
-            for channel, one in problem.readouts(end.x, job.recording).items():
-                t, measured = recording.samples[channel]
-                y, slopes, by = one.expected(signals, t)
-                _, weight = one.residuals(y, measured)
-                block = np.zeros((len(t), len(known) + len(faults)))
-                if slopes is not None:
-                    block[:, : len(known)] = slopes * [float(each.step) for each in known]
+            for one in problem.readings(end.x, job, run):
+                block = np.zeros((len(one.t), len(known) + len(faults)))
+                if one.slopes is not None:
+                    block[:, : len(known)] = one.slopes * [float(each.step) for each in known]
                 for k, fault in enumerate(faults, len(known)):
                     assert fault.fault is not None
-                    if fault.fault[0] == channel:
-                        block[:, k] = by[fault.fault[1]] * fault.step
-                rows = problem.whitened(recording, channel, weight[:, None] * block)
+                    if fault.fault[0] == one.channel:
+                        block[:, k] = one.by[fault.fault[1]] * fault.step
+                rows = problem.whitened(recording, one.channel, one.weight[:, None] * block)
                 blocks.append(np.asarray(rows))
         blocks.append(np.zeros((len(problem.coordinates.priors), len(known) + len(faults))))
         out += zip((*known, *faults), np.concatenate(blocks).T)
