@@ -129,31 +129,6 @@ def test_peers_smoke() -> None:
     assert "scipy LSODA" in module.peers_table(numbers)
 
 
-@pytest.mark.slow
-def test_random_runs_smoke(tmp_path: Path) -> None:
-    """Every run ends, finite or with a sentence; one that takes too much of the processor's time is
-    ended."""
-    module = importlib.import_module(
-        "random_runs"
-    )  # by its own name, which worker processes import
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    numbers = module.summary(result)
-    for way in module.WAYS:
-        kinds = numbers[way]["kinds"]
-        assert sum(kinds.values()) == numbers["runs"] == len(result.motions)
-        assert not [
-            kind
-            for kind in kinds
-            if kind in (module.NOT_FINITE, module.HUNG) or "without a sentence" in kind
-        ]
-        assert all(
-            one.sentence for one in result.outcomes[way].values() if one.kind != module.FINISHED
-        )
-    assert f"of {numbers['runs']} runs" in module.table(numbers)
-    short = module.run(module.Config(out=tmp_path, runs=1, workers=1, limit=0.01))
-    assert module.summary(short)["tolerances"]["kinds"] == {module.HUNG: 1}
-
-
 def test_experiment_design_smoke(tmp_path: Path) -> None:
     """Jerks of a light grasp see friction and dashpots better than strokes; together they see more
     than either alone."""
