@@ -447,37 +447,17 @@ def table(result: Result) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """Coefficients beside mechanics, and errors under slip."""
-    fig = Figure(figsize=(10, 4.5), layout="constrained")
-    coefficients, slip = fig.subplots(1, 2)
-    rows = [row for row in result.stick["coefficients"] if row["expected"]]
-    for i, row in enumerate(rows):
-        coefficients.plot(
-            [x / row["expected"] for x in row["interval"]], [i, i], "C0", lw=3, alpha=0.5
-        )
-        coefficients.plot(row["value"] / row["expected"], i, "oC0")
-    coefficients.axvline(1.0, color="k", lw=0.8)
-    coefficients.set_yticks(
-        range(len(rows)), [f"{row['equation']}': {row['term']}" for row in rows]
-    )
-    coefficients.set(xlabel="over the expectation", title="Stick: coefficients")
-    by = result.slip["by_stroke"]
+    """Errors under slip."""
+    fig = Figure(figsize=(6, 4.5), layout="constrained")
+    axes, by = fig.subplots(), result.slip["by_stroke"]
     for key, label in (
         ("nrmse", "with friction"),
         ("nrmse_linear", "its limit for small slip (linear)"),
     ):
-        slip.loglog(
-            [row["acceleration_m_s2"] for row in by],
-            [100 * min(row[key], 10.0) for row in by],
-            "o-",
-            label=label,
-        )
-    slip.set(
-        xlabel="peak acceleration of the bracket [m/s$^2$]",
-        ylabel="NRMSE [%]",
-        title="Slip: other strokes",
-    )
-    slip.legend()
+        errors = [100 * min(row[key], 10.0) for row in by]
+        axes.loglog([row["acceleration_m_s2"] for row in by], errors, "o-", label=label)
+    axes.set(xlabel="peak acceleration of the bracket [m/s$^2$]", ylabel="NRMSE [%]")
+    axes.legend()
     return fig
 
 

@@ -23,7 +23,6 @@ import identify_contact
 import numpy as np
 import torch
 from identify_contact import TRUTH
-from matplotlib.figure import Figure
 from scipy import stats
 from tqdm import tqdm
 
@@ -228,22 +227,6 @@ def run(config: Config) -> Result:
     return Result(config, found, prices, rest, wall)
 
 
-def figure(result: Result) -> Figure:
-    """By case, errors of the parameters that are shown, over their standard deviations."""
-    fig = Figure(figsize=(4.0 * len(result.found), 4.0), layout="constrained")
-    for axes, (case, found) in zip(
-        fig.subplots(1, len(result.found), squeeze=False)[0], result.found.items()
-    ):
-        for name in result.shown(case):
-            errors = [np.log(one[name].last / TRUTH[name]) / one[name].relative_sd for one in found]
-            axes.plot(errors, [name.split(".")[1]] * len(errors), "o", ms=3)
-        axes.axvspan(-1.96, 1.96, color="0.93", zorder=0)
-        axes.set(
-            xlim=(-5, 5), xlabel="error of ln(estimate), in its standard deviations", title=case
-        )
-    return fig
-
-
 def main(config: Config) -> None:
     result = run(config)
     cases, cells, n = {}, [], result.config.seeds
@@ -282,7 +265,7 @@ def main(config: Config) -> None:
     table = markdown(head, cells)
     for case, rest in result.rest.items():
         print(f"\n{case}, rest assumed: {rest['library']}")
-    write(result.config, {"cases": cases}, {"unknown_start": figure(result)}, table)
+    write(result.config, {"cases": cases}, table=table)
 
 
 if __name__ == "__main__":

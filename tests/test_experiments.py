@@ -140,7 +140,6 @@ def test_experiment_design_smoke(tmp_path: Path) -> None:
     assert single["jerks, light"]["contact.R_n"] < single["strokes"]["contact.R_n"]
     assert all(both[name] <= min(sd[name] for sd in single.values()) for name in module.NAMES)
     assert all(row["inconsistency"] < module.CONSISTENT for row in summary["single"])
-    assert (tmp_path / "experiment_design.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
@@ -160,7 +159,7 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
         )  # each rests within 0.2
     assert max(cases["noisy"]["heldout_nrmse"]["shaking"].values()) < 0.05
     assert cases["finite differences"]["simulations"] > 2 * cases["noisy"]["jacobians"]
-    assert {"report.html", "identify_contact.png"} <= {path.name for path in tmp_path.iterdir()}
+    assert (tmp_path / "report.html").exists()
 
 
 @pytest.mark.slow
@@ -176,7 +175,6 @@ def test_identify_by_touch_smoke(tmp_path: Path) -> None:
         assert max(abs(one["error_in_sd"]) for one in fit.values()) < 3.5
     assert max(summary["chi2"].values()) == pytest.approx(1.0, abs=0.1)
     assert summary["jacobian"]["ratio"] < 2.0  # one timing in a test
-    assert (tmp_path / "identify_by_touch.png").exists()
 
 
 @pytest.mark.slow
@@ -199,7 +197,6 @@ def test_interval_coverage_smoke(tmp_path: Path) -> None:
     for name, lab in (("two fingers", module.FINGERS), ("two jaws", module.JAWS)):
         assert list(cases[name]["parameters"]) == list(lab.truth)[:3]
         assert max(errors[name]) < 4
-    assert (tmp_path / "interval_coverage.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -31,5 +31,5 @@ def test_reduced_model_smoke(tmp_path: Path) -> None:
     assert (
         fastest["nrmse_linear"] > 2 * fastest["nrmse"]
     )  # saturation is what the faster strokes need
-    assert len(module.figure(result).axes) == 2
+    assert len(module.figure(result).axes) == 1
     assert "| stick |" in module.table(result)

@@ -341,4 +341,3 @@ def test_unknown_start_smoke(tmp_path: Path) -> None:
         assert abs(np.log(found[name].last / module.TRUTH[name])) < 4 * sd, name
         assert 1.0 < sd / price.known[name] < 5.0, name
     assert result.rest[case]["library"]
-    assert module.figure(result).axes

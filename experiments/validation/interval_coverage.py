@@ -33,7 +33,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import stats
 from scipy.signal import lfilter
 
@@ -312,19 +311,6 @@ def summed(case: Case, found: list[Repetition]) -> dict[str, Any]:
     return out
 
 
-def figure(rows: dict[str, Any]) -> Figure:
-    """Coverage by unknown with its own interval, a panel a case."""
-    fig = Figure(figsize=(8.0, 2.4 * len(rows)), layout="constrained")
-    for axes, (case, row) in zip(fig.subplots(len(rows), squeeze=False)[:, 0], rows.items()):
-        for name, one in row["parameters"].items():
-            axes.plot([100 * end for end in one["ci95"]], [name, name], color="C0", lw=1.5)
-            axes.plot(100 * one["share"], name, "o", color="C0", ms=5)
-        axes.axvspan(90, 99, color="0.92", zorder=0)
-        axes.set(title=case, xlabel="intervals that hold the truth [%]")
-        axes.invert_yaxis()
-    return fig
-
-
 def main(config: Config) -> None:
     if config.smoke:
         config = replace(config, seeds=2, workers=1, rtol=1e-4, checked=0)
@@ -343,7 +329,7 @@ def main(config: Config) -> None:
         "its own 95 % interval", "mean error / sd", "sd of that",
     )  # fmt: skip
     content = {"seeds": config.seeds, "cases": rows}
-    write(config, content, {"interval_coverage": figure(rows)}, markdown(head, cells))
+    write(config, content, table=markdown(head, cells))
 
 
 if __name__ == "__main__":
