@@ -52,7 +52,6 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
         "multibond.dot",
         "animation.gif",
         "snapshots.png",
-        "friction_sets.png",
     } <= names
     assert not [name for name in names if "partial" in name]
     lines = module.table(numbers).splitlines()
