@@ -40,9 +40,6 @@ from torchsoft.solve.progress import Integrals
 from torchsoft.solve.trajectory import channels, units
 from torchsoft.tables import line, read_toml, shown
 
-NAMED = ("file", "network")
-"""Fields of tables that name a file."""
-
 EMBEDDED = 2e6
 """Size [B] of all files that a rig file names, at the most: they are part of the configuration."""
 
@@ -64,14 +61,6 @@ def embedded(tree: Any, folder: Path) -> Any:
     path, contents = folder / name, dict[str, str]()
     RigFile.from_toml(path)
 
-    def packed(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {
-                key: stored(x) if key in NAMED and isinstance(x, str) else packed(x)
-                for key, x in value.items()
-            }
-        return [packed(x) for x in value] if isinstance(value, list) else value
-
     def stored(file: str) -> str:
         data = check_file(path.parent / file, EMBEDDED).read_bytes()
         own = f"{sha256(data).hexdigest()[:16]}{Path(file).suffix}"
@@ -83,7 +72,7 @@ def embedded(tree: Any, folder: Path) -> Any:
             )
         return own
 
-    rig = packed(read_toml(path))
+    rig = places.files_renamed(read_toml(path), stored)
     return {**tree, "rig": rig} | ({"files": contents} if contents else {})
 
 
