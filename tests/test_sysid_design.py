@@ -2,7 +2,6 @@
 should be recorded next."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -234,10 +233,8 @@ def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
     assert len(design_figure(found).get_axes()) == 4
 
 
-def test_a_design_is_an_excitation_in_a_file(found: Design, tmp_path: Path) -> None:
-    excitation, path = found.excitation(PLAN), tmp_path / "motion.toml"
-    path.write_text(excitation.to_toml(), encoding="utf-8")
-    again = begin(Excitation.from_toml(path), P).rig.reference
+def test_a_design_is_an_excitation(found: Design) -> None:
+    again = begin(found.excitation(PLAN), P).rig.reference
     t = torch.linspace(0, 0.3, 200, dtype=torch.float64)
     off = again(t, ["x_d", "y_d", "F_ff"]) - found.recording.rig.reference(
         t, ["x_d", "y_d", "F_ff"]

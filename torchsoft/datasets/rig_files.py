@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 
-from torchsoft.datasets.schema import Label, Signal
+from torchsoft.datasets.schema import Label
 from torchsoft.datasets.subject import (
     RTOL,
     Begun,
@@ -140,7 +140,7 @@ class RigOfFile(Subject):
             raise ValueError(f"rig: {error}") from None
 
     @cached_property
-    def there(self) -> dict[str, Signal]:
+    def there(self) -> dict[str, Label]:
         """Every channel of the rig."""
         rig = self.template
         nothing = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
@@ -149,10 +149,10 @@ class RigOfFile(Subject):
         with torch.no_grad():
             known = channels(rig, state, nothing, moments)
         meanings, of = dict(channel_meanings(rig)), units(rig)
-        return {key: Signal(of[key], meanings[key]) for key in known}
+        return {key: Label(of[key], meanings[key]) for key in known}
 
     @property
-    def signals(self) -> dict[str, Signal]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def signals(self) -> dict[str, Label]:  # pyright: ignore[reportIncompatibleVariableOverride]
         kept = self.config.channels
         return self.there if kept is None else {name: self.there[name] for name in kept}
 
