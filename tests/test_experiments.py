@@ -201,7 +201,6 @@ def test_contact_points_smoke(tmp_path: Path) -> None:
     name = "static ripple of the force along the pad [mN]"
     assert between[name] < 0.3 * nodes[name]
     assert max(case["gradient from differences over 1e-06"] for case in (nodes, between)) < 5e-5
-    assert (tmp_path / "contact_points.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
