@@ -15,7 +15,7 @@ worst of them with a standard deviation of 3 %; both starts end at the same plac
 identification takes some 45 runs with sensitivities and 20 without.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -163,7 +163,7 @@ def start(config: Config, seed: int) -> dict[str, float]:
 
 
 def problem(
-    recordings: list[Recording], begin: dict[str, float], sensors: Mapping[str, Sensor] = RIG,
+    recordings: list[Recording], begin: dict[str, float], sensors: dict[str, Sensor] = RIG,
     kind: type[Problem] = Problem,
 ) -> Problem:  # fmt: skip
     """Unknowns that begin there, mu_k as a part of mu_s."""
