@@ -2,6 +2,7 @@
 sense."""
 
 import io
+import json
 import re
 import subprocess
 import sys
