@@ -21,8 +21,6 @@ from pathlib import Path
 
 import numpy as np
 from identify_contact import TRUTH
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Parameters
@@ -195,31 +193,12 @@ def table(rows: list[Row]) -> str:
     )
 
 
-def figure(result: Result) -> Figure:
-    """Standard deviations with the shift by the steps [%], as a heat map."""
-    every = result.single + result.together[:8]
-    fig = Figure(figsize=(10, 1.6 + 0.36 * len(every)), layout="constrained")
-    axes = fig.subplots()
-    values = [
-        [100 * np.hypot(row.sd[n], row.shift[n]) if row.sd else np.nan for n in NAMES]
-        for row in every
-    ]
-    image = axes.imshow(np.array(values), norm=LogNorm(0.1, 100.0), cmap="RdYlGn_r", aspect="auto")
-    axes.set_yticks(
-        range(len(every)),
-        [" + ".join(row.names) + (" (dropped)" if row.dropped else "") for row in every],
-    )
-    axes.set_xticks(range(len(NAMES)), [name.split(".")[1] for name in NAMES])
-    fig.colorbar(image, label="root of (standard deviation² + shift by the steps²) [%]")
-    return fig
-
-
 def main(config: Config) -> None:
     result = run(config)
     rows = {"single": result.single, "together": result.together[:20]}
     summary = {name: [asdict(row) for row in some] for name, some in rows.items()}
     tables = f"{table(result.single)}\n\n{table(result.together[:8])}"
-    write(result.config, summary, {"experiment_design": figure(result)}, tables)
+    write(result.config, summary, table=tables)
 
 
 if __name__ == "__main__":

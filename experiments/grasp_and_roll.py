@@ -242,12 +242,10 @@ def figures(result: Result) -> dict[str, Figure]:
     }
     for time, number in ((0.125, 14), (5.0, 15)):
         if time <= trajectory.t[-1]:
-            out[f"force_distribution_{time:g}s"] = draw.force_distribution(
-                trajectory, time, title=f"Contact forces at {time:g} s (paper: Fig. {number})"
-            )
-    if len(result.runs) > 1:
-        runs = {name: run.trajectory for name, run in result.runs.items()}
-        out["friction_sets"] = draw.friction_comparison(runs, (0.375, 5.0), "F_x")
+            out[f"force_distribution_{time:g}s"] = draw_run(
+                trajectory, only=("scene", "contact U", "contact L"), time=time,
+                title=f"Contact forces at {time:g} s (paper: Fig. {number})",
+            )  # fmt: skip
     return out
 
 

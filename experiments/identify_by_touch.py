@@ -21,16 +21,15 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import identify_contact
 import numpy as np
 from identify_contact import TRUTH
-from matplotlib.figure import Figure
 
 from torchsoft import Parameters, SoftGrasp, Taxels
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.physics.motion import Reference
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
-from torchsoft.sysid.estimate import IDENTIFIABLE
+from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, identify, record
 from torchsoft.sysid.fit import percent, standard_deviations
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
@@ -97,16 +96,10 @@ def recording(config: Config, truth: dict[str, float], name: str, motion: Excita
 
 
 def problem(data: Recording, sets: tuple[str, ...], start: dict[str, float]) -> Problem:
-    """Parameters that begin there; mu_k as a part of mu_s."""
-    unknowns = {name: Unknown(nominal=value) for name, value in start.items()}
-    if "contact.mu_k" in start:
-        ratio = start["contact.mu_k"] / start["contact.mu_s"]
-        unknowns["contact.mu_k"] = Unknown(
-            nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0
-        )
+    """Parameters that begin there, from some of the sensors."""
     used = sensors(*sets)
     samples = {channel: data.samples[channel] for channel in used}
-    return Problem([replace(data, samples=samples)], used, unknowns)
+    return identify_contact.problem([replace(data, samples=samples)], start, used)
 
 
 def jacobian(config: Config, stated: Problem) -> tuple[Array, Any]:
@@ -163,24 +156,6 @@ def run(config: Config) -> Result:
     )
 
 
-def figure(result: Result) -> Figure:
-    """Standard deviations of every parameter by sensors, a panel a motion."""
-    fig = Figure(figsize=(3.4 * len(result.deviations) + 1.2, 4.4), layout="constrained")
-    axes = fig.subplots(1, len(result.deviations), sharey=True, squeeze=False)[0]
-    rows = np.arange(len(result.truth))
-    for ax, (motion, by) in zip(axes, result.deviations.items()):
-        for i, (label, sds) in enumerate(by.items()):
-            sd = np.minimum(100 * np.array(list(sds.values())), 1e4)
-            ax.plot(sd, rows + 0.15 * (i - 1.5), "osD^"[i], label=label, ms=6)
-        ax.axvline(100 * IDENTIFIABLE, color="k", lw=0.8, ls=":")
-        ax.set(xscale="log", title=motion, xlabel="standard deviation [%]")
-        ax.grid(axis="x", lw=0.3)
-    axes[0].set_yticks(rows, [name.split(".")[1] for name in result.truth])
-    axes[0].invert_yaxis()
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    return fig
-
-
 def main(config: Config) -> None:
     result = run(config)
     rows = [
@@ -206,7 +181,7 @@ def main(config: Config) -> None:
         "jacobian": result.cost,
     }
     head = ("motion", "sensors", *(name.split(".")[1] for name in result.truth))
-    write(result.config, content, {"identify_by_touch": figure(result)}, markdown(head, rows))
+    write(result.config, content, table=markdown(head, rows))
     print(
         f"a Jacobian with {SKIN.count} taxels takes {result.cost['with_taxels_s']:.3g} s, "
         f"{result.cost['ratio']:.2f} times one without"

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchsoft import Parameters
@@ -31,6 +30,7 @@ from torchsoft.sysid.problem import Residuals, StepsByName
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.report import report
 from torchsoft.sysid.runs import Runner, forget
+from torchsoft.sysid.unknowns import Sensor
 
 TRUTH = {
     "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0,
@@ -163,8 +163,9 @@ def start(config: Config, seed: int) -> dict[str, float]:
 
 
 def problem(
-    recordings: list[Recording], begin: dict[str, float], kind: type[Problem] = Problem
-) -> Problem:
+    recordings: list[Recording], begin: dict[str, float], sensors: dict[str, Sensor] = RIG,
+    kind: type[Problem] = Problem,
+) -> Problem:  # fmt: skip
     """Unknowns that begin there, mu_k as a part of mu_s."""
     unknowns = {name: Unknown(nominal=value) for name, value in begin.items()}
     if "contact.mu_k" in begin:
@@ -172,7 +173,7 @@ def problem(
         unknowns["contact.mu_k"] = Unknown(
             nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0
         )
-    return kind(recordings, RIG, unknowns)
+    return kind(recordings, sensors, unknowns)
 
 
 def run(config: Config) -> Result:
@@ -183,7 +184,7 @@ def run(config: Config) -> Result:
 
     def case(name: str, noise: float, seed: int, kind: type[Problem] = Problem) -> Problem:
         begin = start(config, seed)
-        stated = problem(noisy if noise else exact, begin, kind)
+        stated = problem(noisy if noise else exact, begin, kind=kind)
         print(
             f"\n{name}, start {seed}: off by factors of",
             *(f"{v / truths(config)[k]:.2f}" for k, v in begin.items()),
@@ -211,23 +212,6 @@ def run(config: Config) -> Result:
         case("finite differences", 1.0, config.starts[0], FiniteDifferences)
     assert last is not None
     return Result(config, truths(config), cases, last)
-
-
-def figure(result: Result) -> Figure:
-    """Estimate over truth with its interval, and where each began, a panel a case."""
-    fig = Figure(figsize=(3.2 * len(result.cases), 4.2), layout="constrained")
-    axes = fig.subplots(1, len(result.cases), sharey=True, squeeze=False)[0]
-    for ax, case in zip(axes, result.cases):
-        for name, truth in result.truth.items():
-            e, label = case.found[name], name.split(".")[1]
-            ax.plot(case.start[name] / truth, label, "o", mfc="none", color="0.6")
-            ax.plot(e.last / truth, label, "o", color="C0" if e.identifiable else "C3", ms=4)
-            ax.plot(
-                [c / truth for c in e.ci95 or ()], [label] * len(e.ci95 or ()), color="C0", lw=2
-            )
-        ax.axvline(1.0, color="k", lw=0.5)
-        ax.set(xscale="log", xlim=(0.25, 4.0), xlabel="over the truth", title=case.name)
-    return fig
 
 
 def main(config: Config) -> None:
@@ -275,7 +259,7 @@ def main(config: Config) -> None:
             )
         )
     head = ("case", "worst error", "worst predicted sd", "simulations", "Jacobians", "wall [s]")
-    write(config, summary, {"identify_contact": figure(result)}, markdown(head, cells))
+    write(config, summary, table=markdown(head, cells))
 
 
 if __name__ == "__main__":

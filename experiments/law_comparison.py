@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearSolid
@@ -272,28 +271,6 @@ def run(config: Config) -> Result:
     return Result(config, [done[k] for k in range(len(cases))])
 
 
-def figure(result: Result) -> Figure:
-    """z of the rule over D, a colour a kind of answer."""
-    fig = Figure(figsize=(6.0, 4.0), layout="constrained")
-    axes = fig.subplots()
-    for answer in ANSWERS:
-        here = [one for one in result.judged if one.answer == answer]
-        against = [(one, one.said.against[0]) for one in here]
-        z = [versus.z if versus.best == one.case.law else -versus.z for one, versus in against]
-        axes.plot([max(one.apart, 0.05) for one in here], z, "o", ms=4, label=answer)
-    D = np.geomspace(0.05, max(one.apart for one in result.judged), 100)
-    axes.plot(D, D / 2, "k", lw=1, label="expected, D / 2")
-    axes.axhspan(-2, 2, color="#f6e3d6", lw=0, zorder=0)
-    axes.set(
-        xscale="log",
-        xlabel="D without noise",
-        ylabel="z for the law that made the data",
-        yscale="symlog",
-    )
-    axes.legend()
-    return fig
-
-
 def rows(result: Result) -> list[dict]:
     """By motion, then for all data that can tell, and all that cannot, by D."""
     groups = {
@@ -334,9 +311,7 @@ def main(config: Config) -> None:
         }
         for one in result.judged
     ]  # fmt: skip
-    write(
-        result.config, {"groups": summed, "cases": cases}, {"law_comparison": figure(result)}, table
-    )
+    write(result.config, {"groups": summed, "cases": cases}, table=table)
 
 
 if __name__ == "__main__":

@@ -24,16 +24,12 @@ alone the ellipse of 1.1 and all that is farther from a disc, which efforts fed 
 ellipse of 2, which asks for 0.82 and has 0.8, and is lost. Little more than a minute on one core.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -57,7 +53,7 @@ from torchsoft.experiment import markdown, options, timed, write
 from torchsoft.physics.motion import Piecewise, evaluate
 from torchsoft.physics.statics import resting, standing
 from torchsoft.plot.animation import animate
-from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, snapshots
+from torchsoft.plot.figures import snapshots
 from torchsoft.rigs import RigFile
 
 FILE = Path(__file__).parents[1] / "rigs" / "orientation.toml"
@@ -316,24 +312,29 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-@dataclass
+GROUPS = {
+    "loops_alone": "{}",
+    "efforts_fed_forward": "{}, efforts fed forward",
+    "speeds": "disc, {} times as fast",
+    "disc_frictions": "disc, fast, mu = {}",
+    "frictions": "ellipse, fed forward, mu = {}",
+}
+"""Groups of runs, and what the table calls one of them."""
+
+
+@dataclass(frozen=True)
 class Result:
+    """Outcomes by group and key, predictions of rigid statics by shape, lags a / w^2 [mm, deg] by
+    speed, the coefficients of friction that the fast disc asks for, and runs to be drawn."""
+
     config: Config
     gains: Gains
     grip: float  # [N]
-    # the coefficient of friction m a / 2 N that carrying the disc asks for at `disc_speed`
-    carrying: float
-    turning: float  # and I alpha / 2 R N, turning it
-    rigid: dict[str, Rigid] = field(default_factory=dict)  # predictions by shape
-    alone: dict[str, Outcome] = field(default_factory=dict)  # by shape, by loops alone
-    known: dict[str, Outcome] = field(default_factory=dict)  # by shape, with efforts fed forward
-    speeds: dict[float, Outcome] = field(default_factory=dict)
-    lags: dict[float, tuple[float, float]] = field(
-        default_factory=dict
-    )  # a / w^2 [mm, deg] by speed
-    disc_frictions: dict[float, Outcome] = field(default_factory=dict)
-    frictions: dict[float, Outcome] = field(default_factory=dict)
-    runs: dict[str, tuple[Case, Trajectory]] = field(default_factory=dict)  # for the figures
+    outcomes: dict[str, dict[str, Outcome]]
+    rigid: dict[str, Rigid]
+    lags: dict[str, tuple[float, float]]
+    cones: dict[str, float]
+    runs: dict[str, Trajectory]
 
     def verdict(self, one: Outcome) -> str:
         if one.stopped:
@@ -344,75 +345,21 @@ class Result:
 def table(result: Result) -> str:
     """Every run in a row, and what rigid parts ask for."""
     head = (
-        "run",
-        "centre [mm]",
-        "angle [deg]",
-        "at rest [mm]",
-        "[deg]",
-        "friction / normal",
-        "effort [N]",
-        "verdict",
-    )
-    named: list[tuple[str, Outcome]] = [(name, one) for name, one in result.alone.items()]
-    named += [(f"{name}, efforts fed forward", one) for name, one in result.known.items()]
-    named += [
-        (f"disc, {speed:g} times as fast", one)
-        for speed, one in result.speeds.items()
-        if speed != 1
-    ]
-    named += [
-        (f"disc, {result.config.disc_speed:g} times, mu = {mu:g}", x)
-        for mu, x in result.disc_frictions.items()
-    ]
-    aspect = f"{result.config.slipping_aspect:g}"
-    named += [
-        (f"ellipse {aspect}, fed forward, mu = {mu:g}", one) for mu, one in result.frictions.items()
-    ]
+        "run", "centre [mm]", "angle [deg]", "at rest [mm]", "[deg]", "friction / normal",
+        "effort [N]", "verdict",
+    )  # fmt: skip
     rows = [
-        (name, f"{x.position_mm:.4f}", f"{x.angle_deg:.3f}", f"{x.rest_mm:.4f}",
-        f"{x.rest_deg:.4f}", f"{x.friction:.3g}",
-         f"{x.effort:.3g}", result.verdict(x))
-        for name, x in named
+        (GROUPS[group].format(key), f"{x.position_mm:.4f}", f"{x.angle_deg:.3f}",
+         f"{x.rest_mm:.4f}", f"{x.rest_deg:.4f}", f"{x.friction:.3g}", f"{x.effort:.3g}",
+         result.verdict(x))
+        for group, some in result.outcomes.items() for key, x in some.items()
     ]  # fmt: skip
-    fast = f"disc, {result.config.disc_speed:g} times as fast"
     cones = {name: one.friction for name, one in result.rigid.items()}
-    cones |= {f"{fast}, turned": result.turning, f"{fast}, carried": result.carrying}
+    cones |= {f"disc, fast, {name}": mu for name, mu in result.cones.items()}
     asked = markdown(
         ("rigid", "asks for a friction of"), [(name, f"{mu:.3g}") for name, mu in cones.items()]
     )
     return f"{markdown(head, rows)}\n\n{asked}"
-
-
-@rc_context(STYLE)
-def figure(result: Result) -> Figure:
-    """Largest errors in parts of the tolerance: by shape, over speed and over friction; a cross
-    where the body was lost."""
-    c = result.config
-    fig = Figure(figsize=(13, 4), layout="constrained")
-    shape, speed, friction = fig.subplots(1, 3, sharey=True)
-
-    def draw(axes: Axes, label: str, outcomes: Mapping[Any, Outcome], colour: str) -> None:
-        error = [
-            max(one.position_mm / c.position_mm, one.angle_deg / c.angle_deg)
-            for one in outcomes.values()
-        ]
-        axes.plot(list(outcomes), error, "o", color=colour, label=label)
-        lost = {key: one for (key, x), one in zip(outcomes.items(), error) if x.stopped}
-        axes.plot(list(lost), list(lost.values()), "X", color="#cc3311", ms=9)
-
-    draw(shape, "loops alone", result.alone, ACTUAL)
-    draw(shape, "efforts fed forward", result.known, OTHER)
-    draw(speed, "disc", result.speeds, ACTUAL)
-    draw(friction, f"disc, {c.disc_speed:g} times as fast", result.disc_frictions, ACTUAL)
-    draw(friction, f"ellipse {c.slipping_aspect:g}, efforts fed forward", result.frictions, OTHER)
-    shape.tick_params(axis="x", rotation=30)
-    shape.set(yscale="log", ylabel="largest error over its tolerance")
-    speed.set(xscale="log", xlabel="times as fast")
-    friction.set(xscale="log", xlabel="coefficient of friction")
-    for axes in (shape, speed, friction):
-        axes.axhline(1.0, color="#cc3311", ls=":", lw=1.0)
-        axes.legend()
-    return fig
 
 
 def peak(signal: Any) -> float:
@@ -448,95 +395,83 @@ def run(config: Config) -> Result:
     base = case_of(file)
     hurried, disc = faster(base, config.disc_speed), base.rig.bodies["disc"]
     assert isinstance(disc.shape, Circle)
-    R, mass = disc.shape.radius.item(), disc.mass.item()
+    R, mass, inertia = disc.shape.radius.item(), disc.mass.item(), disc.inertia.item()
     weight = base.rig.gravity.item() * mass
     grip = -float(base.signals["grip"](torch.tensor(base.end, dtype=torch.float64))[0].detach())
-    inertia = disc.inertia.item()
-    carrying = mass * peak(hurried.signals["x_d"]) / (2 * grip)
-    turning = inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip)
-    result = Result(config, gains, grip, carrying, turning)
+    cones = {
+        "turning": inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip),
+        "carrying": mass * peak(hurried.signals["x_d"]) / (2 * grip),
+    }
+    outcomes: dict[str, dict[str, Outcome]] = {group: {} for group in GROUPS}
+    result = Result(config, gains, grip, outcomes, {DISC: rigid(disc.shape, grip, weight)}, {},
+                    cones, {})  # fmt: skip
     bar = tqdm(unit="run")
 
-    def attempt(case: Case, name: str = "") -> tuple[Trajectory, Outcome]:
-        bar.set_postfix_str(name)
+    def attempt(case: Case, group: str, key: object) -> Trajectory:
         done, stopped = simulate(case, config.rtol)
+        outcomes[group][str(key)] = outcome(case, done, stopped)
         bar.update()
-        if name:
-            result.runs[name] = case, done
-        return done, outcome(case, done, stopped)
+        return done
 
-    result.alone[DISC] = attempt(base, DISC)[1]
-    result.rigid[DISC] = rigid(disc.shape, grip, weight)
-    result.alone[KINEMATICS] = attempt(by_kinematics(base, gains, R), KINEMATICS)[1]
+    result.runs[DISC] = attempt(base, "loops_alone", DISC)
+    attempt(by_kinematics(base, gains, R), "loops_alone", KINEMATICS)
     for speed in config.speeds:
         case = faster(base, speed)
-        result.lags[speed] = inertia_alone(case, config.bandwidth)
-        result.speeds[speed] = attempt(case)[1]
+        result.lags[str(speed)] = inertia_alone(case, config.bandwidth)
+        attempt(case, "speeds", speed)
     for mu in config.disc_frictions:
         rubbed(base, mu)
-        result.disc_frictions[mu] = attempt(hurried)[1]
+        attempt(hurried, "disc_frictions", mu)
     for name, shape in shapes(config, R).items():
         case, result.rigid[name] = case_of(file, shape), rigid(shape, grip, weight)
-        done, one = attempt(case, name)
-        result.alone[name] = one
+        done, last = attempt(case, "loops_alone", name), outcomes["loops_alone"]
         for _ in range(config.passes):
-            if one.stopped:
+            if last[name].stopped:
                 break
-            case = fed(case, done)
-            done, one = attempt(case, f"{name}, fed")
-            result.known[name] = one
-        if name == f"ellipse {config.slipping_aspect:g}" and not one.stopped:
+            case, last = fed(case, done), outcomes["efforts_fed_forward"]
+            done = result.runs[name] = attempt(case, "efforts_fed_forward", name)
+        if name == f"ellipse {config.slipping_aspect:g}" and not last[name].stopped:
             case = fed(case, done)
             for mu in config.frictions:
                 rubbed(case, mu)
-                result.frictions[mu] = attempt(case)[1]
+                attempt(case, "frictions", mu)
     bar.close()
     return result
 
 
 def summary(result: Result) -> dict[str, Any]:
     """What `summary.json` holds."""
-
-    def rows(outcomes: Mapping[Any, Outcome]) -> dict[str, Any]:
-        return {
-            str(key): one._asdict() | {"verdict": result.verdict(one)}
-            for key, one in outcomes.items()
-        }
-
     return {
         "gains": result.gains,
         "grip_N": result.grip,
         "rigid": {name: one._asdict() for name, one in result.rigid.items()},
-        "loops_alone": rows(result.alone),
-        "efforts_fed_forward": rows(result.known),
-        "speeds": rows(result.speeds),
-        "inertia_alone_mm_deg": {str(key): value for key, value in result.lags.items()},
-        "disc_cones": {"turning": result.turning, "carrying": result.carrying},
-        "disc_frictions": rows(result.disc_frictions),
-        "frictions": rows(result.frictions),
+        "inertia_alone_mm_deg": result.lags,
+        "disc_cones": result.cones,
+    } | {
+        group: {key: one._asdict() | {"verdict": result.verdict(one)} for key, one in some.items()}
+        for group, some in result.outcomes.items()
     }
 
 
 def main(config: Config) -> None:
     result, wall = timed(lambda: run(config))
-    _, done = result.runs[DISC]
     stills = snapshots(
-        done, (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), title="Turned by 90 degrees, then carried"
+        result.runs[DISC], (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), title="A disc turned, then carried"
     )
-    figures = {"orientation": figure(result), "snapshots": stills}
-    write(result.config, summary(result) | {"wall_s": wall}, figures, table(result))
+    write(result.config, summary(result) | {"wall_s": wall}, {"snapshots": stills}, table(result))
     aspect = f"ellipse {config.slipping_aspect:g}"
     videos = {
         "orientation.gif": (DISC, "A disc turned by 90 degrees between two jaws, then carried"),
         "ellipse.gif": (
-            f"{aspect}, fed",
-            f"{aspect.capitalize()}, with efforts fed forward: the jaws give way",
+            aspect, f"{aspect.capitalize()}, with efforts fed forward: the jaws give way",
         ),
-    }
+    }  # fmt: skip
     for file, (name, title) in videos.items():
         if config.animation and name in result.runs:
-            (_, done), path, frames = result.runs[name], config.out / file, result.config.frames
-            animate(done, path, frames=frames, title=title, follow="disc.theta")
+            animate(
+                result.runs[name], config.out / file, frames=result.config.frames, title=title,
+                follow="disc.theta",
+            )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -34,7 +34,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
@@ -87,14 +86,13 @@ class Config:
         0.02,
     )  # held out [s]
     speeds: tuple[float, ...] = (0.005, 0.01, 0.02)  # that tanh(s' / speed) is tried with [m/s]
-    gains: int = 60  # of the sweep
     seed: int = 0
     smoke: bool = False  # a size that takes seconds
 
 
-def law(p: Parameters, R_80: float | None = None) -> dict[str, dict[str, float]]:
+def law(p: Parameters) -> dict[str, dict[str, float]]:
     """The horizontal loop as feedback of the reduced model (Eq. 33, 34)."""
-    K, R = p.control.K_81, R_80 or p.control.R_80
+    K, R = p.control.K_81, p.control.R_80
     x, v = ("x_C", "v_C") if p.control.senses == "disc" else ("x_Br", "v_Br")
     return {"F_x": {"x_d": K, "x_d_dot": R, x: -K, v: -R}}
 
@@ -143,16 +141,11 @@ class Grasp:
     y: torch.Tensor
     force: float
 
-    def model(self, **changed: float) -> SoftGrasp:
-        return SoftGrasp(self.p.override({f"control.{k}": v for k, v in changed.items()}))
-
-    def move(
-        self, x: Profile, duration: float, *, step: float, sample: float, **changed: float
-    ) -> Trajectory:
+    def move(self, x: Profile, duration: float, *, step: float, sample: float) -> Trajectory:
         """The run in which the disc is to follow x_d(t) from the settled grasp."""
         y, force = Profile([0.0], [self.p.scenario.y_Br_grasp]), Profile([0.0], [-self.force])
         t, reference = grid(duration, sample), Reference(x_d=x, y_d=y, F_ff=force)
-        return simulate(self.model(**changed), t, y0=self.y, reference=reference, step=step)
+        return simulate(SoftGrasp(self.p), t, y0=self.y, reference=reference, step=step)
 
 
 def settle(p: Parameters) -> Grasp:
@@ -186,7 +179,7 @@ def sines(
 
 def tapped(grasp: Grasp, config: Config) -> list[Record]:
     """The taps."""
-    rng, (_, v, _), out = np.random.default_rng(config.seed), indices(grasp.model()), []
+    rng, (_, v, _), out = np.random.default_rng(config.seed), indices(SoftGrasp(grasp.p)), []
     for i in range(config.taps):
         kick = config.kick * rng.standard_normal(3) / (1.0, grasp.p.disc.radius, 1.0)
         y = grasp.y.clone()
@@ -208,7 +201,7 @@ def indices(model: SoftGrasp) -> tuple[list[int], list[int], int]:
 def expected(grasp: Grasp, A: np.ndarray, frequency: float = 1.0) -> dict[str, float]:
     """k, c, r and c_r of the linearised full model, pads and stretches condensed at a low frequency
     [Hz]."""
-    model, w = grasp.model(), 2j * np.pi * frequency
+    model, w = SoftGrasp(grasp.p), 2j * np.pi * frequency
     q, v, inner = indices(model)
     inner = slice(0, inner)
     disc, bracket = model.bodies["disc"], model.bodies["bracket"]
@@ -241,7 +234,7 @@ def by_mechanics(e: dict[str, float]) -> dict[tuple[str, str], float]:
     }
 
 
-def study_stick(config: Config) -> tuple[dict[str, Any], Grasp, ReducedModel]:
+def study_stick(config: Config) -> dict[str, Any]:
     changes: dict[str, Any] = COARSE if config.smoke else {}
     times = {"roll_time": 10.0, "hold_time": 5.0, "rest_time": 5.0}
     p = Parameters().override(
@@ -283,7 +276,7 @@ def study_stick(config: Config) -> tuple[dict[str, Any], Grasp, ReducedModel]:
     parts = expected(grasp, A)
     result = score(model_, held)
     fast = rollout_time(model_, held)
-    summary = {
+    return {
         "terms": len(model_.terms), "heldout_nrmse": result.worst,
         "heldout_nrmse_by_state": result.nrmse,
         "validation_nrmse": choice.tried[choice.index]["nrmse"], "speedup": wall / fast,
@@ -291,56 +284,6 @@ def study_stick(config: Config) -> tuple[dict[str, Any], Grasp, ReducedModel]:
         "latex": model_.latex(),
         "rolling_radius_mm": {"found": 1e3 * r, "expected": 1e3 * parts["r"]}, "mechanics": parts,
         "coefficients": compared(model_, by_mechanics(parts)), "thresholds": choice.tried,
-    }  # fmt: skip
-    return summary, grasp, model_
-
-
-def step_response(t: np.ndarray, x: np.ndarray, height: float, begun: float) -> dict[str, float]:
-    """Overshoot over the step's height, and the time after which x stays within 2 % of it [s]."""
-    away = np.abs(x - height) > 0.02 * height
-    last = len(x) - 1 - int(away[::-1].argmax()) if away.any() else 0
-    return {"overshoot": float(x.max() / height - 1), "settling_s": float(t[last] - begun)}
-
-
-def study_gain(config: Config, grasp: Grasp, model: ReducedModel) -> dict[str, Any]:
-    """R_80 swept on the reduced model; a step of 50 um with the own gain and the best one confirmed
-    on the full one."""
-    p, height, begun = grasp.p, 5e-5, 0.01
-    x = Profile([begun, 2 * begun], [0.0, height])
-    t = np.linspace(0.0, 0.4, 1601)
-    u = np.column_stack([part.numpy() for part in x(torch.from_numpy(t))])
-
-    def growth(R: float) -> float:
-        modes = np.linalg.eigvals(model.with_feedback(law(p, R_80=R)).state_space()[0])
-        return float(modes[np.abs(modes) > 1.0].real.max())
-
-    def response(R: float) -> dict[str, float]:
-        out = model.with_feedback(law(p, R_80=R)).rollout(t, np.zeros(6), u)
-        return step_response(t, out.y[:, 0], height, begun) if growth(R) < 0 else {}
-
-    gains = np.geomspace(3.0, 30_000.0, config.gains)
-    rows, cost = timed(
-        lambda: [{"R_80": float(R), "growth_1_s": growth(R), **response(R)} for R in gains]
-    )
-    signs = np.sign([row["growth_1_s"] for row in rows])
-    limits: list[Any] = [
-        brentq(growth, a, b) for a, b, s in zip(gains, gains[1:], np.diff(signs)) if s
-    ]
-    best = min((row for row in rows if "settling_s" in row), key=lambda row: row["settling_s"])
-    confirmed = []
-    for R in [p.control.R_80] if config.smoke else [p.control.R_80, best["R_80"]]:
-        x_full = Profile([begun, 2 * begun], [p.scenario.x_C0, p.scenario.x_C0 + height])
-        run = grasp.move(x_full, 0.4, step=2.5e-4, sample=2.5e-4, R_80=R)
-        x_C = (run["x_C"] - run["x_C"][0]).numpy()
-        early, late = (np.ptp(x_C[i:j]) for i, j in ((600, 1000), (1200, 1600)))
-        confirmed.append({
-            "R_80": R, "growth_reduced_1_s": growth(R), "reduced": response(R),
-            "full": step_response(t, x_C, height, begun),
-            "full_dies_out": bool(late < max(early, 1e-2 * height)),
-        })  # fmt: skip
-    return {
-        "gain": "R_80 [N.s/m]", "limits": limits, "best": best, "sweep": rows, "sweep_wall_s": cost,
-        "confirmed": confirmed,
     }  # fmt: skip
 
 
@@ -463,7 +406,6 @@ class Result:
     config: Config
     stick: dict[str, Any]
     slip: dict[str, Any]
-    gain: dict[str, Any]
 
 
 def run(config: Config) -> Result:
@@ -471,17 +413,13 @@ def run(config: Config) -> Result:
         config = replace(
             config, taps=6, tap_time=0.15, validation=2e-4, scenario=0.2,
             thresholds=(0.03, 0.07, 0.14), models=10, stroke_times=(0.08, 0.05, 0.03),
-            checking_times=(0.06,), other_times=(0.025,), speeds=(0.01,), gains=8,
+            checking_times=(0.06,), other_times=(0.025,), speeds=(0.01,),
         )  # fmt: skip
-    stick, grasp, model = study_stick(config)
-    gain = study_gain(config, grasp, model)
-    slip = study_slip(config)
-    return Result(config, stick, slip, gain)
+    return Result(config, study_stick(config), study_slip(config))
 
 
 def summary(result: Result) -> dict[str, Any]:
-    found = {"stick": result.stick, "slip": result.slip, "gain_sweep": result.gain}
-    return finite(found | {"pysindy": version("pysindy")})
+    return finite({"stick": result.stick, "slip": result.slip, "pysindy": version("pysindy")})
 
 
 def table(result: Result) -> str:
@@ -509,46 +447,17 @@ def table(result: Result) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """Coefficients beside mechanics, errors under slip, and the gain sweep."""
-    fig = Figure(figsize=(15, 4.5), layout="constrained")
-    coefficients, slip, sweep = fig.subplots(1, 3)
-    rows = [row for row in result.stick["coefficients"] if row["expected"]]
-    for i, row in enumerate(rows):
-        coefficients.plot(
-            [x / row["expected"] for x in row["interval"]], [i, i], "C0", lw=3, alpha=0.5
-        )
-        coefficients.plot(row["value"] / row["expected"], i, "oC0")
-    coefficients.axvline(1.0, color="k", lw=0.8)
-    coefficients.set_yticks(
-        range(len(rows)), [f"{row['equation']}': {row['term']}" for row in rows]
-    )
-    coefficients.set(xlabel="over the expectation", title="Stick: coefficients")
-    by = result.slip["by_stroke"]
+    """Errors under slip."""
+    fig = Figure(figsize=(6, 4.5), layout="constrained")
+    axes, by = fig.subplots(), result.slip["by_stroke"]
     for key, label in (
         ("nrmse", "with friction"),
         ("nrmse_linear", "its limit for small slip (linear)"),
     ):
-        slip.loglog(
-            [row["acceleration_m_s2"] for row in by],
-            [100 * min(row[key], 10.0) for row in by],
-            "o-",
-            label=label,
-        )
-    slip.set(
-        xlabel="peak acceleration of the bracket [m/s$^2$]",
-        ylabel="NRMSE [%]",
-        title="Slip: other strokes",
-    )
-    slip.legend()
-    gains = result.gain["sweep"]
-    sweep.semilogx([row["R_80"] for row in gains], [row["growth_1_s"] for row in gains])
-    sweep.axhline(0.0, color="k", lw=0.8)
-    sweep.set(
-        xlabel="gain $R_{80}$ [N s/m]",
-        ylabel="growth of the slowest mode [1/s]",
-        title="Gain sweep",
-        ylim=(None, 30),
-    )
+        errors = [100 * min(row[key], 10.0) for row in by]
+        axes.loglog([row["acceleration_m_s2"] for row in by], errors, "o-", label=label)
+    axes.set(xlabel="peak acceleration of the bracket [m/s$^2$]", ylabel="NRMSE [%]")
+    axes.legend()
     return fig
 
 

@@ -1,13 +1,12 @@
-"""Question: how long does a newcomer wait for a first result, and what does a short run cost?
+"""Question: how long does a newcomer wait for a first result?
 
 A wheel is built from this checkout and unpacked into an empty folder, and every figure comes from
 Python processes that import it from there, medians of repeats:
 
 - imports, and commands that need no simulation;
 - from the end of `import torch`: the first run of 0.3 s, then the first gradient and the first
-  sensitivities, with the kernels of the wheel and, once, with none: then they are compiled;
-- the second run, a run of 0.1 s from a state at hand, and 1,000 runs of 0.3 s on one and two
-  threads, each with parameters of its own.
+  sensitivities, with the kernels of the wheel and, once, with none: then they are compiled. What
+  many runs cost is in `validation/benchmark.py`.
 
 Command: .venv/bin/python experiments/startup.py [--smoke]
 Expected: a first result 1.5 s after `import torch`, 15 s where the kernels are compiled. Two
@@ -60,34 +59,11 @@ times["first sensitivities"] = passed()
 print(json.dumps(times))
 """
 
-SHORT = """
-import json, statistics, sys, time
-import torch
-torch.set_num_threads(1)
-from torchsoft import SoftGrasp, simulate, simulate_batch
-from torchsoft.scenario import grasp_and_roll
-count, m = int(sys.argv[1]), grasp_and_roll(SoftGrasp(), grasp_force=80.66)
-def timed(function):
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
-t, short = (torch.linspace(0, x, n, dtype=torch.float64) for x, n in ((0.3, 31), (0.1, 11)))
-one = [timed(lambda: simulate(m.model, short, y0=m.y0, rtol=1e-3)) for _ in range(21)]
-K_n = m.model.parameter("contact.K_n").detach() * torch.linspace(0.8, 1.2, count).double()
-def batch(threads):
-    simulate_batch(
-        m.model, t, y0=m.y0, rtol=1e-3, parameters={"contact.K_n": K_n}, threads=threads
-    )
-runs = {f"{count} runs, {n} threads": timed(lambda: batch(n)) for n in (1, 2)}
-print(json.dumps({"0.1 s run": statistics.median(one[1:])} | runs))
-"""
-
 
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/startup")
     repeats: int = 5  # processes of which the median is taken
-    runs: int = 1000  # of the batch of short runs
     smoke: bool = False  # a size that takes seconds
 
 
@@ -123,9 +99,9 @@ def medians(rows: Iterable[dict[str, float]]) -> dict[str, float]:
 
 
 def main(config: Config) -> None:
-    repeats, runs = (1, 20) if config.smoke else (config.repeats, config.runs)
+    repeats = 1 if config.smoke else config.repeats
     result: dict[str, Any] = {"level": level()}
-    with TemporaryDirectory() as name, tqdm(total=2 * repeats + 3) as bar:
+    with TemporaryDirectory() as name, tqdm(total=2 * repeats + 2) as bar:
         folder = Path(name)
         site = unpacked(folder)
         wrong = folder / "wrong.toml"
@@ -146,8 +122,6 @@ def main(config: Config) -> None:
             firsts.append(json.loads(python(site, "-c", FIRST)))
             bar.update()
         result |= {"processes_s": medians(rows), "wheel_s": medians(firsts)}
-        result["short_runs_s"] = json.loads(python(site, "-c", SHORT, runs))
-        bar.update()
         for path in (site / "torchsoft/solve/kernel/objects").rglob("*.o"):
             path.unlink()
         empty = {"TORCHSOFT_CACHE_DIR": str(folder / "cache")}
@@ -161,7 +135,6 @@ def main(config: Config) -> None:
                 {"of the wheel": result["wheel_s"], "compiled": result["fallback_s"]},
                 3,
             ),
-            numbers("short runs, wall time [s]", {"": result["short_runs_s"]}, 3),
         ]
     )
     write(config, result, table=table)

@@ -51,15 +51,3 @@ def test_knots_are_reached_from_the_grasp():
         [y, y - 1e-3, y - 1.05e-3, y - 1.1e-3, y - 1.1e-3, y - 1.1e-3]
     )
     assert rate[[0, 1, 2, 4, 5], 0].abs().max() == 0
-
-
-@pytest.mark.parametrize(
-    "motion", [Knots(x=((0.1, 4e-3),)), *(one.motion for one in CATALOGUE.values())]
-)
-def test_a_file_holds_an_excitation_to_the_bit(motion, tmp_path):
-    excitation, path = (
-        Excitation(motion=motion, depth=1 / 3e3, duration=3.0),
-        tmp_path / "excitation.toml",
-    )
-    path.write_text(excitation.to_toml(), encoding="utf-8")
-    assert Excitation.from_toml(path) == excitation

@@ -52,7 +52,6 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
         "multibond.dot",
         "animation.gif",
         "snapshots.png",
-        "friction_sets.png",
     } <= names
     assert not [name for name in names if "partial" in name]
     lines = module.table(numbers).splitlines()
@@ -62,13 +61,15 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
 
 def test_pad_fidelity_smoke(tmp_path: Path) -> None:
     """Inertia changes the disc by nanometres and the forces by millinewtons, and more in a fast
-    stroke."""
+    stroke; the mesh moves the grasp by little, eta not at all."""
     module = experiment("pad_fidelity")
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    slow, fast = result.differences.values()
+    slow, fast, mesh, eta = result.differences.values()
     assert slow["y_C"]["difference"] < 0.02  # [um]
     assert slow["F_y"]["difference"] < 10  # [mN]
     assert fast["x_C"]["difference"] > slow["x_C"]["difference"]
+    assert mesh["y_C"]["difference"] < 30  # [um]
+    assert eta["F_y"]["difference"] < 10
     assert "| F_y | mN |" in module.table(result)
 
 
@@ -88,16 +89,6 @@ def test_step_accuracy_smoke(tmp_path: Path) -> None:
     assert equal["refused"] == 0
     assert module.table(rows).count("|\n") == 4
     assert len(module.figure(result).axes) == 1
-
-
-def test_refinement_smoke(tmp_path: Path) -> None:
-    """The mesh moves the grasp by little; eta not at all."""
-    module = experiment("refinement")
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    two, one = result.meshes.values()
-    assert abs(two["y_C_grasp_mm"] - one["y_C_grasp_mm"]) < 0.03
-    smooth, limit = result.etas.values()
-    assert abs(smooth["F_y_grasp_N"] - limit["F_y_grasp_N"]) < 0.01
 
 
 @pytest.mark.slow
@@ -129,31 +120,6 @@ def test_peers_smoke() -> None:
     assert "scipy LSODA" in module.peers_table(numbers)
 
 
-@pytest.mark.slow
-def test_random_runs_smoke(tmp_path: Path) -> None:
-    """Every run ends, finite or with a sentence; one that takes too much of the processor's time is
-    ended."""
-    module = importlib.import_module(
-        "random_runs"
-    )  # by its own name, which worker processes import
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    numbers = module.summary(result)
-    for way in module.WAYS:
-        kinds = numbers[way]["kinds"]
-        assert sum(kinds.values()) == numbers["runs"] == len(result.motions)
-        assert not [
-            kind
-            for kind in kinds
-            if kind in (module.NOT_FINITE, module.HUNG) or "without a sentence" in kind
-        ]
-        assert all(
-            one.sentence for one in result.outcomes[way].values() if one.kind != module.FINISHED
-        )
-    assert f"of {numbers['runs']} runs" in module.table(numbers)
-    short = module.run(module.Config(out=tmp_path, runs=1, workers=1, limit=0.01))
-    assert module.summary(short)["tolerances"]["kinds"] == {module.HUNG: 1}
-
-
 def test_experiment_design_smoke(tmp_path: Path) -> None:
     """Jerks of a light grasp see friction and dashpots better than strokes; together they see more
     than either alone."""
@@ -165,7 +131,6 @@ def test_experiment_design_smoke(tmp_path: Path) -> None:
     assert single["jerks, light"]["contact.R_n"] < single["strokes"]["contact.R_n"]
     assert all(both[name] <= min(sd[name] for sd in single.values()) for name in module.NAMES)
     assert all(row["inconsistency"] < module.CONSISTENT for row in summary["single"])
-    assert (tmp_path / "experiment_design.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
@@ -185,7 +150,7 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
         )  # each rests within 0.2
     assert max(cases["noisy"]["heldout_nrmse"]["shaking"].values()) < 0.05
     assert cases["finite differences"]["simulations"] > 2 * cases["noisy"]["jacobians"]
-    assert {"report.html", "identify_contact.png"} <= {path.name for path in tmp_path.iterdir()}
+    assert (tmp_path / "report.html").exists()
 
 
 @pytest.mark.slow
@@ -201,40 +166,28 @@ def test_identify_by_touch_smoke(tmp_path: Path) -> None:
         assert max(abs(one["error_in_sd"]) for one in fit.values()) < 3.5
     assert max(summary["chi2"].values()) == pytest.approx(1.0, abs=0.1)
     assert summary["jacobian"]["ratio"] < 2.0  # one timing in a test
-    assert (tmp_path / "identify_by_touch.png").exists()
 
 
 @pytest.mark.slow
 def test_interval_coverage_smoke(tmp_path: Path) -> None:
     """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour
-    is found where it is."""
+    is found where it is, and rig files are identified by their names."""
     module = experiment("interval_coverage")
     module.main(module.Config(out=tmp_path, smoke=True))
     cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
-    mean = {
-        case: sum(abs(e) for one in row["parameters"].values() for e in one["errors"]) / 8
+    errors = {
+        case: [abs(e) for one in row["parameters"].values() for e in one["errors"]]
         for case, row in cases.items()
     }
+    mean = {case: sum(some) / len(some) for case, some in errors.items()}
     assert 0.1 < mean["white"] < 2
     assert 0.1 < mean["coloured"] < 2
     assert mean["coloured, ignored"] > 1.5 * mean["coloured"]
     assert cases["white"]["notices"] == cases["white"]["orders"] == {}
     assert sum(cases["coloured"]["orders"].values()) == 14
-    assert (tmp_path / "interval_coverage.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_rig_files_smoke(tmp_path: Path) -> None:
-    """Errors of a few standard deviations, of the numbers of both rigs."""
-    module = experiment("rig_files")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    rigs = json.loads((tmp_path / "summary.json").read_text())["rigs"]
-    assert set(rigs) == {"two fingers", "two jaws"}
-    for name, row in rigs.items():
-        assert set(row["unknowns"]) == set(module.CASES[name].few)
-        assert all(abs(e) < 4 for one in row["unknowns"].values() for e in one["errors"])
-        assert row["chi2"] == pytest.approx([1.0, 1.0], abs=0.15)
-    assert (tmp_path / "rig_files.png").stat().st_size > 10_000
+    for name, lab in (("two fingers", module.FINGERS), ("two jaws", module.JAWS)):
+        assert list(cases[name]["parameters"]) == list(lab.truth)[:3]
+        assert max(errors[name]) < 4
 
 
 @pytest.mark.slow
@@ -248,7 +201,6 @@ def test_contact_points_smoke(tmp_path: Path) -> None:
     name = "static ripple of the force along the pad [mN]"
     assert between[name] < 0.3 * nodes[name]
     assert max(case["gradient from differences over 1e-06"] for case in (nodes, between)) < 5e-5
-    assert (tmp_path / "contact_points.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
@@ -275,7 +227,7 @@ def test_orientation_smoke(tmp_path: Path) -> None:
         summary["inertia_alone_mm_deg"]["6.0"][0], rel=0.2
     )
     assert summary["frictions"]["0.2"]["stopped"].startswith("at t = ")
-    assert {"orientation.png", "snapshots.png", "orientation.gif", "ellipse.gif"} <= {
+    assert {"snapshots.png", "orientation.gif", "ellipse.gif"} <= {
         x.name for x in tmp_path.iterdir()
     }
 
@@ -294,32 +246,24 @@ def test_orientation_rig_has_the_gains_of_its_design() -> None:
 
 
 @pytest.mark.slow
-def test_shapes_and_materials_smoke(tmp_path: Path) -> None:
-    """Force and power give one resistance, near theory's; a shape that would slide is refused, a
-    hexagon rolls."""
-    module = experiment("shapes_and_materials")
+def test_rolling_resistance_smoke(tmp_path: Path) -> None:
+    """Force and power give one resistance, near theory's, with a peak."""
+    module = experiment("rolling_resistance")
     module.main(module.Config(out=tmp_path, smoke=True))
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert "it would slide" in summary["refused"]["long box"]
-    assert set(summary["objects"]) == {"circle", "rounded hexagon"}
     (one,) = summary["resistance"].values()
     assert one["power over force less one, largest"] < 0.02
     assert 0.97 < min(one["force over theory"]) < max(one["force over theory"]) < 1.06
     low, top, high = (roll["force"] for roll in one["rolls"])
     assert top > 1.2 * max(low, high)  # the peak
     assert summary["by load"]["10 N"]["force over theory"] == pytest.approx(1.01, abs=0.02)
-    assert (
-        summary["rubbers"]["standard linear solid"]["the paper's loop on it, leading mode [1/s]"][0]
-        > 50
-    )
-    names = {path.name for path in tmp_path.iterdir()}
-    assert {"objects.png", "rubbers.png", "paths.png", "resistance.png", "table.md"} <= names
+    assert {"rolling_resistance.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_the_theories_of_rolling_meet() -> None:
     """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the
     moving contact is the closed form's, with the same peak."""
-    theory = experiment("_shapes_resistance")
+    theory = experiment("rolling_resistance")
     h, nu = 4e-3, 0.3
     long, deep, deeper = theory.layer_compliance(np.array([1e-3, 11.9, 12.1]) / h, h, nu)
     assert long[1, 1].real == pytest.approx(h * (1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-5)

@@ -11,9 +11,10 @@ EXACT = 1e-6
 
 
 @pytest.mark.slow
-def test_gradient_accuracy_smoke(tmp_path: Path) -> None:
+def test_gradient_accuracy_smoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = experiment("gradient_accuracy")
-    module.write(module.run(module.Config(out=tmp_path, smoke=True)))
+    monkeypatch.setattr("sys.argv", ["", "--smoke", "--out", str(tmp_path)])
+    module.main()
     numbers = json.loads((tmp_path / "summary.json").read_text())
     assert set(numbers["windows"]) == {"stick", "slip", "make-break", "grasp", "full"}
     slip, stick, grasp = (numbers["windows"][name] for name in ("slip", "stick", "grasp"))

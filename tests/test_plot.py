@@ -219,12 +219,8 @@ DRAWN: dict[str, Callable[[Rig, Trajectory], Figure]] = {
     "dashboard": lambda m, r: dashboard(r),
     "page": lambda m, r: dashboard(r, look="page"),
     "column": lambda m, r: dashboard(r, look="column", only=("scene", *list(panels(r))[:2])),
-    "force_distribution": lambda m, r: figures.force_distribution(r, 0.125),
     "snapshots": lambda m, r: figures.snapshots(r, (0.05, 0.1, 0.15, 0.2)),
     "snapshots_of_the_end": lambda m, r: figures.snapshots(r),
-    "friction_comparison": lambda m, r: figures.friction_comparison(
-        {"one": r, "two": r}, (0.1, 0.2), next(iter(r))
-    ),
     "multibond_graph": lambda m, r: multibond_graph(m),
 }
 

@@ -13,7 +13,7 @@ def test_reduced_model_smoke(tmp_path: Path) -> None:
     module = experiment("reduced_model")
     result = module.run(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads(json.dumps(module.summary(result), allow_nan=False))
-    stick, slip, gain = numbers["stick"], numbers["slip"], numbers["gain_sweep"]
+    stick, slip = numbers["stick"], numbers["slip"]
     assert stick["terms"] <= 10
     assert stick["heldout_nrmse"] < 0.02
     assert stick["rolling_radius_mm"]["found"] == pytest.approx(
@@ -31,10 +31,5 @@ def test_reduced_model_smoke(tmp_path: Path) -> None:
     assert (
         fastest["nrmse_linear"] > 2 * fastest["nrmse"]
     )  # saturation is what the faster strokes need
-    confirmed = gain["confirmed"][0]
-    assert confirmed["full_dies_out"]
-    assert confirmed["reduced"]["overshoot"] == pytest.approx(
-        confirmed["full"]["overshoot"], abs=0.02
-    )
-    assert len(module.figure(result).axes) == 3
+    assert len(module.figure(result).axes) == 1
     assert "| stick |" in module.table(result)

@@ -295,15 +295,3 @@ def test_law_comparison_smoke(tmp_path: Path) -> None:
         > 1
         > max(case["D"] for case in summary["cases"][2:])
     )
-    assert (tmp_path / "law_comparison.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_resume_after_kill_smoke(tmp_path: Path) -> None:
-    """Both answers are the undisturbed one, and the one killed in a write had kept some runs."""
-    module = experiment("resume_after_kill")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert [case["wrong"] for case in summary["cases"]] == ["", ""]
-    assert summary["cases"][1]["writing"]
-    assert summary["cases"][1]["remembered"] >= summary["cases"][1]["kept"] > 0

@@ -1,12 +1,11 @@
 """Motions that make parameters visible: a grasp of a given depth, then strokes, sines, chirps,
 presses, jerks or knots.
 
-An `Excitation` is plain validated data, so that it can stand in a TOML file; `begin` turns it into
-a model at rest with the reference that its controllers follow.
+An `Excitation` is plain validated data; `begin` turns it into a model at rest with the reference
+that its controllers follow.
 """
 
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -19,7 +18,7 @@ from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp, apart
 from torchsoft.physics.motion import FADE, Knotted, Profile, Reference, Wave, Waves, wave
 from torchsoft.physics.statics import BuiltRig
-from torchsoft.tables import LISTED, SEED, Table, from_toml, toml_row
+from torchsoft.tables import LISTED, SEED, Table
 
 MOST = 10_000
 """Strokes in one motion."""
@@ -162,18 +161,6 @@ class Excitation(Table):
                     f"{last:g} s"
                 )
         return self
-
-    @classmethod
-    def from_toml(cls, path: str | Path) -> Self:
-        """Read from a TOML file. Raises `InvalidTable` in one sentence."""
-        return from_toml(path, cls.model_validate)
-
-    def to_toml(self) -> str:
-        """The text of a TOML file that `from_toml` reads."""
-        fields = self.model_dump(mode="json")
-        motion = fields.pop("motion")
-        rows, others = ([toml_row(*row) for row in table.items()] for table in (fields, motion))
-        return "\n".join([*rows, "", "[motion]", *others, ""])
 
     def settings(self, p: Parameters) -> Parameters:
         """The parameters p with this excitation's grasp. Raises `ValueError` for a grasp that is

@@ -50,9 +50,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; name a file, perhaps one in it")
-    make_folder(path.parent)
     remove_partials(path.parent.glob(f"{escape(path.name)}.*.partial"))
-    partial, handle = new_partial(path)
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
+    handle = hold(partial)
+    assert handle is not None  # of a name of its own
     try:
         yield partial
         flush(partial)
@@ -65,21 +66,6 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         os.close(handle)
     flush_folder(path.parent)
-
-
-def new_partial(path: Path) -> tuple[Path, int]:
-    """An empty file beside `path` under a name of its own, and a handle that holds its lock."""
-    while True:
-        partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
-        handle = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        with suppress(
-            OSError
-        ):  # where the file system has no locks, nobody removes partial files either
-            if fcntl is not None:
-                fcntl.flock(handle, fcntl.LOCK_EX)
-        if partial.exists():
-            return partial, handle
-        os.close(handle)  # removed between its making and its lock
 
 
 @contextmanager

@@ -4,17 +4,16 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def prepare_worker(prepare: Callable[..., None] | None = None, *arguments: Any) -> None:
+def prepare_worker() -> None:
     """Leave Ctrl-C to the parent, end with it however it ends, and compute on one thread."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
@@ -26,24 +25,16 @@ def prepare_worker(prepare: Callable[..., None] | None = None, *arguments: Any) 
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
-    if prepare is not None:
-        prepare(*arguments)
 
 
 @contextmanager
-def local_processes(
-    workers: int, prepare: Callable[..., None] | None = None, *arguments: Any
-) -> Iterator[ProcessPoolExecutor]:
-    """A pool of spawned processes, each begun with `prepare(*arguments)`.
-
-    Scripts that use it need the usual `if __name__ == "__main__"`.
-    """
+def local_processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of spawned processes. Scripts that use it need the usual `if __name__ ==
+    "__main__"`."""
     for name in THREADS:
         os.environ[name] = "1"
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(
-        workers, context, initializer=prepare_worker, initargs=(prepare, *arguments)
-    )
+    pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker)
     try:
         yield pool
     finally:

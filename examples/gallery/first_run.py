@@ -9,7 +9,6 @@ rubber pads and rolled by 20 mm; the picture shows the forces on every touching 
 import torch
 
 from torchsoft import SoftGrasp, simulate
-from torchsoft.plot.figures import force_distribution
 from torchsoft.scenario import grasp_and_roll
 
 model = SoftGrasp()  # the paper's rig
@@ -21,4 +20,4 @@ for time in (0, 1000, 3000):
     print(f"t = {t[time]:4.0f} s: x_C = {1e3 * run['x_C'][time]:.3f} mm")
 print(f"the disc turns by {run['theta'][1000]:.3f} rad; {manipulation.grasp_force:.1f} N hold it")
 
-figure = force_distribution(run, 5.0)
+figure = run.plot(time=5.0, only=("scene", "contact U", "contact L"))

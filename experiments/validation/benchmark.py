@@ -22,6 +22,7 @@ steps; forces need rtol 1e-4 to be as exact as by 2 ms. About five minutes, thre
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -201,15 +202,18 @@ OURS = "torchsoft (SDIRK2)"
 
 @dataclass(frozen=True)
 class Attempt:
-    """One method at one tolerance: wall time of the window [s], right-hand sides, largest
-    errors."""
+    """One method at one tolerance: wall time of the window [s], right-hand sides, largest errors of
+    the disc's place [nm] and of the forces, over the largest."""
 
     method: str
     rtol: float
     wall_s: float
     calls: int
     position_nm: float
-    force: float  # over the largest
+    force: float
+
+    def as_exact(self, goal: "Attempt") -> bool:
+        return self.position_nm <= goal.position_nm and self.force <= goal.force
 
 
 class Window:
@@ -237,23 +241,19 @@ class Window:
     def attempt(
         self, method: str, rtol: float, solve: Callable[[], Array], repeats: int
     ) -> Attempt:
-        """Run and time one method; repeated runs are timed after the first."""
-        self.f.calls = 0
+        """Run and time one method, in the first run with what it compiles."""
+        self.f.calls, lost = 0, Attempt(method, rtol, np.inf, 0, np.inf, np.inf)
         try:
-            y, first = timed(solve)
-        except (
-            RuntimeError,
-            AssertionError,
-        ):  # a trial state without forces, or steps that underflow
-            return Attempt(method, rtol, np.inf, self.f.calls, np.inf, np.inf)
+            y = solve()
+        except (RuntimeError, AssertionError):  # a trial state without forces, or steps of nothing
+            return lost
         if y.shape != self.exact.shape:  # given up on the way
-            return Attempt(method, rtol, first, self.f.calls, np.inf, np.inf)
-        calls = self.f.calls
-        walls = [timed(solve)[1] for _ in range(repeats)] or [first]
-        position = 1e9 * float(np.abs(y - self.exact)[:, self.place].max())
-        off = np.linalg.norm((y - self.exact)[:, self.pads], axis=1).max()
-        force = float(off / np.linalg.norm(self.exact[:, self.pads], axis=1).max())
-        return Attempt(method, rtol, median(walls), calls, position, force)
+            return lost
+        calls, wall = self.f.calls, median(timed(solve)[1] for _ in range(repeats))
+        off = np.abs(y - self.exact)
+        largest = np.linalg.norm(self.exact[:, self.pads], axis=1).max()
+        force = float(np.linalg.norm(off[:, self.pads], axis=1).max() / largest)
+        return Attempt(method, rtol, wall, calls, 1e9 * float(off[:, self.place].max()), force)
 
 
 Solver = Callable[[float], Callable[[], Array]]
@@ -351,51 +351,30 @@ def peers(config: Config) -> dict[str, Any]:
     exact."""
     w, repeats = Window(config), min(config.repeats, 3)
     solvers = scipy_solvers(w) | torchdiffeq_solvers(w) | diffrax_solvers(w)
-    goals = {
-        rtol: w.attempt(
-            OURS,
-            rtol,
-            lambda rtol=rtol: simulate(w.model, w.t, y0=w.y0, rtol=rtol).y.numpy(),
-            max(repeats, 9),
-        )
-        for rtol in config.rtols
-    }
+
+    def own(rtol: float) -> Array:
+        return simulate(w.model, w.t, y0=w.y0, rtol=rtol).y.numpy()
+
+    goals = {rtol: w.attempt(OURS, rtol, partial(own, rtol), 9) for rtol in config.rtols}
     hardest, attempts = goals[min(goals)], dict[str, list[Attempt]]()
     for name, solver in tqdm(solvers.items(), unit="integrator", leave=False):
         attempts[name] = []
         for rtol in RTOLS[:: 2 if config.smoke else 1]:
-            attempts[name].append(w.attempt(name, rtol, solver(rtol), 0))
-            if as_exact(attempts[name][-1], hardest):
+            attempts[name].append(w.attempt(name, rtol, solver(rtol), repeats))
+            if attempts[name][-1].as_exact(hardest):
                 break
     out: dict[str, Any] = {"window_s": config.window, "begin_s": BEGIN, "equal": {}}
-
-    def described(one: Attempt, goal: Attempt) -> dict[str, Any]:
-        over = {
-            "wall_per_simulated": one.wall_s / config.window,
-            "over_torchsoft": one.wall_s / goal.wall_s,
-        }
-        return asdict(one) | over
-
     for rtol, goal in goals.items():
-        rows: dict[str, Any] = {OURS: described(goal, goal)}
-        for name, some in attempts.items():
-            rows[name] = None
-            for found in (
-                one for one in some if as_exact(one, goal)
-            ):  # timed again, it has to be as exact again
-                again = w.attempt(
-                    name, found.rtol, solvers[name](found.rtol), repeats if found.wall_s < 2 else 1
-                )
-                if as_exact(again, goal):
-                    rows[name] = described(again, goal)
-                    break
-        out["equal"][f"rtol = {rtol:g}"] = rows
-    out["attempts"] = {name: [asdict(one) for one in some] for name, some in attempts.items()}
+        rows = {name: next((one for one in some if one.as_exact(goal)), None)
+                for name, some in ({OURS: [goal]} | attempts).items()}  # fmt: skip
+        out["equal"][f"rtol = {rtol:g}"] = {
+            name: one and asdict(one) | {
+                "wall_per_simulated": one.wall_s / config.window,
+                "over_torchsoft": one.wall_s / goal.wall_s,
+            }
+            for name, one in rows.items()
+        }  # fmt: skip
     return out
-
-
-def as_exact(one: Attempt, goal: Attempt) -> bool:
-    return one.position_nm <= goal.position_nm and one.force <= goal.force
 
 
 def peers_table(numbers: dict[str, Any]) -> str:

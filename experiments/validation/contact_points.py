@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -58,13 +57,6 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    numbers: dict[Key, dict[str, float]]
-    curves: dict[Key, tuple[Tensor, Tensor]]  # times [s] and F_x less its trend [N]
-
-
 def build(elements_x: int, points: int, changes: dict[str, Any] | None = None) -> SoftGrasp:
     mesh = {
         "pad.elements_x": elements_x,
@@ -74,10 +66,10 @@ def build(elements_x: int, points: int, changes: dict[str, Any] | None = None) -
     return SoftGrasp(Parameters().override(mesh | (changes or {})))
 
 
-def detrended(t: Tensor, x: Tensor, window: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """Times in the window, and the signal there less its cubic trend."""
+def ripple(t: Tensor, x: Tensor, window: tuple[float, float]) -> float:
+    """Half of the peak-to-peak of a signal in the window, less its cubic trend."""
     t, x = (signal[(t >= window[0]) & (t <= window[1])] for signal in (t, x))
-    return t, x - torch.from_numpy(np.polyval(np.polyfit(t, x, 3), t.numpy()))
+    return 0.5 * float(np.ptp(x.numpy() - np.polyval(np.polyfit(t, x, 3), t.numpy())))
 
 
 @torch.no_grad()
@@ -126,56 +118,45 @@ def gradient(case: Key, x: float) -> dict[float, float]:
     return errors
 
 
-def run(config: Config) -> Result:
+def run(config: Config) -> dict[str, dict[str, float]]:
+    """Numbers of every case by its label."""
     if config.smoke:
         config = replace(config, elements_x=(120,), points=(0, 2), places=5, gradient_mm=(0.0,),
             duration=0.8,
                          window=(0.5, 0.8))  # fmt: skip
-    found, curves = {}, {}
+    out = {}
     for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
-        found[case] = static(config, case)
         m = grasp_and_roll(build(*case))
         rolled = simulate(m.model, grid(config.duration, 5e-3), y0=m.y0)
         F_x = rolled["F_x"]
-        curves[case] = detrended(rolled.t, F_x, config.window)
         errors = [gradient(case, 1e-3 * (config.node_mm + x)) for x in config.gradient_mm]
-        found[case] |= {
-            "peak of F_x [mN]": 1e3 * F_x.abs().max().item(),
-            "ripple of F_x [mN]": 0.5e3 * float(np.ptp(curves[case][1].numpy())),
-            "theta at the end [rad]": rolled["theta"][-1].item(),
-            "energy residual, relative": rolled.energy_residual_rel,
-            "points that touch at the end": sum(
-                (force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()
-            ),
-            "Newton iterations a step": rolled.stats.newton_per_step,
-        } | {f"gradient from differences over {d:g}": max(e[d] for e in errors) for d in errors[0]}
-    return Result(config, found, curves)
-
-
-def label(case: Key) -> str:
-    return f"{120 / case[0]:g} mm, {case[1] or 'nodes'}"
-
-
-def figure(result: Result) -> Figure:
-    """F_x of the manipulation, less its trend."""
-    fig = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = fig.subplots()
-    for case, (t, F_x) in result.curves.items():
-        axes.plot(t, 1e3 * F_x, lw=1, label=label(case))
-    axes.set(xlabel="time [s]", ylabel="$F_x$ less a cubic trend [mN]")
-    axes.legend(fontsize="small", ncols=2)
-    return fig
+        out[f"{120 / case[0]:g} mm, {case[1] or 'nodes'}"] = (
+            static(config, case)
+            | {
+                "peak of F_x [mN]": 1e3 * F_x.abs().max().item(),
+                "ripple of F_x [mN]": 1e3 * ripple(rolled.t, F_x, config.window),
+                "theta at the end [rad]": rolled["theta"][-1].item(),
+                "energy residual, relative": rolled.energy_residual_rel,
+                "points that touch at the end": sum(
+                    (force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()
+                ),
+                "Newton iterations a step": rolled.stats.newton_per_step,
+            }
+            | {
+                f"gradient from differences over {d:g}": max(e[d] for e in errors)
+                for d in errors[0]
+            }
+        )
+    return out
 
 
 def main(config: Config) -> None:
-    result = run(config)
-    cases = {label(case): one for case, one in result.numbers.items()}
+    cases = run(config)
     rows = {
         name: {case: one[name] for case, one in cases.items()}
         for name in next(iter(cases.values()))
     }
-    figures = {"contact_points": figure(result)}
-    write(config, {"cases": cases}, figures, numbers("elements, points", rows))
+    write(config, {"cases": cases}, table=numbers("elements, points", rows))
 
 
 if __name__ == "__main__":

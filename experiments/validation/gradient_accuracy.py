@@ -1,5 +1,4 @@
-"""Question: how exact are the two routes to a gradient, in every contact mode, and what do they
-cost?
+"""Question: how exact are the two routes to a gradient, in every contact mode?
 
 The loss over a window of outputs t_k is L = mean over k and i of (1/2 + (t_k - t_0)/(t_T - t_0))
 (z_ki + z_ki^2 / 2), with z = (q - mean q) / std q of the nominal run, constants both, and q = (x_C,
@@ -17,17 +16,15 @@ Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms w
 um above touching) and `full` (the 30 s manipulation).
 
 Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k. How far
-gradients depend on the step is in `step_accuracy.py`.
+gradients depend on the step is in `step_accuracy.py`, and their price in `benchmark.py`.
 
 Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
 Expected, largest error of both routes among parameters whose central difference is itself known to
 1e-6: 6e-7 in each of the short windows, 6e-6 over 30 s and 180 node events; elsewhere within the
-judge's uncertainty. With the adjoint a run takes 1.3 to 1.9 times as long. Coulomb's law with mu_s
-> mu_k: it calls dL/dmu_s 0, the loss falls with a slope of -0.105 +- 0.01; with mu_s = mu_k they
-agree to 2e-4. About seven minutes on one core.
+judge's uncertainty. Coulomb's law with mu_s > mu_k: the adjoint calls dL/dmu_s 0, the loss falls
+with a slope of -0.105 +- 0.01; with mu_s = mu_k they agree to 2e-4. About six minutes on one core.
 """
 
-import statistics
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -35,13 +32,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
-from torchsoft.experiment import COARSE, at_the_points, markdown, options, timed
-from torchsoft.experiment import write as write_files
+from torchsoft.experiment import COARSE, at_the_points, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.solve.trajectory import channels
@@ -80,7 +75,6 @@ class Config:
     )  # the same over the whole manipulation, where a run takes a second
     coulomb_ms: float = 0.02  # step of the runs with Coulomb's law [ms]
     coulomb_runs: int = 81  # runs over which the slope of its loss is averaged
-    repeats: int = 5  # runs of which a time is the median
     duration: float = 30.0  # of the full window [s]
     only: tuple[str, ...] = ()  # scalar parameters; all of them if none is named
     changes: tuple[
@@ -221,37 +215,18 @@ def by_sensitivities(window: Window, loss: Callable[[Tensor], Tensor], config: C
 ROUTES = {"discrete": by_backward, "forward": by_sensitivities}
 
 
-def priced(
-    window: Window, loss: Callable[[Tensor], Tensor], config: Config, route: str
-) -> tuple[Gradient, dict[str, float]]:
-    """Gradient of a route, the median time of a plain run [s], and the median time with the
-    gradient over it."""
-    plain, total, gradient = [], [], Gradient()
-    for _ in range(config.repeats):
-        with torch.no_grad():
-            plain.append(timed(lambda: states(window))[1])
-        gradient, spent = timed(lambda: ROUTES[route](window, loss, config))
-        total.append(spent)
-    forward_s = statistics.median(plain)
-    return gradient, {"forward_s": forward_s, "total": statistics.median(total) / forward_s}
-
-
 @torch.no_grad()
 def events(window: Window, y: Tensor) -> dict[str, Any]:
-    """Nodes that touch, leave, slip and begin to slip between the outputs."""
+    """Nodes that touch, leave and begin to slip between the outputs."""
     parts = [
         at_the_points(window.model, window.t[rows], y[rows])
         for rows in torch.arange(len(y)).split(200)
     ]
     depth, speed = (torch.cat(part) for part in zip(*parts))
-    on = depth > 0
-    slipping = (speed > 0) & on
-    touch, leave, onset = on[1:] & ~on[:-1], on[:-1] & ~on[1:], slipping[1:] & ~slipping[:-1]
-    return {
-        "steps": len(y) - 1, "touching": on.sum(1).max().item(), "touch": touch.sum().item(),
-        "leave": leave.sum().item(), "slipping": slipping.any(0).sum().item(),
-        "slip_onsets": onset.sum().item(), "fastest_slip_mm_s": 1e3 * (speed * on).max().item(),
-    }  # fmt: skip
+    on, slips = depth > 0, (speed > 0) & (depth > 0)
+    changes = {"touch": on[1:] & ~on[:-1], "leave": on[:-1] & ~on[1:]}
+    changes |= {"slip_onsets": slips[1:] & ~slips[:-1]}
+    return {name: some.sum().item() for name, some in changes.items()}
 
 
 def stroke(
@@ -306,19 +281,17 @@ def windows(config: Config) -> list[Window]:
 
 
 def judge_window(window: Window, config: Config) -> dict[str, Any]:
-    """Errors and costs of the routes over one window."""
+    """Errors of the routes over one window."""
     loss = make_loss(window)
     with torch.no_grad():
         found = events(window, states(window))
     steps = config.full_steps if window.name == "full" else config.steps
     judge, unsure = central_differences(window, loss, config, steps)
-    routes = {route: priced(window, loss, config, route) for route in ROUTES}
-    gradients = {route: gradient for route, (gradient, _) in routes.items()}
+    gradients = {name: route(window, loss, config) for name, route in ROUTES.items()}
     return {
         "events": found, "gradient": judge, "judge_uncertainty": unsure,
         "relative_error": {route: relative_errors(g, judge) for route, g in gradients.items()},
         "discrete_against_forward": relative_errors(gradients["forward"], gradients["discrete"]),
-        "cost_ratio": {route: cost for route, (_, cost) in routes.items()},
     }  # fmt: skip
 
 
@@ -375,8 +348,7 @@ def coulomb(config: Config) -> dict[str, Any]:
         slope = sum(slopes) / len(slopes)
         out[label] = {
             "events": events(window, y.detach()), "adjoint": adjoint, "slope": slope,
-            "slopes": slopes, "widths": WIDTHS, "uncertainty": (max(slopes) - min(slopes)) / 2,
-            "mu": (middle * (1 + changes)).tolist(), "loss": scan,
+            "slopes": slopes, "uncertainty": (max(slopes) - min(slopes)) / 2,
         }  # fmt: skip
     return out
 
@@ -392,7 +364,7 @@ def run(config: Config) -> Result:
     if config.smoke:  # the same questions for three parameters on a coarse mesh
         config = replace(
             config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25,
-            coulomb_runs=17, repeats=1, duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
+            coulomb_runs=17, duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
             changes=tuple(COARSE.items()),
         )  # fmt: skip
     judged = {
@@ -402,19 +374,19 @@ def run(config: Config) -> Result:
 
 
 def table(result: Result) -> str:
-    """Markdown: per window and route the largest error and the cost; then the Coulomb bias."""
+    """Markdown: per window and route the largest error; then the Coulomb bias."""
     rows = []
     for name, window in result.windows.items():
         for route, errors in window["relative_error"].items():
-            worst, cost = max(errors, key=lambda n: errors[n]), window["cost_ratio"][route]
+            worst = max(errors, key=lambda n: errors[n])
             e, unsure = window["events"], window["judge_uncertainty"]
             known = max((errors[n] for n in errors if unsure[n] <= 1e-6), default=float("nan"))
             counts = f"{e['touch']} / {e['leave']} / {e['slip_onsets']}"
             largest = f"{errors[worst]:.1e} ({worst}, {unsure[worst]:.0e})"
-            rows.append((name, counts, route, largest, f"{known:.1e}", f"{cost['total']:.2f}"))
+            rows.append((name, counts, route, largest, f"{known:.1e}"))
     head = ("window", "touch / leave / slip onsets", "route",
     "largest error (parameter, judge's own uncertainty)",
-            "largest where the judge knows 1e-6", "total / forward")  # fmt: skip
+            "largest where the judge knows 1e-6")  # fmt: skip
     tables = [markdown(head, rows)]
     rows = [
         (label, f"{c['adjoint']:.4g}", f"{c['slope']:.3g} +- {c['uncertainty']:.1g}",
@@ -425,40 +397,10 @@ def table(result: Result) -> str:
     return "\n\n".join(tables)
 
 
-def figure(result: Result) -> Figure:
-    """Errors of the discrete adjoint per parameter and window; Coulomb's jumps."""
-    fig = Figure(figsize=(11, 5), layout="constrained")
-    errors, jumps = fig.subplots(1, 2)
-    for name, numbers in result.windows.items():
-        row = numbers["relative_error"]["discrete"]
-        errors.semilogy(
-            [n.split(".")[-1] for n in row], [max(e, 1e-16) for e in row.values()], "o", label=name
-        )
-    errors.tick_params(axis="x", rotation=45)
-    errors.set(ylabel="relative error [1]", title="Discrete adjoint against central differences")
-    for k, (label, c) in enumerate(result.coulomb.items()):
-        mu, L = torch.tensor(c["mu"]), torch.tensor(c["loss"])
-        jumps.plot(mu, L - L.mean(), f"C{k}.", ms=3, label=f"L by {label}")
-        jumps.plot(mu, c["adjoint"] * (mu - mu.mean()), f"C{k}-")
-    jumps.set(
-        xlabel="mu [1]",
-        ylabel="L less its mean [1]",
-        title="Coulomb's law to the letter; lines: the adjoint's slope",
-    )
-    for axes in (errors, jumps):
-        axes.legend(fontsize=8)
-    return fig
-
-
-def write(result: Result) -> None:
-    """summary.json, table.md and gradient_accuracy.png into the output folder."""
-    parts = {name: getattr(result, name) for name in ("windows", "coulomb")}
-    write_files(result.config, parts, {"gradient_accuracy": figure(result)}, table(result))
-
-
 def main() -> None:
     result = run(options(Config, __doc__))
-    write(result)
+    parts = {"windows": result.windows, "coulomb": result.coulomb}
+    write(result.config, parts, table=table(result))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -181,31 +180,6 @@ def table(result: Result) -> str:
     return "\n\n".join(out)
 
 
-def figure(result: Result) -> Figure:
-    """Force against compression, and its approach to its limits."""
-    fig = Figure(figsize=(11, 4), layout="constrained")
-    force, approach = fig.subplots(1, 2)
-    for name, c in result.meshes.items():
-        force.plot(MILLI * c.compression, c.force, ".-", label=f"{name} elements")
-    for name, c in result.penalties.items():
-        force.plot(MILLI * c.compression, c.force, ".--", label=f"{name} $K_n$")
-    for name, family in result.families.items():
-        error = [abs(c.force[-1].item() / family.limit - 1) for c in family.curves.values()]
-        approach.loglog(
-            family.coarseness,
-            error,
-            "o-",
-            label=f"{name}, limit {family.limit:.2f} N, order {family.order}",
-        )
-    approach.set(
-        xlabel="node spacing / 1 mm, default $K_n$ / $K_n$", ylabel="force from its limit, relative"
-    )
-    force.set(xlabel="compression [mm]", ylabel="force on the upper pad [N]")
-    for axes in (force, approach):
-        axes.legend(fontsize="small")
-    return fig
-
-
 def summary(result: Result) -> dict[str, Any]:
     """What `summary.json` holds."""
     out: dict[str, Any] = {
@@ -224,8 +198,8 @@ def summary(result: Result) -> dict[str, Any]:
 
 
 def write(result: Result) -> None:
-    """`summary.json`, `table.md` and `statics.png` in the configured folder."""
-    write_files(result.config, summary(result), {"statics": figure(result)}, table(result))
+    """`summary.json` and `table.md` in the configured folder."""
+    write_files(result.config, summary(result), table=table(result))
 
 
 def main() -> None:

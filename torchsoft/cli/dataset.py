@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import failed, say
+from torchsoft.cli.results import add_command, failed, say
 
 MAKE = """\
 Simulates the dataset of CONFIG.toml, shard by shard, into a folder or what fsspec opens. Ctrl-C and
@@ -44,15 +44,7 @@ def add_commands(commands: Any) -> None:
     group = commands.add_parser("dataset", help="make datasets, check them, and give them away")
     own = group.add_subparsers(required=True, metavar="COMMAND")
 
-    def add(name: str, run: Any, help: str, description: str) -> argparse.ArgumentParser:
-        one = own.add_parser(
-            name, help=help, description=description,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )  # fmt: skip
-        one.set_defaults(run=run)
-        return one
-
-    one = add("make", make, "make a dataset, or a part of one", MAKE)
+    one = add_command(own, "make", make, "make a dataset, or a part of one", MAKE)
     add_config(one)
     one.add_argument("--part", type=part, default=(1, 1), metavar="I/N", help="such as 2/8")
     workers = "threads, or processes if more than a few"
@@ -61,13 +53,19 @@ def add_commands(commands: Any) -> None:
     one.add_argument(
         "--yes", action="store_true", help="begin even what takes hours, or much memory or disk"
     )
-    one = add("slurm", slurm, "write the job array that makes a dataset in parts", SLURM)
+    one = add_command(
+        own, "slurm", slurm, "write the job array that makes a dataset in parts", SLURM
+    )
     add_config(one)
     one.add_argument("--parts", type=int, required=True, metavar="N", help="jobs of the array")
-    one = add("check", check, "read a dataset and say what is wrong with it", "One line a finding.")
+    one = add_command(
+        own, "check", check, "read a dataset and say what is wrong with it", "One line a finding."
+    )
     one.add_argument("store", help="folder or fsspec URL")
     one.add_argument("--picture", type=Path, help="where to draw what the set covers")
-    one = add("export", export, "write a dataset in the form of another project", EXPORT)
+    one = add_command(
+        own, "export", export, "write a dataset in the form of another project", EXPORT
+    )
     one.add_argument("store", help="folder or fsspec URL")
     one.add_argument("--to", required=True, choices=("the-well", "lerobot", "mcap"))
     one.add_argument("--out", type=Path, required=True, help="a new folder")

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_out, failed, say, try_folder
+from torchsoft.cli.results import add_command, add_out, failed, say, try_folder
 
 DESIGN = """\
 Which motion of the rig should be recorded?
@@ -18,10 +18,9 @@ there are already."""
 
 def add_commands(commands: Any) -> None:
     """The command that designs motions."""
-    one = commands.add_parser(
-        "design", help="find a motion that identifies parameters", description=DESIGN,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    one = add_command(
+        commands, "design", design, "find a motion that identifies parameters", DESIGN
+    )
     one.add_argument(
         "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml",
         help="recordings, if there are any, and one configuration",
@@ -29,7 +28,6 @@ def add_commands(commands: Any) -> None:
     add_out(one, default=Path("out/design"), help="folder for the results (%(default)s)")
     one.add_argument("--workers", type=int, default=1, help="threads of the search (%(default)s)")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
-    one.set_defaults(run=design)
 
 
 def design(options: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_out, failed, say, try_folder
+from torchsoft.cli.results import add_command, add_out, failed, say, try_folder
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
@@ -42,13 +42,10 @@ def add_commands(commands: Any) -> None:
         ("explain", "find what is wrong where a model does not explain recordings", EXPLAIN),
         ("rehearse", "find what an experiment would identify, before it is done", REHEARSE),
     ):
-        add_command(commands.add_parser(
-            name, help=help, description=description,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        ))  # fmt: skip
+        add_arguments(add_command(commands, name, identify, help, description))
 
 
-def add_command(one: argparse.ArgumentParser) -> None:
+def add_arguments(one: argparse.ArgumentParser) -> None:
     """Arguments of either."""
     metavar, said = "DATA.csv ... CONFIG.toml", "data files and a configuration"
     if one.prog.endswith("rehearse"):
@@ -69,7 +66,7 @@ def add_command(one: argparse.ArgumentParser) -> None:
     )
     one.add_argument("--no-progress", action="store_true", help="show no progress")
     verb = one.prog.split()[-1]
-    one.set_defaults(run=identify, explains=verb == "explain", rehearses=verb == "rehearse")
+    one.set_defaults(explains=verb == "explain", rehearses=verb == "rehearse")
 
 
 def identify(options: argparse.Namespace) -> int:

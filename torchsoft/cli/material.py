@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_out, say, try_folder
+from torchsoft.cli.results import add_command, add_out, say, try_folder
 
 MATERIAL_FIT = """\
 Which material relaxes, or creeps, as this one did?
@@ -27,14 +27,9 @@ def add_commands(commands: Any) -> None:
     material = commands.add_parser(
         "material", help="fit a material to a test, or list some", description="Materials of pads."
     )
-    add_material_commands(material.add_subparsers(required=True, metavar="COMMAND"))
-
-
-def add_material_commands(commands: Any) -> None:
-    one = commands.add_parser(
-        "fit", help="fit a material to a relaxation or creep test", description=MATERIAL_FIT,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    commands = material.add_subparsers(required=True, metavar="COMMAND")
+    help = "fit a material to a relaxation or creep test"
+    one = add_command(commands, "fit", fit_material, help, MATERIAL_FIT)
     one.add_argument("file", type=Path, metavar="FILE.csv", help="the test")
     add_out(one, default=Path("out/material"), help="folder for the results (%(default)s)")
     one.add_argument(
@@ -59,11 +54,7 @@ def add_material_commands(commands: Any) -> None:
             type=float,
             help=f"{meaning}, which the test does not tell (as the paper's pads)",
         )
-    one.set_defaults(run=fit_material)
-    one = commands.add_parser(
-        "presets", help="list rubbers from the literature", description=PRESETS
-    )
-    one.set_defaults(run=list_presets)
+    add_command(commands, "presets", list_presets, "list rubbers from the literature", PRESETS)
 
 
 def fit_material(options: argparse.Namespace) -> int:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_out, say, try_folder
+from torchsoft.cli.results import add_command, add_out, say, try_folder
 
 PLAN = """\
 Which motion brings the rig where it is wanted?
@@ -20,17 +20,13 @@ the exit status is 1 where a target or limit is not kept."""
 
 def add_commands(commands: Any) -> None:
     """The command that plans motions."""
-    one = commands.add_parser(
-        "plan", help="find a motion that reaches a goal", description=PLAN,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    one = add_command(commands, "plan", plan, "find a motion that reaches a goal", PLAN)
     one.add_argument("rig", type=Path, metavar="RIG.toml")
     one.add_argument("goal", type=Path, metavar="GOAL.toml")
     said = "draw what an identification of the rig leaves unknown"
     one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=said)
     add_out(one, default=Path("out/plan"), help="folder for the results (%(default)s)")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
-    one.set_defaults(run=plan)
 
 
 def plan(options: argparse.Namespace) -> int:

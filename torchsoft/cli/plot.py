@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import say
+from torchsoft.cli.results import add_command, say
 
 PLOT = """\
 Draws a run that `torchsoft run` or Trajectory.save wrote: FILE.png, a dashboard of motions, contact
@@ -17,10 +17,7 @@ as wide as a page or a column, with --only for some of its panels."""
 
 def add_commands(commands: Any) -> None:
     """The commands `plot` and `version`."""
-    one = commands.add_parser(
-        "plot", help="draw a saved run", description=PLOT,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    one = add_command(commands, "plot", plot, "draw a saved run", PLOT)
     one.add_argument("file", type=Path, metavar="FILE.nc", help="the run")
     one.add_argument("--html", action="store_true", help="write the interactive player")
     one.add_argument("--pdf", action="store_true", help="write a camera-ready dashboard")
@@ -33,7 +30,6 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--time", type=float, help="instant that is shown [s] (largest force)")
     one.add_argument("--title", default="", help="title (the file's name)")
     one.add_argument("--out", type=Path, help="folder for what is written (the file's)")
-    one.set_defaults(run=plot)
     one = commands.add_parser("version", help="say which versions are at work")
     one.set_defaults(run=versions)
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_out, say, try_folder
+from torchsoft.cli.results import add_command, add_out, say, try_folder
 
 REDUCE = """\
 Which sparse equations do saved runs of a rig obey?
@@ -18,10 +18,7 @@ and the error of the prediction; the exit status is 1 where that is no better th
 
 def add_commands(commands: Any) -> None:
     """The command that finds reduced models."""
-    one = commands.add_parser(
-        "reduce", help="find sparse equations of saved runs", description=REDUCE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    one = add_command(commands, "reduce", reduce, "find sparse equations of saved runs", REDUCE)
     one.add_argument("files", type=Path, nargs="+", metavar="RUN.nc", help="runs")
     one.add_argument("--held-out", type=Path, metavar="RUN.nc", help="run that is predicted")
     one.add_argument("--begin", type=float, help="time of the first sample taken [s]")
@@ -31,7 +28,6 @@ def add_commands(commands: Any) -> None:
     said = "least part of a rate that a term must account for (%(default)s)"
     one.add_argument("--threshold", type=float, default=0.05, help=said)
     add_out(one, default=Path("out/reduced"), help="folder for the result (%(default)s)")
-    one.set_defaults(run=reduce)
 
 
 def reduce(options: argparse.Namespace) -> int:

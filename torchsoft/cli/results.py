@@ -1,12 +1,26 @@
 """Results of a command: the folder that they are written to, and sentences on the terminal."""
 
+import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
 from torchsoft.files import claim
 from torchsoft.tables import line, plain
+
+
+def add_command(
+    commands: Any, name: str, run: Callable[[argparse.Namespace], int], help: str, description: str
+) -> argparse.ArgumentParser:
+    """A command that `run` carries out, its description as it is written."""
+    one = commands.add_parser(
+        name, help=help, description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.set_defaults(run=run)
+    return one
 
 
 def add_out(command: Any, **more: Any) -> None:

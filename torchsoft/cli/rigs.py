@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_out, failed, say, try_folder
+from torchsoft.cli.results import add_command, add_out, failed, say, try_folder
 
 RUN = """\
 Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and
@@ -27,12 +27,7 @@ every number in a comment. A folder that is not there is made."""
 
 def add_commands(commands: Any) -> None:
     """The commands on rig files."""
-    one = commands.add_parser(
-        "run",
-        help="simulate a rig file",
-        description=RUN,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    one = add_command(commands, "run", run_rig, "simulate a rig file", RUN)
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
     add_out(one, help="folder for the results (out/RIG)")
     one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
@@ -40,22 +35,13 @@ def add_commands(commands: Any) -> None:
     one.add_argument(
         "--yes", action="store_true", help="begin without asking, however long it takes"
     )
-    one.set_defaults(run=run_rig)
-    one = commands.add_parser(
-        "check", help="say what is wrong in a rig file", description=CHECK,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    one = add_command(commands, "check", check_rig, "say what is wrong in a rig file", CHECK)
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
     one.add_argument(
         "--yes", action="store_true", help="begin without asking, however long it takes"
     )
-    one.set_defaults(run=check_rig)
-    one = commands.add_parser(
-        "init", help="write a rig file to start from", description=INIT,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    one = add_command(commands, "init", init_rig, "write a rig file to start from", INIT)
     one.add_argument("name", metavar="NAME", help="the file's name, with or without .toml")
-    one.set_defaults(run=init_rig)
 
 
 def run_rig(options: argparse.Namespace) -> int:

@@ -90,12 +90,9 @@ def rig(config: Config) -> str:
 
 def drawn(config: Config) -> Iterable[tuple[str, ...]]:
     """What is drawn: numbers of the rig, and of its motions."""
-    schema = variables(config)
-    for name, one in config.parameters.items():
-        unit = schema[name.replace("/", "_over_")].unit
-        yield f"`{name}`", distribution(one), "1" if one.ratio_to else unit
-    if config.rig is None:
-        yield "`grasp_depth`", distribution(config.grasp_depth), "m"
+    for name, one in config.subject.ranges.items():
+        unit = "1" if getattr(one, "ratio_to", None) else variables(config)[name].unit
+        yield f"`{name}`", distribution(one), unit
     for kind in config.kinds:
         said = (f"{name} {distribution(one)}" for name, one in kind.ranges.items())
         yield f"motion `{kind.kind}`, weight {kind.weight:g}", "; ".join(said), "SI"

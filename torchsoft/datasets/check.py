@@ -193,11 +193,7 @@ def summary(url: str, data: xr.Dataset) -> str:
 def figure(data: xr.Dataset, config: Config) -> Figure:
     """Each parameter over the next by split, failures crossed; trajectories of each kind of motion
     and split; some sound motions."""
-    ranged: dict[str, Any] = {
-        name.replace("/", "_over_"): r for name, r in config.parameters.items()
-    }
-    if config.rig is None:
-        ranged["grasp_depth"] = config.grasp_depth
+    ranged = config.subject.ranges
     by = [name for name in ("kind", "split") if name in data]
     names, series = list(ranged), moving(data, config)
     count = len(names) + 1 + len(series)

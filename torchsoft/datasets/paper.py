@@ -12,7 +12,7 @@ from pydantic import Field
 
 from torchsoft.channels import CHANNELS
 from torchsoft.datasets.distributions import Frequencies, Lengths, Range, Times
-from torchsoft.datasets.schema import Label, Signal
+from torchsoft.datasets.schema import Label
 from torchsoft.datasets.subject import (
     RTOL,
     Begun,
@@ -55,7 +55,7 @@ FORCE = 4
 """Decimals that grasping forces [N] are rounded to."""
 
 SIGNALS = {
-    name: Signal(one.unit, one.meaning)
+    name: Label(one.unit, one.meaning)
     for name, one in CHANNELS.items()
     if name not in ("t", "angular_momentum")
 }
@@ -152,7 +152,7 @@ class PaperRun(NamedTuple):
 class PaperGrasp(Subject):
     """Grasps and rolls of the paper's rig. Parameters are those of `Parameters`, by its names."""
 
-    signals: Mapping[str, Signal] = SIGNALS
+    signals: Mapping[str, Label] = SIGNALS
 
     @cached_property
     def template(self) -> SoftGrasp:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -183,6 +183,10 @@ class PaperGrasp(Subject):
             ),
             "grasp_force": Label("N", "grasping force fed forward"),
         }
+
+    @property
+    def ranges(self) -> dict[str, Any]:
+        return super().ranges | {"grasp_depth": self.config.grasp_depth}
 
     words: Mapping[str, Label] = {"kind": Label("1", "kind of motion", "str")}
 

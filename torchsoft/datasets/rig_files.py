@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 
-from torchsoft.datasets.schema import Label, Signal
+from torchsoft.datasets.schema import Label
 from torchsoft.datasets.subject import (
     RTOL,
     Begun,
@@ -40,9 +40,6 @@ from torchsoft.solve.progress import Integrals
 from torchsoft.solve.trajectory import channels, units
 from torchsoft.tables import line, read_toml, shown
 
-NAMED = ("file", "network")
-"""Fields of tables that name a file."""
-
 EMBEDDED = 2e6
 """Size [B] of all files that a rig file names, at the most: they are part of the configuration."""
 
@@ -64,14 +61,6 @@ def embedded(tree: Any, folder: Path) -> Any:
     path, contents = folder / name, dict[str, str]()
     RigFile.from_toml(path)
 
-    def packed(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {
-                key: stored(x) if key in NAMED and isinstance(x, str) else packed(x)
-                for key, x in value.items()
-            }
-        return [packed(x) for x in value] if isinstance(value, list) else value
-
     def stored(file: str) -> str:
         data = check_file(path.parent / file, EMBEDDED).read_bytes()
         own = f"{sha256(data).hexdigest()[:16]}{Path(file).suffix}"
@@ -83,7 +72,7 @@ def embedded(tree: Any, folder: Path) -> Any:
             )
         return own
 
-    rig = packed(read_toml(path))
+    rig = places.files_renamed(read_toml(path), stored)
     return {**tree, "rig": rig} | ({"files": contents} if contents else {})
 
 
@@ -151,7 +140,7 @@ class RigOfFile(Subject):
             raise ValueError(f"rig: {error}") from None
 
     @cached_property
-    def there(self) -> dict[str, Signal]:
+    def there(self) -> dict[str, Label]:
         """Every channel of the rig."""
         rig = self.template
         nothing = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
@@ -160,10 +149,10 @@ class RigOfFile(Subject):
         with torch.no_grad():
             known = channels(rig, state, nothing, moments)
         meanings, of = dict(channel_meanings(rig)), units(rig)
-        return {key: Signal(of[key], meanings[key]) for key in known}
+        return {key: Label(of[key], meanings[key]) for key in known}
 
     @property
-    def signals(self) -> dict[str, Signal]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def signals(self) -> dict[str, Label]:  # pyright: ignore[reportIncompatibleVariableOverride]
         kept = self.config.channels
         return self.there if kept is None else {name: self.there[name] for name in kept}
 

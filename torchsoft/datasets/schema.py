@@ -13,15 +13,8 @@ if TYPE_CHECKING:
     from torchsoft.datasets.subject import Subject
 
 
-class Signal(NamedTuple):
-    """A channel of every trajectory: unit and meaning."""
-
-    unit: str
-    meaning: str
-
-
 class Label(NamedTuple):
-    """A number or text of every trajectory: unit, meaning and type."""
+    """A channel, or a number or text of every trajectory: unit, meaning and type."""
 
     unit: str
     meaning: str
@@ -105,8 +98,8 @@ def arrays(subject: "Subject") -> dict[str, Variable]:
     config, out = subject.config, dict[str, Variable]()
     single = {"trajectory": config.trajectories}
     series = single | {"time": config.samples}
-    for name, (unit, meaning) in subject.signals.items():
-        out[name] = Variable(series, unit, meaning)
+    for name, one in subject.signals.items():
+        out[name] = Variable(series, *one)
     more = nodal(subject) if config.nodal else {}
     for kind, (dimension, parts) in energies(subject).items():
         meaning = "energy stored" if kind == "stored" else f"{kind} since t = 0"

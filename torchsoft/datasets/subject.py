@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchsoft.datasets.schema import Label, Signal, Variable, arrays
+from torchsoft.datasets.schema import Label, Variable, arrays
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 
@@ -58,7 +58,7 @@ class Subject(ABC):
     a trajectory can begin.
     """
 
-    signals: Mapping[str, Signal]
+    signals: Mapping[str, Label]
     template: Rig
     words: Mapping[str, Label] = {}
     prelude: float = 0.0
@@ -75,6 +75,11 @@ class Subject(ABC):
     @abstractmethod
     def labels(self) -> dict[str, Label]:
         """Numbers of every trajectory, besides those of any run."""
+
+    @property
+    def ranges(self) -> dict[str, Any]:
+        """Distributions of the numbers that are drawn for every trajectory, by their arrays."""
+        return {name.replace("/", "_over_"): r for name, r in self.config.parameters.items()}
 
     @property
     @abstractmethod

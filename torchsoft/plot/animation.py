@@ -16,8 +16,8 @@ from tqdm import tqdm
 from torchsoft.display import suggestion
 from torchsoft.files import replacing
 from torchsoft.physics.mesh import Array
-from torchsoft.plot.dashboard import curves, liveliest
-from torchsoft.plot.figures import ACTUAL, DESIRED, SIZES, STYLE, stress_bar, timeline
+from torchsoft.plot.dashboard import curves, liveliest, motion
+from torchsoft.plot.figures import ACTUAL, SIZES, STYLE, stress_bar
 from torchsoft.plot.scene import (
     DISC,
     FRICTION,
@@ -83,13 +83,8 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> 
         scene.scale_bar(whole)
         whole.grid(False)
         figure.legend(handles=keys(setup, shown), loc="outside lower center", ncols=5)
-        t = timeline(strip, curve.label, run)
+        motion(strip, run, curve)
         strip.set_xlabel("time [s]")
-        if curve.setpoint is not None:
-            strip.plot(t, curve.setpoint, color=DESIRED, lw=3, label="desired")
-        strip.plot(t, curve.values, color=ACTUAL, lw=1, label="actual")
-        if curve.setpoint is not None:
-            strip.legend(loc="lower right", ncols=2)
         (cursor,) = strip.plot([], [], "o", color=INK, ms=6)
         clock = whole.text(
             0.012, 0.97, "", transform=whole.transAxes, va="top", family="monospace", fontsize=12

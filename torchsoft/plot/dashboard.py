@@ -110,47 +110,46 @@ def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
         legend_above(axes)
 
 
-def contact_forces(axes: Axes, run: Trajectory) -> None:
-    """Sums of the normal forces."""
-    for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
-        t = timeline(axes, "normal force [N]", run)
-        axes.plot(t, force[..., 0].sum(-1).detach().numpy(), color=colour, label=name)
-    legend_above(axes)
+def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
+    """What the points of every contact come to over time, with its unit, by contact (T,): forces,
+    how much of the friction cone is used (of the normal force where the law has no mu_s; NaN
+    without force), points that touch, and those of them that slip."""
+    units = {"normal force": "N", "friction": "N", "friction in its cone": "%",
+             "points in contact": "1", "slipping": "1"}  # fmt: skip
+    out: dict[str, tuple[str, dict[str, Array]]] = {
+        kind: (unit, {}) for kind, unit in units.items()
+    }
+    for name, force in run.force.items():
+        normal, friction = force.detach().unbind(-1)
+        total, state = normal.sum(-1), run.contact_state[name]
+        mu = run.setup.contacts[name].friction.get("mu_s", 1.0)
+        share = torch.where(total > 1e-9, 100 * friction.abs().sum(-1) / (mu * total), torch.nan)
+        touching, slipping = (state != 0).sum(-1), (state == SLIPPING).sum(-1)
+        for kind, values in zip(out, (total, friction.sum(-1), share, touching, slipping)):
+            out[kind][1][name] = values.double().numpy()
+    return out
 
 
-def friction(axes: Axes, run: Trajectory) -> None:
-    """Sums of the friction."""
-    for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
-        total = force[..., 1].sum(-1).detach().numpy()
-        axes.plot(timeline(axes, "friction [N]", run), total, color=colour, label=name)
-    axes.axhline(0, color=INK, lw=0.5, zorder=1)
-    legend_above(axes)
-
-
-def mobilised(axes: Axes, run: Trajectory) -> None:
-    """How much of the friction cone is used: sum of |friction| over mu_s times that of the normal
-    forces."""
-    for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
-        t = timeline(axes, "share of the cone [%]", run)
-        mu, normal = run.setup.contacts[name].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
-        share = force[..., 1].abs().sum(-1) / (mu * normal)
-        share = torch.where(normal > 1e-9, share, torch.nan)
-        label = (
-            f"{name}, mu_s = {mu:g}" if run.setup.contacts[name].friction else f"{name} / normal"
-        )
-        axes.plot(t, 100 * share.detach().numpy(), color=colour, label=label)
-    axes.axhline(100, color=INK, lw=0.8, ls=":")
-    axes.set_ylim(0, max(108.0, 1.04 * axes.dataLim.y1))
+def contact_sums(axes: Axes, run: Trajectory, kind: str) -> None:
+    """One of the sums over all contacts."""
+    unit, series = sums(run)[kind]
+    for (name, values), colour in zip(series.items(), COLOURS * len(series)):
+        axes.plot(timeline(axes, f"{kind} [{unit}]", run), values, color=colour, label=name)
+    if kind == "friction":
+        axes.axhline(0, color=INK, lw=0.5, zorder=1)
+    if unit == "%":
+        axes.axhline(100, color=INK, lw=0.8, ls=":")
+        axes.set_ylim(0, max(108.0, 1.04 * axes.dataLim.y1))
     legend_above(axes)
 
 
 def points(axes: Axes, run: Trajectory) -> None:
     """How many points touch, and how many of these slip."""
-    for (name, state), colour in zip(run.contact_state.items(), COLOURS * len(run.force)):
-        t = timeline(axes, "contact points", run)
-        touching, slipping = (state != 0).sum(-1).numpy(), (state == SLIPPING).sum(-1).numpy()
-        axes.step(t, touching, where="mid", color=colour, label=name)
-        axes.fill_between(t, 0, slipping, step="mid", color=colour, alpha=0.45, lw=0)
+    t, every = timeline(axes, "contact points", run), sums(run)
+    touching, slipping = every["points in contact"][1], every["slipping"][1]
+    for name, colour in zip(touching, COLOURS * len(touching)):
+        axes.step(t, touching[name], where="mid", color=colour, label=name)
+        axes.fill_between(t, 0, slipping[name], step="mid", color=colour, alpha=0.45, lw=0)
     axes.fill_between([], [], color=INK, alpha=0.45, lw=0, label="of these slip")
     if any(bool((state < 0).any()) for state in run.contact_state.values()):
         axes.set_title("slip not known: the rig has changed since", fontsize="small", loc="right")
@@ -230,9 +229,8 @@ def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
         curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving
     }
     if run.force:
-        out["normal force"] = lambda axes: contact_forces(axes, run)
-        out["friction"] = lambda axes: friction(axes, run)
-        out["friction in its cone"] = lambda axes: mobilised(axes, run)
+        for kind in ("normal force", "friction", "friction in its cone"):
+            out[kind] = lambda axes, kind=kind: contact_sums(axes, run, kind)
         out["points in contact"] = lambda axes: points(axes, run)
     for one in run.setup.actuators.values():
         out[one.channel] = lambda axes, one=one: effort(axes, run, one)

@@ -1,16 +1,14 @@
-"""The look of figures, and pictures of instants of a run: snapshots, forces over deformed pads, the
-friction of several runs.
+"""The look of figures, and pictures of instants of a run.
 
 Times in s, lengths in mm, forces in N, stresses in kPa.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-import torch
 from matplotlib import rc_context, rcParams
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -20,7 +18,6 @@ from numpy.typing import NDArray
 
 from torchsoft.display import suggestion
 from torchsoft.files import replacing
-from torchsoft.physics.mesh import Array
 from torchsoft.physics.setup import Setup
 from torchsoft.plot.scene import (
     FRICTION,
@@ -30,13 +27,11 @@ from torchsoft.plot.scene import (
     STRESS,
     Instant,
     Scene,
-    along_surface,
     around_contact,
     force_scale,
     instants,
     keys,
     largest_stress,
-    unit,
 )
 from torchsoft.solve.trajectory import Trajectory
 
@@ -66,9 +61,6 @@ COLOURS = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#b
 
 SNAPSHOTS = (0.375, 2.5, 5.0, 7.5, 10.0, 17.5, 20.0, 22.5, 25.0)
 """Times [s] of the paper's Fig. 16."""
-
-CLOSE = 10.0
-"""How far a close-up reaches on either side, for pads like the paper's [mm]."""
 
 Look = Literal["screen", "page", "column"]
 """For a screen, with titles; or camera-ready for the width of a page or a column, without."""
@@ -182,68 +174,6 @@ def forces_on(axes: Axes, setup: Setup, instant: Instant, contact: str) -> None:
     axes.set_ylabel("force [N]")
 
 
-def close_up(axes: Axes, setup: Setup, instant: Instant, contact: str, stress: float) -> None:
-    """The deformed pad under one contact, and the body on it."""
-    Scene(axes, setup, stress=stress).show(instant)
-    touched = instant.points[contact][instant.force[contact][:, 0] > 0]
-    where = touched if len(touched) else instant.points[contact]
-    x, y = where.mean(0)
-    axes.set_xlim(x - CLOSE * unit(setup), x + CLOSE * unit(setup))
-    axes.set_ylim(y - 3.6 * unit(setup), y + 3.6 * unit(setup))
-    axes.set(xlabel="x [mm]", ylabel="y [mm]")
-    axes.grid(False)
-
-
-def force_distribution(
-    run: Trajectory, time: float, *, title: str = "", look: Look = "screen"
-) -> Figure:
-    """At the sample nearest to `time` [s]: the whole, then every contact close up, over its normal
-    force and its friction with the cone."""
-    (instant,) = instants(run, [time])
-    setup, contacts = run.setup, list(run.setup.contacts)[::-1]
-    stress = largest_stress([instant])
-    with looking(look) as size:
-        wide = size.columns > 1
-        columns, rows = (len(contacts) + 1, 2) if wide else (1, 2 * len(contacts) + 1)
-        heading = (title or f"Contact forces at t = {instant.time:g} s") if size.titled else ""
-        height = 0.42 * size.width if wide else size.width * 0.62 * rows
-        width = size.width * (max(1.0, (len(contacts) + 1) / 3) if size.titled else 1.0)
-        figure = new_figure(heading, width, height)
-        grid = figure.add_gridspec(rows, columns)
-        whole = figure.add_subplot(grid[:, 0] if wide else grid[0, 0])
-        scene = Scene(whole, setup, stress=stress, size=0.1 * size.font)
-        scene.show(instant)
-        x_limits, y_limits = scene.limits([instant])
-        whole.set(xlim=x_limits, ylim=y_limits, title="a) bodies and pads", xlabel="x [mm]")
-        whole.set_ylabel("y [mm]")
-        whole.grid(False)
-        panels = []
-        for i, key in enumerate(contacts):
-            near = figure.add_subplot(grid[0, i + 1] if wide else grid[i + 1, 0])
-            near.set_title(f"{letter(i + 1)} contact {key}")
-            close_up(near, setup, instant, key, stress)
-        for i, key in enumerate(contacts, len(contacts)):
-            place = grid[1, i + 1 - len(contacts)] if wide else grid[i + 1, 0]
-            forces = figure.add_subplot(place)
-            forces.set_title(f"{letter(i + 1)} forces at {key}")
-            forces_on(forces, setup, instant, key)
-            pad = setup.pads[setup.contacts[key].pad]
-            level = along_surface(pad, instant.base[setup.contacts[key].pad])[0] > 0.999
-            forces.set_xlabel("x [mm]" if level else "along the surface [mm]")
-            panels.append(forces)
-        ends = [forces.get_ylim() for forces in panels]
-        for forces in panels:
-            forces.set_ylim(min(low for low, _ in ends), max(high for _, high in ends))
-        stress_bar(figure, [whole], stress, size)
-        lines = panels[-1].get_legend_handles_labels()
-        points = keys(setup, [instant], forces=False)
-        figure.legend(
-            [*lines[0], *points], [*lines[1], *(str(one.get_label()) for one in points)],
-            loc="outside lower center", ncols=6 if wide else 2,
-        )  # fmt: skip
-    return figure
-
-
 def snapshots(
     run: Trajectory, times: Sequence[float] = SNAPSHOTS, *, title: str = "", look: Look = "screen"
 ) -> Figure:
@@ -285,47 +215,4 @@ def snapshots(
         figure.legend(
             handles=keys(setup, shown), loc="outside lower center", ncols=min(5, 2 * columns)
         )
-    return figure
-
-
-def friction_ratio(run: Trajectory) -> Array:
-    """Sum of |F_T| over sum of F_N, all contacts, in %; zero where nothing touches."""
-    forces = torch.cat(list(run.force.values()), 1)
-    normal, friction = forces[..., 0].sum(-1), forces[..., 1].abs().sum(-1)
-    return (100 * friction / normal.clamp(min=1e-12)).detach().numpy()
-
-
-def friction_comparison(
-    runs: Mapping[str, Trajectory], times: Sequence[float], channel: str
-) -> Figure:
-    """Friction of several runs: along two contacts at two times [s], its ratio to the normal force,
-    and an actuator's effort."""
-    with looking("screen") as size:
-        title = "Friction of two sets of numbers"
-        figure = new_figure(title, 10, 8)
-        axes = figure.subplots(3, 2)
-        for panel in axes[:2].flat[1:]:
-            panel.sharey(axes[0, 0])
-        styles = list(zip((FRICTION, OTHER, INK), ("o-", "s--", "^:")))
-        end = min(float(run.t[-1]) for run in runs.values())
-        for column, time in enumerate(times):
-            for (name, run), (colour, marker) in zip(runs.items(), styles):
-                (instant,) = instants(run, [min(time, end)])
-                for row, k in enumerate(list(run.setup.contacts)[1::-1]):
-                    x, force = around_contact(instant, k)
-                    panel, i = axes[row, column], 2 * row + column
-                    panel.plot(x, force[:, 1], marker, color=colour, ms=3.5, label=name)
-                    panel.set_title(f"{letter(i)} contact {k}, t = {instant.time:g} s")
-                    panel.set(xlabel="x [mm]", ylabel="friction, right + [N]")
-        for (name, run), (colour, marker) in zip(runs.items(), styles):
-            line = {"color": colour, "ls": marker[1:], "lw": 0.11 * size.font, "label": name}
-            ratio, effort = axes[2]
-            ratio.plot(timeline(ratio, "friction / normal [%]", run), friction_ratio(run), **line)
-            label = f"{channel} [{run.units.get(channel, 'N')}]"
-            effort.plot(timeline(effort, label, run), run[channel].detach().numpy(), **line)
-        for panel in axes[2]:
-            panel.set_xlabel("time [s]")
-        axes[2, 0].set_title("e) sum of |friction| over sum of normal force")
-        axes[2, 1].set_title(f"f) {channel}")
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure

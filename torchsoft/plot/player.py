@@ -17,7 +17,7 @@ from torchsoft.channels import CHANNELS
 from torchsoft.files import replacing
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.setup import von_mises
-from torchsoft.plot.dashboard import RIPPLE, curves, ripples
+from torchsoft.plot.dashboard import RIPPLE, curves, ripples, sums
 from torchsoft.plot.figures import COLOURS
 from torchsoft.plot.scene import (
     MM,
@@ -132,25 +132,11 @@ def charts(run: Trajectory) -> list[dict[str, Any]]:
         if curve.setpoint is not None:
             lines.insert(0, ("set-point", curve.setpoint, "#999999"))
         group(name, unit.rstrip("]"), lines)
-    forces = list(zip(run.force.items(), COLOURS * len(run.force)))
-    if forces:
+    if run.force:
         least = 1e-9 * max(float(x[..., 0].detach().sum(-1).max()) for x in run.force.values())
-        for kind, i in (("normal force", 0), ("friction", 1)):
-            sums = [(k, x[..., i].sum(-1).detach().numpy(), c) for (k, x), c in forces]
-            group(kind, "N", sums, least)
-        share = []
-        for (key, force), colour in forces:
-            mu, normal = run.setup.contacts[key].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
-            part = 100 * force[..., 1].abs().sum(-1) / (mu * normal).clamp(min=1e-9)
-            share.append((key, part.where(normal > 1e-9, 0.0).detach().numpy(), colour))
-        group("friction in its cone", "%", share, 1e-7)
-        states = list(zip(run.contact_state.items(), COLOURS * len(run.force)))
-        for word, of in (("points in contact", lambda s: s != 0), ("slipping", lambda s: s == 2)):
-            group(
-                word,
-                "1",
-                [(k, of(s).sum(-1).detach().numpy().astype(float), c) for (k, s), c in states],
-            )
+        for kind, (unit, series) in sums(run).items():
+            lines = [(*one, colour) for one, colour in zip(series.items(), COLOURS * len(series))]
+            group(kind, unit, lines, {"N": least, "%": 1e-7}.get(unit, 0.0))
     shown = {one for body in run.setup.bodies.values() for one in body.channels.values()}
     for name, values in run.channels.items():
         if name not in shown and float(values.detach().abs().max()) > 0:

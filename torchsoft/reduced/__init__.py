@@ -3,10 +3,10 @@ the full model."""
 
 from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
-from torchsoft.reduced.records import Record, noisy, record, rolling_radius
-from torchsoft.reduced.terms import friction, joined, mechanics, polynomials
+from torchsoft.reduced.records import Record, record, rolling_radius
+from torchsoft.reduced.terms import friction, joined, mechanics
 
 __all__ = [
     "Choice", "Recipe", "Record", "ReducedModel", "assemble", "choose", "fit", "friction", "joined",
-    "loop", "mechanics", "noisy", "polynomials", "record", "rolling_radius", "rollout_of", "score",
+    "loop", "mechanics", "record", "rolling_radius", "rollout_of", "score",
 ]  # fmt: skip

@@ -1,5 +1,4 @@
-"""Records: the variables of a reduced model over time, from trajectories and datasets, with or
-without noise."""
+"""Records: the variables of a reduced model over time, from trajectories and datasets."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -52,10 +51,6 @@ class Record(Shown):
                 f"the record has no series {', '.join(lacking)}; it has {', '.join(self.series)}"
             )
         return np.column_stack([self.series[name] for name in names])
-
-    def part(self, begin: int, end: int) -> "Record":
-        """Samples `begin` to `end`, positions as they are."""
-        return Record(self.t[begin:end], {name: x[begin:end] for name, x in self.series.items()})
 
 
 def record(
@@ -158,19 +153,6 @@ def _of_run(run: Trajectory, disc: str, bracket: str) -> tuple[dict[str, np.ndar
         out |= {measured: state.pose[body][:, 0]}
         out |= {"x_d": run[signal], "x_d_dot": run[f"{signal}_dot"]}
     return {name: x.detach().numpy() for name, x in out.items()}, measured
-
-
-def noisy(source: Record, level: float, seed: int) -> Record:
-    """The record with white noise on every measured series, `level` times its standard deviation;
-    x_d is not measured."""
-    rng, clean = np.random.default_rng(seed), ("x_d", "x_d_dot")
-    return Record(
-        source.t,
-        {
-            k: x if k in clean else x + level * x.std() * rng.standard_normal(x.shape)
-            for k, x in source.series.items()
-        },
-    )
 
 
 def rolling_radius(records: Sequence[Record]) -> float:

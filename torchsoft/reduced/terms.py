@@ -1,4 +1,4 @@
-"""Candidate terms for reduced models: what mechanics suggests, what saturates, and polynomials.
+"""Candidate terms for reduced models: what mechanics suggests, and what saturates.
 
 Two pads join disc and bracket. While their contacts stick, each is a spring k and a dashpot c (pad
 and contact springs in series) on the slip that a rigid rolling disc would have, s_L = x_C + r theta
@@ -16,7 +16,6 @@ are small differences of large positions, which is why they, and not the positio
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations_with_replacement
 
 from torchsoft.reduced.ode import Factor, Term, symbol
 from torchsoft.reduced.records import KINEMATICS
@@ -73,21 +72,6 @@ def friction(r: float, speed: float) -> dict[str, list[Term]]:
         for rate in (slips(r)[side][1] for side in ("lower", "upper"))
     )
     return {"v_C": [lower, upper], "omega": [lower, upper], "v_Br": [upper]}
-
-
-def polynomials(names: Sequence[str], degree: int) -> list[Term]:
-    """Every monomial of the variables up to `degree`: the library that knows no mechanics."""
-    every = (
-        chosen for d in range(1, degree + 1) for chosen in combinations_with_replacement(names, d)
-    )
-    return [
-        Term(
-            " ".join(some),
-            " ".join(symbol(name)[1] for name in some),
-            tuple(Factor({name: 1.0}) for name in some),
-        )
-        for some in every
-    ]
 
 
 def joined(*libraries: Candidates) -> dict[str, list[Term]]:

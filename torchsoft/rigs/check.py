@@ -9,18 +9,16 @@ import itertools
 from collections.abc import Callable, Iterator
 
 import networkx as nx
-import numpy as np
 import torch
 
 from torchsoft.diagnostic import SEVERITIES, Diagnostic
-from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Sampled
 from torchsoft.physics.pads import Pad
 from torchsoft.rigs.balance import at_moments
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, at, signals
 from torchsoft.rigs.fields import Refused
-from torchsoft.rigs.geometry import Scene, Surface, collision, nodes, tied
+from torchsoft.rigs.geometry import Scene, collision, nodes, tied
 from torchsoft.rigs.motion import CsvTable
 from torchsoft.solve.ledger import COMPRESSED
 from torchsoft.threads import single_threaded
@@ -207,118 +205,6 @@ def corners(e: Estimate) -> Iterator[Diagnostic]:
             )  # fmt: skip
 
 
-def unreachable(e: Estimate) -> Iterator[Diagnostic]:
-    """Contacts whose body comes nowhere near the pad on its way."""
-    slack = wanders(e)
-    for key, contact in e.rig.contacts.items():
-        pad = e.rig.pads[contact.pad]
-        free = slack[contact.body] + (0.0 if pad.base is None else slack[pad.base])
-        gaps = []
-        for _, scene in e.course:
-            body, there = scene.outline(contact.body), nodes(pad, scene.pose)
-            apart = np.maximum(there.min(0) - body.max(0), body.min(0) - there.max(0))
-            gaps.append(float((apart - np.where(free > 0, free, pad.mesh.height)).max()))
-        if min(gaps) > 0:
-            near = min(-scene.pressed(key) for _, scene in e.course)
-            yield Diagnostic(
-                "warning", f"contacts.{key}",
-                f"it cannot close: `{contact.body}` comes no nearer to `{contact.pad}` than "
-                f"{near:.3g} m; change pads.{contact.pad}.origin, the starts or the motions, or "
-                "leave the contact out",
-            )  # fmt: skip
-
-
-def wanders(e: Estimate) -> dict[str, Array]:
-    """How far bodies may go in x and y (2,) [m] besides their course: along a coordinate that no
-    motion holds, with the others and the pads, and as they are thrown or fall."""
-    travel = sum(
-        float(np.ptp([scene.pose[name][:2] for _, scene in e.course], 0).sum())
-        for name in e.rig.bodies
-    )
-    travel += sum(pad.mesh.length + pad.mesh.height for pad in e.rig.pads.values())
-    out = {}
-    for name, body in e.file.bodies.items():
-        thrown = np.abs(body.start.velocity[:2]) * e.end
-        thrown[1] += 0.5 * e.file.gravity * e.end**2 * body.weighted
-        out[name] = np.where([e.is_own(name, axis) for axis in (0, 1)], travel + thrown, 0.0)
-    return out
-
-
-def departures(e: Estimate) -> Iterator[Diagnostic]:
-    """Motions that take a body past the end of a pad that it had touched. A body that no motion
-    holds may be anywhere on the pad opposite."""
-    closed, said = set[str](), set[str]()
-    for time, scene in e.course:
-        closed |= {key for key in e.rig.contacts if scene.pressed(key) > 0}
-        at_pads = {key: scene.surface(key) for key in closed}
-        for key in sorted(closed):
-            body, own, base = e.rig.contacts[key].body, at_pads[key], scene.pad(key).base
-            there = {body: (scene.pose[body][:2], 0.0)} | {
-                scene.pad(other).base: (face.middle, face.half) for other, face in at_pads.items()
-                if e.rig.contacts[other].body == body and face.faces(own)
-            }  # fmt: skip
-            off = {
-                by: own.off(middle) - half
-                for by, (middle, half) in there.items()
-                if holds(e, by, own)
-            }
-            presses = own.depth(scene.pose[body][:2]) + scene.reach(body, -own.normal) > 0
-            if (
-                body not in said
-                and presses
-                and holds(e, base, own)
-                and max(off.values(), default=0.0) > 0
-            ):
-                said.add(body)
-                by = max(off, key=lambda one: off[one])
-                yield Diagnostic(
-                    "warning", f"motion.{mover(e, scene, {by, base})}",
-                    f"at t = {time:.3g} s it has taken `{body}` {off[by]:.3g} m past the end of "
-                    f"`{e.rig.contacts[key].pad}`, which contacts.{key} presses until then; let it "
-                    "go less far, or take a longer pad",
-                )  # fmt: skip
-
-
-def crossings(e: Estimate) -> Iterator[Diagnostic]:
-    """Motions that take a pad through the body between it and another one."""
-    for body in e.rig.bodies:
-        for pair in e.course[0][1].facing(body):
-            for time, scene in e.course:
-                a, b = (scene.surface(key) for key in pair)
-                if a.depth(b.middle) > a.height and a.off(b.middle) < b.half and a.faces(b):
-                    yield Diagnostic(
-                        "error",
-                        f"motion.{mover(e, scene, {body, *(scene.pad(key).base for key in pair)})}",
-                        f"at t = {time:.3g} s it has taken the pads of contacts.{pair[0]} and "
-                        f"contacts.{pair[1]} through each other, and through `{body}` between "
-                        "them; let it go less far",
-                    )  # fmt: skip
-                    break
-
-
-def holds(e: Estimate, body: str | None, on: Surface) -> bool:
-    """Whether motions or fixed values hold a body along a surface; they do the ground."""
-    return body is None or not any(
-        abs(on.along[axis]) > 0.1 and e.is_own(body, axis) for axis in (0, 1)
-    )
-
-
-def mover(e: Estimate, scene: Scene, bodies: set[str | None]) -> str:
-    """The motion that has taken some bodies furthest."""
-    follow = {one.measured: one.setpoint for one in e.loops}
-    follow |= {
-        f"{body}.{axis}": f"{body}.{axis}"
-        for body, axis, kind in e.file.coordinates()
-        if kind == "driven"
-    }
-    way = {
-        name: abs(scene.pose[body][axis] - e.start[body][axis])
-        for coordinate, name in follow.items() for body,
-        axis in [at(coordinate)] if body in bodies and axis < 2
-    }  # fmt: skip
-    return max(way, key=lambda name: way[name])
-
-
 def overloads(e: Estimate) -> Iterator[Diagnostic]:
     """Efforts that would press the pads of a body in too far, however they were spread over
     them."""
@@ -357,7 +243,6 @@ def bears(pad: Pad) -> float:
 
 
 CHECKS: tuple[Callable[[Estimate], Iterator[Diagnostic]], ...] = (
-    ties, recordings, jumps, carried, overlaps, corners, unreachable, departures, crossings,
-    overloads,
+    ties, recordings, jumps, carried, overlaps, corners, overloads,
 )  # fmt: skip
 """Another check is one more of these."""

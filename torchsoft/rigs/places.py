@@ -1,6 +1,6 @@
 """Numbers of a rig file by name: where they stand, and the file with others in their place."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from pydantic.fields import FieldInfo
@@ -61,6 +61,20 @@ def replaced(file: RigFile, values: Mapping[str, Any]) -> RigFile:
             node, full = node[key], full[key]
         node[last] = value
     return RigFile.from_tree(tree, file.folder)
+
+
+FILES = ("file", "network")
+"""Fields of a rig file that name another file."""
+
+
+def files_renamed(tree: Any, name: Callable[[str], str]) -> Any:
+    """The tables of a rig file with other names of the files that they name."""
+    if isinstance(tree, dict):
+        return {
+            key: name(x) if key in FILES and isinstance(x, str) else files_renamed(x, name)
+            for key, x in tree.items()
+        }
+    return [files_renamed(x, name) for x in tree] if isinstance(tree, list) else tree
 
 
 def listed(value: Any) -> Any:

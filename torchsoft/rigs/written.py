@@ -10,10 +10,8 @@ from pydantic.fields import FieldInfo
 from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import Group, NumberOr
+from torchsoft.rigs.places import files_renamed
 from torchsoft.tables import read_toml, toml_row
-
-FILES = ("file", "network")
-"""Fields of a rig file that name another file."""
 
 
 def to_toml(file: RigFile) -> str:
@@ -111,15 +109,7 @@ def template(title: str) -> RigFile:
 
 def located(file: RigFile) -> RigFile:
     """The same file, wherever it is written to: files that it names by whole paths."""
-
-    def whole(tree: Any) -> Any:
-        if not isinstance(tree, dict):
-            return tree
-        return {
-            key: str((file.folder / value).resolve())
-            if key in FILES and isinstance(value, str)
-            else whole(value)
-            for key, value in tree.items()
-        }
-
-    return RigFile.model_validate(whole(file.model_dump(exclude_unset=True)))
+    tree = file.model_dump(exclude_unset=True)
+    return RigFile.model_validate(
+        files_renamed(tree, lambda name: str((file.folder / name).resolve()))
+    )

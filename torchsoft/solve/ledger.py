@@ -34,7 +34,7 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
             f"of {better:.2g} s"
         )
     for name, work in run.dissipated.items():
-        back = -float(work.detach().diff().min())
+        back = -float(work.detach().diff(prepend=work[:1].detach()).min())
         if back > SUPPLIED * scale:
             found[f"dissipated {name}"] = (
                 f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "
