@@ -32,7 +32,7 @@ def experiment(name: str) -> ModuleType:
     return module
 
 
-def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
+def test_grasp_and_roll_smoke(tmp_path):
     module = experiment("grasp_and_roll")
     result = module.run(module.Config(out=tmp_path, smoke=True))
     module.write(result)
@@ -59,7 +59,7 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
     assert "23.20" in next(line for line in lines if "y_C in the grasp" in line)
 
 
-def test_pad_fidelity_smoke(tmp_path: Path) -> None:
+def test_pad_fidelity_smoke(tmp_path):
     """Inertia changes the disc by nanometres and the forces by millinewtons, and more in a fast
     stroke; the mesh moves the grasp by little, eta not at all."""
     module = experiment("pad_fidelity")
@@ -73,7 +73,7 @@ def test_pad_fidelity_smoke(tmp_path: Path) -> None:
     assert "| F_y | mN |" in module.table(result)
 
 
-def test_step_accuracy_smoke(tmp_path: Path) -> None:
+def test_step_accuracy_smoke(tmp_path):
     """Motion, forces and gradients come nearer with the tolerance; the table and the figure hold
     every way."""
     module = experiment("step_accuracy")
@@ -92,7 +92,7 @@ def test_step_accuracy_smoke(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_benchmark_smoke(tmp_path: Path) -> None:
+def test_benchmark_smoke(tmp_path):
     """A sweep costs less than two runs, a Jacobian less than four; every part has its place in the
     summary."""
     module = experiment("benchmark")
@@ -110,7 +110,7 @@ def test_benchmark_smoke(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_peers_smoke() -> None:
+def test_peers_smoke():
     """Every integrator reaches the stepper's solution with the compiled right-hand side."""
     pytest.importorskip("diffrax")
     module = experiment("benchmark")
@@ -120,7 +120,7 @@ def test_peers_smoke() -> None:
     assert "scipy LSODA" in module.peers_table(numbers)
 
 
-def test_experiment_design_smoke(tmp_path: Path) -> None:
+def test_experiment_design_smoke(tmp_path):
     """Jerks of a light grasp see friction and dashpots better than strokes; together they see more
     than either alone."""
     module = experiment("experiment_design")
@@ -134,7 +134,7 @@ def test_experiment_design_smoke(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_identify_contact_smoke(tmp_path: Path) -> None:
+def test_identify_contact_smoke(tmp_path):
     """Without noise the truth, with noise the truth within what was predicted, by differences the
     same at more runs."""
     module = experiment("identify_contact")
@@ -154,7 +154,7 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_identify_by_touch_smoke(tmp_path: Path) -> None:
+def test_identify_by_touch_smoke(tmp_path):
     """Taxels shrink every interval, shear shrinks it further, and the fits are within theirs."""
     module = experiment("identify_by_touch")
     module.main(module.Config(out=tmp_path, smoke=True))
@@ -169,7 +169,7 @@ def test_identify_by_touch_smoke(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_interval_coverage_smoke(tmp_path: Path) -> None:
+def test_interval_coverage_smoke(tmp_path):
     """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour
     is found where it is, and rig files are identified by their names."""
     module = experiment("interval_coverage")
@@ -191,7 +191,7 @@ def test_interval_coverage_smoke(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_contact_points_smoke(tmp_path: Path) -> None:
+def test_contact_points_smoke(tmp_path):
     """Two points an element take most of the nodes out of the force along the pad; gradients are
     exact with either."""
     module = experiment("contact_points")
@@ -204,7 +204,7 @@ def test_contact_points_smoke(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_orientation_smoke(tmp_path: Path) -> None:
+def test_orientation_smoke(tmp_path):
     """Loops turn and carry the disc within the tolerance; what they do not do is as rigid statics
     say, and is said."""
     module = experiment("orientation")
@@ -232,7 +232,7 @@ def test_orientation_smoke(tmp_path: Path) -> None:
     }
 
 
-def test_orientation_rig_has_the_gains_of_its_design() -> None:
+def test_orientation_rig_has_the_gains_of_its_design():
     """The gains in the file are those of the experiment's bandwidth; rigid statics are the closed
     form of an ellipse."""
     module = experiment("orientation")
@@ -246,7 +246,7 @@ def test_orientation_rig_has_the_gains_of_its_design() -> None:
 
 
 @pytest.mark.slow
-def test_rolling_resistance_smoke(tmp_path: Path) -> None:
+def test_rolling_resistance_smoke(tmp_path):
     """Force and power give one resistance, near theory's, with a peak."""
     module = experiment("rolling_resistance")
     module.main(module.Config(out=tmp_path, smoke=True))
@@ -260,7 +260,7 @@ def test_rolling_resistance_smoke(tmp_path: Path) -> None:
     assert {"rolling_resistance.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_the_theories_of_rolling_meet() -> None:
+def test_the_theories_of_rolling_meet():
     """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the
     moving contact is the closed form's, with the same peak."""
     theory = experiment("rolling_resistance")
@@ -278,7 +278,7 @@ def test_the_theories_of_rolling_meet() -> None:
 
 
 @pytest.mark.slow
-def test_startup_smoke(tmp_path: Path) -> None:
+def test_startup_smoke(tmp_path):
     """Kernels of the wheel are as good as loaded; those that are missing are compiled."""
     module = experiment("startup")
     module.main(module.Config(out=tmp_path, smoke=True))
@@ -287,7 +287,7 @@ def test_startup_smoke(tmp_path: Path) -> None:
     assert found["processes_s"]["import torchsoft"] < found["processes_s"]["import torch"]
 
 
-def test_a_policy_becomes_a_controller(tmp_path: Path) -> None:
+def test_a_policy_becomes_a_controller(tmp_path):
     """Ranges of what it sees and does are folded into the network of the rig file."""
     module = experiment("learn_policy")
     env = module.environment()
@@ -311,7 +311,7 @@ def test_a_policy_becomes_a_controller(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
-def test_learn_policy_smoke(tmp_path: Path) -> None:
+def test_learn_policy_smoke(tmp_path):
     module = experiment("learn_policy")
     module.run(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads((tmp_path / "summary.json").read_text())

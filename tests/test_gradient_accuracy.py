@@ -1,7 +1,6 @@
 """The experiment that judges gradients, at smoke size."""
 
 import json
-from pathlib import Path
 
 import pytest
 from test_experiments import experiment
@@ -11,7 +10,7 @@ EXACT = 1e-6
 
 
 @pytest.mark.slow
-def test_gradient_accuracy_smoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradient_accuracy_smoke(tmp_path, monkeypatch):
     module = experiment("gradient_accuracy")
     monkeypatch.setattr("sys.argv", ["", "--smoke", "--out", str(tmp_path)])
     module.main()

@@ -2,8 +2,6 @@
 draws something."""
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +34,6 @@ from torchsoft.plot import figures
 from torchsoft.plot.animation import animate, pace
 from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
 from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
-from torchsoft.plot.figures import Look
 from torchsoft.plot.scene import Scene, instants, straight_up
 from torchsoft.scenario import grasp_and_roll
 
@@ -51,11 +48,11 @@ def manipulated(**changes: object) -> Done:
 
 
 @pytest.fixture(scope="module")
-def done() -> Done:
+def done():
     return manipulated()
 
 
-def test_a_spoke_ends_on_the_outline() -> None:
+def test_a_spoke_ends_on_the_outline():
     square = np.array([[-1.0, -2.0], [3.0, -2.0], [3.0, 1.0], [-1.0, 2.0], [-1.0, -2.0]])
     np.testing.assert_allclose(straight_up(square), [0.0, 1.75], rtol=1e-15)
     np.testing.assert_allclose(straight_up(Circle(2.0).outline().numpy()), [0.0, 2.0], atol=1e-3)
@@ -64,9 +61,7 @@ def test_a_spoke_ends_on_the_outline() -> None:
 
 @pytest.mark.parametrize("enclosed", [False, True])
 @pytest.mark.parametrize("which", ["L", "U"])
-def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(
-    which: str, enclosed: bool
-) -> None:
+def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(which, enclosed):
     model, run = manipulated(pad__enclosed=enclosed)
     pad, u = model.pads[which], run.displacement[which]
     mesh = run.setup.pads[which].deformed(u.numpy())
@@ -89,7 +84,7 @@ def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(
 
 
 @pytest.mark.parametrize("which", ["L", "U"])
-def test_stress_of_a_uniform_strain_is_hookes(done: Done, which: str) -> None:
+def test_stress_of_a_uniform_strain_is_hookes(done, which):
     """Plane strain: every element of a pad that is stretched and sheared alike."""
     pad = done[1].setup.pads[which]
     gradient = np.array([[0.01, 0.004], [0.002, -0.02]])
@@ -107,7 +102,7 @@ def test_stress_of_a_uniform_strain_is_hookes(done: Done, which: str) -> None:
     np.testing.assert_allclose(von_mises(pad.stress(strain)), expected, rtol=1e-10)
 
 
-def test_the_stress_under_a_contact_carries_its_force(done: Done) -> None:
+def test_the_stress_under_a_contact_carries_its_force(done):
     """In a held grasp s_yy, summed along the bonded layer, balances the nodal forces."""
     model = coarse(pad__elements_x=120, pad__elements_y=6)
     start = grasp_and_roll(model, grasp_force=80.0)
@@ -121,7 +116,7 @@ def test_the_stress_under_a_contact_carries_its_force(done: Done) -> None:
     assert carried == pytest.approx(-float(run.state.pads["L"][-1, 0, :, 1].sum()), rel=1e-3)
 
 
-def test_friction_is_drawn_towards_the_right(done: Done) -> None:
+def test_friction_is_drawn_towards_the_right(done):
     """In the grasp the pads are squeezed outwards, so friction on them points inwards, whichever
     pad."""
     (instant,) = instants(done[1], [0.2])
@@ -162,7 +157,7 @@ def hand() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def held() -> tuple[Rig, Trajectory]:
+def held():
     """The egg between wall, floor and finger."""
     rig = hand()
     state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
@@ -174,7 +169,7 @@ def held() -> tuple[Rig, Trajectory]:
     return rig, simulate(rig, t, y0=rig.pack(state._replace(pose=pose)), step=1e-3)
 
 
-def test_any_rig_is_drawn_where_its_bodies_are(held: tuple[Rig, Trajectory]) -> None:
+def test_any_rig_is_drawn_where_its_bodies_are(held):
     rig, run = held
     (instant,) = instants(run, [0.12])
     assert all(bool((force[:, 0] > 0).any()) for force in instant.force.values())
@@ -208,7 +203,7 @@ def test_any_rig_is_drawn_where_its_bodies_are(held: tuple[Rig, Trajectory]) -> 
     assert len(axes.patches) == 3 + 2 + 3 + 2 * 4  # pads, bodies with a shape, plates, curves
 
 
-def test_energies_of_any_rig_are_all_in_the_balance(held: tuple[Rig, Trajectory]) -> None:
+def test_energies_of_any_rig_are_all_in_the_balance(held):
     _, run = held
     drawn = sum(part for _, part, _ in energy_groups(run))
     total = sum([*run.energy.values(), *run.dissipated.values()])
@@ -227,7 +222,7 @@ DRAWN: dict[str, Callable[[Rig, Trajectory], Figure]] = {
 
 @pytest.mark.parametrize("name", DRAWN)
 @pytest.mark.parametrize("rig", ["done", "held"])
-def test_figure_draws_something(rig: str, name: str, request: pytest.FixtureRequest) -> None:
+def test_figure_draws_something(rig, name, request):
     """All of it within the figure, axes with labels, without a title where it is for print."""
     figure = DRAWN[name](*request.getfixturevalue(rig))
     canvas = FigureCanvasAgg(figure)
@@ -254,18 +249,14 @@ def test_figure_draws_something(rig: str, name: str, request: pytest.FixtureRequ
         ({"only": ["disc.yy"]}, "there is no panel `disc.yy`; did you mean `disc.y`"),
     ],
 )
-def test_a_dashboard_that_there_is_not_is_refused(
-    done: Done, how: dict[str, Any], message: str
-) -> None:
+def test_a_dashboard_that_there_is_not_is_refused(done, how, message):
     with pytest.raises(ValueError, match=message):
         dashboard(done[1], **how)
 
 
 @pytest.mark.parametrize("look", ["screen", "page"])
 @pytest.mark.parametrize("rig", ["done", "held"])
-def test_legends_stand_above_the_curves(
-    rig: str, look: Look, request: pytest.FixtureRequest
-) -> None:
+def test_legends_stand_above_the_curves(rig, look, request):
     figure = dashboard(request.getfixturevalue(rig)[1], look=look)
     FigureCanvasAgg(figure).draw()
     legends = [(axes, one) for axes in figure.axes if (one := axes.get_legend())]
@@ -275,16 +266,14 @@ def test_legends_stand_above_the_curves(
         assert legend.get_window_extent().y0 > top - 3.0, axes.get_title(loc="left")
 
 
-def test_ripples_are_explained_in_a_whole_dashboard_only(
-    done: Done, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ripples_are_explained_in_a_whole_dashboard_only(done, monkeypatch):
     monkeypatch.setattr("torchsoft.plot.dashboard.ripples", lambda run: True)
     assert dashboard(done[1]).get_supxlabel() == RIPPLE
     assert not dashboard(done[1], only=["scene", "disc.y"]).get_supxlabel()
     assert not dashboard(done[1], look="page").get_supxlabel()
 
 
-def test_a_loaded_run_has_the_same_mesh(done: Done, tmp_path: Path) -> None:
+def test_a_loaded_run_has_the_same_mesh(done, tmp_path):
     done[1].save(tmp_path / "run.nc")
     drawn = []
     for run in (done[1], Trajectory.load(tmp_path / "run.nc")):
@@ -301,11 +290,11 @@ def test_a_loaded_run_has_the_same_mesh(done: Done, tmp_path: Path) -> None:
     [(1.0, ""), (2.517, "\n2.5 times as fast"), (0.1, "\n10 times slower"),
      (123.0, "\n120 times as fast")],
 )  # fmt: skip
-def test_a_video_says_how_fast_it_is(speed: float, text: str) -> None:
+def test_a_video_says_how_fast_it_is(speed, text):
     assert pace(speed) == text
 
 
-def test_save_writes_the_whole_file_or_none(done: Done, tmp_path: Path) -> None:
+def test_save_writes_the_whole_file_or_none(done, tmp_path):
     figures.save(dashboard(done[1], only=["F_y"]), tmp_path / "moment.png", dpi=50)
     assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
     with Image.open(tmp_path / "moment.png") as picture:
@@ -313,7 +302,7 @@ def test_save_writes_the_whole_file_or_none(done: Done, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("build", [coarse, lambda: coarse(pad__fidelity="inertial"), hand])
-def test_diagram_places_every_node_of_the_graph_by_itself(build: Callable[[], Rig]) -> None:
+def test_diagram_places_every_node_of_the_graph_by_itself(build):
     rig = build()
     graph = graph_of(rig)
     assert {"egg_spin", "contact_egg at tip", "pad_tip: field"} <= set(graph) or isinstance(
@@ -327,7 +316,7 @@ def test_diagram_places_every_node_of_the_graph_by_itself(build: Callable[[], Ri
     assert dot(rig).startswith("digraph")
 
 
-def test_animation_moves(done: Done, tmp_path: Path) -> None:
+def test_animation_moves(done, tmp_path):
     animate(done[1], tmp_path / "run.gif", frames=4, dpi=40)
     assert [path.name for path in tmp_path.iterdir()] == ["run.gif"]
     with Image.open(tmp_path / "run.gif") as gif:
@@ -340,7 +329,7 @@ def test_animation_moves(done: Done, tmp_path: Path) -> None:
     assert np.abs(pictures[0] - pictures[1]).max() > 50
 
 
-def test_animation_in_an_unknown_format_is_refused(done: Done, tmp_path: Path) -> None:
+def test_animation_in_an_unknown_format_is_refused(done, tmp_path):
     with pytest.raises(ValueError, match=r"must end in \.gif or \.mp4"):
         animate(done[1], tmp_path / "run.avi")
     with pytest.raises(ValueError, match=r"`follow` is `disk\.x`.* did you mean `disc\.x`"):

@@ -61,14 +61,14 @@ def motion(model: ReducedModel, seed: int, duration: float = 0.3) -> Record:
 
 
 @pytest.fixture(scope="module")
-def motions() -> list[Record]:
+def motions():
     return [motion(truth(), seed) for seed in range(6)]
 
 
 RECIPE = Recipe(width=0.004, window=0.3, threshold=0.01)
 
 
-def test_known_equations_are_recovered(motions: list[Record]) -> None:
+def test_known_equations_are_recovered(motions):
     """Exactly the true terms, their coefficients to a few per cent."""
     model = fit(assemble(motions, mechanics(R), RECIPE), RECIPE)
     found = {
@@ -82,7 +82,7 @@ def test_known_equations_are_recovered(motions: list[Record]) -> None:
             assert found[target][text] == pytest.approx(value, rel=0.05), text
 
 
-def test_the_choice_takes_the_true_terms_and_rolls_out(motions: list[Record]) -> None:
+def test_the_choice_takes_the_true_terms_and_rolls_out(motions):
     choice = choose(
         assemble(motions, mechanics(R), RECIPE),
         [motion(truth(), 50)],
@@ -96,7 +96,7 @@ def test_the_choice_takes_the_true_terms_and_rolls_out(motions: list[Record]) ->
     assert max(row["nrmse"] for row in choice.tried) > 0.05  # thresholds matter
 
 
-def test_raw_variables_contain_the_equations_too(motions: list[Record]) -> None:
+def test_raw_variables_contain_the_equations_too(motions):
     """In raw variables x_C'' = k/m x_Br - 2 k/m x_C + ...: the same equation with more terms."""
     library = {"v_C": [variable(name) for name in ("x_C", "x_Br", "v_C", "v_Br")]}
     recipe = replace(RECIPE, threshold=0.0)
@@ -106,7 +106,7 @@ def test_raw_variables_contain_the_equations_too(motions: list[Record]) -> None:
     assert found["v_C"] == pytest.approx(-2.2e3, rel=0.05)
 
 
-def test_saturating_friction_is_recovered() -> None:
+def test_saturating_friction_is_recovered():
     """tanh(s' / v) with v known: amplitude to 5 %, and the linear terms beside it."""
     upper = friction(R, 1e-3)["v_C"][1]
     model = truth({"v_C": [(upper, 3.0)]})
@@ -119,7 +119,7 @@ def test_saturating_friction_is_recovered() -> None:
     assert found[-1][1] == pytest.approx(3.0, rel=0.05)
 
 
-def test_ensembles_give_intervals_and_leave_the_global_generator(motions: list[Record]) -> None:
+def test_ensembles_give_intervals_and_leave_the_global_generator(motions):
     rng = np.random.default_rng(0)
     rough = [
         replace(one, series={k: x + 0.005 * x.std() * rng.standard_normal(len(x))
@@ -139,7 +139,7 @@ def test_ensembles_give_intervals_and_leave_the_global_generator(motions: list[R
 
 
 @pytest.mark.parametrize("nonlinear", [False, True])
-def test_all_routes_are_one(nonlinear: bool) -> None:
+def test_all_routes_are_one(nonlinear):
     """Rollout, torchdiffeq and scipy through the same terms; the batched right-hand side as
     well."""
     product = Term("x_C |v_C|", "m m/s", (Factor({"x_C": 1.0}), Factor({"v_C": 1.0}, "abs")))
@@ -167,7 +167,7 @@ def test_all_routes_are_one(nonlinear: bool) -> None:
     assert torch.equal(model(0.01, batch)[0], model(0.01, batch[0]))
 
 
-def test_gradients_through_torchdiffeq_are_those_of_the_rollout() -> None:
+def test_gradients_through_torchdiffeq_are_those_of_the_rollout():
     """d x_C(0.02 s) by a coefficient, a gain and y0, against central differences of the exact
     rollout."""
     model, one = truth(), motion(truth(), 3, duration=0.02)
@@ -191,7 +191,7 @@ def test_gradients_through_torchdiffeq_are_those_of_the_rollout() -> None:
 
 
 @pytest.mark.parametrize("nonlinear", [False, True])
-def test_divergence_is_reported_with_its_time(nonlinear: bool) -> None:
+def test_divergence_is_reported_with_its_time(nonlinear):
     """v' = a v from v = 1 leaves 100 times its scale at ln(100) / a; v' = v^2 blows up at t = 1."""
     square = Term("v_C v_C", "m2/s2", (Factor({"v_C": 1.0}), Factor({"v_C": 1.0})))
     term, value, when = (
@@ -205,7 +205,7 @@ def test_divergence_is_reported_with_its_time(nonlinear: bool) -> None:
     assert np.isfinite(out.y[: int(1000 * when) - 2]).all()
 
 
-def test_a_choice_of_divergent_models_fails_with_the_time(motions: list[Record]) -> None:
+def test_a_choice_of_divergent_models_fails_with_the_time(motions):
     away = {"F_x": {name: -gain for name, gain in LAW["F_x"].items()}}
     with pytest.raises(ValueError, match=r"rollouts stay bounded.*diverged at t = 0\.\d+ s"):
         choose(
@@ -243,14 +243,12 @@ BAD: list[tuple[Callable[[Record, dict[str, list[Term]]], object], str]] = [
 
 
 @pytest.mark.parametrize(("call", "sentence"), BAD)
-def test_bad_data_are_refused_by_name(
-    motions: list[Record], call: Callable[..., object], sentence: str
-) -> None:
+def test_bad_data_are_refused_by_name(motions, call, sentence):
     with pytest.raises(ValueError, match=sentence):
         call(motions[0], mechanics(R))
 
 
-def test_the_bracket_may_be_the_input(motions: list[Record]) -> None:
+def test_the_bracket_may_be_the_input(motions):
     """With the bracket's motion as u only the disc has equations."""
     library = {k: v for k, v in mechanics(R).items() if k != "v_Br"}
     model = fit(assemble(motions, library, RECIPE, inputs=("x_Br", "v_Br")), RECIPE)
@@ -259,7 +257,7 @@ def test_the_bracket_may_be_the_input(motions: list[Record]) -> None:
     assert score(model, motion(truth(), 60)).worst < 1e-2
 
 
-def test_equations_read_in_text_and_latex() -> None:
+def test_equations_read_in_text_and_latex():
     model = truth()
     assert model.text()[0] == "x_C' = v_C"
     assert model.with_feedback(None).text() == model.text()
@@ -273,7 +271,7 @@ def test_equations_read_in_text_and_latex() -> None:
     )
 
 
-def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
+def test_records_of_a_run_and_of_a_dataset_are_the_same():
     model = coarse()
     y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
     x_0, y_Br = (float(model.unpack(y0).pose[name][i]) for name, i in (("disc", 0), ("bracket", 1)))
@@ -304,15 +302,13 @@ def run_of(file: RigFile, **motion: dict[str, object]) -> tuple[BuiltRig, Trajec
 
 
 @pytest.fixture(scope="module")
-def beside() -> Trajectory:
+def beside():
     """A run whose loop measures the bracket, 0.3 mm beside the disc."""
     x_d = {"kind": "profile", "times": [0.0, 0.02], "values": ["start", 1e-4]}
     return run_of(template("t"), x_d=x_d)[1]
 
 
-def test_a_set_point_counts_from_where_its_coordinate_starts(
-    beside: Trajectory, tmp_path: Path
-) -> None:
+def test_a_set_point_counts_from_where_its_coordinate_starts(beside, tmp_path):
     """The law of the loop holds in the variables of the record, from any begin on."""
     for begin in (None, 0.01):
         one = record(beside, begin=begin)
@@ -336,7 +332,7 @@ def test_a_set_point_counts_from_where_its_coordinate_starts(
         record(series, beside.t, measured="x")
 
 
-def test_bodies_of_a_record_have_any_names(beside: Trajectory) -> None:
+def test_bodies_of_a_record_have_any_names(beside):
     """Efforts on one coordinate add up; set-points of several loops are no x_d."""
     with pytest.raises(
         ValueError, match="`disc` = 'disk' is no body of the run; did you mean `disc"
@@ -355,16 +351,14 @@ def test_bodies_of_a_record_have_any_names(beside: Trajectory) -> None:
     assert ready.rig.actuators["turn_upper"].pushes == "upper.x"
 
 
-def test_the_law_of_the_loop_is_found(motions: list[Record]) -> None:
+def test_the_law_of_the_loop_is_found(motions):
     assert loop(motions)["F_x"] == pytest.approx(LAW["F_x"], rel=1e-6)
     shaken = np.random.default_rng(0).standard_normal(len(motions[0].t))
     with pytest.raises(ValueError, match=r"F_x is no PD law of x_d: .* N of .* N are left"):
         loop([replace(motions[0], series=motions[0].series | {"F_x": shaken})])
 
 
-def test_saved_runs_are_reduced_by_a_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_saved_runs_are_reduced_by_a_command(tmp_path, capsys):
     """Small waves about a settled grasp; the last run is predicted."""
     files = []
     for seed in range(2):
@@ -390,7 +384,7 @@ def test_saved_runs_are_reduced_by_a_command(
         assert said in capsys.readouterr().err
 
 
-def test_a_fit_that_misses_its_record_says_why(motions: list[Record]) -> None:
+def test_a_fit_that_misses_its_record_says_why(motions):
     """Coarse samples of a large motion; a law on the wrong coordinate; no law at all."""
     coarse_ones = [Record(one.t[::100], {k: x[::100] for k, x in one.series.items()})
                    for one in (motion(truth(), seed, 3.0) for seed in range(4))]  # fmt: skip
@@ -411,7 +405,7 @@ def test_a_fit_that_misses_its_record_says_why(motions: list[Record]) -> None:
         fit(problem, replace(RECIPE, threshold=0.3))
 
 
-def test_objects_show_themselves_in_a_few_lines(motions: list[Record]) -> None:
+def test_objects_show_themselves_in_a_few_lines(motions):
     problem = assemble(motions, mechanics(R), RECIPE)
     done = score(fit(problem, RECIPE, LAW), motions[0])
     for thing in (motions[0], done, done.rollout, problem):

@@ -2,14 +2,13 @@
 where it is used."""
 
 import json
-from pathlib import Path
 
 import pytest
 from test_experiments import experiment
 
 
 @pytest.mark.slow
-def test_reduced_model_smoke(tmp_path: Path) -> None:
+def test_reduced_model_smoke(tmp_path):
     module = experiment("reduced_model")
     result = module.run(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads(json.dumps(module.summary(result), allow_nan=False))

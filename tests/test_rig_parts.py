@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from functools import reduce
 from pathlib import Path
@@ -73,7 +72,7 @@ def slow(*kinds: str) -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """With a contour, a material, a mesh and networks."""
     path = tmp_path_factory.mktemp("parts")
     turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
@@ -193,7 +192,7 @@ RUN = [
 
 
 @pytest.mark.parametrize("kind", [*MATERIALS, *RUN])
-def test_every_kind_of_part_is_built_written_and_runs(kind: str, folder: Path) -> None:
+def test_every_kind_of_part_is_built_written_and_runs(kind, folder):
     table, made = (SHAPES | MATERIALS | PADS)[kind]
     file = rig(folder, **in_a_rig(kind, table))
     built = file.build().rig
@@ -219,7 +218,7 @@ def test_every_kind_of_part_is_built_written_and_runs(kind: str, folder: Path) -
         )  # it rests
 
 
-def test_parts_of_two_builds_are_not_the_same(folder: Path) -> None:
+def test_parts_of_two_builds_are_not_the_same(folder):
     """A contour is fitted once, but parameters that one user trains are not another's."""
     file = rig(folder, bodies={"disc": {"shape": {"kind": "contour", "file": "pear.csv"}}})
     one, other = (file.build().rig.bodies["disc"].shape for _ in range(2))
@@ -229,7 +228,7 @@ def test_parts_of_two_builds_are_not_the_same(folder: Path) -> None:
     assert torch.equal(one.control, other.control)
 
 
-def test_a_mesh_from_a_file_is_the_block_that_it_was_made_of(folder: Path) -> None:
+def test_a_mesh_from_a_file_is_the_block_that_it_was_made_of(folder):
     table = {"kind": "mesh", **PADS["mesh"][0]}
     found = [
         float(rig(folder, **change).build().y0[:-12].abs().sum())
@@ -238,13 +237,13 @@ def test_a_mesh_from_a_file_is_the_block_that_it_was_made_of(folder: Path) -> No
     assert found[0] == pytest.approx(found[1], rel=1e-9)
 
 
-def test_a_pad_without_a_kind_is_a_block() -> None:
+def test_a_pad_without_a_kind_is_a_block():
     tree = template("t").model_dump(exclude_unset=True)
     del tree["pads"]["lower"]["kind"]
     assert RigFile.from_tree(tree).pads["lower"].kind == "block"
 
 
-def test_the_middle_of_a_hollow_pad_is_below_its_ends(folder: Path) -> None:
+def test_the_middle_of_a_hollow_pad_is_below_its_ends(folder):
     """And what lies in the hollow does not overlap it."""
     hollow = COARSE | {"kind": "curved", "radius": -0.05, "height": 3e-3}
     file = rig(folder, pads={"lower": hollow}, bodies={"disc": {"start": {"x": 0.0}}})
@@ -266,7 +265,7 @@ def test_the_middle_of_a_hollow_pad_is_below_its_ends(folder: Path) -> None:
         assert (collision(pads["lower"], small, pose) > 1e-6) == overlap
 
 
-def test_pads_that_cross_without_a_node_in_each_other_overlap() -> None:
+def test_pads_that_cross_without_a_node_in_each_other_overlap():
     """Like a plus: their sides cross."""
     rubber = KelvinVoigt(E=1e6, nu=0.45, rho=1100.0, tau=0.01, depth=0.04)
     mesh = PadMesh(length=60e-3, height=4e-3, elements_x=2, elements_y=1)
@@ -287,7 +286,7 @@ def test_pads_that_cross_without_a_node_in_each_other_overlap() -> None:
     ],
     ids=["block", "square", "curved", "fingertip"],
 )
-def test_a_mesh_is_counted_before_it_is_built(mesh: Mesh) -> None:
+def test_a_mesh_is_counted_before_it_is_built(mesh):
     """As it is counted of itself, as of those in files."""
     assert mesh.counts()[:2] == (len(mesh.face), len(mesh.free))
     surface, free, band = Mesh.counts(mesh)
@@ -323,7 +322,7 @@ for mesh in (
 @pytest.mark.skipif(
     not Path("/proc/self/clear_refs").exists(), reason="the peak of memory is Linux's"
 )
-def test_the_memory_of_a_pad_is_estimated_before_it_is_built() -> None:
+def test_the_memory_of_a_pad_is_estimated_before_it_is_built():
     """By the order of what condensing takes at its peak."""
     lines = subprocess.run(
         [sys.executable, "-c", CONDENSING], capture_output=True, text=True, check=True
@@ -337,7 +336,7 @@ def test_the_memory_of_a_pad_is_estimated_before_it_is_built() -> None:
 # ----------------------------------------------------------------------
 
 
-def test_a_network_from_a_file_is_the_module_in_python(folder: Path) -> None:
+def test_a_network_from_a_file_is_the_module_in_python(folder):
     file = rig(folder, actuators={"x": {"network": "law.npz"}}, outputs={"duration": 0.12})
     ready = file.build()
     run = running.carry_out(file).trajectory
@@ -374,9 +373,7 @@ def test_a_network_from_a_file_is_the_module_in_python(folder: Path) -> None:
         ),
     ],
 )
-def test_weights_that_are_no_network_are_refused(
-    tmp_path: Path, arrays: dict[str, Any], sentence: str
-) -> None:
+def test_weights_that_are_no_network_are_refused(tmp_path, arrays, sentence):
     np.savez(tmp_path / "law.npz", allow_pickle=True, **arrays)
     (found,) = check(rig(tmp_path, actuators={"x": {"network": "law.npz"}}))
     assert (found.severity, found.where) == ("error", "actuators.x.network")
@@ -575,7 +572,7 @@ wrong."""
 
 
 @pytest.fixture(scope="module")
-def said(folder: Path) -> Callable[[dict[str, Any]], tuple[int, str]]:
+def said(folder):
     """Status and words of `torchsoft check` on the template, changed: right or wrong."""
 
     def check_file(changes: dict[str, Any]) -> tuple[int, str]:
@@ -593,14 +590,12 @@ def said(folder: Path) -> Callable[[dict[str, Any]], tuple[int, str]]:
 
 
 @pytest.fixture(scope="module")
-def quiet(said: Callable[[dict[str, Any]], tuple[int, str]]) -> str:
+def quiet(said):
     return said({})[1]
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_rig_that_makes_no_sense_is_refused(
-    name: str, said: Callable[[dict[str, Any]], tuple[int, str]], quiet: str
-) -> None:
+def test_a_rig_that_makes_no_sense_is_refused(name, said, quiet):
     changes, sentence = REFUSED[name]
     status, words = said(changes)
     assert re.search(sentence, words), words
@@ -608,7 +603,7 @@ def test_a_rig_that_makes_no_sense_is_refused(
     assert status == (0 if sentence.startswith("warning") else 2)
 
 
-def test_a_mass_by_density_is_pythons(folder: Path) -> None:
+def test_a_mass_by_density_is_pythons(folder):
     disc = (
         rig(folder, bodies={"disc": {"mass": None, "density": 2700.0, "depth": 44e-3}})
         .build()
@@ -619,7 +614,7 @@ def test_a_mass_by_density_is_pythons(folder: Path) -> None:
     assert disc.inertia.item() == expected.inertia.item()
 
 
-def test_a_run_that_ends_where_it_begins_has_its_summary(folder: Path, tmp_path: Path) -> None:
+def test_a_run_that_ends_where_it_begins_has_its_summary(folder, tmp_path):
     running.run(rig(folder, pads={"upper": {"origin": (5.0, 0.0)}}), tmp_path)
     numbers = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert numbers["simulated_s"] == 0.0

@@ -2,8 +2,6 @@
 finite-element program."""
 
 import json
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,16 +17,16 @@ from torchsoft.physics.state import State
 
 
 @pytest.fixture(scope="module")
-def statics() -> ModuleType:
+def statics():
     return experiment("statics")
 
 
 @pytest.fixture(scope="module")
-def result(statics: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def result(statics, tmp_path_factory):
     return statics.run(statics.Config(out=tmp_path_factory.mktemp("statics"), smoke=True))
 
 
-def test_the_full_grasp(statics: ModuleType, result: Any) -> None:
+def test_the_full_grasp(statics, result):
     grasp = statics.full_grasp(result.meshes)["120 x 4"]
     assert grasp["force_N"] == pytest.approx(70.16, abs=0.01)
     assert grasp["y_C_mm"] == pytest.approx(
@@ -39,7 +37,7 @@ def test_the_full_grasp(statics: ModuleType, result: Any) -> None:
     assert grasp["nodes_touching"] == 11
 
 
-def test_the_force_converges_in_mesh_and_penalty(statics: ModuleType, result: Any) -> None:
+def test_the_force_converges_in_mesh_and_penalty(statics, result):
     # two curves and the expected order already foretell the limits of the whole experiment (70.54
     # and 79.33 N)
     assert result.families["mesh"].limit == pytest.approx(70.54, rel=2e-3)
@@ -52,7 +50,7 @@ def test_the_force_converges_in_mesh_and_penalty(statics: ModuleType, result: An
     )
 
 
-def test_force_and_contact_grow_with_compression(result: Any) -> None:
+def test_force_and_contact_grow_with_compression(result):
     for curve in (*result.meshes.values(), *result.penalties.values()):
         for grows in (curve.force, curve.half_width, curve.penetration, -curve.y_C):
             assert bool((grows.diff() > 0).all())
@@ -60,12 +58,12 @@ def test_force_and_contact_grow_with_compression(result: Any) -> None:
         assert float(curve.compression[-1]) == pytest.approx(1.5e-3, abs=1e-15)
 
 
-def test_half_width_is_interpolated_between_nodes(statics: ModuleType) -> None:
+def test_half_width_is_interpolated_between_nodes(statics):
     x = torch.linspace(-5, 5, 11, dtype=torch.float64)
     assert float(statics.half_width(x, 2.3 - x.abs())) == pytest.approx(2.3, rel=1e-14)
 
 
-def test_files(statics: ModuleType, result: Any) -> None:
+def test_files(statics, result):
     statics.write(result)
     numbers = json.loads((result.config.out / "summary.json").read_text())
     assert numbers["mesh"]["full_grasp"]["120 x 4"] == numbers["penalty"]["full_grasp"]["1"]
@@ -95,7 +93,7 @@ def punched(K_n: float, elements_x: int) -> tuple[SoftGrasp, State, float]:
     return model, model.unpack(y), holding_force(model, y)
 
 
-def test_a_long_box_is_a_flat_punch_on_springs() -> None:
+def test_a_long_box_is_a_flat_punch_on_springs():
     """On the same mesh, assembled by scikit-fem, with a spring K_n between each node under the flat
     side and the box."""
     model, state, force = punched(1.2e5, 120)
@@ -115,7 +113,7 @@ def test_a_long_box_is_a_flat_punch_on_springs() -> None:
     )
 
 
-def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch() -> None:
+def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch():
     """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are
     bilinear of half a millimetre."""
     pad = Parameters().pad

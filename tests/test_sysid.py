@@ -373,9 +373,7 @@ def test_data_out_of_reach_name_the_recording():
         identify(problem, plan=[Stage("all", ("strokes",), ("pad.E",), 1e-3)])
 
 
-def test_a_plan_ends_where_a_finer_stage_cannot_begin(
-    strokes: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_plan_ends_where_a_finer_stage_cannot_begin(strokes, monkeypatch):
     """The fit is kept, says so, and is tested on its own steps."""
     freeze, first = Problem.freeze, iter([True])
 

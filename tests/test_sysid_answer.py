@@ -82,7 +82,7 @@ def example(kind: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def problem() -> Problem:
+def problem():
     """Two short grasps, one of them from a place that is not known well."""
     recordings = [
         record(name, begin(GRASP, BASE), {"contact.K_n": 1.6e5}, SENSORS, rtol=1e-3, seed=seed)
@@ -93,19 +93,19 @@ def problem() -> Problem:
 
 
 @pytest.fixture(scope="module")
-def result(problem: Problem) -> IdentificationResult:
+def result(problem):
     plan = [Stage("all", problem.names, problem.coordinates.labels, 1e-3, evaluations=3)]
     return identify(problem, plan=plan, tightenings=0, assumptions="trusted")
 
 
 @pytest.fixture(scope="module")
-def path(result: IdentificationResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def path(result, tmp_path_factory):
     path = tmp_path_factory.mktemp("answer") / "answer.json"
     result.save(path)
     return path
 
 
-def test_draws_are_those_of_the_covariance(result: IdentificationResult) -> None:
+def test_draws_are_those_of_the_covariance(result):
     """The estimates first; parameters that are not identifiable stay, and a ratio is multiplied."""
     with pytest.warns(UserWarning, match="not identifiable"):
         drawn = result.draws(2000, "second", seed=1)
@@ -131,13 +131,13 @@ def test_draws_are_those_of_the_covariance(result: IdentificationResult) -> None
         result.draws(0, "second")
 
 
-def test_the_published_schema_is_current() -> None:
+def test_the_published_schema_is_current():
     published = json.loads((ROOT / "docs" / "answer.schema.json").read_text(encoding="utf-8"))
     assert published == schema(), f"write it anew: {PUBLISH}"
     jsonschema.Draft202012Validator.check_schema(published)
 
 
-def test_files_are_what_the_schema_says(path: Path) -> None:
+def test_files_are_what_the_schema_says(path):
     check = jsonschema.Draft202012Validator(schema())
     for text in (path.read_text(encoding="utf-8"), example(IdentificationResult).to_json()):
         content = json.loads(text)
@@ -149,7 +149,7 @@ def test_files_are_what_the_schema_says(path: Path) -> None:
         ]
 
 
-def test_what_was_saved_comes_back(result: IdentificationResult, path: Path) -> None:
+def test_what_was_saved_comes_back(result, path):
     answer = load_answer(path)
     assert type(answer) is IdentificationResult
     assert not answer.rigs
@@ -159,7 +159,7 @@ def test_what_was_saved_comes_back(result: IdentificationResult, path: Path) -> 
     assert answer.recordings[1].began == {"start.disc.x": result["start.disc.x"].last}
 
 
-def test_an_answer_says_what_was_asked_for(result: IdentificationResult) -> None:
+def test_an_answer_says_what_was_asked_for(result):
     """The tolerance too, beside the one at which the fit ended."""
     asked = Settings(tightenings=0, assumptions="trusted").model_dump() | {
         "rtol_asked": 1e-3,
@@ -168,7 +168,7 @@ def test_an_answer_says_what_was_asked_for(result: IdentificationResult) -> None
     assert {name: result.made_by[name] for name in asked} == asked | {"rtol": 1e-3}
 
 
-def test_everything_that_an_answer_can_hold_comes_back(tmp_path: Path) -> None:
+def test_everything_that_an_answer_can_hold_comes_back(tmp_path):
     whole = example(IdentificationResult)
     assert all(getattr(whole, one.name) for one in fields(IdentificationResult))
     whole.save(tmp_path / "answer.json")
@@ -179,7 +179,7 @@ def test_everything_that_an_answer_can_hold_comes_back(tmp_path: Path) -> None:
     assert answer.noise == whole.noise
 
 
-def test_a_file_may_be_written_otherwise(path: Path, tmp_path: Path) -> None:
+def test_a_file_may_be_written_otherwise(path, tmp_path):
     content = json.loads(path.read_text(encoding="utf-8"))
     text = json.dumps(dict(sorted(content.items())))
     assert "10.0," in text
@@ -208,7 +208,7 @@ DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 
 
 @pytest.mark.parametrize("how", DAMAGE)
-def test_a_damaged_file_is_refused_with_a_sentence(path: Path, tmp_path: Path, how: str) -> None:
+def test_a_damaged_file_is_refused_with_a_sentence(path, tmp_path, how):
     change, said = DAMAGE[how]
     content, other = json.loads(path.read_text(encoding="utf-8")), tmp_path / "answer.json"
     change(content)
@@ -220,7 +220,7 @@ def test_a_damaged_file_is_refused_with_a_sentence(path: Path, tmp_path: Path, h
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '{"a": 1}', "\xff", "[" * 100_000, "cut"])
-def test_other_files_are_refused_with_a_sentence(path: Path, tmp_path: Path, text: str) -> None:
+def test_other_files_are_refused_with_a_sentence(path, tmp_path, text):
     other = tmp_path / "other.json"
     whole = path.read_bytes()
     other.write_bytes(whole[: len(whole) // 2] if text == "cut" else text.encode("latin-1"))
@@ -232,9 +232,7 @@ def test_other_files_are_refused_with_a_sentence(path: Path, tmp_path: Path, tex
 
 
 @pytest.mark.filterwarnings("ignore:not identifiable")
-def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(
-    result: IdentificationResult, path: Path
-) -> None:
+def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path):
     mine, its = result.model("second"), load_answer(path).model("second")
     assert isinstance(its, SoftGrasp)
     names = {
@@ -260,9 +258,7 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(
     assert mine is not begun
 
 
-def test_what_is_not_identifiable_is_named_when_it_is_used(
-    result: IdentificationResult, path: Path
-) -> None:
+def test_what_is_not_identifiable_is_named_when_it_is_used(result, path):
     assert not result["contact.eta"].identifiable
     for answer in (result, load_answer(path)):
         with pytest.warns(
@@ -274,8 +270,8 @@ def test_what_is_not_identifiable_is_named_when_it_is_used(
 
 
 def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
-    result: IdentificationResult,
-) -> None:
+    result,
+):
     def left_out(c: Coordinate) -> Coordinate:
         return replace(c, fixed=True) if c.recording == "second" else c
 
@@ -289,7 +285,7 @@ def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
         answer.model("first")
 
 
-def test_a_recording_must_be_named_where_rigs_differ(result: IdentificationResult) -> None:
+def test_a_recording_must_be_named_where_rigs_differ(result):
     with pytest.raises(
         ValueError, match="not the same in all recordings: say in which one, of `first`, `second`"
     ):
@@ -301,7 +297,7 @@ def test_a_recording_must_be_named_where_rigs_differ(result: IdentificationResul
 
 
 @pytest.fixture(scope="module")
-def slippery(problem: Problem, result: IdentificationResult) -> IdentificationResult:
+def slippery(problem, result):
     """A result for rigs with a law of the user's own, whose alpha is not identifiable."""
     own = [replace(r, rig=slide(BASE, r.rig.reference)) for r in problem.recordings]
     mine = Problem(own, SENSORS, {"contact.friction.alpha": Unknown(), "pad.E": Unknown()})
@@ -324,9 +320,7 @@ def slide(settings: Parameters, reference: Reference) -> SoftGrasp:
     return SoftGrasp(settings, reference, friction=Viscous(0.6, 30.0))
 
 
-def test_a_law_of_the_users_own_needs_the_users_rig(
-    slippery: IdentificationResult, tmp_path: Path
-) -> None:
+def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
     slippery.save(tmp_path / "answer.json")
     answer, reference = load_answer(tmp_path / "answer.json"), slippery.rigs["first"].reference
     said = r"SoftGrasp with parts of its own, which no file holds: .* `applied_to\(rig\)`"
@@ -357,9 +351,7 @@ def test_a_law_of_the_users_own_needs_the_users_rig(
         answer.applied_to(SoftGrasp(BASE))
 
 
-def test_contributions_are_those_of_the_inverse_matrices(
-    problem: Problem, result: IdentificationResult
-) -> None:
+def test_contributions_are_those_of_the_inverse_matrices(problem, result):
     """Against numpy's inverses of what Fisher's matrices of the recordings add up to."""
     x, free = np.array(result.x), problem.coordinates.free
     J = problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3, free).J
@@ -387,8 +379,8 @@ def test_contributions_are_those_of_the_inverse_matrices(
 
 
 def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinates(
-    problem: Problem,
-) -> None:
+    problem,
+):
     sure, unknowns = Prior(median=0.8, sd=0.1), {
         "contact.mu_s": Unknown(prior=Prior(median=0.8, sd=0.1)),
         "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s", fixed=True),

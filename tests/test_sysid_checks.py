@@ -1,7 +1,6 @@
 """What an identification takes for granted: data say where it is otherwise; intervals allow for
 what they cannot tell."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +25,6 @@ from torchsoft.sysid.assumptions import (
 )
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
-from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import AMOUNTS, End, difference, refit, varied
 from torchsoft.sysid.runs import Runner
@@ -78,12 +76,12 @@ def checked(
 
 
 @pytest.fixture(scope="module")
-def same() -> Checked:
+def same():
     """Of data that the same model made."""
     return checked(recorded(excitation=BRIEF))
 
 
-def test_nothing_is_said_of_what_is_right(same: Checked) -> None:
+def test_nothing_is_said_of_what_is_right(same):
     assert not assumption_notices(same)
     names = {one.name for one in same.checks}
     assert {
@@ -101,7 +99,7 @@ def test_nothing_is_said_of_what_is_right(same: Checked) -> None:
     assert not any(one.unchecked for one in same.checks)
 
 
-def test_intervals_allow_for_what_the_data_cannot_tell_of_the_computation(same: Checked) -> None:
+def test_intervals_allow_for_what_the_data_cannot_tell_of_the_computation(same):
     plain = np.linalg.inv(same.J.T @ same.J)
     wider = same.covariance()
     assert (np.diag(wider) >= np.diag(plain)).all()
@@ -157,9 +155,7 @@ def late(data: Recording) -> Recording:
         ),
     ],
 )  # fmt: skip
-def test_the_cause_is_named_with_its_amount(
-    made: Callable[[Recording], Recording], name: str, favoured: float, says: str
-) -> None:
+def test_the_cause_is_named_with_its_amount(made, name, favoured, says):
     found = checked(made(recorded()), doubtful=True)
     (one,) = (one for one in found.checks if one.name == name)
     assert one.suspected
@@ -188,7 +184,7 @@ def made_by(
 
 
 @pytest.mark.slow
-def test_a_finer_mesh_is_asked_for_by_data_that_one_made() -> None:
+def test_a_finer_mesh_is_asked_for_by_data_that_one_made():
     data = recorded()
     found = checked(made_by(remeshed(data, 2, 0), data))
     (mesh,) = (one for one in found.checks if one.name == "mesh")
@@ -209,9 +205,7 @@ QUIET = {name: Sensor(noise=0.2 * one.noise) for name, one in SENSORS.items()}
         (lambda data: scaled(data, ["contact.epsilon"], 0.1), "ramp"),
     ],
 )
-def test_another_ramp_is_asked_for_by_data_that_it_made(
-    vary: Callable[[Recording], Recording], name: str
-) -> None:
+def test_another_ramp_is_asked_for_by_data_that_it_made(vary, name):
     """A light grasp that slips: many points are hardly in contact. The fit runs off, and is
     repeated."""
     data = recorded(excitation=LIGHT)
@@ -223,7 +217,7 @@ def test_another_ramp_is_asked_for_by_data_that_it_made(
 
 
 @pytest.fixture(scope="module")
-def far_off() -> tuple[Problem, np.ndarray, Residuals]:
+def far_off():
     """Data of Coulomb's friction, with coordinates and residuals at which a fit with smooth
     friction has ended where nothing can be learnt."""
     known = BASE.override(
@@ -238,8 +232,8 @@ def far_off() -> tuple[Problem, np.ndarray, Residuals]:
 
 @pytest.mark.slow
 def test_what_no_test_explains_has_candidates(
-    far_off: tuple[Problem, np.ndarray, Residuals],
-) -> None:
+    far_off,
+):
     """Nothing is fitted again: a notice says what `explain` would try."""
     problem, x, at = far_off
     free = problem.coordinates.free
@@ -252,8 +246,8 @@ def test_what_no_test_explains_has_candidates(
 
 @pytest.mark.slow
 def test_under_another_law_a_fit_that_is_far_off_begins_anew(
-    far_off: tuple[Problem, np.ndarray, Residuals],
-) -> None:
+    far_off,
+):
     problem, x, at = far_off
     runner = Runner(problem.recordings)
     base, steps = problem.freeze(runner, x, problem.names, RTOL)
@@ -272,7 +266,7 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
         assert again.of(name) == pytest.approx(np.log(value), abs=0.1)
 
 
-def test_a_number_is_varied_as_far_as_there_is_a_rig() -> None:
+def test_a_number_is_varied_as_far_as_there_is_a_rig():
     """A disc that is smaller by a hundredth leaves these pads apart."""
     problem = Problem([recorded(excitation=LIGHT)], SENSORS, {name: Unknown() for name in TRUTH})
     (one,) = (
@@ -286,7 +280,7 @@ def test_a_number_is_varied_as_far_as_there_is_a_rig() -> None:
     assert (1 - reach) * radius.nominal < radius.low < radius.nominal
 
 
-def test_a_doubtful_fit_is_repeated_with_what_would_explain_most() -> None:
+def test_a_doubtful_fit_is_repeated_with_what_would_explain_most():
     """And with every law, which either holds or does not."""
     names = [f"number {k}" for k in range(MOST + 5)]
     taken = [Variation(name, "known", "", "", parameter=name) for name in names]
@@ -300,7 +294,7 @@ def test_a_doubtful_fit_is_repeated_with_what_would_explain_most() -> None:
     assert found == [*names[:3], *names[4 : MOST + 1], "law"]
 
 
-def test_what_cannot_be_told_apart_is_named_with_its_odds(same: Checked) -> None:
+def test_what_cannot_be_told_apart_is_named_with_its_odds(same):
     """Equal gains have equal odds, a much smaller one none."""
     tests = [
         AssumptionTest(
@@ -324,7 +318,7 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same: Checked) -> None
     assert said[1] == "none of 3 suspects explains F_y: 3.1 times the noise left"
 
 
-def test_two_causes_are_both_named() -> None:
+def test_two_causes_are_both_named():
     """An offset of one sensor and the gain of another: the second one besides the first."""
     data = turned(recorded(excitation=BRIEF))
     t, force = data.samples["F_y"]
@@ -337,7 +331,7 @@ def test_two_causes_are_both_named() -> None:
 
 
 @pytest.mark.slow
-def test_extensions_are_suspects() -> None:
+def test_extensions_are_suspects():
     """A pad that is stiffer than its material, and dry friction of a guide."""
     data = recorded()
     other = extended(data, ["guides.bracket.x.friction"])
@@ -348,7 +342,7 @@ def test_extensions_are_suspects() -> None:
     assert one.value == pytest.approx(1.0, abs=4 * one.favoured_sd)
 
 
-def test_every_pad_is_meshed_anew_where_it_was() -> None:
+def test_every_pad_is_meshed_anew_where_it_was():
     data = recorded(excitation=BRIEF)
     other = remeshed(data, 2, 3)
     assert other is not None
@@ -362,7 +356,7 @@ def test_every_pad_is_meshed_anew_where_it_was() -> None:
         assert new.material is not pad.material
 
 
-def test_what_is_unknown_is_not_taken_for_granted() -> None:
+def test_what_is_unknown_is_not_taken_for_granted():
     data = recorded(excitation=BRIEF)
     names = {one.name for one in assumptions([data], set())}
     left = {
@@ -371,7 +365,7 @@ def test_what_is_unknown_is_not_taken_for_granted() -> None:
     assert names - left == {"disc.radius", "ramp", "x_C0"}
 
 
-def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_variation_that_cannot_be_run_is_said(monkeypatch):
     def bare(*_: object) -> list[Variation]:
         return [
             Variation(
@@ -400,9 +394,7 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
         (124.0, False, "N", True),
     ],
 )
-def test_a_negative_mass_explains_nothing(
-    favoured: float, refitted: bool, unit: str, suspected: bool
-) -> None:
+def test_a_negative_mass_explains_nothing(favoured, refitted, unit, suspected):
     """A number of the rig that would have to vanish is no cause, and ends no search for one."""
     one = AssumptionTest(
         "disc.mass",
@@ -418,7 +410,7 @@ def test_a_negative_mass_explains_nothing(
     assert one.suspected is suspected
 
 
-def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
     calls = []
 
     def interrupted(*args: object) -> object:
@@ -436,7 +428,7 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch: pytest.Mo
     assert {one.name for one in answer.assumptions} >= {"mesh", "contact points", "disc.radius"}
 
 
-def test_no_bound_is_to_be_widened_for_what_is_not_identifiable() -> None:
+def test_no_bound_is_to_be_widened_for_what_is_not_identifiable():
     def one(identifiable: bool) -> SimpleNamespace:
         return SimpleNamespace(
             identifiable=identifiable,

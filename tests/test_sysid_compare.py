@@ -3,7 +3,6 @@ and laws of friction."""
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -56,7 +55,7 @@ def shares(D: float, draws: list[np.ndarray]) -> dict[str, float]:
     return {one: said.count(one) / len(said) for one in ("right", "wrong", "cannot tell")}
 
 
-def test_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ() -> None:
+def test_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ():
     """As a normal distribution has it: z is (D / 2, 1) where the first law made the data."""
     rng = np.random.default_rng(0)
     draws = list(rng.standard_normal((50, len(T))))
@@ -68,8 +67,8 @@ def test_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ()
 
 
 def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     """The likelihood ratio is then some standard deviations of the stated noise from zero by
     chance."""
     rng, colour = np.random.default_rng(1), Autoregression.stated((0.95,), 5e-3)
@@ -84,7 +83,7 @@ def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named
     assert shares(5.0, draws)["wrong"] > 0.05
 
 
-def test_a_law_is_not_named_for_having_fewer_parameters_and_pays_for_more() -> None:
+def test_a_law_is_not_named_for_having_fewer_parameters_and_pays_for_more():
     r = np.random.default_rng(2).standard_normal(len(T))
     same = versus(law("a", r, k=1), law("b", r.copy(), k=9))
     assert same.evidence == same.z == 0.0
@@ -93,7 +92,7 @@ def test_a_law_is_not_named_for_having_fewer_parameters_and_pays_for_more() -> N
     assert fewer.evidence - more.evidence == pytest.approx(1.5 * np.log(len(T)))
 
 
-def test_heldout_recordings_count_and_may_contradict() -> None:
+def test_heldout_recordings_count_and_may_contradict():
     rng = np.random.default_rng(3)
     r, held = rng.standard_normal((2, len(T)))
     alone = versus(law("a", r), law("b", r + apart(3.0)))
@@ -120,7 +119,7 @@ def fitted(
     )
 
 
-def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_converged() -> None:
+def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_converged():
     r = np.random.default_rng(4).standard_normal(len(T))
     clear = versus(law("a", r), law("b", r + apart(30.0)))
     assert judged([fitted("a"), fitted("b", p=0.0)], [clear])[:2] == ("law", "a")
@@ -193,13 +192,11 @@ def plans(problems: dict[str, Problem]) -> dict[str, list[Stage]]:
 
 
 @pytest.fixture(scope="module")
-def stroke() -> dict[str, Problem]:
+def stroke():
     return made(STROKE, viscous, {"contact.friction.alpha": 0.55})
 
 
-def test_a_users_own_law_is_named_where_contacts_slip(
-    stroke: dict[str, Problem], tmp_path: Path
-) -> None:
+def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
     found = compare(stroke, plans=plans(stroke))
     assert (found.outcome, found.law) == ("law", "viscous"), found.verdict
     assert found["viscous"].weight > 0.999 > found["viscous"].p > 1e-3
@@ -210,7 +207,7 @@ def test_a_users_own_law_is_named_where_contacts_slip(
     assert found.table().count("\n") == 2
 
 
-def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another() -> None:
+def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another():
     problems = made(GENTLE, viscous, {"contact.friction.alpha": 0.6})
     found = compare(problems, plans=plans(problems))
     assert (found.outcome, found.law) == ("cannot tell", None), found.verdict
@@ -218,7 +215,7 @@ def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another() -> None:
     assert "cannot tell them apart" in found.verdict
 
 
-def test_laws_that_were_not_given_the_same_data_are_refused(stroke: dict[str, Problem]) -> None:
+def test_laws_that_were_not_given_the_same_data_are_refused(stroke):
     one, p = stroke["viscous"], stroke["smooth"]
     recording = p.recordings[0]
 
@@ -251,7 +248,7 @@ def test_laws_that_were_not_given_the_same_data_are_refused(stroke: dict[str, Pr
         compare({"a": one, "b": p}, plans=elsewhere)
 
 
-def test_densities_are_those_of_the_normal_distribution() -> None:
+def test_densities_are_those_of_the_normal_distribution():
     """With coloured noise and uncertain estimates, as scipy has it."""
     rng, n = np.random.default_rng(6), 40
     t: Any = np.arange(n) * 5e-3
@@ -278,7 +275,7 @@ def test_densities_are_those_of_the_normal_distribution() -> None:
 
 
 @pytest.mark.slow
-def test_law_comparison_smoke(tmp_path: Path) -> None:
+def test_law_comparison_smoke(tmp_path):
     """Named where contacts slip, and not where they roll."""
     module = experiment("law_comparison")
     module.main(module.Config(out=tmp_path, smoke=True))

@@ -22,7 +22,7 @@ from torchsoft.sysid.criterion import (
     next_recording,
     optimality,
 )
-from torchsoft.sysid.design import BENT, Design, design
+from torchsoft.sysid.design import BENT, design
 from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.planner import LEFT, Planner
@@ -42,12 +42,12 @@ SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 
 
 @pytest.fixture(scope="session")
-def plan() -> Recording:
+def plan():
     return record("plan", begin(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
 
 
 @pytest.fixture(scope="session")
-def problem(plan: Recording) -> Problem:
+def problem(plan):
     return Problem([plan], SENSORS, {"pad.E": Unknown(), "contact.K_n": Unknown()})
 
 
@@ -58,7 +58,7 @@ def planner(problem: Problem, criterion: Optimality, **limits: tuple[float, floa
 
 
 @pytest.mark.parametrize("criterion", ["D", "A", "worst"])
-def test_a_criterion_has_the_derivative_of_its_differences(criterion: Optimality) -> None:
+def test_a_criterion_has_the_derivative_of_its_differences(criterion):
     rng = np.random.default_rng(0)
     root, direction = rng.standard_normal((2, 3, 3))
     C, direction = root @ root.T, direction + direction.T
@@ -70,7 +70,7 @@ def test_a_criterion_has_the_derivative_of_its_differences(criterion: Optimality
     )  # a logarithm of standard deviations
 
 
-def test_for_one_parameter_the_criteria_are_one() -> None:
+def test_for_one_parameter_the_criteria_are_one():
     kinds: tuple[Optimality, ...] = ("D", "A", "worst")
     values = [optimality(kind, np.array([[0.04]]))[0] for kind in kinds]
     assert values == pytest.approx([np.log(0.2)] * 3)
@@ -79,9 +79,7 @@ def test_for_one_parameter_the_criteria_are_one() -> None:
 @pytest.mark.parametrize(
     ("sensors", "rel"), [({}, 1e-3), ({"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}, 1e-3)]
 )
-def test_slopes_are_those_of_differences(
-    plan: Recording, sensors: dict[str, Sensor], rel: float, monkeypatch: Any
-) -> None:
+def test_slopes_are_those_of_differences(plan, sensors, rel, monkeypatch):
     """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted
     beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
@@ -100,7 +98,7 @@ def test_slopes_are_those_of_differences(
     assert slopes @ direction == pytest.approx(wanted, rel=rel)
 
 
-def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan: Recording) -> None:
+def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
     """Sensors a thousand times as good see the steps, and what a covariance promises is not
     there."""
     parts, sds = [], []
@@ -121,7 +119,7 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan: Recording) 
     np.testing.assert_allclose(sds[0], 1e3 * sds[1], rtol=1e-9)
 
 
-def test_nuisances_are_left_out_as_the_schur_complement(plan: Recording) -> None:
+def test_nuisances_are_left_out_as_the_schur_complement(plan):
     stated = Problem(
         [plan],
         {**SENSORS, "F_y": Sensor(noise=0.1, bias=1.0)},
@@ -136,7 +134,7 @@ def test_nuisances_are_left_out_as_the_schur_complement(plan: Recording) -> None
     assert list(sds.values()) == pytest.approx(np.sqrt(np.diag(np.linalg.inv(left))))
 
 
-def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan: Recording) -> None:
+def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan):
     unknowns = {
         "contact.mu_s": Unknown(),
         "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s"),
@@ -147,7 +145,7 @@ def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan: Recording) -> None:
     assert T.tolist() == [[1.0, 1.0]]
 
 
-def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> None:
+def test_motions_keep_within_their_bounds_between_knots_too(plan):
     moves, t = (
         Moves(plan.rig.reference, BOUNDS, 0.25),
         torch.linspace(0.13, 0.3, 2000, dtype=torch.float64),
@@ -192,28 +190,26 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> 
         ({"iterations": -1}, "`iterations` must not be negative"),
     ],
 )
-def test_what_does_not_fit_is_refused(
-    problem: Problem, changes: dict[str, Any], message: str
-) -> None:
+def test_what_does_not_fit_is_refused(problem, changes, message):
     given: dict[str, Any] = {"plan": "plan", "bounds": BOUNDS} | changes
     with pytest.raises(ValueError, match=message):
         design(problem, **given)
 
 
-def test_bounds_are_checked() -> None:
+def test_bounds_are_checked():
     with pytest.raises(ValueError, match="low = 1 must be below high = 0"):
         Bounds(low=1, high=0, speed=1)
 
 
 @pytest.fixture(scope="session")
-def found(problem: Problem) -> Design:
+def found(problem):
     return design(
         problem, "plan", BOUNDS, limits={"F_y": (-70.0, 70.0)}, iterations=20, rate=0.4,
         criterion="worst",
     )  # fmt: skip
 
 
-def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
+def test_a_designed_motion_tells_more(found, problem):
     """What is predicted for it is what its recording's own Jacobian says."""
     assert all(found.after[name] < 0.9 * was for name, was in found.before.items())
     assert not any("beyond its limits" in notice for notice in found.notices)
@@ -228,7 +224,7 @@ def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
     assert len(design_figure(found).get_axes()) == 4
 
 
-def test_any_rig_with_profiles() -> None:
+def test_any_rig_with_profiles():
     """It has no excitation, and its start is given."""
     rig: Any = turning(control__senses="bracket")
     y, still = grasp(rig.fixed())
@@ -263,7 +259,7 @@ def test_any_rig_with_profiles() -> None:
     assert found.made_by["gradients"] >= 4 * 4
 
 
-def test_what_cannot_be_run_is_left(problem: Problem, monkeypatch: Any) -> None:
+def test_what_cannot_be_run_is_left(problem, monkeypatch):
     """In the search; the motion given is refused."""
     look, count = Planner.evaluate, [0]
 
@@ -286,7 +282,7 @@ def never(self: Planner, *given: Any) -> Any:
     raise SimulationFailed("the disc was lost", 0.1)
 
 
-def test_an_interruption_leaves_the_best_so_far(problem: Problem, monkeypatch: Any) -> None:
+def test_an_interruption_leaves_the_best_so_far(problem, monkeypatch):
     slopes, count = Planner.slopes, [0]
 
     def interrupted(self: Planner, *given: Any) -> Array:
@@ -300,7 +296,7 @@ def test_an_interruption_leaves_the_best_so_far(problem: Problem, monkeypatch: A
     assert "interrupted after 2 of 50 iterations" in found.notices
 
 
-def test_the_next_recording_is_predicted(plan: Recording, problem: Problem) -> None:
+def test_the_next_recording_is_predicted(plan, problem):
     """What a recording would add is what it does add; one that cannot be made comes last."""
     strokes = PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)})
     roll = record("roll", begin(strokes, P), {}, SENSORS, rtol=1e-3, noise=0.0)

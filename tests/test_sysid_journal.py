@@ -59,7 +59,7 @@ def files(folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("name", RESULTS)
-def test_a_result_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
+def test_a_result_is_read_as_it_was_written(tmp_path, name):
     journal(tmp_path).keep(RUN, RESULTS[name])
     again = journal(tmp_path)
     assert same(again.recall(RUN), RESULTS[name])
@@ -86,9 +86,7 @@ DAMAGES: dict[str, Callable[[bytes, bytes, Trap], bytes]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_or_planted_file_is_noticed_and_never_executed(
-    tmp_path: Path, damage: str
-) -> None:
+def test_a_damaged_or_planted_file_is_noticed_and_never_executed(tmp_path, damage):
     folder, trap = tmp_path / "runs", Trap(tmp_path / "executed")
     journal(folder).keep(RUN, PREDICTION)
     (path,) = files(folder)
@@ -102,7 +100,7 @@ def test_a_damaged_or_planted_file_is_noticed_and_never_executed(
     assert same(journal(folder).recall(RUN), PREDICTION)
 
 
-def test_a_result_of_another_run_is_noticed(tmp_path: Path) -> None:
+def test_a_result_of_another_run_is_noticed(tmp_path):
     one = journal(tmp_path)
     one.keep(RUN, PREDICTION)
     one.keep(OTHER, PREDICTION._replace(knots=None))
@@ -116,14 +114,14 @@ def test_a_result_of_another_run_is_noticed(tmp_path: Path) -> None:
     assert again.recall(OTHER) is None
 
 
-def test_an_archive_is_no_pickle() -> None:
+def test_an_archive_is_no_pickle():
     assert same(decoded(encoded(PREDICTION)), PREDICTION)
     content = encoded(FailedRun(np.array([{}], dtype=object), 0.0))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="allow_pickle"):
         decoded(content)
 
 
-def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
+def test_a_folder_of_others_is_refused(tmp_path):
     (tmp_path / "thesis.pickle").write_text("mine")
     with pytest.raises(
         ValueError, match=r"the checkpoint .* holds other files; give a new or an empty folder$"
@@ -137,7 +135,7 @@ def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.pickle"]
 
 
-def test_only_its_own_files_are_removed(tmp_path: Path) -> None:
+def test_only_its_own_files_are_removed(tmp_path):
     folder = tmp_path / "runs"
     journal(folder).keep(RUN, PREDICTION)
     name = files(folder)[0].name
@@ -155,7 +153,7 @@ def test_only_its_own_files_are_removed(tmp_path: Path) -> None:
     forget(folder)
 
 
-def test_it_goes_on_where_another_was_done_with_the_folder(tmp_path: Path) -> None:
+def test_it_goes_on_where_another_was_done_with_the_folder(tmp_path):
     one = journal(tmp_path / "runs")
     forget(tmp_path / "runs")
     one.keep(RUN, PREDICTION)
@@ -163,9 +161,7 @@ def test_it_goes_on_where_another_was_done_with_the_folder(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_what_is_done_is_kept_at_an_interruption(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
-) -> None:
+def test_what_is_done_is_kept_at_an_interruption(tmp_path, monkeypatch, count):
     """What was done before it, and what another thread still runs when it comes."""
     jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(4)]
     running = threading.Barrier(count)
@@ -188,7 +184,7 @@ def test_what_is_done_is_kept_at_an_interruption(
     assert not all(kept)
 
 
-def test_frozen_steps_are_named_to_the_bit(tmp_path: Path) -> None:
+def test_frozen_steps_are_named_to_the_bit(tmp_path):
     knots = np.array([0.0, 0.1, 0.3])
     job = Job(0, {"pad.E": 1.0}, (), Frozen(knots))
     journal(tmp_path).keep(job, PREDICTION)

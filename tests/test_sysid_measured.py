@@ -15,7 +15,7 @@ import torch
 import xarray as xr
 from conftest import paper_settings
 
-from torchsoft import Parameters, Trajectory, simulate
+from torchsoft import Parameters, simulate
 from torchsoft.channels import CHANNELS
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.physics.contact import Coulomb
@@ -62,7 +62,7 @@ Change = Callable[[Table], object]
 
 
 @pytest.fixture(scope="module")
-def example() -> Table:
+def example():
     """Cells of the first 0.3 s of the example, with its heading."""
     with (EXAMPLE / "rolling.csv").open(newline="") as file:
         return list(csv.reader(file))[:62]
@@ -78,7 +78,7 @@ def write(path: Path, table: Table) -> Path:
 
 
 @pytest.fixture
-def case(example: Table, tmp_path: Path) -> Callable[..., list[str]]:
+def case(example, tmp_path):
     """Writes the example, changed, and a configuration; gives the paths."""
 
     def make(change: Change = lambda table: None, config: str = CONFIG) -> list[str]:
@@ -91,7 +91,7 @@ def case(example: Table, tmp_path: Path) -> Callable[..., list[str]]:
 
 
 @pytest.fixture
-def loaded(case: Callable[..., list[str]]) -> Callable[..., Any]:
+def loaded(case):
     """Loads the example, changed, with a configuration."""
 
     def load_case(*given: Any, **named: Any) -> Any:
@@ -288,16 +288,14 @@ BAD_CONFIG = {
 
 
 @pytest.mark.parametrize("name", [*BAD, *BAD_CONFIG])
-def test_a_mistake_is_named_with_its_row_and_column_or_its_field(
-    loaded: Callable[..., Any], name: str
-) -> None:
+def test_a_mistake_is_named_with_its_row_and_column_or_its_field(loaded, name):
     change, message = BAD.get(name, (lambda table: None, ""))
     config, message = BAD_CONFIG.get(name, (CONFIG, message))
     with pytest.raises(ValueError, match=message):
         loaded(change, config)
 
 
-def test_empty_cells_are_missing_samples(case: Callable[..., list[str]]) -> None:
+def test_empty_cells_are_missing_samples(case):
     def change(table: Table) -> None:
         for row in (5, 6, 40):
             table[row - 1][X_C] = ""
@@ -314,7 +312,7 @@ def test_empty_cells_are_missing_samples(case: Callable[..., list[str]]) -> None
 
 
 @pytest.mark.parametrize("name", sorted(set(COLUMNS) - {"t"}))
-def test_every_unit_is_understood(tmp_path: Path, name: str) -> None:
+def test_every_unit_is_understood(tmp_path, name):
     dimension = CHANNELS[name].unit
     for unit, factor in UNITS[dimension].items():
         table = [["t [ms]", "x_d [m]", "y_d [m]"]] + [
@@ -335,7 +333,7 @@ def test_every_unit_is_understood(tmp_path: Path, name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def made() -> tuple[Any, Recording]:
+def made():
     """The example's own script, and a short recording."""
     spec = importlib.util.spec_from_file_location("make", EXAMPLE / "make.py")
     assert spec is not None
@@ -351,9 +349,7 @@ def made() -> tuple[Any, Recording]:
     )
 
 
-def test_a_recording_survives_the_way_through_csv(
-    made: tuple[Any, Recording], tmp_path: Path
-) -> None:
+def test_a_recording_survives_the_way_through_csv(made, tmp_path):
     script, one = made
     script.UNITS["rad/s"] = ("deg/s", 180 / np.pi)
     script.write(one, tmp_path / "short.csv", digits=17)
@@ -372,7 +368,7 @@ def test_a_recording_survives_the_way_through_csv(
         assert float((read - exact).abs().max()) < tolerance
 
 
-def test_the_examples_files_are_what_its_script_makes(made: tuple[Any, Recording]) -> None:
+def test_the_examples_files_are_what_its_script_makes(made):
     script, _ = made
     case = load([EXAMPLE / "rolling.csv"], EXAMPLE / "rolling.toml")
     assert case.problem.names == ("rolling", "checking")
@@ -393,7 +389,7 @@ def test_the_examples_files_are_what_its_script_makes(made: tuple[Any, Recording
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
+def run():
     """A grasp of 60 ms."""
     excitation = Excitation(
         motion=Strokes(), senses="bracket", grasp_time=0.05, settle=0.0, depth=1e-3
@@ -402,7 +398,7 @@ def run() -> Trajectory:
     return simulate(model, torch.linspace(0, 0.06, 31, dtype=torch.float64), y0=y0, step=2e-3)
 
 
-def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> None:
+def test_a_trajectory_file_is_a_recording(run, tmp_path):
     run.save(tmp_path / "run.nc")
     tables = read_tables([tmp_path / "run.nc"], (), {})
     settings = {
@@ -457,9 +453,7 @@ def in_degrees(data: xr.Dataset) -> xr.Dataset:
         (None, "has no checksum at its end"),
     ],
 )  # fmt: skip
-def test_a_mistake_in_a_trajectory_file_is_named(
-    run: Trajectory, tmp_path: Path, change: Callable[..., xr.Dataset] | None, message: str
-) -> None:
+def test_a_mistake_in_a_trajectory_file_is_named(run, tmp_path, change, message):
     path = tmp_path / "bad.nc"
     if change is None:
         path.write_text("not a file of this kind")
@@ -470,8 +464,8 @@ def test_a_mistake_in_a_trajectory_file_is_named(
 
 
 def test_samples_much_denser_than_the_motion_are_not_all_simulated(
-    loaded: Callable[..., Any],
-) -> None:
+    loaded,
+):
     (one,) = loaded().problem.recordings
     t, x = one.samples["x_C"]
     dense = np.linspace(t[0], t[-1], 20_001)
@@ -487,7 +481,7 @@ def test_samples_much_denser_than_the_motion_are_not_all_simulated(
     assert np.all(np.diff(between) > 0)
 
 
-def test_a_long_identification_is_priced(loaded: Callable[..., Any]) -> None:
+def test_a_long_identification_is_priced(loaded):
     made = loaded().problem
     assert cost(made, 1e-3, 1, 1).seconds < 60
     assert cost(made, 1e-3, 1_000_000, 1).seconds > 1e5
@@ -496,9 +490,7 @@ def test_a_long_identification_is_priced(loaded: Callable[..., Any]) -> None:
     assert cost(delayed, 1e-5, 1, 1, method="adam").memory > cost(delayed, 1e-5, 1, 1).memory
 
 
-def test_recordings_have_settings_of_their_own(
-    case: Callable[..., list[str]], tmp_path: Path
-) -> None:
+def test_recordings_have_settings_of_their_own(case, tmp_path):
     more = (
         '[[recordings]]\nname = "data"\nsettings.disc.mass = 0.5\n'
         '[[recordings]]\nfile = "second.csv"\nname = "b"\n'
@@ -511,13 +503,13 @@ def test_recordings_have_settings_of_their_own(
     assert paper_settings(first).contact.v_s == paper_settings(second).contact.v_s == 0.05
 
 
-def test_a_name_is_the_same_where_the_system_knows_ascii_only() -> None:
+def test_a_name_is_the_same_where_the_system_knows_ascii_only():
     """Which gives Python the bytes of a file's name one by one."""
     assert stem(Path("a/größe.csv")) == stem(Path("a/gr\udcc3\udcb6\udcc3\udc9fe.csv")) == "größe"
     assert stem(Path("a/\udcff.csv")) == "�"
 
 
-def test_columns_may_stand_in_any_order_beside_others(loaded: Callable[..., Any]) -> None:
+def test_columns_may_stand_in_any_order_beside_others(loaded):
     def change(table: Table) -> None:
         for i, cells in enumerate(table):
             cells.reverse()
@@ -528,7 +520,7 @@ def test_columns_may_stand_in_any_order_beside_others(loaded: Callable[..., Any]
     assert one.fingerprint == plain.fingerprint
 
 
-def test_a_laboratorys_headings_stand_for_ours(loaded: Callable[..., Any]) -> None:
+def test_a_laboratorys_headings_stand_for_ours(loaded):
     def change(table: Table) -> None:
         at = next(i for i, cell in enumerate(table[0]) if cell.startswith("x_C "))
         table[0][at] = table[0][at].replace("x_C", "Disc x")
@@ -540,9 +532,7 @@ def test_a_laboratorys_headings_stand_for_ours(loaded: Callable[..., Any]) -> No
         loaded(change, 'columns."Disc x" = "x_D"\n' + CONFIG)
 
 
-def test_a_constant_stands_for_a_column_that_is_missing(
-    loaded: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_constant_stands_for_a_column_that_is_missing(loaded, tmp_path):
     own = '[[recordings]]\nname = "data"\nmissing.F_ff = -2.5\n'
     for text, force in (("[missing]\nF_ff = 0.0\n", 0.0), ("[missing]\nF_ff = 0.0\n" + own, -2.5)):
         made = loaded(drop(F_FF), CONFIG + text)
@@ -564,8 +554,8 @@ def test_a_constant_stands_for_a_column_that_is_missing(
 
 
 def test_a_constant_may_stand_for_the_column_of_one_of_the_recordings(
-    case: Callable[..., list[str]],
-) -> None:
+    case,
+):
     more = '[missing]\nF_ff = 7.0\n[[recordings]]\nfile = "second.csv"\n'
     data, config = case(config=CONFIG + more)
     Path(data).with_name("second.csv").write_text(Path(data).read_text())
@@ -581,7 +571,7 @@ def parts(table: Table, *columns: list[int]) -> list[Table]:
     return [[[cells[i] for i in chosen] for cells in table] for chosen in columns]
 
 
-def test_a_recording_may_stand_in_several_files(example: Table, tmp_path: Path) -> None:
+def test_a_recording_may_stand_in_several_files(example, tmp_path):
     asked, camera, force = parts(
         example, [T, X_D, 2, Y_D, Y_D_DOT, F_FF], [T, X_C, THETA], [T, X_BR, Y_BR, F_X, F_Y]
     )
@@ -624,8 +614,8 @@ def test_a_recording_may_stand_in_several_files(example: Table, tmp_path: Path) 
 
 
 def test_a_file_may_state_everything_that_a_problem_can_have(
-    loaded: Callable[..., Any],
-) -> None:
+    loaded,
+):
     text = CONFIG.replace(
         '[unknowns."contact.K_n"]\nnominal = 1e5',
         '[unknowns."contact.K_n"]\nnominal = 1e5\nper = "recording"\nprior = {median = 1e5, sd = '
@@ -659,7 +649,7 @@ def test_a_file_may_state_everything_that_a_problem_can_have(
     assert made.sensors["F_x"].high == 50.0
 
 
-def test_a_recording_may_begin_anywhere_if_that_is_said(loaded: Callable[..., Any]) -> None:
+def test_a_recording_may_begin_anywhere_if_that_is_said(loaded):
     """Cut from the middle of the grasp."""
 
     def cut(table: Table) -> None:
@@ -689,7 +679,7 @@ def test_a_recording_may_begin_anywhere_if_that_is_said(loaded: Callable[..., An
         loaded(cut, text.replace("disc.y", "disc.z"))
 
 
-def test_competing_laws_have_the_same_data(loaded: Callable[..., Any]) -> None:
+def test_competing_laws_have_the_same_data(loaded):
     text = CONFIG + (
         '[unknowns."contact.eta"]\n[compare.coulomb]\nsettings.contact.friction = '
         '"coulomb"\nwithout = ["contact.eta"]\n[compare.solid]\npads = {kind = '
@@ -732,7 +722,7 @@ def test_competing_laws_have_the_same_data(loaded: Callable[..., Any]) -> None:
         ),
     ],
 )
-def test_pads_may_be_of_any_series(loaded: Callable[..., Any], pads: str, message: str) -> None:
+def test_pads_may_be_of_any_series(loaded, pads, message):
     """Of the relaxed modulus `pad.E`; their coefficients may be unknown."""
     symbol, bound = ("E", "") if "prony" in pads else ("J", "\nhigh = 0.7")
     config = CONFIG.replace(

@@ -80,7 +80,7 @@ def reading(case: Case, where: tuple[str, str]) -> np.ndarray:
     return next(p.reading for p in case.fitted()[0] if (p.recording, p.channel) == where)
 
 
-def test_a_right_model_raises_no_alarm_more_often_than_it_says() -> None:
+def test_a_right_model_raises_no_alarm_more_often_than_it_says():
     """p-values are uniform, by test; of 120 cases about one raises an alarm."""
     found = [Case(seed, lengths=(120, 150)).judged() for seed in range(120)]
     assert sum(any(f.alarming for f in one) for one in found) <= 4
@@ -92,7 +92,7 @@ def test_a_right_model_raises_no_alarm_more_often_than_it_says() -> None:
             assert stats.kstest(p, "uniform").pvalue > 1e-3, test
 
 
-def test_a_right_colour_raises_none_either() -> None:
+def test_a_right_colour_raises_none_either():
     noise = Autoregression.stated((0.9,), H)
     found = [Case(seed, noise=noise, assumed=noise).judged() for seed in range(30)]
     assert sum(any(f.alarming for f in one) for one in found) <= 2
@@ -100,7 +100,7 @@ def test_a_right_colour_raises_none_either() -> None:
     assert 0.01 < np.mean(p < 0.05) < 0.1
 
 
-def test_the_level_is_judged_by_how_many_samples_there_are() -> None:
+def test_the_level_is_judged_by_how_many_samples_there_are():
     """1.12 in 7600 samples is seven standard deviations, and in 76 nothing."""
     many = Case(0, lengths=(1267, 1267), scale=1.12**0.5).judged()
     (overall,) = [f for f in alarms(many, "level") if f.recording is None]
@@ -114,7 +114,7 @@ def test_the_level_is_judged_by_how_many_samples_there_are() -> None:
     assert not alarms(few, "level")
 
 
-def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well() -> None:
+def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well():
     rng = np.random.default_rng(5)
     loud = Case(1, fault={("run 1", "theta"): 0.9 * rng.standard_normal(400)}).judged()
     named = [f for f in alarms(loud, "level") if f.recording]
@@ -137,7 +137,7 @@ def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well() -> No
         ("inertia", "most like the acceleration of theta"),
     ],
 )
-def test_what_follows_the_motion_is_named(kind: str, words: str) -> None:
+def test_what_follows_the_motion_is_named(kind, words):
     """Each fault is of half a standard deviation, and shows in no other recording."""
     case, where, t = Case(2), ("run 1", "F_x"), np.arange(400) * H
     own, other = reading(case, where), reading(case, ("run 1", "theta"))
@@ -154,7 +154,7 @@ def test_what_follows_the_motion_is_named(kind: str, words: str) -> None:
     assert any(words in notice for notice in residual_notices(found))
 
 
-def test_colour_is_noticed_found_allowed_for_and_named() -> None:
+def test_colour_is_noticed_found_allowed_for_and_named():
     noise = Autoregression.stated((0.6,), H)
     case = Case(3, noise=noise)
     assert alarms(case.judged(), "white")
@@ -174,7 +174,7 @@ def test_colour_is_noticed_found_allowed_for_and_named() -> None:
     assert not residual_notices(Case(3, noise=noise, assumed=found["theta"].noise).judged())
 
 
-def test_white_noise_is_hardly_ever_called_coloured() -> None:
+def test_white_noise_is_hardly_ever_called_coloured():
     """Where nobody declared it; with declared colour the order is the criterion's, usually none."""
     found = []
     for seed in range(15):
@@ -187,14 +187,14 @@ def test_white_noise_is_hardly_ever_called_coloured() -> None:
     assert not colours(faint, J)
 
 
-def test_channels_that_err_together_are_named() -> None:
+def test_channels_that_err_together_are_named():
     common = np.random.default_rng(9).standard_normal(300)
     fault = {("run 0", "x_C"): 0.6 * common, ("run 0", "F_x"): -0.6 * common}
     (found,) = alarms(Case(4, fault=fault).judged(), "channels")
     assert "x_C and F_x of `run 0` (correlation -0." in found.words
 
 
-def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss() -> None:
+def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss():
     spike = np.zeros(300)
     spike[100] = 9.0
     case = Case(4, fault={("run 0", "theta"): spike})
@@ -209,7 +209,7 @@ def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss() -> No
     assert alarms(loud.judged(robust=True), "level")
 
 
-def test_saturated_samples_and_ends_that_cannot_be_tested() -> None:
+def test_saturated_samples_and_ends_that_cannot_be_tested():
     parts, r, J = Case(0).fitted()
     quiet = np.where(
         np.arange(len(r)) % 3 == 0, 0.0, r
@@ -238,7 +238,7 @@ def test_saturated_samples_and_ends_that_cannot_be_tested() -> None:
     assert not [f for f in short if f.alarming]
 
 
-def test_a_prior_that_the_data_contradict_is_named() -> None:
+def test_a_prior_that_the_data_contradict_is_named():
     """The first unknown is known beforehand to 0.05, and to be zero, or to be 0.4."""
     for far in (0.0, 0.4):
         (parts, r, J), row = Case(6).fitted(), np.eye(4)[:1] / 0.05
@@ -264,14 +264,14 @@ def test_a_prior_that_the_data_contradict_is_named() -> None:
     assert not alarms(unseen, "priors")
 
 
-def test_holm_by_hand() -> None:
+def test_holm_by_hand():
     p = (0.01, 0.04, 0.03, 0.005)
     adjusted = [f.adjusted for f in holm([Verdict("level", None, None, one, 1.0, "") for one in p])]
     np.testing.assert_allclose(adjusted, [0.03, 0.06, 0.06, 0.02])
     assert LEVEL == 0.01
 
 
-def test_whiteness_counts_fitted_coefficients() -> None:
+def test_whiteness_counts_fitted_coefficients():
     noise = np.random.default_rng(0).standard_normal(500)
     rho, p = whiteness(noise)
     assert rho == autocorrelation(noise)[0]

@@ -5,9 +5,6 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +34,7 @@ def exact(problem: ClosedForm, parts: tuple[float, ...]) -> np.ndarray:
     return np.interp(parts, np.cumsum(p) / p.sum(), x)
 
 
-def test_laplace_of_a_linear_problem_is_the_posterior(tmp_path: Path) -> None:
+def test_laplace_of_a_linear_problem_is_the_posterior(tmp_path):
     o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, workers=2)
     found = laplace(o, draws=1000)
     x = np.log(found.draws[0])
@@ -52,7 +49,7 @@ def test_laplace_of_a_linear_problem_is_the_posterior(tmp_path: Path) -> None:
     assert saved["marginals"][0]["sd"] == pytest.approx(np.exp(x[:, 0]).std(), rel=1e-6)
 
 
-def test_weights_correct_laplace_where_it_is_roughly_right() -> None:
+def test_weights_correct_laplace_where_it_is_roughly_right():
     found = laplace(optimum(BENT, 0), draws=4000)
     (one,) = found.marginals
     ends = exact(BENT, (0.025, 0.5, 0.975))
@@ -61,7 +58,7 @@ def test_weights_correct_laplace_where_it_is_roughly_right() -> None:
     assert found.checks["k_hat"] < 0.7
 
 
-def test_laplace_says_where_it_is_not_to_be_trusted_and_refuses_where_it_says_nothing() -> None:
+def test_laplace_says_where_it_is_not_to_be_trusted_and_refuses_where_it_says_nothing():
     bent = laplace(optimum(BANANA, 0.1, 0.01))
     assert bent.checks["k_hat"] > 0.7
     assert any("not to be trusted" in notice for notice in bent.notices)
@@ -71,7 +68,7 @@ def test_laplace_says_where_it_is_not_to_be_trusted_and_refuses_where_it_says_no
         laplace(optimum(BENT, 0), draws=50)
 
 
-def test_draws_that_cannot_be_simulated_have_no_weight() -> None:
+def test_draws_that_cannot_be_simulated_have_no_weight():
     found = laplace(
         optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0), draws=1000
     )
@@ -83,7 +80,7 @@ def test_draws_that_cannot_be_simulated_have_no_weight() -> None:
     )
 
 
-def test_residuals_too_large_for_the_noise_are_said() -> None:
+def test_residuals_too_large_for_the_noise_are_said():
     off = ClosedForm(lambda x: np.append(STRAIGHT @ x, np.full(40, 3.0)), 3)
     assert any(
         "larger than the noise" in notice for notice in laplace(optimum(off, 0, 0, 0)).notices
@@ -92,7 +89,7 @@ def test_residuals_too_large_for_the_noise_are_said() -> None:
 
 @pytest.mark.parametrize("kind", ["normal", "log-normal"])
 @pytest.mark.parametrize("scale", ["log", "linear"])
-def test_the_density_that_nuts_sees_has_its_gradient(kind: Any, scale: Any) -> None:
+def test_the_density_that_nuts_sees_has_its_gradient(kind, scale):
     prior = Prior(median=2.0, sd=0.7, kind=kind)
     o = optimum(
         ClosedForm(
@@ -113,7 +110,7 @@ def test_the_density_that_nuts_sees_has_its_gradient(kind: Any, scale: Any) -> N
 
 @pytest.mark.parametrize("kind", ["normal", "log-normal"])
 @pytest.mark.parametrize("scale", ["log", "linear"])
-def test_without_data_nuts_gives_the_prior_back(kind: Any, scale: Any) -> None:
+def test_without_data_nuts_gives_the_prior_back(kind, scale):
     """Whatever the coordinate's scale: densities of values, not of coordinates."""
     pytest.importorskip("nutpie")
     prior = Prior(median=2.0, sd=0.4, kind=kind)
@@ -124,7 +121,7 @@ def test_without_data_nuts_gives_the_prior_back(kind: Any, scale: Any) -> None:
     assert stats.kstest(u, "uniform").pvalue > 1e-3
 
 
-def test_nuts_finds_the_quantiles_and_the_same_draws_by_the_same_seed() -> None:
+def test_nuts_finds_the_quantiles_and_the_same_draws_by_the_same_seed():
     pytest.importorskip("nutpie")
     found = nuts(optimum(BENT, 0, workers=2), chains=2, draws=500)
     ends = exact(BENT, (0.025, 0.5, 0.975))
@@ -138,7 +135,7 @@ def test_nuts_finds_the_quantiles_and_the_same_draws_by_the_same_seed() -> None:
     assert found.cost["gradients"] > 1000
 
 
-def test_nuts_follows_a_banana() -> None:
+def test_nuts_follows_a_banana():
     """p1 is p0^2, give or take one: its mean is 1.01, where Laplace has 0.01."""
     pytest.importorskip("nutpie")
     found = nuts(optimum(BANANA, 0.1, 0.01), chains=4, draws=300, accept=0.9)
@@ -148,7 +145,7 @@ def test_nuts_follows_a_banana() -> None:
     assert x[:, 1].std() == pytest.approx(3.04**0.5, rel=0.2)
 
 
-def test_nuts_says_where_it_has_not_arrived() -> None:
+def test_nuts_says_where_it_has_not_arrived():
     pytest.importorskip("nutpie")
     thin = ClosedForm(lambda x: [x[0] - 0.1, 5 * (x[1] - x[0] ** 2)], 2, low=1e-6, high=1e6)
     found = nuts(optimum(thin, 0.1, 0.01), chains=2, draws=100, tune=60)
@@ -156,7 +153,7 @@ def test_nuts_says_where_it_has_not_arrived() -> None:
     assert any("have not mixed" in notice for notice in found.notices)
 
 
-def test_nuts_takes_failing_runs_for_walls_and_says_so() -> None:
+def test_nuts_takes_failing_runs_for_walls_and_says_so():
     pytest.importorskip("nutpie")
     found = nuts(
         optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0),
@@ -169,7 +166,7 @@ def test_nuts_takes_failing_runs_for_walls_and_says_so() -> None:
 
 
 @pytest.fixture
-def heard() -> Iterator[None]:
+def heard():
     """Ctrl-C is heard, which test runners in the background ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
@@ -177,7 +174,7 @@ def heard() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("heard")
-def test_an_interruption_keeps_the_draws_so_far() -> None:
+def test_an_interruption_keeps_the_draws_so_far():
     pytest.importorskip("nutpie")
     count, lock = 0, threading.Lock()
 
@@ -197,7 +194,7 @@ def test_an_interruption_keeps_the_draws_so_far() -> None:
         nuts(optimum(ClosedForm(slowly, 1), 0), chains=1, draws=100_000, tune=1000)
 
 
-def test_nuts_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nuts_says_what_it_needs(monkeypatch):
     with pytest.raises(ValueError, match="4 draws and 20 for tuning"):
         nuts(optimum(BENT, 0), tune=5)
     monkeypatch.setitem(sys.modules, "nutpie.compiled_pyfunc", None)
@@ -206,7 +203,7 @@ def test_nuts_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def rolling() -> Problem:
+def rolling():
     """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a
     saturated sensor."""
     base = Parameters().override(COARSE)
@@ -218,7 +215,7 @@ def rolling() -> Problem:
     return Problem([data], sensors, unknowns, {"F_x": Autoregression.stated((0.8,), 5e-3)})
 
 
-def test_the_density_on_a_rig_has_its_gradient(rolling: Problem) -> None:
+def test_the_density_on_a_rig_has_its_gradient(rolling):
     o = Optimum(rolling, rolling.coordinates.start, rtol=1e-4)
     white, z = Whitened.of(o), np.array([0.4, -0.3, 0.2])
     _, gradient = white.density(o, z)

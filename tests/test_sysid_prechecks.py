@@ -48,7 +48,7 @@ MOTIONS = {
 
 
 @pytest.fixture(scope="module")
-def recordings() -> dict[str, Recording]:
+def recordings():
     """What rigs with parameters far from the nominal ones give."""
     table = NOMINAL.table()
     truth = {name: factor * table[name]["value"] for name, factor in FAR.items()}
@@ -59,7 +59,7 @@ def recordings() -> dict[str, Recording]:
 
 
 @pytest.fixture(scope="module")
-def runs(recordings: dict[str, Recording]) -> dict[str, Signals]:
+def runs(recordings):
     """Runs with the nominal parameters."""
     problem = Problem(list(recordings.values()), SENSORS, {"pad.E": Unknown()})
     jobs = problem.jobs(problem.coordinates.start, problem.names, LOOSE, None)
@@ -199,9 +199,7 @@ def opposite(recording: Recording) -> Profile:
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_gets_the_sentence_that_helps(
-    recordings: dict[str, Recording], runs: dict[str, Signals], name: str
-) -> None:
+def test_a_mistake_gets_the_sentence_that_helps(recordings, runs, name):
     mistake = MISTAKES[name]
     one = mistake.change(recordings[mistake.motion])
     found = looked_at(
@@ -214,9 +212,7 @@ def test_a_mistake_gets_the_sentence_that_helps(
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_nothing_is_said_of_what_is_right(
-    recordings: dict[str, Recording], runs: dict[str, Signals], motion: str
-) -> None:
+def test_nothing_is_said_of_what_is_right(recordings, runs, motion):
     """With a start that is off by a factor of three, with fewer sensors, and with faults that were
     declared."""
     one, run = recordings[motion], runs[motion]
@@ -238,8 +234,8 @@ def test_nothing_is_said_of_what_is_right(
 
 
 def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
-    recordings: dict[str, Recording],
-) -> None:
+    recordings,
+):
     flipped = changed(recordings["rolling"], F_y=scaled(-1))
     assert list(controller_findings(flipped, SENSORS))
     gains = ["control.K_98", "control.R_99", "control.K_81"]
@@ -253,8 +249,8 @@ def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
 
 
 def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_named(
-    recordings: dict[str, Recording],
-) -> None:
+    recordings,
+):
     one = recordings["rolling"]
     rig: Any = deepcopy(one.rig)
     loop = rig.actuators["x"]
@@ -275,9 +271,7 @@ def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_
     assert "F_x is not compared with its controller, since theta is not recorded" in note.message
 
 
-def test_coloured_noise_is_no_mistake(
-    recordings: dict[str, Recording], runs: dict[str, Signals]
-) -> None:
+def test_coloured_noise_is_no_mistake(recordings, runs):
     """First-order autoregressions of 0.9, where the fit does not know it."""
     rng = np.random.default_rng(0)
     for motion, one in recordings.items():
@@ -293,9 +287,7 @@ def test_coloured_noise_is_no_mistake(
             assert looked_at(replace(one, samples=samples), runs[motion]) == []
 
 
-def test_gaps_and_other_rates_of_samples_are_no_mistake(
-    recordings: dict[str, Recording], runs: dict[str, Signals]
-) -> None:
+def test_gaps_and_other_rates_of_samples_are_no_mistake(recordings, runs):
     """A force with a hole in it, and a camera at 50 Hz."""
     one, samples = recordings["rolling"], dict(recordings["rolling"].samples)
     t, F = samples["F_x"]
@@ -313,9 +305,7 @@ def at_rows(recording: Recording, rate: float, *, rates: bool = False) -> Record
 
 
 @pytest.mark.parametrize("rates", [False, True])
-def test_sparse_set_points_are_told_by_what_they_do(
-    recordings: dict[str, Recording], rates: bool
-) -> None:
+def test_sparse_set_points_are_told_by_what_they_do(recordings, rates):
     """The estimate from the rows alone against what the exact set-points would have had the
     controller do."""
     one, exact = recordings["shaking"], recordings["shaking"].rig.reference
@@ -346,8 +336,8 @@ def test_sparse_set_points_are_told_by_what_they_do(
 
 
 def test_a_rate_that_is_not_that_of_its_set_point_is_named(
-    recordings: dict[str, Recording],
-) -> None:
+    recordings,
+):
     one = at_rows(recordings["rolling"], 500.0, rates=True)
     x_d = one.rig.reference["x_d"]
     assert isinstance(x_d, Sampled)
@@ -360,7 +350,7 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(
         assert words in found.message
 
 
-def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings: dict[str, Recording]) -> None:
+def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings):
     one = at_rows(recordings["shaking"], 1000.0, rates=True)
     x_d = one.rig.reference["x_d"]
     assert isinstance(x_d, Sampled)
@@ -370,7 +360,7 @@ def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings: dict[str, 
     assert "is a clock, or a unit of time, a little off?" in found[0].message
 
 
-def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant() -> None:
+def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant():
     found = together([
         Diagnostic("error", "a", "F_x looks wrong", "sign of F_x"),
         Diagnostic("warning", "a", "F_y is off", "loop of F_y"),

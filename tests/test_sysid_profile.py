@@ -15,7 +15,7 @@ RNG = np.random.default_rng(0)
 STRAIGHT = RNG.standard_normal((20, 3))
 
 
-def test_of_a_linear_problem_the_profile_is_the_parabola_of_the_covariance() -> None:
+def test_of_a_linear_problem_the_profile_is_the_parabola_of_the_covariance():
     o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0)
     sd = np.sqrt(np.diag(np.linalg.inv(STRAIGHT.T @ STRAIGHT)))
     for i, one in enumerate(profiles(o)):
@@ -29,7 +29,7 @@ def test_of_a_linear_problem_the_profile_is_the_parabola_of_the_covariance() -> 
         assert not one.notices
 
 
-def test_variance_of_residuals_above_the_stated_one_widens_the_profile() -> None:
+def test_variance_of_residuals_above_the_stated_one_widens_the_profile():
     (wide,) = profiles(
         optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, variance=4.0), ["p1"]
     )
@@ -37,7 +37,7 @@ def test_variance_of_residuals_above_the_stated_one_widens_the_profile() -> None
     np.testing.assert_allclose(np.log(wide.ci95), 2 * np.log(usual.ci95), rtol=1e-6)  # type: ignore[arg-type]
 
 
-def test_a_curved_profile_has_the_exact_ends_and_says_that_the_covariance_has_others() -> None:
+def test_a_curved_profile_has_the_exact_ends_and_says_that_the_covariance_has_others():
     """(e^x - 1) / 0.3 is one residual, and p1 follows x^2: the others bend, the profile of p0 is
     known."""
     o = optimum(
@@ -50,7 +50,7 @@ def test_a_curved_profile_has_the_exact_ends_and_says_that_the_covariance_has_ot
     assert any("no parabola" in notice for notice in one.notices)
 
 
-def test_an_end_that_is_not_there_is_open_and_says_why() -> None:
+def test_an_end_that_is_not_there_is_open_and_says_why():
     saturating = ClosedForm(lambda x: [1.5 * np.tanh(x[0])], 1)
     (one,) = profiles(optimum(saturating, 0))
     assert one.ci95 == (None, None)
@@ -65,13 +65,13 @@ def test_an_end_that_is_not_there_is_open_and_says_why() -> None:
     assert any("no upper bound" in notice and WALL in notice for notice in cut.notices)
 
 
-def test_a_fit_that_was_not_at_its_optimum_is_found_out() -> None:
+def test_a_fit_that_was_not_at_its_optimum_is_found_out():
     (one,) = profiles(optimum(ClosedForm(lambda x: [x[0] - 0.5], 1), 0))
     assert any("fit did not end at the optimum" in notice for notice in one.notices)
     assert one.ci95[1] is None
 
 
-def test_a_profile_of_what_is_not_free_is_refused() -> None:
+def test_a_profile_of_what_is_not_free_is_refused():
     o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, free=np.array([True, True, False]))
     with pytest.raises(ValueError, match="no free coordinate 'p2' to profile; there are p0, p1"):
         profiles(o, ["p2"])
@@ -84,7 +84,7 @@ def seen(*rows: list[float]) -> list[Combination]:
     return combinations(["E", "K", "R"], np.linalg.inv(J.T @ J), 0.3)
 
 
-def test_a_combination_names_what_is_seen_in_place_of_its_parameters() -> None:
+def test_a_combination_names_what_is_seen_in_place_of_its_parameters():
     (ratio,) = seen([0, 1, -1], [1, 0, 0])
     assert ratio.exponents == {"K": 1.0, "R": -1.0}
     assert ratio.sd == pytest.approx(0.01, rel=1e-2)
@@ -96,7 +96,7 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters() -> None:
     assert seen([1, 0, 0]) == []  # K and R are not seen at all
 
 
-def test_profile_and_combination_of_stiffnesses_in_series() -> None:
+def test_profile_and_combination_of_stiffnesses_in_series():
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in
     series."""
     base = Parameters().override(COARSE)

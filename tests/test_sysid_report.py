@@ -55,7 +55,7 @@ NOISE = Autoregression((0.8,), 0.7, 5e-3)
 
 
 @pytest.fixture(scope="module")
-def found() -> Found:
+def found():
     """Two grasps, from which the viscosity of slip is not identifiable, and another one held
     out."""
     p = Parameters().override(COARSE)
@@ -93,7 +93,7 @@ def found() -> Found:
     ), problem
 
 
-def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Found) -> None:
+def test_the_first_line_says_when_the_model_does_not_explain_the_data(found):
     """Whatever colour was found: it is the noise that sensors state that counts."""
     answer, problem = found
     assert answer.chi2_stated == pytest.approx(answer.chi2, rel=0.05)
@@ -109,7 +109,7 @@ def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Fou
     assert first in page_of(bad, *traces(bad, problem, None))
 
 
-def test_a_prediction_with_values_that_nothing_tells_says_so(found: Found) -> None:
+def test_a_prediction_with_values_that_nothing_tells_says_so(found):
     """Of the unknown that is the held-out recording's own."""
     answer, _ = found
     said = undetermined({"contact.R_n": answer.recorded("held").identified["contact.R_n"]})
@@ -117,7 +117,7 @@ def test_a_prediction_with_values_that_nothing_tells_says_so(found: Found) -> No
 
 
 @pytest.fixture(scope="module")
-def full(found: Found) -> IdentificationResult:
+def full(found):
     """The result with whatever else an answer may hold."""
     answer, _ = found
     harmless = AssumptionTest(
@@ -170,13 +170,11 @@ def written(answer: IdentificationResult, problem: Problem, folder: Path) -> Pag
 
 
 @pytest.fixture(scope="module")
-def page(
-    full: IdentificationResult, found: Found, tmp_path_factory: pytest.TempPathFactory
-) -> Page:
+def page(full, found, tmp_path_factory):
     return written(full, found[1], tmp_path_factory.mktemp("report") / "new")
 
 
-def test_the_page_stands_alone(page: Page) -> None:
+def test_the_page_stands_alone(page):
     assert page.open == []
     assert {"script", "link", "iframe", "object", "b", "a", "cannot", "open"}.isdisjoint(
         tag for tag, _ in page.tags
@@ -203,7 +201,7 @@ def test_the_page_stands_alone(page: Page) -> None:
     ) in page.tags
 
 
-def test_the_page_holds_what_the_answer_holds(page: Page, full: IdentificationResult) -> None:
+def test_the_page_holds_what_the_answer_holds(page, full):
     parameters = [e for e in full.estimates if e.kind == "parameter"]
     known = [e for e in full.estimates if e.identifiable]
     assert {e.name for e in known} >= {"pad.E", "start.disc.x", "bias of y_Br"}
@@ -230,14 +228,14 @@ def test_the_page_holds_what_the_answer_holds(page: Page, full: IdentificationRe
     assert json.loads(decided.strip()) == json.loads(json.dumps(full.made_by))
 
 
-def test_warnings_come_first_and_all_of_them(page: Page, full: IdentificationResult) -> None:
+def test_warnings_come_first_and_all_of_them(page, full):
     assert full.notices
     places = [page.text.index(f"\n{notice}\n") for notice in full.notices]
     assert sorted(places) == places
     assert places[-1] < page.text.index("\nEstimates\n")
 
 
-def test_starts_and_sensors_are_apart_from_parameters(page: Page) -> None:
+def test_starts_and_sensors_are_apart_from_parameters(page):
     order = [
         "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n",
         "\nParameters of which each recording has its own\n",
@@ -250,7 +248,7 @@ def test_starts_and_sensors_are_apart_from_parameters(page: Page) -> None:
     assert "×/÷ 1.65" in page.text  # the prior: a factor of exp(0.5)
 
 
-def test_what_recordings_told_is_in_the_table(page: Page, full: IdentificationResult) -> None:
+def test_what_recordings_told_is_in_the_table(page, full):
     assert [one.source for one in full.contributions] == [HOSTILE, "shallow", None]
     for label in ("pad.E", "contact.R_n in shallow"):
         cells = []
@@ -272,7 +270,7 @@ def test_what_recordings_told_is_in_the_table(page: Page, full: IdentificationRe
         assert f"\n{name} may change without a trace in the data\n" in page.text
 
 
-def test_assumptions_that_matter_stand_open_and_others_are_folded(page: Page) -> None:
+def test_assumptions_that_matter_stand_open_and_others_are_folded(page):
     folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
     said = (
         "\nthe disc weighs 1 kg\nit were not\n−4.2 sd of pad.E\nyes −3.1 ± 1.2 %: the sum of "
@@ -286,7 +284,7 @@ def test_assumptions_that_matter_stand_open_and_others_are_folded(page: Page) ->
     assert ("details", {}) in page.tags
 
 
-def test_predictions_are_the_models(found: Found) -> None:
+def test_predictions_are_the_models(found):
     answer, problem = found
     drawn, lost = traces(answer, problem, None)
     assert not lost
@@ -312,9 +310,7 @@ def test_predictions_are_the_models(found: Found) -> None:
             assert nrmse == pytest.approx(held[trace.channel], rel=1e-6)
 
 
-def test_coloured_residuals_are_whitened_by_the_noise_of_the_result(
-    full: IdentificationResult, found: Found
-) -> None:
+def test_coloured_residuals_are_whitened_by_the_noise_of_the_result(full, found):
     drawn, _ = traces(full, found[1], None)
     for one in drawn:
         if one.channel == "F_y":
@@ -325,7 +321,7 @@ def test_coloured_residuals_are_whitened_by_the_noise_of_the_result(
             np.testing.assert_array_equal(one.white, one.residual)
 
 
-def test_starts_are_the_settings_values(found: Found) -> None:
+def test_starts_are_the_settings_values(found):
     answer, problem = found
     known = paper_settings(problem.recordings[0]).table()
     for e in answer.estimates:
@@ -339,7 +335,7 @@ def test_starts_are_the_settings_values(found: Found) -> None:
         assert e.start == pytest.approx(value, abs=1e-3 if e.kind == "start" else 0.0)
 
 
-def test_an_answer_to_other_data_is_refused(found: Found, tmp_path: Path) -> None:
+def test_an_answer_to_other_data_is_refused(found, tmp_path):
     answer, problem = found
     other = Problem(problem.recordings[:1], problem.sensors, problem.unknowns)
     with pytest.raises(ValueError, match="other recordings"):
@@ -353,12 +349,12 @@ def undrawn(figure: Figure) -> str:
 
 
 def test_a_loaded_answer_makes_the_same_page(
-    full: IdentificationResult,
-    found: Found,
-    page: Page,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    full,
+    found,
+    page,
+    tmp_path,
+    monkeypatch,
+):
     monkeypatch.setattr(sections, "png", undrawn)
     full.save(tmp_path / "answer.json")
     (tmp_path / "page").mkdir()
@@ -367,9 +363,7 @@ def test_a_loaded_answer_makes_the_same_page(
     assert again.text[:when] == page.text[:when]
 
 
-def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
-    found: Found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(found, tmp_path, monkeypatch):
     answer, problem = found
     run = Runner.run
 
@@ -400,7 +394,7 @@ def tabulated(*given: Any) -> Page:
     return Page(made.render(given=given, kept=kept, cell=cell))
 
 
-def test_tables_leave_out_what_is_empty_and_escape_the_rest() -> None:
+def test_tables_leave_out_what_is_empty_and_escape_the_rest():
     page = tabulated(
         ["<h>", "none", "n"], [["1&b", "", "−1.5"], [("weak", "<i>"), "", "0.5 … 3"]], "<c>"
     )
@@ -422,11 +416,11 @@ def test_tables_leave_out_what_is_empty_and_escape_the_rest() -> None:
         (12.3456789, "12.346"),
     ],
 )
-def test_numbers_have_five_digits(value: float, text: str) -> None:
+def test_numbers_have_five_digits(value, text):
     assert grouped(value) == text
 
 
-def test_directions_are_named_by_their_largest_parts() -> None:
+def test_directions_are_named_by_their_largest_parts():
     parts = {"pad.E": -0.8, "contact.K_n": 0.5, "pad.tau": -0.25, "contact.mu_s": 0.21}
     assert (
         direction_name(Direction(0.1, True, parts))
@@ -435,7 +429,7 @@ def test_directions_are_named_by_their_largest_parts() -> None:
     assert direction_name(Direction(0.1, True, {"pad.E": -0.9999})) == "pad.E"
 
 
-def test_autocorrelation_is_numpys() -> None:
+def test_autocorrelation_is_numpys():
     r = np.cumsum(np.random.default_rng(0).standard_normal(200))
     rho = autocorrelation(r)
     assert len(rho) == 20
@@ -482,9 +476,7 @@ FIGURES: dict[str, Callable[[IdentificationResult, Problem], Figure | None]] = {
 
 
 @pytest.mark.parametrize("which", FIGURES)
-def test_no_text_of_a_picture_is_cut_or_overlaps(
-    full: IdentificationResult, found: Found, which: str
-) -> None:
+def test_no_text_of_a_picture_is_cut_or_overlaps(full, found, which):
     figure = FIGURES[which](full, found[1])
     assert figure is not None
     drawn, (width, height) = texts(figure), figure.canvas.get_width_height()

@@ -4,7 +4,6 @@ parameters found all the same."""
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,7 +45,7 @@ Cut = tuple[Recording, Tensor]
 
 
 @pytest.fixture(scope="module")
-def cut() -> Cut:
+def cut():
     """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
     model, y0, _ = begin(MOTION, Parameters().override(COARSE))
     at = np.arange(SINCE, MOTION.duration, 5e-3)
@@ -88,7 +87,7 @@ def tensors(values: Mapping[str, float]) -> dict[str, Tensor]:
     }
 
 
-def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut: Cut) -> None:
+def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut):
     recording, y0 = cut
     out, truth = (
         estimate_initial_state(noisy(recording), RIG, lead=0.05),
@@ -112,7 +111,7 @@ def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut: Cut) ->
         assert float(s[touching].abs().max()) < 2 * known.sd
 
 
-def test_samples_out_of_a_sensors_range_say_nothing() -> None:
+def test_samples_out_of_a_sensors_range_say_nothing():
     t = 5e-3 * np.arange(10.0)
     y = np.minimum(1.0 + 20 * t, 1.5)
     sensor = Sensor(noise=1e-3, high=1.5)
@@ -127,7 +126,7 @@ def test_samples_out_of_a_sensors_range_say_nothing() -> None:
     assert late[0][1] == pytest.approx(np.hypot(sd, 0.2), rel=1e-3)
 
 
-def test_what_no_sensor_measures_is_assumed(cut: Cut) -> None:
+def test_what_no_sensor_measures_is_assumed(cut):
     recording, y0 = cut
     truth = true_bodies(recording, y0)
     few = {channel: RIG[channel] for channel in ("x_C", "F_x", "F_y")}
@@ -147,7 +146,7 @@ def test_what_no_sensor_measures_is_assumed(cut: Cut) -> None:
         estimate_initial_state(recording, none)
 
 
-def test_stretches_last_as_long_as_friction_holds_them() -> None:
+def test_stretches_last_as_long_as_friction_holds_them():
     def contact(mu: float) -> Contact:
         return Contact(
             "L", "disc", SoftContact(1e5, 4e2, 1e5, 4e2, friction=SmoothSlip(mu, mu, 0.05, 1e-3))
@@ -158,7 +157,7 @@ def test_stretches_last_as_long_as_friction_holds_them() -> None:
     assert lasting_stretch(contact(1e6), 10.0, 0.05) == 1e-3
 
 
-def test_derivatives_of_the_state_are_those_of_differences(cut: Cut) -> None:
+def test_derivatives_of_the_state_are_those_of_differences(cut):
     recording, _ = cut
     out = estimate_initial_state(recording, RIG)
     begun = out.begin()
@@ -182,7 +181,7 @@ def test_derivatives_of_the_state_are_those_of_differences(cut: Cut) -> None:
     assert torch.equal(before, again.y0(tensors(means)))
 
 
-def test_residuals_and_gradient_know_the_start(cut: Cut) -> None:
+def test_residuals_and_gradient_know_the_start(cut):
     recording, _ = cut
     out = estimate_initial_state(noisy(recording), RIG)
     problem = Problem([out], RIG, {"pad.E": Unknown(), "contact.mu_s": Unknown()})
@@ -212,7 +211,7 @@ def test_residuals_and_gradient_know_the_start(cut: Cut) -> None:
     assert gradient == pytest.approx(at.J.T @ at.r, rel=1e-5, abs=1e-3)
 
 
-def test_the_start_does_not_depend_on_the_mesh(cut: Cut) -> None:
+def test_the_start_does_not_depend_on_the_mesh(cut):
     recording, _ = cut
     out = estimate_initial_state(recording, RIG)
     rig = recording.rig
@@ -235,7 +234,7 @@ def test_the_start_does_not_depend_on_the_mesh(cut: Cut) -> None:
         assert forces[0] == pytest.approx(forces[1], rel=0.1)
 
 
-def test_another_rig_may_begin_underway() -> None:
+def test_another_rig_may_begin_underway():
     """A cylinder driven over a pad, of which only the place is free, from the samples of its
     rate."""
     rubber = KelvinVoigt(E=7.5e5, nu=0.45, rho=1100.0, tau=0.01, depth=0.044)
@@ -259,7 +258,7 @@ def test_another_rig_may_begin_underway() -> None:
     assert float(state.pads["P"][0, :, 1].sum()) < -1.0  # [N]
 
 
-def test_a_run_that_cannot_begin_is_lost(cut: Cut) -> None:
+def test_a_run_that_cannot_begin_is_lost(cut):
     out = estimate_initial_state(cut[0], RIG)
     far = {"start.disc.y": 0.01} | {
         c.name: 1e-3 for c in out.start_coordinates if ".L.stretch" in c.name
@@ -270,7 +269,7 @@ def test_a_run_that_cannot_begin_is_lost(cut: Cut) -> None:
         out.begin().y0(tensors(far))
 
 
-def test_parameters_are_found_from_the_middle_of_a_roll(cut: Cut) -> None:
+def test_parameters_are_found_from_the_middle_of_a_roll(cut):
     out = estimate_initial_state(noisy(cut[0], seed=3), RIG)
     truth = {name: float(cut[0].rig.parameter(name).detach()) for name in ("pad.E", "pad.tau")}
     problem = Problem(
@@ -286,7 +285,7 @@ def test_parameters_are_found_from_the_middle_of_a_roll(cut: Cut) -> None:
     assert found.chi2 == pytest.approx(1.0, abs=4 * (2 / problem.samples()) ** 0.5)
 
 
-def test_refusals(cut: Cut) -> None:
+def test_refusals(cut):
     recording, _ = cut
     start = underway(estimate_initial_state(recording, RIG))
     rig, samples = recording.rig, recording.samples
@@ -330,7 +329,7 @@ def test_refusals(cut: Cut) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Newton did not converge")  # where rest is assumed, wrongly
-def test_unknown_start_smoke(tmp_path: Path) -> None:
+def test_unknown_start_smoke(tmp_path):
     """The experiment: errors of a few standard deviations, a price for not knowing the start, and
     rest not assumed in silence."""
     module = experiment("unknown_start")

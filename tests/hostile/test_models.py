@@ -167,7 +167,7 @@ def run_randomly(rng: np.random.Generator) -> bool:
 
 
 @pytest.mark.timeout(1800)
-def test_random_models_run_or_say_why_not(tally: Callable[[str], Tally]) -> None:
+def test_random_models_run_or_say_why_not(tally):
     line, ran = tally("random models"), 0
     for number in range(count(1000)):
         run = partial(run_randomly, random("models", number))
@@ -207,7 +207,7 @@ def together(line: Tally, run: Callable[[int, int], list[Tensor]], runs: int) ->
 
 
 @pytest.mark.filterwarnings("ignore:the energies of the run")
-def test_threads_give_the_bits_of_runs_alone(tally: Callable[[str], Tally]) -> None:
+def test_threads_give_the_bits_of_runs_alone(tally):
     """Eight threads, a hundred runs with gradients in each; two threads share a model."""
     models = [
         coarse(pad__elements_x=24),
@@ -234,7 +234,7 @@ def test_threads_give_the_bits_of_runs_alone(tally: Callable[[str], Tally]) -> N
     together(tally("runs with gradients in threads"), run, count(RUNS))
 
 
-def test_laws_first_compiled_in_many_threads_are_right(tally: Callable[[str], Tally]) -> None:
+def test_laws_first_compiled_in_many_threads_are_right(tally):
     """Every thread meets the same new law at the same time, round after round."""
     line, base = tally("laws first compiled in threads"), coarse(pad__elements_x=24)
     y0, held = grasp(base, (0.05, 0.0))

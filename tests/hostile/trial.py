@@ -101,7 +101,7 @@ def random(name: str, number: int = 0) -> np.random.Generator:
 
 
 @pytest.fixture
-def tally() -> Iterator[Callable[[str], Tally]]:
+def tally():
     """`tally("kind")` begins a line of the table; the test fails if anything in it did not hold."""
     lines: list[Tally] = []
 
