@@ -10,10 +10,29 @@ from fem_oracle import dilatation, shear, world_stiffness
 from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, condense, solve
 from test_experiments import experiment
 
-from torchsoft import Parameters, RoundedBox, SoftGrasp, press
+from torchsoft import (
+    PD,
+    Actuator,
+    Body,
+    Circle,
+    Contact,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Parameters,
+    Profile,
+    Reference,
+    Rig,
+    RoundedBox,
+    SmoothSlip,
+    SoftContact,
+    SoftGrasp,
+    press,
+)  # fmt: skip
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.state import State
+from torchsoft.physics.statics import resting
 
 
 @pytest.fixture(scope="module")
@@ -136,3 +155,36 @@ def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch():
     assert punched(1.2e8, 120)[2] == pytest.approx(
         rigid, rel=3e-2
     )  # the flat side ends between its nodes
+
+
+# --- a neutral direction
+# ----------------------------------------------------------------------
+
+
+def weightless(E: float) -> Rig:
+    """A disc under 20 N that nothing turns, on a pad of modulus E [Pa]."""
+    law = SoftContact(1e6, 0.0, 1e6, 0.0, friction=SmoothSlip(0.8, 0.8, 0.05, 10.0))
+    material = KelvinVoigt(E, 0.45, rho=1e3, tau=0.01, depth=0.02)
+    press = Actuator("disc.y", "disc.y", PD(0.0, 0.0), setpoint="y_d", feed_forward="load")
+    held = {"disc.x": 20.3e-3, "y_d": 0.0, "load": -20.0}
+    return Rig(
+        bodies={"disc": Body(0.1, Circle(0.01), x="driven", weighted=False)},
+        pads={"pad": Pad(PadMesh(0.04, 0.005, 40, 4), material, points=2)},
+        contacts={"pad": Contact("pad", "disc", law)},
+        actuators={"press": press},
+        reference=Reference(**{name: Profile([0.0], [value]) for name, value in held.items()}),
+    )
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.3])
+def test_a_neutral_direction_stays_where_it_is(theta):
+    """Its stiffness and load are rounding; the depth and its derivative are exact."""
+    rig, start = weightless(1e6), torch.tensor([20.3e-3, 14.8e-3, theta], dtype=torch.float64)
+    found = resting(rig, {"disc": start})["disc"]
+    assert found[2].item() == pytest.approx(theta, abs=1e-12)
+    alone = resting(rig, {"disc": start}, {"disc": (1,)})["disc"]
+    assert found[1].item() == pytest.approx(alone[1].item(), abs=1e-13)
+    (slope,) = torch.autograd.grad(found[1], rig.parameter("pads.pad.material.E"))
+    with torch.no_grad():
+        ends = [resting(weightless(1e6 + by), {"disc": start})["disc"][1] for by in (100, -100)]
+    assert slope.item() == pytest.approx((ends[0] - ends[1]).item() / 200, rel=1e-5)

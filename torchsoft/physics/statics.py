@@ -32,6 +32,10 @@ SETTLING = 30
 STRIDE = 0.2
 """Longest step of the search for balance over the height of the thinnest pad."""
 
+NEUTRAL, ROUNDED = 1e-12, 1e-14
+"""Stiffness of a direction over the largest that makes it neutral, such as the turning of a disc
+without weight, and load on it, over that stiffness and a stride, that is rounding."""
+
 STALLED = 20
 """Steps without smaller loads and without way, after which the search ends: loads to and fro over
 the edge of a contact."""
@@ -250,11 +254,16 @@ def resting(
             (rows,) = torch.autograd.grad(F.diagonal().sum(), x, materialize_grads=True)
         F, K = F[0].detach(), -rows
         size = float(F.norm())
+        U, S, V = torch.linalg.svd(K)
+        along = U.mT @ F
+        lost = (NEUTRAL * S[0] >= S) & (along.abs() <= ROUNDED * S[0] * stride)
         # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
         held = max(size / stride, torch.finfo(q.dtype).tiny)  # of a body without load, too
-        step = torch.linalg.solve(K + held * torch.eye(len(q), dtype=q.dtype), F)
+        own = held * torch.eye(len(q), dtype=q.dtype)
+        step = torch.linalg.solve(K + own, F - U[:, lost] @ along[lost])
         if float(step.norm()) <= residual:
-            return poses(q + torch.linalg.solve(K, loads(q)) if torch.is_grad_enabled() else q)
+            inverse = (V.mT[:, ~lost] / S[~lost]) @ U.mT[~lost]
+            return poses(q + inverse @ loads(q) if torch.is_grad_enabled() else q)
         path.append((size, q))
         q = q + step
     worst = int(F.abs().argmax())
