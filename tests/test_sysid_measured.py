@@ -220,8 +220,6 @@ BAD_CONFIG = {
         r"touch .* at 46.92 mm \(twice pad.height"),
     "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"),
         r"fit\.rtol should be greater than or equal to 1e-08, not -1"),
-    "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"),
-        r"fit: .*tolerances choose the steps; leave it out, or give"),
     "a disc that fits nowhere": (
         CONFIG.replace('unknowns."pad.E"]\nnominal = 0.7e6', 'unknowns."disc.radius"]'),
         r"unknowns\.disc\.radius\.low = 0\.001937 is impossible: the disc does not fit",

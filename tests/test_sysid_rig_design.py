@@ -16,7 +16,8 @@ from torchsoft.rigs import RigFile
 from torchsoft.rigs.written import located
 from torchsoft.sysid import Problem
 from torchsoft.sysid.configuration import read_config
-from torchsoft.sysid.rig_design import AS_STATED, planned
+from torchsoft.sysid.rehearsal import planned
+from torchsoft.sysid.rig_design import AS_STATED
 from torchsoft.sysid.runs import Runner
 
 RIG = Path(__file__).parents[1] / "rigs" / "orientation.toml"
@@ -70,8 +71,8 @@ def test_candidates_are_ranked_by_what_they_tell(out):
     assert "the body was lost" in last["lost"]
     stated = read_config(out / "fit.toml")
     file = RigFile.from_toml(RIG).override(**stated.settings)
-    _, made = planned(stated, file, "twist", stated.design.candidates["twist"])
-    assert not isinstance(made, str)
+    built = file.override(**stated.design.candidates["twist"]).build()
+    made = planned(stated, built, "twist", stated.design.rtol, noise=0.0)
     problem = Problem([made], stated.sensors, stated.unknowns)
     x, free = problem.coordinates.start, problem.coordinates.free
     J = problem.residuals(Runner([made]), x, ["twist"], stated.design.rtol, free).J
