@@ -30,8 +30,8 @@ def assumption_notices(checked: Checked) -> list[str]:
             for c in sorted((c for c in checks if c.suspected), key=lambda c: -c.gain)[:4]
         )
         out.append(
-            f"no suspect explains to first order all that the fit left; nearest come {near or '-'}"
-            f": `explain` fits again with each of {len(checked.candidates)} and compares them"
+            "no suspect explains to first order all that the fit left; "
+            f"{f'nearest come {near}' if near else 'the data favour none'}: `explain` fits again with each of {len(checked.candidates)} and compares them"
         )
     if checked.untried:
         out.append(
