@@ -29,9 +29,10 @@ def assumption_notices(checked: Checked) -> list[str]:
             f"{c.name} ({c.gain / square:.0%} of the sum of squares)"
             for c in sorted((c for c in checks if c.suspected), key=lambda c: -c.gain)[:4]
         )
+        favoured = f"nearest come {near}" if near else "the data favour none"
         out.append(
-            "no suspect explains to first order all that the fit left; "
-            f"{f'nearest come {near}' if near else 'the data favour none'}: `explain` fits again with each of {len(checked.candidates)} and compares them"
+            f"no suspect explains to first order all that the fit left; {favoured}: `explain` fits "
+            f"again with each of {len(checked.candidates)} and compares them"
         )
     if checked.untried:
         out.append(
