@@ -29,9 +29,9 @@ def assumption_notices(checked: Checked) -> list[str]:
             f"{c.name} ({c.gain / square:.0%} of the sum of squares)"
             for c in sorted((c for c in checks if c.suspected), key=lambda c: -c.gain)[:4]
         )
-        favoured = f"nearest come {near}" if near else "the data favour none"
+        nearest = f"nearest come {near}" if near else "the data favour none"
         out.append(
-            f"no suspect explains to first order all that the fit left; {favoured}: `explain` fits "
+            f"no suspect explains to first order all that the fit left; {nearest}: `explain` fits "
             f"again with each of {len(checked.candidates)} and compares them"
         )
     if checked.untried:
