@@ -229,7 +229,10 @@ def test_motions_go_through_what_they_are_given(tmp_path):
     ("text", "sentence"),
     [
         ("t [s],x_d [mm]\n0,0\n1,1\n", r"x\.csv ends at 1 s, but the run lasts until 2 s"),
-        ("t [s],x [mm]\n0,0\n1,1\n", r"x\.csv has no column `x_d \[m\]`; it has `t`, `x`"),
+        (
+            "t [s],x [mm]\n0,0\n1,1\n",
+            r"x\.csv has no column `x_d \[m\]`, in this unit .*; it has `t`, `x`",
+        ),
         (
             "t [s],x_d [N]\n0,0\n1,1\n",
             r"row 1, column `x_d` cannot be in 'N'; it can be in m, cm, mm",

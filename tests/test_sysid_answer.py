@@ -323,7 +323,9 @@ def slide(settings: Parameters, reference: Reference) -> SoftGrasp:
 def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
     slippery.save(tmp_path / "answer.json")
     answer, reference = load_answer(tmp_path / "answer.json"), slippery.rigs["first"].reference
-    said = r"SoftGrasp with parts of its own, which no file holds: .* `applied_to\(rig\)`"
+    said = (
+        r"SoftGrasp with parts of its own, which the answer does not hold: .* `applied_to\(rig\)`"
+    )
     with pytest.raises(ValueError, match=said):
         answer.model()
     mine, weak = (

@@ -177,7 +177,7 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan):
         ({"bounds": {"z_d": Bounds(low=0, high=1, speed=1)}}, "no Profile called `z_d`"),
         (
             {"bounds": {"x_d": Bounds(low=0, high=1, speed=1, after=-1)}},
-            "must have a knot at or before -1 s",
+            "must have a knot at or before after = -1 s",
         ),
         (
             {"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}},

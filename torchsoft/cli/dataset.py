@@ -130,8 +130,8 @@ def make(options: argparse.Namespace) -> int:
         say(f"another process is making shards {listed(elsewhere)}")
         made -= sum(len(config.rows(shard)) for shard in elsewhere)
     say(
-        f"{made} trajectories in {options.out}; {bad} of those made now failed, each with its "
-        "reason"
+        f"{made} trajectories in {options.out}; of those made now "
+        + (f"{bad} failed, each with its reason" if bad else "none failed")
     )
     if left:
         say(f"of the whole set {len(left)} of {config.shards} shards are left: {listed(left)}")

@@ -14,6 +14,9 @@ forces with the friction cone, points that stick and slip, stress and energies. 
 interactive player, one file for any browser that needs no network; --pdf a camera-ready dashboard,
 as wide as a page or a column, with --only for some of its panels."""
 
+PAGE = 250
+"""Height of a page [mm]."""
+
 
 def add_commands(commands: Any) -> None:
     """The commands `plot` and `version`."""
@@ -50,7 +53,10 @@ def plot(options: argparse.Namespace) -> int:
         player(run, written[-1], title=title)
     if options.pdf:
         written.append(made.with_name(f"{made.name}.pdf"))
-        save(dashboard(run, look=options.width, **common), written[-1])
+        figure = dashboard(run, look=options.width, **common)
+        if (tall := 25.4 * figure.get_figheight()) > PAGE:
+            say(f"the figure is {tall:.0f} mm tall, a page {PAGE}: choose panels with --only")
+        save(figure, written[-1])
     if options.vtk:
         listed = made.with_name(f"{made.name}.pvd")
         run.to_vtk(listed, None if options.time is None else [options.time])

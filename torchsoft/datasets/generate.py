@@ -48,9 +48,9 @@ class Part(NamedTuple):
         """Its shards. Raises `ValueError` for a part that has none."""
         if self.of > config.shards:
             raise ValueError(
-                f"--part {self.number}/{self.of}: the set has only {config.shards} shards of "
-                f"{config.trajectories_per_shard} trajectories; take {config.shards} parts at the "
-                "most, or smaller trajectories_per_shard"
+                f"part {self.number} of {self.of} is empty, since trajectories come in shards of "
+                f"{config.trajectories_per_shard}: make at most {config.shards} parts of the set, "
+                "or smaller shards (trajectories_per_shard)"
             )
         return range(self.number - 1, config.shards, self.of)
 

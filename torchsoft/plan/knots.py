@@ -92,8 +92,9 @@ class Moves:
                 raise ValueError(f"`{name}` has no knot after {one.after:g} s that could move")
             if first == 0 or times[-1] > end * (1 + 1e-9):
                 raise ValueError(
-                    f"`{name}` must have a knot at or before {one.after:g} s that stays, and none "
-                    f"after {end:g} s"
+                    f"`{name}` must have a knot at or before after = {one.after:g} s that stays, "
+                    f"and none beyond the end, {end:g} s; it has knots at "
+                    f"{', '.join(f'{t:g}' for t in times)} s: change `after`, or the motion"
                 )
             self.knots[name] = times, values, first
             spans = np.diff(times[first - 1 :])

@@ -110,19 +110,28 @@ def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
         legend_above(axes)
 
 
+def cone(run: Trajectory) -> str:
+    """Title of how much of the friction cone is used; of the normal force where a law has no
+    mu_s."""
+    laws = [one.friction for one in run.setup.contacts.values()]
+    known = all("mu_s" in law for law in laws)
+    return "friction in its cone" if known else "friction over normal force"
+
+
 def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
     """What the points of every contact come to over time, with its unit, by contact (T,): forces,
     how much of the friction cone is used (of the normal force where the law has no mu_s; NaN
     without force), points that touch, and those of them that slip."""
-    units = {"normal force": "N", "friction": "N", "friction in its cone": "%",
+    units = {"normal force": "N", "friction": "N", cone(run): "%",
              "points in contact": "1", "slipping": "1"}  # fmt: skip
     out: dict[str, tuple[str, dict[str, Array]]] = {
         kind: (unit, {}) for kind, unit in units.items()
     }
+    in_cone = "friction in its cone" in out
     for name, force in run.force.items():
         normal, friction = force.detach().unbind(-1)
         total, state = normal.sum(-1), run.contact_state[name]
-        mu = run.setup.contacts[name].friction.get("mu_s", 1.0)
+        mu = run.setup.contacts[name].friction["mu_s"] if in_cone else 1.0
         share = torch.where(total > 1e-9, 100 * friction.abs().sum(-1) / (mu * total), torch.nan)
         touching, slipping = (state != 0).sum(-1), (state == SLIPPING).sum(-1)
         for kind, values in zip(out, (total, friction.sum(-1), share, touching, slipping)):
@@ -229,7 +238,7 @@ def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
         curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving
     }
     if run.force:
-        for kind in ("normal force", "friction", "friction in its cone"):
+        for kind in ("normal force", "friction", cone(run)):
             out[kind] = lambda axes, kind=kind: contact_sums(axes, run, kind)
         out["points in contact"] = lambda axes: points(axes, run)
     for one in run.setup.actuators.values():

@@ -81,7 +81,7 @@ class OutputsTable(Group):
         "given [s]",
     )
     video: Literal["gif", "mp4", "none"] = Field(
-        default="gif", description="kind of the video; mp4 needs imageio-ffmpeg"
+        default="gif", description="kind of the video, or none; mp4 needs imageio-ffmpeg"
     )
     frames: Annotated[int, Field(ge=2, le=10_000)] = Field(
         default=150, description="pictures of the video, 12 a second"

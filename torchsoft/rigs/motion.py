@@ -239,8 +239,8 @@ def read_column(path: Path, column: str, unit: str) -> tuple[list[float], list[f
             if name not in there:
                 shown = ", ".join(f"`{line(one, 40)}`" for one in there) or "nothing"
                 raise ValueError(
-                    f"{path} has no column `{name} [{'s' if name == 't' else unit}]`; it has "
-                    f"{shown}"
+                    f"{path} has no column `{name} [{'s' if name == 't' else unit}]`, in this unit "
+                    f"or one like it; it has {shown}"
                 )
         known = {"t": UNITS["s"], column: UNITS[unit]}
         table = csvfile.read(

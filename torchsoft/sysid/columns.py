@@ -211,7 +211,10 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
     plain = {re.sub(r"[^a-z]", "", one.lower()): one for one in names} | {"time": "t"}
     near = nearest(re.sub(r"[^a-z]", "", name.lower()), plain)
     meant = f": did you mean `{plain[near]}`? If" if near else "; if"
-    return f"{meant} it has nothing to do with the motion, say ignore = [{shown(name)}]; {known}"
+    return (
+        f"{meant} it has nothing to do with the motion, say ignore = [{shown(name)}]; if it is one "
+        f"under another name, say which in [columns]; {known}"
+    )
 
 
 def read_csv(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:

@@ -75,7 +75,8 @@ class RecordedRig:
         if self.settings is None:
             raise ValueError(
                 f"the rig of recording `{self.name}` is a {self.rig} with parts of its own, which "
-                "no file holds: build it as it was built for the fit, and call `applied_to(rig)`"
+                "the answer does not hold: build it as it was built for the fit, as in "
+                "RigFile.from_toml(FILE).build().rig, and call `applied_to(rig)`"
             )
         return SoftGrasp(self.settings)
 
