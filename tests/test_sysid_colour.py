@@ -52,6 +52,27 @@ def problem(recording: Recording, colour: str = "white") -> Problem:
     )
 
 
+def test_colour_of_coarse_steps_is_gone_with_them(exact):
+    """White samples: what a first tolerance leaves is coloured, what the last leaves is not."""
+    rng, quiet = np.random.default_rng(0), {name: 0.1 * noise for name, noise in NOISE.items()}
+    samples = {
+        name: (t, y + quiet[name] * rng.standard_normal(len(t)))
+        for name, (t, y) in exact.samples.items()
+    }
+    fine = Problem(
+        [replace(exact, samples=samples)],
+        {name: Sensor(noise=noise) for name, noise in quiet.items()},
+        {name: Unknown(nominal=1.01 * value) for name, value in TRUTH.items()},
+    )
+    plan = [replace(STAGE, rtol=1e-2)]
+    assert identify(fine, plan=plan, assumptions="trusted", tightenings=0).noise
+    answer = identify(fine, plan=plan, assumptions="trusted")
+    assert answer.made_by["rtol"] < 1e-2
+    assert not answer.noise
+    assert not answer.notices
+    assert answer.converged
+
+
 def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact):
     white = identify(problem(noisy(exact, 0, None)), plan=[STAGE], assumptions="trusted")
     found = identify(problem(noisy(exact, 0, AR)), plan=[STAGE], assumptions="trusted")

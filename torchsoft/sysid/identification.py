@@ -127,19 +127,33 @@ def conclude(
     """The result, from the fit of the last stage with the noise that was found; `findings` are
     sentences on the recordings and the plan, `asked` is the tolerance of the whole plan, `began` is
     on the clock [s]."""
-    problem, fit = coloured.problem, coloured.fit
-    c = problem.coordinates
-    free, start = np.isin(c.labels, stage.free), clock.perf_counter()
-    with progress_bar("check of the steps", progress) as notify:
-        end = settle(problem, runner, stage, fit, free, how.tightenings, notify)
-    x, at, rtol = end.x, end.at, end.rtol
-    for number, (by, one) in enumerate(end.fits):
-        name = (
-            "steps chosen anew"
-            if by == (end.fits[number - 1][0] if number else stage.rtol)
-            else "tighter tolerance"
-        )
-        stages = [*stages, stage_entry(name, stage, by, one, start)]
+    c = coloured.problem.coordinates
+    free, stages = np.isin(c.labels, stage.free), list(stages)
+
+    def at_rest() -> Settled:
+        """The fit of the noise that is known, gone on until steps do not matter."""
+        start, by = clock.perf_counter(), stage.rtol
+        with progress_bar("check of the steps", progress) as notify:
+            end = settle(
+                coloured.problem, runner, stage, coloured.fit, free, how.tightenings, notify
+            )
+        for rtol, one in end.fits:
+            name = "steps chosen anew" if rtol == by else "tighter tolerance"
+            stages.append(stage_entry(name, stage, rtol, one, start))
+            by = rtol
+        return end
+
+    end = at_rest()
+    if coloured.found and end.fits:  # its noise was that of the residuals before
+        stage, start = replace(stage, rtol=end.rtol), clock.perf_counter()
+        with progress_bar("colour of the noise", progress) as notify:
+            coloured = with_its_noise(
+                coloured.problem, runner, stage, end.fits[-1][1], how.loss, how.settings.method,
+                notify,
+            )  # fmt: skip
+        stages += noise_entries(coloured, stage, start)
+        end = at_rest()
+    problem, x, at, rtol = coloured.problem, end.x, end.at, end.rtol
     J = at.J[:, free]
     C_free, values, vectors = fisher(J)
     left = parts(problem, at.r, stage.recordings)
@@ -228,6 +242,12 @@ def conclude(
         versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
         rigs={recording.name: recording.rig for recording in problem.recordings},
     )  # fmt: skip
+
+
+def noise_entries(coloured: Coloured, stage: Stage, began: float) -> list[dict[str, Any]]:
+    """The result's entries on the fits with the noise that was found."""
+    name = "with the noise that was found"
+    return [stage_entry(name, stage, stage.rtol, one, began) for one in coloured.fits]
 
 
 def tested_assumptions(
@@ -400,10 +420,7 @@ def identify(
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
         coloured = with_its_noise(problem, runner, end.stage, end.fit, loss, method, bar)
-    stages = end.entries + [
-        stage_entry("with the noise that was found", end.stage, end.stage.rtol, one, before)
-        for one in coloured.fits
-    ]
+    stages = end.entries + noise_entries(coloured, end.stage, before)
     how = How(fitted, tuple(heldout), tuple(acknowledged), settings)
     findings += end.notices
     return conclude(
