@@ -127,7 +127,7 @@ BAD: dict[str, tuple[Change, str]] = {
         r"row 1, column `theta` cannot be in 'mm'; it can be in rad"),
     "unknown column": (
         put(1, X_C, "x_c [mm]"),
-        r"`x_c` is not known: did you mean `x_C`\?.* ignore = \['x_c'\]; columns are t, x_d",
+        r"`x_c` is not known: did you mean `x_C`\?.* ignore = \['x_c'\]; .*columns are t, x_d",
     ),
     "misspelt column": (put(1, F_FF, "Fff [N]"), r"`Fff` is not known: did you mean `F_ff`\?"),
     "another column": (put(1, X_C, "Ventil"),
