@@ -19,7 +19,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.validity import check_array, check_points, check_values
-from torchsoft.threads import single_threaded
+from torchsoft.threads import one_torch_thread
 
 R = TypeVar("R", bound=Rig)
 
@@ -57,7 +57,7 @@ class NoEquilibrium(RuntimeError):
     """Newton's iteration found no static equilibrium."""
 
 
-@single_threaded()
+@one_torch_thread()
 def settled(
     rig: Rig,
     pose: Mapping[str, Tensor],
@@ -185,7 +185,7 @@ def unstretched(rig: Rig, batch: Sequence[int]) -> dict[str, Tensor]:
     return {name: torch.zeros(*batch, count, dtype=torch.float64) for name, count in counts.items()}
 
 
-@single_threaded()
+@one_torch_thread()
 def resting(
     rig: Rig, pose: Mapping[str, Tensor], free: Mapping[str, Sequence[int]] | None = None, *,
     signals: Tensor | None = None, actuators: Container[str] | None = None,

@@ -5,7 +5,8 @@ Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, stresses
 mJ.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -110,28 +111,22 @@ def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
         legend_above(axes)
 
 
-def cone(run: Trajectory) -> str:
-    """Title of how much of the friction cone is used; of the normal force where a law has no
-    mu_s."""
-    laws = [one.friction for one in run.setup.contacts.values()]
-    known = all("mu_s" in law for law in laws)
-    return "friction in its cone" if known else "friction over normal force"
-
-
 def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
     """What the points of every contact come to over time, with its unit, by contact (T,): forces,
-    how much of the friction cone is used (of the normal force where the law has no mu_s; NaN
-    without force), points that touch, and those of them that slip."""
-    units = {"normal force": "N", "friction": "N", cone(run): "%",
+    how much of the friction cone is used (of the normal force where a law has no mu_s; NaN without
+    force), points that touch, and those of them that slip."""
+    laws = {name: contact.friction for name, contact in run.setup.contacts.items()}
+    known = all("mu_s" in law for law in laws.values())
+    share_of = "friction in its cone" if known else "friction over normal force"
+    units = {"normal force": "N", "friction": "N", share_of: "%",
              "points in contact": "1", "slipping": "1"}  # fmt: skip
     out: dict[str, tuple[str, dict[str, Array]]] = {
         kind: (unit, {}) for kind, unit in units.items()
     }
-    in_cone = "friction in its cone" in out
     for name, force in run.force.items():
         normal, friction = force.detach().unbind(-1)
         total, state = normal.sum(-1), run.contact_state[name]
-        mu = run.setup.contacts[name].friction["mu_s"] if in_cone else 1.0
+        mu = laws[name]["mu_s"] if known else 1.0
         share = torch.where(total > 1e-9, 100 * friction.abs().sum(-1) / (mu * total), torch.nan)
         touching, slipping = (state != 0).sum(-1), (state == SLIPPING).sum(-1)
         for kind, values in zip(out, (total, friction.sum(-1), share, touching, slipping)):
@@ -139,9 +134,10 @@ def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
     return out
 
 
-def contact_sums(axes: Axes, run: Trajectory, kind: str) -> None:
+def contact_sums(
+    axes: Axes, run: Trajectory, kind: str, unit: str, series: Mapping[str, Array]
+) -> None:
     """One of the sums over all contacts."""
-    unit, series = sums(run)[kind]
     for (name, values), colour in zip(series.items(), COLOURS * len(series)):
         axes.plot(timeline(axes, f"{kind} [{unit}]", run), values, color=colour, label=name)
     if kind == "friction":
@@ -152,10 +148,11 @@ def contact_sums(axes: Axes, run: Trajectory, kind: str) -> None:
     legend_above(axes)
 
 
-def points(axes: Axes, run: Trajectory) -> None:
+def points(
+    axes: Axes, run: Trajectory, touching: Mapping[str, Array], slipping: Mapping[str, Array]
+) -> None:
     """How many points touch, and how many of these slip."""
-    t, every = timeline(axes, "contact points", run), sums(run)
-    touching, slipping = every["points in contact"][1], every["slipping"][1]
+    t = timeline(axes, "contact points", run)
     for name, colour in zip(touching, COLOURS * len(touching)):
         axes.step(t, touching[name], where="mid", color=colour, label=name)
         axes.fill_between(t, 0, slipping[name], step="mid", color=colour, alpha=0.45, lw=0)
@@ -238,9 +235,11 @@ def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
         curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving
     }
     if run.force:
-        for kind in ("normal force", "friction", cone(run)):
-            out[kind] = lambda axes, kind=kind: contact_sums(axes, run, kind)
-        out["points in contact"] = lambda axes: points(axes, run)
+        every = sums(run)
+        touching, slipping = every.pop("points in contact")[1], every.pop("slipping")[1]
+        for kind, (unit, series) in every.items():
+            out[kind] = partial(contact_sums, run=run, kind=kind, unit=unit, series=series)
+        out["points in contact"] = lambda axes: points(axes, run, touching, slipping)
     for one in run.setup.actuators.values():
         out[one.channel] = lambda axes, one=one: effort(axes, run, one)
     if run.setup.pads:
