@@ -10,19 +10,11 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = (
-    "torch",
-    "torchdiffeq",
-    "numpy",
-    "scipy",
-    "numba",
-    "xarray",
-    "h5py",
-    "pydantic",
-    "zarr",
-    "pysindy",
-    "matplotlib",
-)
+VERSIONS = """
+from importlib.metadata import distributions
+print(*sorted(f"{one.name} {one.version}" for one in distributions() if "nvidia" not in one.name))
+"""
+EXTRAS = "reduced,datasets,posterior,export,learn"
 GRADIENT = """
 import torch
 from torchsoft import Circle, SoftGrasp, rest, simulate
@@ -76,10 +68,9 @@ def main(python: str) -> None:
             source,
             where=folder,
         )
-        run(bin / "pip", "install", "--quiet", next(folder.glob("*.whl")), where=folder)
-        run(bin / "python", "-c", f"from importlib.metadata import version as v; print({{p: v(p) "
-                                  f"for p in {PACKAGES}}})",
-            where=work)  # fmt: skip
+        wheel = next(folder.glob("torchsoft*.whl"))
+        run(bin / "pip", "install", "--quiet", wheel, where=folder)
+        run(bin / "python", "-c", VERSIONS, where=work)
         shutil.copytree(ROOT / "examples" / "identify", work / "identify")
         run(bin / "torchsoft", "init", "mine", where=work)
         run(bin / "torchsoft", "check", "mine.toml", where=work)
@@ -94,6 +85,24 @@ def main(python: str) -> None:
             where=work,
         )
         run(bin / "python", "-c", GRADIENT, where=work)
+        run(bin / "pip", "install", "--quiet", f"{wheel}[{EXTRAS}]", where=folder)
+        run(bin / "python", "-c", VERSIONS, where=work)
+        example = ROOT / "examples" / "gallery" / "reduced_model.py"
+        run(bin / "python", example, where=work)
+        small = ROOT / "data_gen" / "configs" / "smoke.toml"
+        run(bin / "torchsoft", "dataset", "make", small, "--out", "set", where=work)
+        run(bin / "torchsoft", "dataset", "check", "set", where=work)
+        run(
+            bin / "torchsoft",
+            "dataset",
+            "export",
+            "set",
+            "--to",
+            "mcap",
+            "--out",
+            "logs",
+            where=work,
+        )
     print(f"all of it in {time.monotonic() - begin:.0f} s")
 
 
