@@ -26,7 +26,7 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
-from torchsoft.sysid.refits import AMOUNTS, End, difference, refit, varied
+from torchsoft.sysid.refits import AMOUNTS, End, difference, joint_fit, refit, varied
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
@@ -36,6 +36,7 @@ from torchsoft.sysid.sensitivity import (
     check_assumptions,
     compared,
     doubted,
+    rivals,
 )
 from torchsoft.sysid.suspects import assumption_notices
 
@@ -264,6 +265,41 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     assert again.fit.chi2 < 2  # on steps as coarse as those of the checks
     for name, value in TRUTH.items():
         assert again.of(name) == pytest.approx(np.log(value), abs=0.1)
+
+
+def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
+    """A heavier disc: at the end of a fit without it, other numbers explain more to first order."""
+    truth = TRUTH | {"disc.mass": 1.08 * BASE.disc.mass}
+    data = record("strokes", begin(STROKES, BASE), truth, QUIET, rtol=1e-6, seed=4)
+    problem = Problem([data], QUIET, {name: Unknown() for name in TRUTH})
+    runner, c = Runner(problem.recordings), problem.coordinates
+    x = c.start + [0.7, -0.7]
+    at, steps = problem.freeze(runner, x, problem.names, RTOL, c.free)
+    end = End(x, at, c.free, problem.names, at, steps, RTOL, runner)
+    suspects = [
+        one
+        for one in assumptions(problem.recordings, set(TRUTH))
+        if one.name in ("disc.mass", "pad.nu", "contact.eta", "mesh")
+    ]
+    found = joint_fit(problem, end, suspects, "linear", lambda chi2: None)
+    assert found is not None
+    assert found.left < 1.1 * len(at.r)
+    assert found.parts.keys() == {"disc.mass", "pad.nu", "contact.eta"}
+    assert max(found.parts, key=lambda name: found.parts[name]) == "disc.mass"
+    assert 0.95 < found.parts["disc.mass"] < 1.05
+    assert np.exp(found.at["pad.E"]) == pytest.approx(TRUTH["pad.E"], rel=0.02)
+
+
+@pytest.mark.parametrize(("second", "near"), [(250.0, ["a", "b"]), (80.0, [])])
+def test_near_rivals_to_first_order_are_left_to_new_fits(same, second, near):
+    taken = [Variation(name, "known", f"{name} is 1", "", parameter=name) for name in "abc"]
+    checks = {
+        one.name: assumption_test(one, gain=gain, favoured=1.0, significance=gain, odds=odds)
+        for one, gain, odds in zip(taken, (300.0, second, 5.0), (1.0, 0.0, 0.0))
+    }
+    assert [one.name for one in rivals(taken, checks)] == near
+    said = assumption_notices(same._replace(checks=[*checks.values()], candidates=tuple(near)))
+    assert (". Nearly as much falls with b (by 250): `explain` compares" in said[0]) == bool(near)
 
 
 def test_a_number_is_varied_as_far_as_there_is_a_rig():

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.physics.contact import SlipLaw
+from torchsoft.physics.contact import SlipLaw, at_once
 from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 
@@ -109,9 +109,29 @@ def plain(settings: Parameters, reference: Reference, law: SlipLaw = frictionles
     return SoftGrasp(settings, reference, friction=law)
 
 
+def scaled(factor: float) -> SlipLaw:
+    return lambda E, F_N, R: factor * E / R
+
+
+def weighted(E: Tensor, F_N: Tensor, R: Tensor, factor: float) -> Tensor:
+    return factor * E / R
+
+
+def sliding_at_once(settings: Parameters, reference: Reference) -> SoftGrasp:
+    model = SoftGrasp(settings, reference)
+    for contact in model.contacts.values():
+        contact.law.sliding = at_once
+    return model
+
+
 def test_a_checkpoint_of_another_law_is_not_read(jerks, tmp_path):
-    """Neither of other numbers, nor of another function, nor of a changed one."""
-    builds = [rig, SoftGrasp, partial(rig, alpha=0.61), plain]
+    """Neither of other numbers, nor of another function, of one that holds others, nor of a changed
+    one."""
+    builds = [rig, SoftGrasp, partial(rig, alpha=0.61), plain, sliding_at_once]
+    for factor in (0.5, 0.25):
+        builds += [
+            partial(plain, law=law) for law in (scaled(factor), partial(weighted, factor=factor))
+        ]
     for number, text in enumerate(("E / R", "E / (2 * R)")):
         path = tmp_path / f"{number}" / "laws.py"
         path.parent.mkdir()
@@ -123,5 +143,5 @@ def test_a_checkpoint_of_another_law_is_not_read(jerks, tmp_path):
         spec.loader.exec_module(laws)
         builds.append(partial(plain, law=laws.law))
     prints = [built(jerks, build).fingerprint for build in builds]
-    assert len(set(prints)) == len(builds) == 6
+    assert len(set(prints)) == len(builds) == 11
     assert prints == [built(jerks, build).fingerprint for build in builds]

@@ -52,16 +52,12 @@ def nodal_forces(
         """Mismatch, what it makes of x, and the slopes (..., points, 2, 2) of the law."""
         x = N @ (free + nodal(relation, N.mT @ f))
         with torch.enable_grad():
-            x = x.detach().requires_grad_()
-            at = law(x)
-            rows = [
-                torch.autograd.grad(
-                    at[..., i].sum(), x, retain_graph=i == 0, materialize_grads=True
-                )
-                for i in (0, 1)
-            ]
-        v = at.detach() - f
-        return v, N @ nodal(relation, N.mT @ v), torch.stack([row for (row,) in rows], -2)
+            twice = torch.stack((x, x)).requires_grad_()  # a copy for each component
+            at = law(twice)
+            components = (at[0, ..., 0] + at[1, ..., 1]).sum()
+            (G,) = torch.autograd.grad(components, twice, materialize_grads=True)
+        v = at[0].detach() - f
+        return v, N @ nodal(relation, N.mT @ v), G.movedim(0, -2)
 
     def correction(v: Tensor, G: Tensor) -> Tensor:
         """(1 - G B)^-1 v with B = N A N^T."""

@@ -455,6 +455,7 @@ class Rig(Shown, nn.Module):
         points' own, in the base's frame. `which` takes some of the points; `stage` is the law's a h
         [s]."""
         contact = self.contacts[key]
+        u, u_dot = torch.broadcast_tensors(u, u_dot)
         X, weight, s = self.pads[contact.pad].point_positions, self.weight(key), state.stretch[key]
         if which is not None:
             X, weight, s = X[which], weight[which], s[..., which]

@@ -5,9 +5,10 @@ import inspect
 from collections.abc import Collection
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -198,9 +199,8 @@ def identity(rig: Rig) -> bytes:
     ]
     text = [f"{name} {type(part).__qualname__} {plain(part)}" for name, part in parts]
     text += [f"{name} {taxels}" for name, taxels in rig.taxels.items()]
-    functions = [
-        value for _, part in parts for value in vars(part).values() if inspect.isfunction(value)
-    ]
+    values = [getattr(v, "func", v) for _, part in parts for v in vars(part).values()]
+    functions = [value for value in values if inspect.isfunction(value)]
     code = {
         f"{one.__module__}.{one.__qualname__}": one
         for one in (*(type(part) for _, part in parts), *functions)
@@ -212,23 +212,38 @@ def identity(rig: Rig) -> bytes:
 
 
 def plain(part: nn.Module) -> str:
-    """A part's own parameters and buffers, and its attributes that are numbers, text, arrays or
-    tuples of them."""
+    """A part's own parameters and buffers, and its attributes that are numbers, text, arrays,
+    functions or tuples of them."""
     tensors = {
         **dict(part.named_parameters(recurse=False)),
         **dict(part.named_buffers(recurse=False)),
     }
     known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
     for name, value in vars(part).items():
-        if isinstance(value, np.ndarray | Tensor):
-            known[name] = sha256(np.asarray(value).tobytes()).hexdigest()
-        elif not name.startswith("_") and isinstance(
-            value, int | float | str | tuple | dict | None
+        if isinstance(value, np.ndarray | Tensor) or (
+            not name.startswith("_")
+            and isinstance(value, int | float | str | tuple | dict | FunctionType | partial | None)
         ):
-            known[name] = value
+            known[name] = stated(value)
     if isinstance(part, Pad):
         known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded.tolist()
     return repr(sorted(known.items()))
+
+
+def stated(value: Any) -> Any:
+    """A value as its `repr` says all of it: an array by its checksum, a function by its name and
+    the values that it holds."""
+    if isinstance(value, np.ndarray | Tensor):
+        array = value.detach().numpy() if isinstance(value, Tensor) else value
+        return array.shape, sha256(array.tobytes()).hexdigest()
+    if isinstance(value, partial):
+        return stated(value.func), [*map(stated, value.args)], stated(value.keywords)
+    if isinstance(value, FunctionType):
+        held = (value.__defaults__, value.__kwdefaults__, inspect.getclosurevars(value).nonlocals)
+        return f"{value.__module__}.{value.__qualname__}", [*map(stated, held)]
+    if isinstance(value, dict):
+        return {key: stated(one) for key, one in value.items()}
+    return tuple(map(stated, value)) if isinstance(value, tuple) else value
 
 
 def source(code: Any) -> bytes:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
-from torchsoft.sysid.plan import SCANNED, USUAL, Stage, default_plan, run_plan
+from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, Stage, default_plan, run_plan
 from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import Problem, Residuals, check_value
 from torchsoft.sysid.recording import Array, Recording
@@ -149,6 +149,65 @@ def since(steps: Frozen, begin: float) -> Frozen:
     return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
 
 
+class Joint(NamedTuple):
+    """A fit with many suspects unknown at once: coordinates by label, the sum of squares that it
+    leaves, and how much each suspect alone takes, to first order there, of the misfit that is left
+    with all of them as stated, as a part of it by name."""
+
+    at: Mapping[str, float]
+    left: float
+    parts: Mapping[str, float]
+
+
+def joint_fit(
+    problem: Problem, end: End, suspects: Sequence[Variation], loss: Loss, notify: Notify
+) -> Joint | None:
+    """The fit with every suspect unknown that is a number or a fault of a sensor, from where the
+    first fit began; None where there is none.
+
+    A fit that lacks something may end far from the truth, where tests to first order rank suspects
+    wrongly. The joint fit ends near it, and there they rank them rightly.
+    """
+    other, tried = problem, list[Variation]()
+    for one in suspects:
+        added = varied(other, end.which, one) if one.label else ""
+        if isinstance(added, Problem):
+            other, tried = added, [*tried, one]
+    if not tried:
+        return None
+    c, free = other.coordinates, freed(problem, other, end)
+    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
+    plan = [
+        Stage(f"joint by rtol = {rtol:g}", end.which, labels, rtol, ALL, ROUGH)
+        for rtol in (LOOSE, end.rtol)
+    ]
+    try:
+        fit = run_plan(other, end.runner.of(other.recordings), plan, c.start,
+                       loss=loss, notify=notify).fit  # fmt: skip
+    except Unreachable:
+        return None
+    J, columns = fit.at.J, [c.labels.index(one.label) for one in tried]
+    Q, _ = np.linalg.qr(J[:, np.isin(c.labels, problem.coordinates.labels) & free])
+
+    def across(d: Array) -> Array:
+        """What no coordinate of the first fit can do (m,)."""
+        return d - Q @ (Q.T @ d)
+
+    stated = across(fit.at.r - J[:, columns] @ (fit.x - c.start)[columns])
+    left, parts = float(fit.at.r @ fit.at.r), dict[str, float]()
+    misfit = max(float(stated @ stated) - left, 1e-300)
+    for one, k in zip(tried, columns):
+        d = across(J[:, k])
+        parts[one.name] = float(d @ stated) ** 2 / max(float(d @ d), 1e-300) / misfit
+    return Joint(dict(zip(c.labels, fit.x.tolist())), left, parts)
+
+
+def freed(problem: Problem, other: Problem, end: End) -> NDArray[np.bool_]:
+    """Mask of coordinates of a varied problem that are free: those of the fit, and its own."""
+    fitted = dict(zip(problem.coordinates.labels, end.free))
+    return np.array([bool(fitted.get(label, True)) for label in other.coordinates.labels])
+
+
 class Refit(NamedTuple):
     """A fit that was repeated: the problem, its end, and which of its coordinates were free."""
 
@@ -163,21 +222,23 @@ class Refit(NamedTuple):
 
 def refit(
     problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify,
+    joint: Joint | None = None,
 ) -> Refit | None:  # fmt: skip
     """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where
     it cannot begin.
 
-    It begins where the fit ended; ratios that ended at a bound are looked for again over all of
-    their range. With anything but a sensor otherwise, and a misfit above `FAR`, it begins where the
-    first fit began as well, and the better end counts.
+    It begins where the fit ended, or where a joint fit did; ratios that ended at a bound are looked
+    for again over all of their range. Without a joint fit, with anything but a sensor otherwise,
+    and a misfit above `FAR`, it begins where the first fit began, too, and the better end counts.
     """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):
         return None
     c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
-    fitted = {label for label, is_free in zip(problem.coordinates.labels, end.free) if is_free}
+    if joint is not None:
+        at |= {label: joint.at[label] for label in c.labels if label in joint.at}
     x = np.array([at.get(label, own) for label, own in zip(c.labels, c.start)])
-    free = np.array([label in fitted or label not in at for label in c.labels])
+    free = freed(problem, other, end)
     stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
     labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
@@ -188,12 +249,9 @@ def refit(
         with suppress(Unreachable):
             yield run_plan(other, runner, plan, x, loss=loss, notify=notify).fit
 
-    fits = [
-        *carried_out(
-            [Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x
-        )
-    ]
-    if one is not None and one.kind != "sensor" and end.far:
+    once = Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)
+    fits = [*carried_out([once], x)]
+    if one is not None and one.kind != "sensor" and end.far and joint is None:
         with suppress(Unreachable):
             plan = default_plan(other, runner, end.rtol, end.which)
             if set(plan[-1].free) == set(labels):

@@ -27,7 +27,7 @@ from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun, Frozen
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, extended
-from torchsoft.sysid.refits import End, Refit, difference, ended, refit
+from torchsoft.sysid.refits import End, Refit, difference, ended, joint_fit, refit
 from torchsoft.sysid.residual_tests import LEVEL, parts
 from torchsoft.sysid.runs import Runner
 from torchsoft.tables import Number, plain
@@ -155,7 +155,8 @@ class Checked(NamedTuple):
     untried: tuple[str, ...] = ()
     """What an interrupt left out."""
     candidates: tuple[str, ...] = ()
-    """Suspects with which a new fit may explain a misfit that none explains to first order."""
+    """Suspects that only new fits can tell: whether one explains a misfit that none explains to
+    first order, or which of several that do."""
     besides: tuple[AssumptionTest, ...] = ()
     """What the data favour to first order besides the likeliest suspect, one after the other."""
     left: Mapping[str, float] = MappingProxyType({})
@@ -187,7 +188,7 @@ def check_assumptions(
     until one explains the misfit: a test to first order says little where a fit has run far off.
     """
     end = ended(problem, runner, x, at, free, which, rtol, own)
-    candidates: list[Variation] = []
+    candidates, explained = list[Variation](), False
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
     judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
@@ -207,9 +208,11 @@ def check_assumptions(
                 checks[one.name], judge.columns[one.name] = judge.column(one, d), d
                 columns += [d] if one.kind == "numerical" else []
             untried.remove(one.name)
-        unexplained = doubtful and not end.base.lost and not judge.explained(checks.values())
         suspects = {one.name: one for one in (*taken, *(one for one, _ in first))}
-        candidates = doubted(suspects.values(), checks) if unexplained else []
+        explained = judge.explained(checks.values())
+        if doubtful and not end.base.lost:
+            look = rivals if explained else doubted
+            candidates = look(suspects.values(), checks)
         if explain and candidates:
             untried = [f"a new fit with another {one.name}" for one in candidates]
             for one in new_fits(problem, end, candidates, loss, judge, checks, progress):
@@ -220,7 +223,7 @@ def check_assumptions(
     rows = np.stack(columns, 1) if columns else np.zeros((len(at.r), 0))
     names = tuple(one.name for one in candidates)
     done = Checked([*checks.values()], rows, judge.J, tuple(untried), names)
-    return done if candidates else compared(done, judge)
+    return compared(done, judge) if explained or not candidates else done
 
 
 def new_fits(
@@ -230,29 +233,38 @@ def new_fits(
     """Repeats the fit with one suspect after the other, whose `checks` it replaces. Once one
     explains the misfit, or `NEARLY` all of it, those that are worth much less to first order are
     left out."""
-    first, count = dict(checks), len(candidates)
+    gains, joint = {one.name: checks[one.name].gain for one in candidates}, None
+    count = len(candidates)
     with quiet(), tqdm(total=count + 1, unit="fit", disable=not progress) as bar:
 
         def notify(chi2: float) -> None:
             bar.set_postfix_str(f"chi2 = {chi2:.4g}")
 
+        if end.far:
+            bar.set_description("new fit with all suspects unknown at once")
+            joint = joint_fit(problem, end, candidates, loss, notify)
+            if joint is not None and judge.takes_nearly_all(judge.square - joint.left):
+                gains |= {name: part * judge.square for name, part in joint.parts.items()}
+            else:
+                joint = None
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, None, loss, notify)
         bar.update()
         enough = 0.0
-        for number, one in enumerate(candidates if as_stated is not None else (), 1):
-            if first[one.name].gain < enough:
+        order = sorted(candidates, key=lambda one: -gains[one.name])
+        for number, one in enumerate(order if as_stated is not None else (), 1):
+            if gains[one.name] < enough:
                 return
             bar.set_description(plain(f"new fit with another {one.name} ({number} of {count})"))
-            tried = one.of(first[one.name].favoured)
-            other = refit(problem, end, tried, loss, notify)
+            tried = one.of(checks[one.name].favoured)
+            other = refit(problem, end, tried, loss, notify, joint)
             if other is not None and as_stated is not None:
                 found = judge.fit(tried, other, as_stated, checks[one.name])
                 checks[one.name] = replace(found, amount=one.amount)
             bar.update()
             yield one
             if judge.nearly(checks[one.name]):
-                enough = max(enough, RIVAL * first[one.name].gain)
+                enough = max(enough, RIVAL * gains[one.name])
 
 
 @contextmanager
@@ -269,6 +281,15 @@ def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest])
     known = [one for one in suspects if one.name in checks and not checks[one.name].unchecked]
     known.sort(key=lambda one: -checks[one.name].gain)
     return [one for k, one in enumerate(known) if k < MOST or one.kind in ("law", "numerical")]
+
+
+def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
+    """Suspects that the data favour to first order nearly as much as the likeliest one, if there
+    are any: only new fits can tell them apart."""
+    favoured = [one for one in suspects if one.name in checks and checks[one.name].suspected]
+    best = max((checks[one.name].gain for one in favoured), default=0.0)
+    near = [one for one in favoured if checks[one.name].gain > RIVAL * best]
+    return near if len(near) > 1 else []
 
 
 def compared(checked: Checked, judge: "Judge") -> Checked:
@@ -313,8 +334,11 @@ class Judge:
 
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""
-        above = max(self.square - self.dof, 0.0)
-        return self.explained([one]) or (one.refitted and one.gain > NEARLY * above > 0.0)
+        return self.explained([one]) or (one.refitted and self.takes_nearly_all(one.gain))
+
+    def takes_nearly_all(self, gain: float) -> bool:
+        """Whether a fall of the sum of squares leaves next to nothing above the noise."""
+        return gain > NEARLY * (self.square - self.dof) > 0.0
 
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,

@@ -23,7 +23,8 @@ def assumption_notices(checked: Checked) -> list[str]:
     """Sentences on what the data favour, the strongest first, and on constants of the computation
     that estimates hang on."""
     out, checks = [], checked.checks
-    if checked.candidates:
+    favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
+    if checked.candidates and not favoured:
         square = max((c.left + c.gain for c in checks), default=1.0)
         near = ", ".join(
             f"{c.name} ({c.gain / square:.0%} of the sum of squares)"
@@ -39,9 +40,8 @@ def assumption_notices(checked: Checked) -> list[str]:
             f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
             "tries them"
         )
-    favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
     if favoured:
-        out += contradictions(favoured)
+        out += contradictions(favoured, [c for c in checks if c.name in checked.candidates])
     out += [
         f"besides, the data contradict that {c.stated}: the sum of squares would fall by another "
         f"{c.gain:.0f}{c.found}"
@@ -68,8 +68,11 @@ def assumption_notices(checked: Checked) -> list[str]:
     return out
 
 
-def contradictions(favoured: Sequence[AssumptionTest]) -> list[str]:
-    """Sentence on the suspect of the best odds, and on those that the data cannot tell from it."""
+def contradictions(
+    favoured: Sequence[AssumptionTest], candidates: Sequence[AssumptionTest]
+) -> list[str]:
+    """Sentence on the suspect of the best odds, and on those that the data, or tests to first
+    order, cannot tell from it."""
     best = favoured[0]
     label, move = best.most_moved
     text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
@@ -83,6 +86,10 @@ def contradictions(favoured: Sequence[AssumptionTest]) -> list[str]:
             f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
             f"{under}"
         )
+    if candidates:
+        others = sorted((c for c in candidates if c is not best), key=lambda c: -c.gain)
+        near = ", ".join(f"{c.name} (by {c.gain:.0f})" for c in others)
+        return [f"{text}. Nearly as much falls with {near}: `explain` compares them by new fits"]
     rivals = [c for c in favoured[1:] if c.odds > LIKELY]
     if rivals:
         said = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
