@@ -211,6 +211,11 @@ def identity(rig: Rig) -> bytes:
     return repr(text).encode() + b"".join(name.encode() + source(own[name]) for name in sorted(own))
 
 
+ARRAYS = np.ndarray, Tensor
+VALUES = int, float, str, np.generic, tuple, list, dict, FunctionType, partial, type(None)
+"""Attributes that name a part."""
+
+
 def plain(part: nn.Module) -> str:
     """A part's own parameters and buffers, and its attributes that are numbers, text, arrays,
     functions or tuples of them."""
@@ -220,10 +225,7 @@ def plain(part: nn.Module) -> str:
     }
     known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
     for name, value in vars(part).items():
-        if isinstance(value, np.ndarray | Tensor) or (
-            not name.startswith("_")
-            and isinstance(value, int | float | str | tuple | dict | FunctionType | partial | None)
-        ):
+        if isinstance(value, ARRAYS) or (not name.startswith("_") and isinstance(value, VALUES)):
             known[name] = stated(value)
     if isinstance(part, Pad):
         known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded.tolist()
@@ -233,7 +235,7 @@ def plain(part: nn.Module) -> str:
 def stated(value: Any) -> Any:
     """A value as its `repr` says all of it: an array by its checksum, a function by its name and
     the values that it holds."""
-    if isinstance(value, np.ndarray | Tensor):
+    if isinstance(value, ARRAYS):
         array = value.detach().numpy() if isinstance(value, Tensor) else value
         return array.shape, sha256(array.tobytes()).hexdigest()
     if isinstance(value, partial):
@@ -243,7 +245,7 @@ def stated(value: Any) -> Any:
         return f"{value.__module__}.{value.__qualname__}", [*map(stated, held)]
     if isinstance(value, dict):
         return {key: stated(one) for key, one in value.items()}
-    return tuple(map(stated, value)) if isinstance(value, tuple) else value
+    return [*map(stated, value)] if isinstance(value, tuple | list) else value
 
 
 def source(code: Any) -> bytes:
