@@ -66,7 +66,10 @@ def layout(kind: Any) -> tuple[Field, ...]:
         elif get_origin(hint) is not None:
             ndim = 1
         if ndim:
-            hint = np.dtype(get_args(get_args(hint)[-1])[0])
+            own = get_args(hint)[
+                -1
+            ]  # of NDArray, which is a generic array or, from numpy 2.5 on, named
+            hint = np.dtype(next(iter(get_args(own)), own))
         fields.append(Field(name, hint, ndim, word))
         word += 1 + ndim
     return tuple(fields)
