@@ -128,7 +128,7 @@ def adjoints(
 def _parts(
     g: Graph, node: int, adjoint: int, rules: Mapping[int, Partials]
 ) -> Iterable[tuple[int, int | None]]:
-    """The arguments of a node and what each receives of its adjoint."""
+    """The arguments of a node, each with its share of the node's adjoint."""
     if node in rules:
         return [(arg, g.product(adjoint, partial)) for arg, partial in rules[node]]
     args = g.args[node]
@@ -136,8 +136,8 @@ def _parts(
 
 
 def jacobian(g: Graph, outputs: Sequence[int], targets: Sequence[int]) -> list[list[int]]:
-    """∂output/∂target, one row per output: a reverse sweep each, sharing what several outputs have
-    in common."""
+    """∂output/∂target, one row per output: a reverse sweep each; nodes that several outputs have in
+    common stand once."""
     marks = dependent(g, targets)
     rules = _shared(g, set(outputs), marks) if len(outputs) > 1 else {}
     return [adjoints(g, {node: g.one}, rules, marks, targets) for node in outputs]

@@ -1,5 +1,5 @@
-"""Whether a law is one of a single contact point: several points at once give what each of them
-gives alone."""
+"""Test that a law is one of a single contact point: several points at once give the same values as
+each of them alone."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,8 +22,8 @@ REMEDY = (
 
 
 class Watch(Trace):
-    """A trace of several points side by side, entry i of x of point i // `size`; refuses what
-    couples them."""
+    """A trace of several points side by side, entry i of x of point i // `size`; refuses operations
+    that couple them."""
 
     size: int
 

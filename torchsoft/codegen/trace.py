@@ -42,8 +42,8 @@ _BITWISE = {"bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_not"}  # no rul
 
 
 class UnknownOperation(TypeError):
-    """The law does something that has no meaning as an expression of its inputs; the sentence says
-    what and where."""
+    """The law does something that has no meaning as an expression of its inputs; the sentence names
+    the operation and its place."""
 
 
 def _place() -> str:
@@ -71,8 +71,8 @@ class _Reads(TorchFunctionMode):
 
 
 class Trace(TorchDispatchMode):
-    """Runs every operation and, where it depends on a symbolic tensor, records what each entry of
-    the result is: without derivatives where torch records none, as under torch.no_grad()."""
+    """Runs every operation and, where it depends on a symbolic tensor, records each entry of the
+    result: without derivatives where torch records none, as under torch.no_grad()."""
 
     def __init__(self, graph: Graph) -> None:
         super().__init__()
@@ -243,8 +243,8 @@ def traced(
     """The nodes of function(x, parameters), an (outputs,) float64 tensor, from one run at these
     values.
 
-    Entry i of x is the leaf `first` + i. Raises UnknownOperation for what cannot be recorded, and
-    TypeError for a result of another kind.
+    Entry i of x is the leaf `first` + i. Raises UnknownOperation for an operation that cannot be
+    recorded, and TypeError for a result of another kind.
     """
     trace = kind(graph)
     x = x.detach().clone()

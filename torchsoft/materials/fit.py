@@ -98,7 +98,7 @@ class Fit:
         return {"E": self.values["E"], argument: strengths, "tau": tau, "tau_instant": instant}
 
     def material(self, *, nu: float, rho: float, depth: float) -> Material:
-        """The material, with what a test in one dimension does not tell."""
+        """The material, with stated values where a test in one dimension has no information."""
         return KINDS[self.kind](**self.table(), nu=nu, rho=rho, depth=depth)
 
 
@@ -212,7 +212,7 @@ def refined(measured: Measured, tau: Array) -> Trial | None:
 
 
 def concluded(measured: Measured, best: Trial, scores: Mapping[int, float]) -> Fit:
-    """Values and standard deviations, and what the data cannot tell."""
+    """Values and standard deviations, and the combinations that the data cannot constrain."""
     names, values, G = named(measured, best)
     correlation = (
         float(np.corrcoef(best.r[1:], best.r[:-1])[0, 1]) if np.ptp(best.r) > ROUNDING else 0.0
@@ -256,7 +256,7 @@ def notices(
     measured: Measured, values: Mapping[str, float], sd: Mapping[str, float],
     scores: Mapping[int, float], correlation: float
 ) -> list[str]:  # fmt: skip
-    """Sentences on what the data do not tell, and on what is taken for granted."""
+    """Sentences on unidentifiable coefficients, and on assumptions."""
     (shortest, longest), terms = measured.window, (len(values) - 1) // 2
     what = "relaxes" if measured.test == "relaxation" else "creeps"
     said = [
@@ -318,8 +318,7 @@ def faded(t: Array, x: Array, tau: Array) -> Array:
 
 
 def responses(test: str, t: Array, x: Array, tau: Array) -> Array:
-    """What each coefficient adds to the answer (n, 1 + terms): of a relaxation series E, E_i [Pa]
-    to the stress under the strain x; of a creep series J_0, J_i [1/Pa] to the strain under the
-    stress x."""
+    """Response to each coefficient (n, 1 + terms): of a relaxation series E, E_i [Pa] to the stress
+    under the strain x; of a creep series J_0, J_i [1/Pa] to the strain under the stress x."""
     h = faded(t, x, tau)
     return np.column_stack((x, h if test == "relaxation" else x[:, None] - h))

@@ -20,7 +20,8 @@ from torchsoft.physics.arguments import positive
 Array = NDArray[np.float64]
 
 Test = Literal["relaxation", "creep"]
-"""Of what was put on: strain, so that the stress relaxes; or stress, so that the strain creeps."""
+"""The controlled quantity: strain, so that the stress relaxes; or stress, so that the strain
+creeps."""
 
 PRESSURE = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9}
 KNOWN: dict[str, csvfile.Units] = {
@@ -45,10 +46,11 @@ SMALL_STRAIN = 0.1
 @dataclass(frozen=True)
 class Measured:
     """A test: times t (n,) [s] since the load was put on, strain (n,) [1], nominal stress (n,)
-    [Pa], and what was put on.
+    [Pa], and which of them was controlled.
 
-    Between rows what was put on is linear in time; it begins at t = 0 with a step to its value in
-    the first row. Both may be `per_load`, over what was put on, which nobody knows then.
+    Between rows the controlled quantity is linear in time; it begins at t = 0 with a step to its
+    value in the first row. Both may be `per_load`, divided by a controlled quantity that is
+    unknown.
     """
 
     path: Path
@@ -60,12 +62,12 @@ class Measured:
 
     @property
     def driven(self) -> Array:
-        """What was put on (n,)."""
+        """Controlled quantity (n,)."""
         return self.strain if self.test == "relaxation" else self.stress
 
     @property
     def answer(self) -> Array:
-        """What was measured of it (n,)."""
+        """Measured response (n,)."""
         return self.stress if self.test == "relaxation" else self.strain
 
     @property
@@ -84,8 +86,8 @@ def read(
     area: float | None = None,
 ) -> Measured:
     """The test in a CSV file. `length` [m] is the gauge length, which elongations are divided by,
-    `area` [m2] the cross-section before the test, for forces. Without `test`, that is what was
-    held: of strain and stress, what changes less over the second half of the rows. Raises
+    `area` [m2] the cross-section before the test, for forces. Without `test`, the controlled one of
+    strain and stress is that which changes less over the second half of the rows. Raises
     `ValueError` naming file, row and column, and `OSError`.
     """
     path = Path(path)
@@ -123,7 +125,8 @@ def read(
 
 
 def held(strain: Array, stress: Array) -> Test:
-    """The test, by what changes less, over its largest value, in the second half of the rows."""
+    """The test, by the quantity that changes less, relative to its largest value, in the second
+    half of the rows."""
     late = slice(len(strain) // 2, None)
     change = [np.ptp(x[late]) / np.abs(x).max() for x in (strain, stress)]
     return "relaxation" if change[0] <= change[1] else "creep"
@@ -176,7 +179,7 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
 
 
 def hint(name: str, columns: int) -> str:
-    """What helps with a column that is not known."""
+    """Remedy for an unknown column."""
     known = "; ".join(f"{column} [{', '.join(units)}]" for column, units in KNOWN.items())
     return (
         f"{'; separate columns with commas' if columns == 1 else ''}; columns and their units are "

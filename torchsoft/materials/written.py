@@ -46,8 +46,8 @@ def write(
 
 
 def toml(fit: Fit, assumed: Mapping[str, float]) -> str:
-    """The material as a table with the names of the constructor's arguments, in comments what must
-    be known of it."""
+    """The material as a table with the names of the constructor's arguments, with its origin and
+    its limits in comments."""
     name = fit.measured.path.stem
     key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
     rows = [f"[materials.{key}]", f'kind = "{fit.kind}"']
@@ -69,7 +69,7 @@ def toml(fit: Fit, assumed: Mapping[str, float]) -> str:
 def summary(
     fit: Fit, assumed: Mapping[str, float], options: Mapping[str, object]
 ) -> dict[str, object]:
-    """What was found, from what, and how, in SI units."""
+    """Coefficients, their origin and the method, in SI units."""
     m = fit.measured
     return {
         "made_by": {"torchsoft": version("torchsoft"), "command": "torchsoft material fit",
@@ -107,8 +107,8 @@ def printed(fit: Fit) -> str:
 @rc_context(STYLE)
 def fitted(fit: Fit) -> Figure:
     """Measured and fitted answer over time, their difference, and strengths over times with 95 %
-    intervals; grey is what the rows do not resolve. The time axis is logarithmic: a row at t = 0 is
-    left out."""
+    intervals; times that the rows do not resolve are grey. The time axis is logarithmic: a row at t
+    = 0 is left out."""
     m, relaxes = fit.measured, fit.kind == "prony"
     seen = m.t > 0
     what, per, scale = ("stress", "MPa", MPA) if relaxes else ("strain", "1", 1.0)

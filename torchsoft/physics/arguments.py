@@ -17,14 +17,14 @@ LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 
 def number(name: str, value: Any) -> float:
-    """Raises `ValueError` for what is not a real number; text and truth values are not."""
+    """Raises `ValueError` unless a value is a real number; text and truth values are not."""
     if not isinstance(value, Real) or isinstance(value, bool):
         raise ValueError(f"`{name}` must be a number, but is {value!r}")
     return float(value)
 
 
 def positive(name: str, value: Any) -> float:
-    """Raises `ValueError` for what is not a positive, finite number."""
+    """Raises `ValueError` unless a value is a positive, finite number."""
     if (
         not isinstance(value, Real)
         or isinstance(value, bool)
@@ -35,7 +35,7 @@ def positive(name: str, value: Any) -> float:
 
 
 def whole(name: str, value: Any, least: int) -> int:
-    """Raises `ValueError` for what is not a whole number from `least` on."""
+    """Raises `ValueError` unless a value is a whole number from `least` on."""
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ValueError(f"`{name}` must be a whole number from {least} on, but is {value!r}")
     return int(value)
@@ -43,7 +43,7 @@ def whole(name: str, value: Any, least: int) -> int:
 
 def tensor(name: str, value: Any) -> Tensor:
     """Numbers as a float64 tensor: a tensor with its graph, numpy's arrays, lists. Raises
-    `ValueError` for what are no numbers; tensors that no run can take stay as they are."""
+    `ValueError` for other values; tensors that no run can take stay as they are."""
     if isinstance(value, Tensor):
         usual = value.device.type == "cpu" and value.layout == torch.strided
         real = not value.dtype.is_complex and value.dtype != torch.bool
@@ -60,8 +60,7 @@ def tensor(name: str, value: Any) -> Tensor:
 
 
 def places(name: str, value: Any) -> Tensor:
-    """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for what is not such
-    numbers."""
+    """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for other values."""
     try:
         given = np.array(value.detach() if isinstance(value, Tensor) else value)
     except (TypeError, ValueError):  # rows of different lengths
@@ -79,7 +78,7 @@ def places(name: str, value: Any) -> Tensor:
 
 
 def names(name: str, value: Any, known: tuple[str, ...]) -> None:
-    """Raises `ValueError` for what is not some of the known names, each of them once."""
+    """Raises `ValueError` unless names are known, each of them once."""
     fine = isinstance(value, tuple) and all(isinstance(one, str) and one in known for one in value)
     if not fine or not value or len({*value}) != len(value):
         raise ValueError(f"`{name}` must be some of {', '.join(known)}, but is {line(value)}")

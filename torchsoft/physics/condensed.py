@@ -1,4 +1,4 @@
-"""Massless pads: what moves at their contact points, from the relation between nodal forces and the
+"""Massless pads: motion of their contact points, from the relation between nodal forces and the
 contact law.
 
 Rates are u' = free + P F with P = C sum of J / (tau + a h) and free = -C sum of J z / (tau + a h);
@@ -49,7 +49,8 @@ def nodal_forces(
     relation = A.detach()
 
     def linearise(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mismatch, what it makes of x, and the slopes (..., points, 2, 2) of the law."""
+        """Mismatch of the forces, the mismatch of x that it causes, and the slopes (..., points, 2,
+        2) of the law."""
         x = N @ (free + nodal(relation, N.mT @ f))
         with torch.enable_grad():
             twice = torch.stack((x, x)).requires_grad_()  # a copy for each component

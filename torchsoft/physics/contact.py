@@ -205,7 +205,7 @@ class SoftContact(nn.Module):
         self.sliding: Sliding = ramped
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
+        """Conflict between the parameters; empty where there is none."""
         if (
             isinstance(self.friction, SmoothSlip)
             and self.R_t.item() + self.friction.eta.item() <= 0

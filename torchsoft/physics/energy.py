@@ -1,7 +1,7 @@
-"""Energies of a rig: what its C and I fields store, element by element, at given states.
+"""Energies of a rig: those stored in its C and I fields, element by element, at given states.
 
-What is dissipated and supplied the stepper integrates beside the state, from the same laws;
-`powers` reads it off the ports of the multibond graph, so that the balance at one instant can be
+Dissipated and supplied energies are integrated beside the state by the stepper, from the same laws;
+`powers` reads them off the ports of the multibond graph, so that the balance at one instant can be
 checked without any stepper.
 """
 
@@ -19,7 +19,7 @@ def stored(
     rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
     """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic
-    energies of what moves freely.
+    energies of bodies and pads that move freely.
 
     `displacement` are those of the pads, where they are known already.
     """
@@ -68,7 +68,7 @@ def stored(
 
 
 def stores(rig: Rig) -> tuple[str, ...]:
-    """Names of what `stored` gives, in its order."""
+    """Names of the energies that `stored` returns, in its order."""
     names = [f"strain_{name}" for name in rig.pads] + ["normal_springs", "tangential_springs"]
     for name, axes in rig.layout.free.items():
         names += [name] * any(axis < 2 for axis in axes) + [f"{name}_spin"] * (2 in axes)

@@ -25,8 +25,8 @@ SLOWER = (10.0, 100.0)
 
 class Extension(NamedTuple):
     """A number that may be added: its `neutral` value, the `amount` of a variation and the interval
-    of a search [`unit`], clauses that say what is so at the neutral value and what else could be,
-    and the function that adds the parameter and returns it."""
+    of a search [`unit`], clauses for the neutral value and for any other, and the function that
+    adds the parameter and returns it."""
 
     neutral: float
     amount: float

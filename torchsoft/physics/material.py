@@ -52,8 +52,8 @@ class SlowBranch(nn.Module):
 
 
 class Material(nn.Module):
-    """What a pad asks of its material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane
-    depth [m], and a chain, to which a `slow` branch may be added."""
+    """Interface of a pad's material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane depth
+    [m], and a chain, to which a `slow` branch may be added."""
 
     slow: SlowBranch | None
 
@@ -91,7 +91,7 @@ class Material(nn.Module):
         return self.E / (J / (1 + 1j * omega[..., None] * tau)).sum(-1)
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
+        """Conflict between the parameters; empty where there is none."""
         return ""
 
 
@@ -193,8 +193,8 @@ class Series(Material):
 
 class GeneralisedKelvin(Series):
     """A spring in series with Kelvin elements: under a held stress, the fractions J (terms,) [1] of
-    the relaxed compliance 1/E set in with the retardation times tau (terms,) [s], and what they
-    leave of one at once.
+    the relaxed compliance 1/E set in with the retardation times tau (terms,) [s], and the rest at
+    once.
 
     Parameters are called J_1, tau_1 and so on.
     """
@@ -222,7 +222,7 @@ class GeneralisedKelvin(Series):
 
 class Prony(Series):
     """A relaxation series: after a step of strain the modulus is E + sum of E_i exp(-t / tau_i),
-    with E [Pa] what remains, `moduli` E_i (terms,) [Pa] what fades, and relaxation times tau
+    with the relaxed modulus E [Pa], `moduli` E_i (terms,) [Pa] that fade, and relaxation times tau
     (terms,) [s], no two of them equal.
 
     Parameters are called E_1, tau_1 and so on. The chain is this same solid, exactly (`retarded`),
@@ -303,7 +303,7 @@ def distances(m: Tensor, t: Tensor) -> Tensor:
 
 
 def terms(name: str, values: Iterable[float]) -> list[float]:
-    """Raises `ValueError` for what is not a list of numbers."""
+    """Raises `ValueError` unless a value is a list of numbers."""
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise ValueError(f"`{name}` must be a list of numbers, but is {values!r}")
     return [number(f"{name}_{k}", value) for k, value in enumerate(values, 1)]
@@ -315,5 +315,5 @@ KINDS: Mapping[str, type[Material]] = {
     "generalised_kelvin": GeneralisedKelvin,
     "prony": Prony,
 }
-"""The materials by what files call them; their tables have the names of the constructors'
+"""The materials by their names in files; their tables have the names of the constructors'
 arguments."""

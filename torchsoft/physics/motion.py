@@ -1,5 +1,4 @@
-"""What a rig is asked to do: signals of time, such as the paper's 7th-order profiles (Eq.
-20-29)."""
+"""Reference of a rig: signals of time, such as the paper's 7th-order profiles (Eq. 20-29)."""
 
 from collections.abc import Sequence
 from math import ceil, comb, perm
@@ -58,8 +57,8 @@ class Piecewise(nn.Module):
             raise ValueError(f"`values` must be finite, but are {line(many.tolist())}")
 
     def ill_posed(self) -> str:
-        """What is wrong with the knots as they are now, but for values that are not finite; empty
-        if nothing is."""
+        """Fault of the knots as they are now, values that are not finite aside; empty where there
+        is none."""
         t = self.times.detach().numpy()  # whose small operations take a tenth of torch's time
         if t.ndim != 1 or len(t) == 0 or not (np.diff(t) > 0).all() or not np.isfinite(t).all():
             return f"`times` must increase strictly, from one time on, but are {line(t.tolist())}"
@@ -220,7 +219,8 @@ class Waves(Profile):
 
 
 class Retimed(Piecewise):
-    """Another signal, what it does at t [s] being done at rate * t + shift."""
+    """Another signal with its time scaled and shifted: the value at t [s] is that at rate * t +
+    shift."""
 
     def __init__(self, signal: Piecewise, rate: float = 1.0, shift: float = 0.0) -> None:
         nn.Module.__init__(self)
@@ -329,7 +329,7 @@ class Tridiagonal(torch.autograd.Function):
 
 
 class Reference(nn.Module):
-    """What a rig is asked to do: named signals of time, setpoints, feed-forward efforts and driven
+    """Reference of a rig: named signals of time, setpoints, feed-forward efforts and driven
     coordinates.
 
     Raises `ValueError` for a signal that is not a module giving (value, rate) at t.

@@ -17,8 +17,8 @@ from torch import Tensor
 
 
 class Junction(NamedTuple):
-    """A 1-junction: `nodes` flow vectors of `width` components, what stores or sets its flow, and
-    the paper's name."""
+    """A 1-junction: `nodes` flow vectors of `width` components, the field that stores or sets its
+    flow, and the paper's name."""
 
     nodes: int
     width: int
@@ -84,7 +84,7 @@ class Port:
 
 
 def net_efforts(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> dict[str, Tensor]:
-    """Effort left over at every 1-junction, what its I field integrates: sum of +-T^T e over the
+    """Net effort at every 1-junction, which its I field integrates: sum of +-T^T e over the
     ports."""
     total: dict[str, Tensor] = {}
     for port in ports.values():

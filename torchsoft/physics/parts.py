@@ -86,12 +86,12 @@ class Body(nn.Module):
 
     @property
     def masses(self) -> tuple[Tensor, Tensor, Tensor]:
-        """What the three coordinates' accelerations are multiplied with."""
+        """Inertias of the three coordinates: mass twice, moment of inertia."""
         return self.mass, self.mass, self.inertia
 
 
 class Contact(nn.Module):
-    """What may touch: a pad (by name) and a body (by name), and the law at their points.
+    """A pair that may touch: a pad (by name) and a body (by name), with the law at their points.
 
     A run ends when the body leaves the space over the pad, unless it `may_leave`.
     """
@@ -107,7 +107,7 @@ def coordinate_unit(name: str) -> str:
 
 
 def law_name(law: Callable[..., Tensor]) -> str:
-    """What a law is called: a function by its own name, a module by that of its class."""
+    """Name of a law: that of a function, or that of a module's class."""
     return getattr(law, "__qualname__", type(law).__name__)
 
 
@@ -182,8 +182,8 @@ class Actuator(nn.Module):
     reference. A law of several coordinates is given `measures` and `setpoint` as sequences of
     names, and sees them along a last dimension; set-points are those of the first coordinates, in
     their order, and there may be none. Laws with several efforts: `controller`. `elements` are the
-    graph's names of what is behind it. Raises `ValueError` for what are no names, and for more
-    set-points than coordinates.
+    graph's names of the elements behind it. Raises `ValueError` unless names are given, and for
+    more set-points than coordinates.
     """
 
     def __init__(
@@ -341,7 +341,7 @@ class StateFeedback(nn.Module):
 
 def gain_unit(law: nn.Module, name: str, users: Sequence[Actuator]) -> str | None:
     """Unit of a gain of a control law by its name in the law, which belongs to some actuators; None
-    for what is no gain."""
+    for another number."""
     if isinstance(law, PD):
         return users[0].gain_unit(name == "Kd")
     if not isinstance(law, StateFeedback):
@@ -352,7 +352,7 @@ def gain_unit(law: nn.Module, name: str, users: Sequence[Actuator]) -> str | Non
 
 
 class OneEffort(nn.Module):
-    """One of the efforts of a controller, and what is fed forward: a law of several coordinates."""
+    """One of the efforts of a controller with its feed-forward: a law of several coordinates."""
 
     def __init__(self, module: nn.Module, number: int) -> None:
         super().__init__()
@@ -376,10 +376,11 @@ def controller(
     `module` (set-points, state) -> efforts (..., k) [N or N.m]: set-points (..., 2 s) and state
     (..., 2 m) hold all values and then all rates, of the s signals `setpoints` and of the m
     coordinates that it `measures`, which may be all of all bodies. `pushes` names the actuators and
-    what each pushes, in the order of the efforts: {"x": "bracket.x"}; the channel of the first is
-    then F_x. `feed_forward` names signals that are added to efforts. The module is shared: its
-    parameters are those of the first of the actuators, and those of the rig's group if it is one
-    (`Rig(groups=)`). Raises `ValueError` for another number of efforts, and what `Actuator` does.
+    the coordinate that each pushes, in the order of the efforts: {"x": "bracket.x"}; the channel of
+    the first is then F_x. `feed_forward` names signals that are added to efforts. The module is
+    shared: its parameters are those of the first of the actuators, and those of the rig's group if
+    it is one (`Rig(groups=)`). Raises `ValueError` for another number of efforts, and what
+    `Actuator` does.
     """
     several, fed = tuple(measures), dict(feed_forward or {})
     if not isinstance(module, nn.Module):

@@ -2,7 +2,7 @@
 right-hand side of the ODE.
 
 The equations of motion are not written down anywhere: `forward` evaluates the ports of the
-multibond graph at the state and integrates what is left over at its 1-junctions.
+multibond graph at the state and integrates the net efforts at its 1-junctions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -164,7 +164,7 @@ class Rig(Shown, nn.Module):
     def named_modules(
         self, memo: Any = None, prefix: str = "", remove_duplicate: bool = True
     ) -> Any:
-        """Each module once, whatever is asked for: `torch.func.functional_call` would put back the
+        """Each module once, with any arguments: `torch.func.functional_call` would put back the
         wrong tensors of a part that several of the lists share."""
         return super().named_modules(memo, prefix, True)
 
@@ -180,7 +180,7 @@ class Rig(Shown, nn.Module):
     """Other names of channels and energies."""
 
     extended: Mapping[str, str] = {}
-    """Parameters that were added to the rig, by what they are called."""
+    """Parameters that were added to the rig, by name."""
 
     @property
     def names(self) -> dict[str, str]:
@@ -188,7 +188,7 @@ class Rig(Shown, nn.Module):
         return {**self.aliases, **self.extended}
 
     def description(self) -> dict[str, Any]:
-        """The numbers and laws of the rig as they are now, for what is saved with a run."""
+        """The numbers and laws of the rig as they are now, saved with a run."""
         from torchsoft.physics.summary import description
 
         return description(self)
@@ -299,8 +299,8 @@ class Rig(Shown, nn.Module):
         return pose, velocity
 
     def unpack(self, y: Tensor, signals: Tensor | None = None, t: Tensor | float = 0.0) -> State:
-        """The state's parts by name; `signals` (..., signals, 2) place what is driven, by default
-        the reference at t."""
+        """The state's parts by name; `signals` (..., signals, 2) place driven bodies, by default
+        those of the reference at t."""
         return self.layout.unpack(y, *self.held(self.follow(t) if signals is None else signals))
 
     def pack(self, state: State) -> Tensor:
@@ -308,7 +308,7 @@ class Rig(Shown, nn.Module):
         return self.layout.pack(state)
 
     def base_motion(self, name: str, state: State) -> tuple[Tensor, Tensor]:
-        """Pose and velocity (..., 3) of what a pad is bonded to."""
+        """Pose and velocity (..., 3) of a pad's base."""
         base = self.pads[name].base
         if base is None:
             like = next(iter(state.pose.values()))
@@ -542,8 +542,8 @@ class Rig(Shown, nn.Module):
         self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor,
         moment_arm: Tensor, angle: Tensor
     ) -> Port:  # fmt: skip
-        """The pad's viscoelastic field on its strain rate: node velocities less those of what it is
-        bonded to (Fig. 7)."""
+        """The pad's viscoelastic field on its strain rate: node velocities less those of its base
+        (Fig. 7)."""
         pad, key = self.pads[name], f"pad_{name}"
         eye = torch.eye(2, dtype=u.dtype).expand(*angle.shape, 2, 2)
         Q_T = torch.stack((turned(eye[..., 0], -angle), turned(eye[..., 1], -angle)), -1)

@@ -1,4 +1,4 @@
-"""What stood where in a run: meshes, outlines, contacts and actuators as they were, in plain
+"""Geometry and parts of a run: meshes, outlines, contacts and actuators as they were, in plain
 numbers that files and pictures take; and the fields inside of pads, from their own elements."""
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], 
     """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in
     `mesh.surface` order.
 
-    The interior follows the surface whatever E and depth, so both are taken as 1.
+    The interior's displacement depends on the surface's only, for any E and depth; both are 1.
     """
     K_lambda, K_mu, _ = mesh.matrices
     lame_lambda, lame_mu = lame_moduli(1.0, nu)

@@ -24,7 +24,7 @@ UPWARDS = 0.5
 
 
 def start(rig: Rig, bodies: Mapping[str, Mapping[str, Any]]) -> Tensor:
-    """What `Rig.state` does."""
+    """Implementation of `Rig.state`."""
     for name in bodies:
         if name not in rig.bodies:
             raise ValueError(

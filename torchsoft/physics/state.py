@@ -9,7 +9,8 @@ from torch import Tensor
 
 
 class State(NamedTuple):
-    """One state, batch dimensions leading, every part by the name of what it belongs to. SI units.
+    """One state, batch dimensions leading, every part by the name of its pad, contact or body. SI
+    units.
 
     pads: of massless pads the nodal forces that have set in (..., branches, nodes, 2) [N], of
     inertial pads the displacements (..., nodes, 2) [m]; stretch: of contacts (..., points); pose,

@@ -67,8 +67,8 @@ def settled(
     """State (size,) with massless pads settled around bodies at `pose` [m, rad], by body (3,), and
     contacts whose points are stretched by `stretch` [m], by contact (points,).
 
-    The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry what they would if
-    these stood still: under a body that rolls at v the pads lag behind by v tau only, whereas pads
+    The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry the loads of bodies
+    that stand still: under a body that rolls at v the pads lag behind by v tau only, whereas pads
     at rest under it would meet all of its dashpots. Differentiable once in all three and in the
     rig's parameters, by the implicit function theorem; not smooth where a point touches or slips.
     Called again with the same numbers it gives the same bits.
@@ -199,7 +199,7 @@ def resting(
     body above its pad comes down to it. Done when a step is below `residual` [m]. `actuators` names
     those that push, by default all, by `signals` (signals, 2), by default the reference's at t = 0.
     Differentiable once in the given pose and in the rig's parameters, by the implicit function
-    theorem. Raises `NoEquilibrium` where there is no balance, and what `settled` does.
+    theorem. Raises `NoEquilibrium` where there is no balance, and as `settled`.
     """
     check_points(rig)
     soft = massless(rig)

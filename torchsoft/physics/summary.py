@@ -84,7 +84,7 @@ def summary(rig: Rig) -> tuple[str, list[tuple[str, str]]]:
 
 
 def description(rig: Rig) -> dict[str, Any]:
-    """What `Rig.description` gives."""
+    """Implementation of `Rig.description`."""
     mine = {
         name: value for name, value in rig.named_parameters() if not name.startswith("reference.")
     }

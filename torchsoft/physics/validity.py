@@ -1,6 +1,6 @@
-"""What a rig has to be before anything is computed with it: numbers in float64 on the CPU, finite
+"""Requirements of a rig before anything is computed with it: numbers in float64 on the CPU, finite
 and physical, materials whose fractions sum to one, shapes that measure distances, slip laws that
-take no more than the effort. Every refusal is one sentence that names what is wrong.
+take no more than the effort. Every refusal is one sentence that names the fault.
 """
 
 import math
@@ -30,7 +30,7 @@ inside."""
 
 ALIKE = 1e-3
 """By how much a shape's normal, the slope of its distance, and its reach (over its size) may differ
-from what they must be."""
+from their exact values."""
 
 ALIKE_POINTS = 1e-9
 """By how much slip rates of several points at once may differ from those of each alone, relatively:
@@ -238,12 +238,12 @@ def check_points(rig: Any) -> None:
 
 
 def check_slip(where: str, law: Any, R: float) -> str:
-    """What is wrong with a slip law at some efforts and normal forces, with the dashpot R [N.s/m];
-    empty if nothing is.
+    """Fault of a slip law at some efforts and normal forces, with the dashpot R [N.s/m]; empty
+    where there is none.
 
-    A slip that takes more than the effort, R gamma' > E, supplies power. Raises `ValueError` for
-    what is no law of three tensors, gives no number, or gives several points at once other rates
-    than each alone.
+    A slip that takes more than the effort, R gamma' > E, supplies power. Raises `ValueError` for a
+    function that is no law of three tensors, gives no number, or gives several points at once other
+    rates than each alone.
     """
     E, F_N = (
         x.flatten()

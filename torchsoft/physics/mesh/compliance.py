@@ -1,4 +1,4 @@
-"""What a pad's mesh is as a whole: its stiffness in a band, and how its surface gives way."""
+"""Stiffness of a pad's mesh, in a band, and compliance of its surface."""
 
 from functools import lru_cache
 

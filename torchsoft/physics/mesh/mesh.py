@@ -1,4 +1,4 @@
-"""What a pad asks of its mesh, and its element, a bilinear quadrilateral."""
+"""Interface of a pad's mesh, and its element, a bilinear quadrilateral."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -72,8 +72,7 @@ class Mesh:
     extents `length` and `height` [m] along x and y, and how many elements are along the face and,
     about, through it.
 
-    Meshes of the same description are equal and have one hash, so that what is computed of one
-    serves all.
+    Meshes of the same description are equal and have one hash, so that results of one serve all.
     """
 
     nodes: Any

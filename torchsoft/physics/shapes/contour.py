@@ -105,7 +105,7 @@ class Contour(Outlined):
             raise ValueError(f"{path}: {error}") from None
 
     def well_posed(self) -> str:
-        """What is wrong with the control points; empty if nothing is."""
+        """Fault of the control points; empty where there is none."""
         control = self.control.detach().numpy().tobytes()
         if self._judged[0] != control:
             self._judged = control, self.judged()
@@ -113,7 +113,7 @@ class Contour(Outlined):
 
     @torch.no_grad()
     def judged(self) -> str:
-        """What is wrong with the control points, which is looked for along the whole contour."""
+        """Fault of the control points, searched for along the whole contour."""
         each = min(8, max(2, JUDGED // len(self.control)))
         points, way, bend = (
             x.flatten(0, 1) for x in self.along(torch.arange(each, dtype=torch.float64) / each)
@@ -196,8 +196,8 @@ class Contour(Outlined):
 
 
 class Pieces(Prepared):
-    """What the law of a contour is compiled from: `cubics` (pieces, 8) [m], the coefficients of
-    every piece's x and y."""
+    """Constants of a contour's compiled law: `cubics` (pieces, 8) [m], the coefficients of every
+    piece's x and y."""
 
     STARTS, ITERATIONS = 64, 8
     """Points of the contour at the most among which the nearest is looked for, and steps of
@@ -238,8 +238,8 @@ class Pieces(Prepared):
         )
 
     def stationarity(self, row: Tensor, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Half of what the squared distance of x from the place t rises by with t [m2], and the
-        slope of that."""
+        """Half of the derivative of the squared distance of x from the place t by t [m2], and its
+        slope."""
         (cx, cy), (tx, ty), (bx, by) = self.curve(row, t)
         ex, ey = cx - x[..., 0], cy - x[..., 1]
         return ex * tx + ey * ty, tx * tx + ty * ty + ex * bx + ey * by
@@ -265,8 +265,8 @@ class Pieces(Prepared):
 
 def contour_points(points: object) -> Array:
     """Points (n, 2) [m] around a contour, the first of which is not there again at the end. Raises
-    `ValueError` for what is not enough points, or points of which some are the same, turn by more
-    than `STEEPEST`, or go along lines that cross."""
+    `ValueError` for too few points, and for points of which some are the same, turn by more than
+    `STEEPEST`, or go along lines that cross."""
     given = places("points", points).numpy()
     if len(given) > 1 and np.array_equal(given[0], given[-1]):
         given = given[:-1]

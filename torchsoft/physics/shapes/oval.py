@@ -59,7 +59,7 @@ class Superellipse(Shape):
         self.a, self.b, self.n = parameter(a), parameter(b), parameter(n)
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
+        """Conflict between the parameters; empty where there is none."""
         low, high = sorted((self.a.item(), self.b.item()))
         return (
             f"the axes a and b differ by more than a factor of {self.SLIM}"
@@ -93,8 +93,8 @@ class Superellipse(Shape):
     def stationarity(
         A: Tensor, B: Tensor, n: Tensor, X: Tensor, Y: Tensor, u: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Half of what the squared distance of (X, Y) from (A u, B v) falls by with u [m2], and the
-        slope of that in u."""
+        """Half of the derivative of the squared distance of (X, Y) from (A u, B v) by -u [m2], and
+        its slope in u."""
         q = u ** (n - 2)
         w = 1 - q * u * u
         v = w ** (1 / n)

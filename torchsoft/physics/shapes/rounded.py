@@ -122,7 +122,7 @@ class RoundedBox(Rounded):
         )
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
+        """Conflict between the parameters; empty where there is none."""
         most = min(self.half_width.item(), self.half_height.item())
         radius = self.radius.item()
         return (
@@ -181,7 +181,7 @@ class RoundedPolygon(Rounded):
         self.note_centre()
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
+        """Conflict between the parameters; empty where there is none."""
         sides, r = self.sides(), self.radius.item()
         short = sides.length.detach() / self.vertices.detach().abs().max()
         if not bool((short > -1e-12).all()):
@@ -202,10 +202,10 @@ class RoundedPolygon(Rounded):
 
 
 class SidesAndArcs(Prepared):
-    """What the law of a rounded polygon is compiled from.
+    """Constants of a rounded polygon's compiled law.
 
-    `edges` (n, 5): the sides' unit tangents, the tangents' and the normals' components of where
-    they begin [m], their lengths [m]; `arcs` (n, 3): the centres [m] of the arcs before them, and 1
+    `edges` (n, 5): the sides' unit tangents, the tangents' and the normals' components of their
+    beginnings [m], their lengths [m]; `arcs` (n, 3): the centres [m] of the arcs before them, and 1
     where they bulge outwards, else -1; `radius` [m].
     """
 

@@ -1,6 +1,6 @@
-"""What a rig asks of the shape of a rigid body, and what closed curves have in common: moments by
-Green's theorem, whether they cross themselves, and how far from them the nearest point stays the
-only one."""
+"""Interface of the shape of a rigid body, and properties of closed curves: moments by Green's
+theorem, whether they cross themselves, and how far from them the nearest point stays the only
+one."""
 
 import logging
 import math
@@ -15,8 +15,8 @@ from torchsoft.physics.arguments import number
 
 
 def parameter(value: float, trained: bool = True) -> nn.Parameter:
-    """A scalar parameter in float64, whatever torch's default is. Raises `ValueError` for what is
-    not a number."""
+    """A scalar parameter in float64, independent of torch's default. Raises `ValueError` unless the
+    value is a number."""
     return nn.Parameter(
         torch.tensor(number("a parameter", value), dtype=torch.float64), requires_grad=trained
     )
@@ -31,8 +31,8 @@ NOTED = 1e-9
 
 
 class Shape(nn.Module):
-    """What a rig asks of a rigid body's shape; lengths are numbers in m, about the centre of mass.
-    A `round` one looks the same however it is turned, and its turning is left out of the law."""
+    """Interface of a rigid body's shape; lengths are numbers in m, about the centre of mass. A
+    `round` one looks the same however it is turned, and its turning is left out of the law."""
 
     round: ClassVar[bool] = False
 
@@ -114,8 +114,8 @@ class Prepared(Shape):
 
 
 class Outlined(Shape):
-    """A shape given by points around it, whatever point they are about: its own frame has its
-    origin at the centre of mass."""
+    """A shape given by points around it, about any point: its own frame has its origin at the
+    centre of mass."""
 
     given: ClassVar = ""
     """Name of the constructor's argument with the points."""
@@ -171,9 +171,9 @@ def gauss(points: int) -> tuple[Tensor, Tensor]:
 
 
 def moments(x: Tensor, dx: Tensor) -> Moments:
-    """Of what lies to the left of a closed contour, from points x (points, 2) [m] of a quadrature
-    along it, and its tangents there times their weights, dx (points, 2) [m]: the integral of x^k dA
-    is that of x^(k+1) dy / (k+1)."""
+    """Moments of the area to the left of a closed contour, from points x (points, 2) [m] of a
+    quadrature along it, and its tangents there times their weights, dx (points, 2) [m]: the
+    integral of x^k dA is that of x^(k+1) dy / (k+1)."""
     middle = x.detach().mean(0)
     x, y = (x - middle).unbind(-1)
     dx, dy = dx.unbind(-1)
