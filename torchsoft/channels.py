@@ -68,4 +68,4 @@ forces."""
 
 SETPOINTS = ("x_d", "y_d")
 FEED_FORWARD = ("x_d_dot", "y_d_dot", "F_ff")
-"""Channels of the reference: set-points, and what may be fed forward besides them."""
+"""Channels of the reference: set-points, and signals that may be fed forward."""

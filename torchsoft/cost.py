@@ -1,5 +1,5 @@
-"""What work will cost, said before it begins: hours, and more memory than there is, need the user's
-word.
+"""Cost of work, stated before it begins: hours, and more memory than there is, need the user's
+consent.
 
 The times are those of one core of a usual machine; they are meant to tell minutes from hours.
 """
@@ -21,7 +21,7 @@ DIFFERENTIATED = {False: 2.5, True: 4.0}
 pads."""
 
 SHARE = 0.8
-"""And so does what needs more than this part of the machine's memory."""
+"""And so does work that needs more than this part of the machine's memory."""
 
 
 class Cost(NamedTuple):
@@ -49,7 +49,7 @@ def agree(cost: Cost, yes: bool, help: str) -> None:
     """Ask whether to begin where it costs much and `yes` was not said; where nobody can be asked
     that is `Costly`.
 
-    `help` says what makes it cost less.
+    `help` is the advice that lowers the cost.
     """
     if yes or (cost.seconds <= LONG and cost.memory <= SHARE * machine_memory()):
         return

@@ -1,4 +1,4 @@
-"""What a check says of an input: how grave, where, and in which words."""
+"""Finding of a check of an input: severity, place and message."""
 
 from typing import Literal, NamedTuple, get_args
 

@@ -1,4 +1,4 @@
-"""What objects show of themselves at a prompt and in a notebook, and near names for wrong ones."""
+"""Representations of objects at a prompt and in a notebook, and near names for wrong ones."""
 
 from collections.abc import Iterable, Sequence
 from difflib import SequenceMatcher

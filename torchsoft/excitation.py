@@ -211,8 +211,9 @@ CATALOGUE = {
 
 def start(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
     """State (size,): the disc at rest under its weight, the bracket at `apart`, so that its pad is
-    clear of the disc by what the disc has sunk in. Differentiable in the model's parameters, and in
-    the place x () [m] of the disc, x_C0 by default; the bracket's place does not depend on them."""
+    clear of the disc by the depth to which the disc has sunk. Differentiable in the model's
+    parameters, and in the place x () [m] of the disc, x_C0 by default; the bracket's place does not
+    depend on them."""
     state, p = model.unpack(rest(model, x)), model.settings
     clear = torch.tensor([p.scenario.x_C0, apart(p), 0.0], dtype=torch.float64)
     return model.pack(state._replace(pose=state.pose | {"bracket": clear}))

@@ -63,14 +63,14 @@ def grid(duration: float, spacing: float = 0.01) -> Tensor:
 
 
 def timed(function: Callable[[], T]) -> tuple[T, float]:
-    """What a function returns, and its wall time [s]."""
+    """Result of a function, and its wall time [s]."""
     start = perf_counter()
     out = function()
     return out, perf_counter() - start
 
 
 def repeated(found: Callable[[int], T], count: int, workers: int, label: str) -> list[T]:
-    """What so many seeds gave, in their order, with progress."""
+    """Results of so many seeds, in their order, with progress."""
     work = tqdm(parallel_map(found, count, workers), desc=label, total=count)
     return [one for _, one in sorted(work, key=lambda pair: pair[0])]
 

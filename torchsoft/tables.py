@@ -1,7 +1,5 @@
-"""Tables: validated data, from Python or from a TOML file. What a table refuses it refuses in one
-sentence.
-
-The sentence names every field that is wrong, what was given and what is allowed.
+"""Tables: validated data, from Python or from a TOML file. A table refuses in one sentence that
+names every wrong field, its value and the values allowed.
 """
 
 import json
@@ -41,7 +39,7 @@ Number = Annotated[
 
 
 class InvalidTable(ValueError):
-    """What a table does not take, in one sentence."""
+    """Refusal of a table, in one sentence."""
 
 
 @contextmanager
@@ -83,8 +81,8 @@ class Table(BaseModel):
 
 
 def findings(error: ValidationError, data: Any = None, within: str = "") -> str:
-    """pydantic's findings in one sentence, each with its field (`within` another), what was given
-    and what is allowed."""
+    """pydantic's findings in one sentence, each with its field (`within` another), its value and
+    the values allowed."""
     found = list(
         dict.fromkeys(finding(one, data, within) for one in error.errors(include_url=False))
     )
@@ -194,7 +192,7 @@ def toml_row(name: str, value: Any, remark: str = "") -> str:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """A TOML file. Raises `ValueError` naming it for what is not TOML in UTF-8, and `OSError`."""
+    """A TOML file. Raises `ValueError` naming it unless it is TOML in UTF-8, and `OSError`."""
     check_file(path, LARGEST)
     try:
         return tomllib.loads(Path(path).read_bytes().removeprefix(b"\xef\xbb\xbf").decode("utf-8"))
@@ -207,7 +205,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def from_toml(path: str | Path, make: Callable[[Any], T]) -> T:
-    """What `make` makes of a TOML file. Raises `ValueError` naming the file and the field."""
+    """Result of `make` for a TOML file. Raises `ValueError` naming the file and the field."""
     tree = read_toml(path)
     try:
         return make(tree)

@@ -1,7 +1,7 @@
 """Runs side by side in threads: the compiled kernels hold no lock, so runs of one process share its
 cores.
 
-What is not compiled does hold one; a run of a second has some twenty milliseconds of that.
+Python code does hold one; a run of a second has some twenty milliseconds of it.
 """
 
 import os
@@ -90,9 +90,9 @@ def parallel_map(
 
     The threads inherit torch's grad mode; each computes on one core. With `turns` one thread at a
     time computes in Python: torch releases the interpreter's lock at every operation, and threads
-    that hand it over each time are slower than one alone. An exception ends what has not
-    begun, and so does Ctrl-C; what runs is waited for. A `pool` of `executor` is used and kept in
-    the place of one for this call alone, which costs 10 ms.
+    that hand it over each time are slower than one alone. An exception cancels work that has not
+    begun, and so does Ctrl-C; running work is waited for. A `pool` of `executor` is used and kept
+    in the place of one for this call alone, which costs 10 ms.
     """
     threads = min(count, cores() if threads is None else threads)
     if threads <= 1 and pool is None:

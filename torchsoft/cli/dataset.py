@@ -93,7 +93,7 @@ def count(text: str) -> int:
 
 
 def make(options: argparse.Namespace) -> int:
-    """Make what is missing of a dataset, or of a part."""
+    """Make the missing shards of a dataset, or of a part."""
     from concurrent.futures.process import BrokenProcessPool
 
     from torchsoft.cost import agree
@@ -147,7 +147,7 @@ def slurm(options: argparse.Namespace) -> int:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Say what is wrong with a dataset; the exit status is 1 for any finding."""
+    """Print the faults of a dataset; the exit status is 1 for any finding."""
     from torchsoft.datasets.check import report
 
     return int(report(options.store, options.picture) > 0)

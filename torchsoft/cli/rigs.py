@@ -45,7 +45,7 @@ def add_commands(commands: Any) -> None:
 
 
 def run_rig(options: argparse.Namespace) -> int:
-    """Check a rig file, simulate it, and write what came of it."""
+    """Check a rig file, simulate it, and write the results."""
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
@@ -81,7 +81,7 @@ def run_rig(options: argparse.Namespace) -> int:
 
 
 def check_rig(options: argparse.Namespace) -> int:
-    """Say what is wrong in a rig file."""
+    """Print the faults of a rig file."""
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check

@@ -66,7 +66,7 @@ class Moment(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What an action led to: the next moment, the observation (n,) and the reward (), both float64
+    """Result of an action: the next moment, the observation (n,) and the reward (), both float64
     with their graph, and the run between."""
 
     moment: Moment

@@ -41,19 +41,19 @@ class RedrawnStart(UserWarning):
 class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """The rig of a file, or one built in Python, under actions at a control rate.
 
-    What `actions`, `observations`, `interval`, `goal`, `reward`, `begin`, `disturbances` and
-    `samples` are, `torchsoft.envs.dynamics.Dynamics` says; each episode draws a peak between the
-    low and high of a disturbance, and its control time. `env.dynamics` and `env.moment` are the
-    environment in torch, with gradients.
+    `actions`, `observations`, `interval`, `goal`, `reward`, `begin`, `disturbances` and `samples`
+    are those of `torchsoft.envs.dynamics.Dynamics`; each episode draws a peak between the low and
+    high of a disturbance, and its control time. `env.dynamics` and `env.moment` are the environment
+    in torch, with gradients.
 
     duration: time limit [s] after `begin`, a multiple of `interval`; by default the rest of the
     file's. bounds: by coordinate such as "disc.y", beyond which an episode terminates [m, rad].
-    held: bodies that terminate it when no contact touches them at a control time. lost: what the
-    reward of such an end, and of a failed run, is. judged: whether every step is, as a run of
-    `simulate` is, by its energies and how deep its pads are pressed, in two thirds more time;
-    `info["doubts"]` then holds what is wrong. parameters: ranges between which each episode draws
-    numbers of the rig file by name, such as "materials.rubber.E" [Pa] or "bodies.disc.start.x"
-    [m]; the rig is then built anew each time, which takes some tenths of a second.
+    held: bodies that terminate it when no contact touches them at a control time. lost: the reward
+    of such an end, and of a failed run. judged: whether every step is judged like a run of
+    `simulate`, by its energies and the depth of its pads, in two thirds more time; `info["doubts"]`
+    then holds the faults. parameters: ranges between which each episode draws numbers of the rig
+    file by name, such as "materials.rubber.E" [Pa] or "bodies.disc.start.x" [m]; the rig is then
+    built anew each time, which takes some tenths of a second.
 
     `info` has the time [s], and "ended" or, where the simulation failed, "failure", as a sentence.
     Raises `ValueError` naming the field and the remedy.

@@ -17,7 +17,7 @@ MOMENT_ARM = 1e-2
 """Largest moment on the object, over its size and the load, that is not worth a warning."""
 
 CLEAR = 1e-16
-"""Gap [m] of what just touches: above rounding, so that no force is between them."""
+"""Gap [m] of surfaces that just touch: above rounding, so that no force is between them."""
 
 TOUCHING = 30
 """Iterations of Newton's method for the height at which an undeformed pad is just touched."""
@@ -99,8 +99,8 @@ def place(x: Tensor, y: Tensor) -> Tensor:
 
 
 def touching(model: SoftGrasp, x: Tensor, y_Br: Tensor) -> State:
-    """The object where it just touches the undeformed lower pad: what a body without weight rests
-    like."""
+    """The object where it just touches the undeformed lower pad: the rest of a body without
+    weight."""
     state = model.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
     y = torch.tensor(model.settings.pad.height + 0.9 * reaches(model)[0], dtype=torch.float64)
     for _ in range(TOUCHING):

@@ -33,7 +33,7 @@ NAMES = {
     "bracket.mass": "bracket.mass",
     "scenario.gravity": "gravity",
 }
-"""What a number of `Parameters` is called among the module's parameters."""
+"""Name of a number of `Parameters` among the module's parameters."""
 
 
 class SoftGrasp(Rig):

@@ -105,7 +105,7 @@ class Evaluator:
 
     def look(self, z: Array, rtol: float | None = None, *, gradient: bool = True) -> Look:
         """The plan at z, by the evaluator's relative tolerance or another. Raises `ValueError` for
-        what no run could do."""
+        values that no run could have."""
         self.looks += 1
         rows = torch.from_numpy(np.tile(z, (self.draws, 1))).requires_grad_(gradient)
         with warnings.catch_warnings():

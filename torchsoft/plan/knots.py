@@ -21,8 +21,8 @@ PEAK = 35 / 16
 
 
 class Bounds(Table):
-    """What a signal of the reference may do: values from `low` to `high` [its unit], at `speed`
-    [its unit/s] at most.
+    """Bounds of a signal of the reference: values from `low` to `high` [its unit], at `speed` [its
+    unit/s] at most.
 
     Knots later than `after` [s] are free. Their times are free too if `shortest` [s] is given, the
     least time between two.
@@ -163,8 +163,8 @@ class Moves:
         return Reference(**signals)
 
     def _excess(self, z: Array) -> Array:
-        """What must not be positive: beyond the bounds, faster than allowed, closer than
-        `shortest`, too late."""
+        """Violations, which must not be positive: beyond the bounds, faster than allowed, closer
+        than `shortest`, too late."""
         rows = [np.zeros(0)]
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]

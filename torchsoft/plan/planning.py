@@ -46,8 +46,8 @@ class Plan(Shown):
     every target and limit is kept in the first draw, by runs of a hundredth of the tolerance;
     `holds` is the part of draws in which they are. `errors` holds the errors of targets over their
     tolerance and `excess` that of limits over their scale, (draws,) by name. `trajectory` is the
-    run of the first draw. `reasons` says what is not reached and what holds it back, `notices`
-    what else a reader must know.
+    run of the first draw. `reasons` names targets that are not reached with their obstacles,
+    `notices` the other facts that a reader must know.
     """
 
     rig: Rig = field(repr=False)
@@ -65,7 +65,7 @@ class Plan(Shown):
     made_by: dict[str, Any]
 
     def summary(self) -> dict[str, Any]:
-        """What is written as JSON."""
+        """The plan as JSON."""
         return {
             "reached": self.reached, "holds": self.holds, "value": self.value,
             "errors": {name: e.tolist() for name, e in self.errors.items()},
@@ -103,7 +103,7 @@ def plan(
     `targets` (errors over a tolerance, which are brought to zero) and `limits` (excess over a
     scale, which is kept from being positive) are functions in torch of a `Trajectory`, such as
     `Target` and `Limit`, by name. `change` weighs half the squared change of the variables, in
-    units of what speed or range allows: by default 1 without an objective, so that the plan is the
+    units of the speed or range allowed: by default 1 without an objective, so that the plan is the
     one nearest to the motion given, else 0.
 
     `over` holds draws of uncertain parameters by name (draws, ...), y0 their starts (draws, size)
@@ -117,7 +117,7 @@ def plan(
     sequence. A run that fails is worse than any other. The search ends after `seconds`, and on
     Ctrl-C, with the best plan so far.
 
-    Raises `ValueError` for what does not fit together, and where no start can be run.
+    Raises `ValueError` for arguments that do not fit together, and where no start can be run.
     """
     t, y0 = tensor("t", t), tensor("y0", y0)
     for name, given, known in (("method", method, ("slsqp", "adam")),

@@ -49,7 +49,7 @@ ACCURACY = 1e-4
 
 
 class Visit(NamedTuple):
-    """An evaluation: its time [s], the value, and what targets and limits miss, 0 if nothing."""
+    """An evaluation: its time [s], the value, and the miss of targets and limits, 0 if none."""
 
     seconds: float
     value: float
@@ -78,7 +78,7 @@ class Failed(Exception):
 
 
 class Search:
-    """Looks at plans, and keeps the best: what misses less, then the lower value.
+    """Evaluates plans, and keeps the best: the smaller miss, then the lower value.
 
     With one draw, or `robust` "mean", the mean of the objective is lowered, the mean errors of the
     draws are brought to zero, and their spread is lowered; with "worst" the largest sum of the
@@ -137,7 +137,7 @@ class Search:
         return look
 
     def value(self, look: Look) -> float:
-        """What is lowered while targets and limits are kept."""
+        """Objective, lowered while targets and limits are kept."""
         if self._worst:
             combined = self._costs(look).max()
         else:
@@ -152,7 +152,7 @@ class Search:
         return 0.5 * self.change * float(way @ way), self.change * D.T @ way
 
     def missed(self, look: Look) -> float:
-        """What targets miss beyond a part of their tolerance, and limits beyond their slack."""
+        """Miss of targets beyond a part of their tolerance, and of limits beyond their slack."""
         errors = np.abs(look.errors).max(initial=0.0)
         excess = look.excess.max(initial=0.0)
         return float(max(errors - WITHIN, 0.0) + EXCESS * max(excess - SLACK, 0.0))

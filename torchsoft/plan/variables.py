@@ -15,9 +15,9 @@ Free = Mapping[str, Bounds | tuple[float, float]]
 
 
 class Variables:
-    """The vector z (n,) of what a plan may change, each number over a unit of its own: for knots
-    the way that speed allows between two of them, for parameters their range, or their largest
-    value where they have none.
+    """The vector z (n,) of a plan's free variables, each over a unit of its own: for knots the way
+    that speed allows between two of them, for parameters their range, or their largest value where
+    they have none.
 
     Raises `ValueError` for names that the rig has not, and bounds that leave nothing.
     """

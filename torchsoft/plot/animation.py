@@ -64,7 +64,7 @@ def pace(speed: float) -> str:
 
 def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and a coordinate over time under
-    it. The axes are drawn once; per picture only what moves."""
+    it. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
     curve = next(curve for curve in curves(run) if curve.name == follow)
     scale = force_scale(setup, shown)

@@ -59,7 +59,7 @@ RIPPLE = (
     "Ripples of forces: points touch and part one by one; more contact points an element smooth "
     "them."
 )
-"""What is known about a zigzag of the forces."""
+"""Cause of a zigzag of the forces."""
 
 
 class Curve(NamedTuple):
@@ -112,8 +112,8 @@ def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
 
 
 def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
-    """What the points of every contact come to over time, with its unit, by contact (T,): forces,
-    how much of the friction cone is used (of the normal force where a law has no mu_s; NaN without
+    """Sums over the points of every contact over time, with their unit, by contact (T,): forces,
+    part of the friction cone that is used (of the normal force where a law has no mu_s; NaN without
     force), points that touch, and those of them that slip."""
     laws = {name: contact.friction for name, contact in run.setup.contacts.items()}
     known = all("mu_s" in law for law in laws.values())
@@ -165,7 +165,7 @@ def points(
 
 
 def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
-    """What an actuator pushes with."""
+    """Effort of an actuator."""
     scale, unit = (MM, "N mm") if one.unit == "N.m" else (1.0, "N")
     t = timeline(axes, f"on {one.pushes} [{unit}]", run)
     axes.plot(t, scale * run[one.channel].detach().numpy(), color=ACTUAL)
@@ -184,7 +184,7 @@ def stresses(axes: Axes, run: Trajectory) -> None:
 
 
 def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
-    """Label, energy [mJ] (T,) and colour of what is stored and dissipated, that is all of it."""
+    """Label, energy [mJ] (T,) and colour of energies stored and dissipated, each counted once."""
     zero = torch.zeros_like(run.t)
     stored, lost = dict(run.energy), dict(run.dissipated)
 
@@ -229,7 +229,7 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
 
 
 def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
-    """What is drawn over time, by its title."""
+    """Panels over time, by title."""
     moving = [one for one in curves(run) if np.ptp(one.values) > STILL] or list(curves(run))[:1]
     out: dict[str, Callable[[Axes], None]] = {
         curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving

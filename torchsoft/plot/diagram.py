@@ -1,7 +1,7 @@
 """The multibond graph of the whole system as a drawing (the paper's Fig. 9) and as Graphviz text.
 
-Both come from `multibond.topology` of the rig's own ports, so they show what is simulated, whatever
-the rig.
+Both come from `multibond.topology` of the rig's own ports, so they show the simulated equations of
+any rig.
 """
 
 import re

@@ -122,7 +122,7 @@ def timeline(axes: Axes, label: str, run: Trajectory) -> NDArray[np.float64]:
 
 
 def legend_above(axes: Axes) -> None:
-    """A legend in room that is made for it above what is drawn."""
+    """A legend above the drawing, in room made for it."""
     room, count = axes.get_window_extent(), len(axes.get_legend_handles_labels()[1])
     for rows in range(1, count + 1):
         legend = axes.legend(

@@ -118,8 +118,8 @@ def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
 
 
 def own_axes(pad: PadSetup, base: Array) -> Array:
-    """A pad's own x and y (2, 2) as unit vectors of the world; base (3,) is the pose of what it is
-    bonded to."""
+    """A pad's own x and y (2, 2) as unit vectors of the world; base (3,) is the pose of its
+    base."""
     return in_world(pad.axes.T, base) - base[:2]
 
 
@@ -150,7 +150,7 @@ def around_contact(instant: Instant, contact: str) -> tuple[Array, Array]:
 
 
 def unit(setup: Setup) -> float:
-    """What margins and curves are measured in [mm]: one for the paper's pads of 120 mm."""
+    """Unit of margins and curves [mm]: one for the paper's pads of 120 mm."""
     return MM * max((pad.mesh.length for pad in setup.pads.values()), default=0.12) / 120
 
 

@@ -96,9 +96,9 @@ def assemble(
     """Columns and rates of the records in weak form.
 
     States without candidates are rates of none: with inputs ("x_Br", "v_Br") and candidates for v_C
-    and omega, the bracket is what drives. Raises `ValueError` for records of different steps,
-    values that are not finite, constant columns, columns that the others already span, and too few
-    rows, naming the column.
+    and omega, the bracket drives. Raises `ValueError` for records of different steps, values that
+    are not finite, constant columns, columns that the others already span, and too few rows, naming
+    the column.
     """
     states = tuple(name for name in STATES if name not in inputs)
     steps = [one.step for one in records]

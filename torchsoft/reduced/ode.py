@@ -1,10 +1,10 @@
 """Small ordinary differential equations y' = S y + C phi(y, u): their text, their torch module,
 their fast rollout.
 
-One list of terms is all there is: `Term` holds what it is made of, and the equations in text and
-LaTeX, the right-hand side that torchdiffeq integrates and the compiled rollout are read off it. A
-linear model is rolled out by an exact recursion, every other one by an L-stable step: scipy's stiff
-solvers call Python at every step and cost more than the simulator that is being reduced.
+One list of terms describes a model: the equations in text and LaTeX, the right-hand side that
+torchdiffeq integrates and the compiled rollout are read off it. A linear model is rolled out by an
+exact recursion, every other one by an L-stable step: scipy's stiff solvers call Python at every
+step and cost more than the simulator that is being reduced.
 """
 
 import math
@@ -163,7 +163,7 @@ class ReducedModel(Shown, nn.Module):
     states, inputs: names. kinematics: which state is the rate of which, as in {"x_C": "v_C"}.
     equations: for every other state the (term, coefficient) pairs of its rate, SI units. feedback:
     for inputs that a control law makes, its gains on states and on further inputs, {"F_x": {"x_d":
-    K, "x_C": -K}}; those further inputs are then what `signal` gives. Coefficients and gains are
+    K, "x_C": -K}}; `signal` then gives those further inputs. Coefficients and gains are
     `nn.Parameter`s. scale (states,): sizes that belong to the states, for judging divergence.
     intervals: for every term in order its (low, high), if an ensemble has found them.
     """

@@ -14,7 +14,7 @@ from torchsoft.solve.trajectory import Trajectory
 STATES = ("x_C", "theta", "x_Br", "v_C", "omega", "v_Br")
 KINEMATICS = {"x_C": "v_C", "theta": "omega", "x_Br": "v_Br"}
 VARIABLES = (*STATES, "F_x", "x_d", "x_d_dot")
-"""What a record may hold."""
+"""Series of a record."""
 
 ALIKE = 1e-9
 """Starts [m] that differ by no more are the same."""
@@ -66,10 +66,10 @@ def record(
 
     Samples before `begin` [s] are left out, and positions and angle counted from the first one
     kept; x_d from where the coordinate starts that its loop measures. A run knows this coordinate;
-    of series, `measured` names it, "x_C" or "x_Br", where these start at different places. What the
-    source lacks the record lacks. Raises `ValueError` for times that are not equally spaced, for a
-    value that is not finite, naming the series, for a body that is not in the run, for a set-point
-    of an unknown coordinate, and for a source without any of the series.
+    of series, `measured` names it, "x_C" or "x_Br", where these start at different places. The
+    record lacks series that the source lacks. Raises `ValueError` for times that are not equally
+    spaced, for a value that is not finite, naming the series, for a body that is not in the run,
+    for a set-point of an unknown coordinate, and for a source without any of the series.
     """
     if isinstance(source, Trajectory):
         t = source.t.detach() if t is None else t

@@ -1,4 +1,4 @@
-"""Candidate terms for reduced models: what mechanics suggests, and what saturates.
+"""Candidate terms for reduced models: those of mechanics, and those that saturate.
 
 Two pads join disc and bracket. While their contacts stick, each is a spring k and a dashpot c (pad
 and contact springs in series) on the slip that a rigid rolling disc would have, s_L = x_C + r theta
@@ -12,7 +12,7 @@ forces on the disc are F_L = -(k s_L + c s_L') and F_U = k s_U + c s_U', so that
 with c_r the rolling dashpot: the normal forces of a Voigt patch shift against the rolling. r is the
 rolling radius, smaller than the disc's. Those bracketed slips are the columns of `mechanics`; they
 are small differences of large positions, which is why they, and not the positions, are the columns.
-`friction` adds what saturates under slip.
+`friction` adds terms that saturate under slip.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,8 +52,8 @@ def mechanics(r: float, *, alike: bool = True) -> dict[str, list[Term]]:
     the slips of the pads that touch it and their rates, drag on its own velocity, and the control
     force.
 
-    The two slips of the disc stand there as difference and sum if both pads are alike in what they
-    do, as in stick, and one by one if not, as when one slips.
+    The two slips of the disc stand there as difference and sum if both pads act alike, as in stick,
+    and one by one if not, as when one slips.
     """
     s = slips(r)
     first, second = ("difference", "sum") if alike else ("lower", "upper")

@@ -1,4 +1,4 @@
-"""What comes of a rig in balance at some moments of its motions: room, strains, modes and steps,
+"""Checks of a rig in balance at some moments of its motions: room, strains, modes and steps,
 friction."""
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ MOMENTS = 5
 """Times at which the rig is brought into balance, at the most."""
 
 NEAR = 1e-4
-"""A gap [m] that loops close before what they measure has gone anywhere."""
+"""A gap [m] that loops close before their measured coordinate has moved."""
 
 STEPS_PER_PERIOD = 5
 """Steps that a period of an oscillation needs at the least."""
@@ -52,7 +52,7 @@ class Moment(NamedTuple):
 
 @torch.no_grad()
 def at_moments(e: Estimate) -> list[Diagnostic]:
-    """What comes of the rig in balance at some of its motions' knots: strains, modes, steps,
+    """Findings on the rig in balance at some of its motions' knots: strains, modes, steps,
     friction."""
     rig, found, there = massless(e.rig), list[Diagnostic](), list[Moment]()
     for time in e.moments(MOMENTS):
@@ -117,7 +117,7 @@ def room(scene: Scene, group: Sequence[str]) -> float:
 
 
 def presses(there: list[Moment]) -> Iterator[Diagnostic]:
-    """Pads that face each other and never press what is between them."""
+    """Pads that face each other and never press a body between them."""
     scene = there[0].scene
     for pair in sorted(
         {
@@ -155,8 +155,9 @@ def strains(there: list[Moment]) -> Iterator[Diagnostic]:
 
 
 def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
-    """Loops that are unstable or not tied to what they measure, and steps that are too long. What
-    goes off where no loop reaches is no loop's fault: a disc on the top of a node rolls off it."""
+    """Loops that are unstable or not tied to their measured coordinate, and steps that are too
+    long. A motion that no loop reaches may be unstable: a disc on the top of a node rolls off
+    it."""
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = {key: float(rig.penetration(key, moment.state).max()) for key in rig.contacts}

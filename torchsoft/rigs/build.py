@@ -1,4 +1,4 @@
-"""A rig file: tables, from TOML or from Python, and what is built from them: the rig with its
+"""A rig file: tables, from TOML or from Python, and the result of building them: the rig with its
 reference, its state at the start, and the times of its outputs."""
 
 import re
@@ -68,7 +68,7 @@ USED = {
 
 
 class OutputsTable(Group):
-    """How long the run lasts, and what is written."""
+    """Duration of the run, and files to be written."""
 
     duration: Annotated[float, Quantity("s", 1e-3, 1e5)] = Field(description="of the run")
     interval: Annotated[float, Quantity("s", 1e-6, 1e3)] = Field(
@@ -171,7 +171,7 @@ class RigFile(Group):
 
     @classmethod
     def from_tree(cls, tree: Any, folder: Path = Path()) -> Self:
-        """From what TOML makes of a file that lies in a folder. Raises `ValueError`."""
+        """From the parsed TOML of a file that lies in a folder. Raises `ValueError`."""
         if isinstance(tree, dict) and "motion" in tree:
             tree = tree | {"motion": flattened(tree["motion"])}
         file = cls.model_validate(tree)
@@ -214,12 +214,12 @@ class RigFile(Group):
                 yield name, axis, kind
 
     def loops(self) -> list[Loop]:
-        """What follows motions, by actuators and by controllers."""
+        """Coordinates that follow motions, by actuators and by controllers."""
         groups = *self.actuators.items(), *self.controllers.items()
         return [loop for name, one in groups for loop in one.loops(name)]
 
     def followers(self) -> dict[str, list[tuple[str, str]]]:
-        """What follows each motion: roles ("setpoint", "feed_forward" or "driven") and coordinates
+        """Followers of each motion: roles ("setpoint", "feed_forward" or "driven") and coordinates
         by the motion's name."""
         fed = [
             (one.feed_forward, "feed_forward", one.pushes)
@@ -236,7 +236,7 @@ class RigFile(Group):
         return out
 
     def unit(self, motion: str) -> str:
-        """Unit of a motion, from what follows it."""
+        """Unit of a motion, from its followers."""
         (role, coordinate), *_ = self.followers()[motion]
         return (
             coordinate_unit(coordinate)
@@ -330,7 +330,7 @@ class RigFile(Group):
         return self
 
     def _check_coordinate(self, field: str, coordinate: str) -> None:
-        """Raises `ValueError` for what a loop can neither measure nor push."""
+        """Raises `ValueError` for a coordinate that a loop can neither measure nor push."""
         kinds = {f"{body}.{axis}": kind for body, axis, kind in self.coordinates()}
         if coordinate not in kinds:
             there = ", ".join(name for name, kind in kinds.items() if kind == "free") or "none"
@@ -404,7 +404,7 @@ class RigFile(Group):
         return rig
 
     def _own_name(self, rig: Rig, group: str, part: str = "", *rest: str) -> str:
-        """What this file calls a parameter of its rig, such as "materials.silicone.E"."""
+        """This file's name of a parameter of its rig, such as "materials.silicone.E"."""
         made = {a: name for name, one in self.controllers.items() for a in one.actuators(name)}
         if group == "pads" and rest[:1] == ("material",):
             material = rig.pads[part].material
@@ -425,7 +425,7 @@ class RigFile(Group):
     @single_threaded()
     @torch.no_grad()
     def build(self) -> BuiltRig[Rig]:
-        """What the file describes, ready for `simulate(rig, t, y0=y0)`.
+        """The rig and its start, ready for `simulate(rig, t, y0=y0)`.
 
         Pads are settled around the bodies where these start. Raises `ValueError` with the field's
         name: for motions that cannot be, recorded ones that cannot be read, bodies that find no

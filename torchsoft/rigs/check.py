@@ -1,8 +1,8 @@
-"""What is wrong or dangerous in a rig file, said before any run: findings, each with its severity,
-its field and a sentence.
+"""Faults and dangers in a rig file, found before any run, each with its severity, its field and a
+sentence.
 
-Every check is a function of the estimated course of the bodies. What comes of the rig in balance is
-in `balance`.
+Every check is a function of the estimated course of the bodies. Checks of the rig in balance are in
+`balance`.
 """
 
 import itertools
@@ -50,8 +50,8 @@ def check(file: RigFile) -> list[Diagnostic]:
 
 
 def ties(e: Estimate) -> Iterator[Diagnostic]:
-    """Loops that measure a body which they cannot move, and efforts of controllers that move
-    nothing of what these see."""
+    """Loops that measure a body which they cannot move, and efforts of controllers that move none
+    of the coordinates that these measure."""
     graph = tied(e.rig, e.rig.contacts)
     wanted = [(one.field, one.pushes, (one.measured,)) for one in e.loops]
     wanted += [

@@ -35,7 +35,7 @@ PYTHON = (
 )
 
 LOOP = "set-point", "its rate", "coordinate", "its rate"
-"""What the network of one loop sees, in SI units."""
+"""Inputs of the network of one loop, in SI units."""
 
 
 class NetworkPD(PD):
@@ -76,7 +76,7 @@ class FedNetwork(nn.Module):
 def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequential:
     """Linear layers with tanh between them from an .npz file of their weights and biases, with the
     names of torch's `Sequential(Linear, Tanh, Linear, ...)`: 0.weight, 0.bias, 2.weight, ...
-    `inputs` are the words for what it sees.
+    `inputs` are the words for its inputs.
 
     Raises `ValueError` naming the file for another kind of file, names or shapes, and `OSError`.
     """
@@ -121,7 +121,7 @@ def declared(path: Path) -> int:
 
 
 def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -> nn.Sequential:
-    """Raises `ValueError` for what is no network of such layers."""
+    """Raises `ValueError` for a network of other layers."""
     found = sorted(
         int(name[1])
         for name in (re.fullmatch(r"(\d{1,3})\.weight", name) for name in arrays)
@@ -168,8 +168,8 @@ Rows = Annotated[tuple[Annotated[tuple[Gain, ...], LISTED], ...], LISTED]
 
 
 class Loop(NamedTuple):
-    """A coordinate that is to follow a motion: the field that says so, what is pushed for it, by
-    actuators of the rig."""
+    """A coordinate that is to follow a motion: its field, and the coordinate that actuators of the
+    rig push for it."""
 
     field: str
     measured: str
@@ -179,8 +179,8 @@ class Loop(NamedTuple):
 
 
 class ActuatorTable(Group):
-    """An effort on one free coordinate, Kp (w - q) + Kd (w' - q') + network(w, w', q, q') + what is
-    fed forward. The coordinate q that it measures may be another one, of another body, and of
+    """An effort on one free coordinate, Kp (w - q) + Kd (w' - q') + network(w, w', q, q') +
+    feed-forward. The coordinate q that it measures may be another one, of another body, and of
     another kind: "disc.theta" through "bracket.x"."""
 
     pushes: str = Field(description='the coordinate that it pushes, such as "bracket.x"')
@@ -231,7 +231,7 @@ class ActuatorTable(Group):
         return self.measures or self.pushes
 
     def loops(self, name: str) -> list[Loop]:
-        """What follows what."""
+        """Coordinates by the motions that they follow."""
         if self.setpoint is None:
             return []
         return [Loop(f"actuators.{name}", self.measured, self.pushes, self.setpoint, (name,))]
@@ -258,8 +258,8 @@ class ActuatorTable(Group):
 
 class ControllerTable(Group):
     """A law of several coordinates with several efforts: gain . (set-points less coordinates, and
-    their rates) + network(...). The efforts' actuators are called by the controller and by what
-    they push: F_NAME_bracket_x of bracket.x."""
+    their rates) + network(...). The efforts' actuators are named after the controller and the
+    coordinate that they push: F_NAME_bracket_x of bracket.x."""
 
     measures: Names = Field(
         min_length=1, description='coordinates that it sees, such as "disc.x", with their rates'
@@ -312,12 +312,12 @@ class ControllerTable(Group):
         return self
 
     def actuators(self, name: str) -> dict[str, str]:
-        """What is pushed, by the names of the actuators."""
+        """Pushed coordinates, by the names of the actuators."""
         return {f"{name}_{pushed.replace('.', '_')}": pushed for pushed in self.pushes}
 
     def loops(self, name: str) -> list[Loop]:
-        """What follows what; pushed for it is the same coordinate where it is pushed, else one
-        along the same axis, else the first."""
+        """Coordinates by the motions that they follow. The coordinate pushed for one is itself
+        where it is pushed, else one along the same axis, else the first."""
 
         def towards(coordinate: str) -> str:
             same = [

@@ -1,4 +1,4 @@
-"""Where bodies will be, before any run: what is driven, what loops follow, and what is gripped
+"""Estimated course of bodies, before any run: driven ones, those that loops move, and those gripped
 between two pads.
 
 Two estimates. By geometry alone, at any time: loops are taken to reach their set-points, a body
@@ -111,7 +111,7 @@ class Estimate:
     @torch.no_grad()
     def balanced(self, time: float) -> dict[str, Array]:
         """By statics: the coordinates in balance are those whose own loop pushes them, and bodies
-        between pads along what these press. By geometry where no balance is found."""
+        between pads along the direction of the press. By geometry where no balance is found."""
         scene = Scene(self.rig, self(time))
         own = [name for name, one in self.file.actuators.items() if one.measured == one.pushes]
         freed = {at(self.file.actuators[name].pushes) for name in own}

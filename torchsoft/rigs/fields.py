@@ -27,7 +27,7 @@ from torchsoft.tables import LISTED, Table, shown
 
 
 class Refused(ValueError):
-    """What cannot be, with the field that says so."""
+    """A refused value, with its field."""
 
     def __init__(self, field: str, sentence: str) -> None:
         super().__init__(f"{field}: {sentence}")
@@ -36,7 +36,7 @@ class Refused(ValueError):
 
 @contextmanager
 def at_field(field: str) -> Iterator[None]:
-    """Turns errors in what a field says into `Refused`, those of a field within it too."""
+    """Turns errors in the value of a field into `Refused`, those of a field within it too."""
     try:
         yield
     except Refused as error:
@@ -123,8 +123,7 @@ class PartTable(Group):
 
 @lru_cache(maxsize=32)
 def made(part: Callable[..., Any], arguments: tuple[tuple[str, Any], ...]) -> Any:
-    """A part, made once: what it logs is said once, and a contour takes a while. Raises
-    `ValueError`."""
+    """A part, made once: its log appears once, and a contour takes a while. Raises `ValueError`."""
     return sound(part(**dict(arguments)))
 
 

@@ -35,7 +35,7 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class Goal(Table):
-    """What a run of a rig file is to reach: `free` motions and numbers of the file, by their names;
+    """Goal of a run of a rig file: `free` motions and numbers of the file, by their names;
     `targets` and `limits` of channels; `uncertain` numbers of the file, of which the plan sees
     `draws` besides the stated ones."""
 

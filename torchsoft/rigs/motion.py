@@ -1,5 +1,5 @@
-"""Motions of a rig file: what loops follow, what is fed forward, and where driven coordinates go,
-as functions of time."""
+"""Motions of a rig file: set-points of loops, feed-forward efforts and driven coordinates, as
+functions of time."""
 
 import csv
 from itertools import pairwise
@@ -33,9 +33,8 @@ Frequency = Annotated[float, Quantity("Hz", 1e-6, 1e5)]
 
 
 class MotionContext(NamedTuple):
-    """What a motion is made for: its name, its unit, where the coordinate that follows it starts
-    (None: no coordinate that is free does), the end of the run [s], and the folder of the rig's
-    file."""
+    """Context of a motion: its name, its unit, where the coordinate that follows it starts (None:
+    no coordinate that is free does), the end of the run [s], and the folder of the rig's file."""
 
     name: str
     unit: str
@@ -229,7 +228,7 @@ class CsvTable(Motion):
 
 
 def read_column(path: Path, column: str, unit: str) -> tuple[list[float], list[float]]:
-    """Times [s] and values, in SI units, of a column that is to be in `unit` or what is converted
+    """Times [s] and values, in SI units, of a column that is to be in `unit` or one that converts
     to it; other columns are left out. Raises `ValueError` naming the file, the row (the heading is
     row 1) and the column.
     """

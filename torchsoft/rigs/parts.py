@@ -90,8 +90,8 @@ class StartTable(Group):
 
 
 class BodyTable(Group):
-    """A rigid body: what is manipulated, or what carries a pad. Each coordinate is "free", "driven"
-    by the motion of that name, or a number at which it is fixed."""
+    """A rigid body, manipulated or carrying a pad. Each coordinate is "free", "driven" by the
+    motion of that name, or a number at which it is fixed."""
 
     mass: Mass | None = Field(
         default=None,
@@ -380,7 +380,7 @@ TaxelsTable = table_of(Taxels)
 
 
 class ContactTable(Group):
-    """What may touch: a pad and a body. What has no contact passes through each other."""
+    """A pair that may touch: a pad and a body. Others pass through each other."""
 
     pad: str = Field(description="name of one of the pads")
     body: str = Field(description="name of one of the bodies, with a shape")

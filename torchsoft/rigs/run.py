@@ -32,7 +32,7 @@ FLOPS = 1e10
 
 
 class RunOutcome(NamedTuple):
-    """A run, as far as it went, and what ended it early, if anything did."""
+    """A run, as far as it went, and the cause of an early end."""
 
     ready: BuiltRig[Rig]
     trajectory: Trajectory
@@ -40,10 +40,9 @@ class RunOutcome(NamedTuple):
 
 
 def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
-    """Simulate what a file describes. A failure and Ctrl-C end it early, with what was simulated
-    until then.
+    """Simulate what a file describes. A failure and Ctrl-C end it early, with the run until then.
 
-    Raises `ValueError` for what cannot be built, and `KeyboardInterrupt` before anything was
+    Raises `ValueError` for a rig that cannot be built, and `KeyboardInterrupt` before anything was
     simulated.
     """
     ready = file.build()
@@ -63,7 +62,7 @@ def run(
 ) -> RunOutcome:
     """Simulate and write everything to the folder `out`: data first, pictures only of a run that
     was not stopped. `found` are the check's findings, for the summary. Raises `OSError` for a
-    folder that cannot be made, and what `carry_out` does."""
+    folder that cannot be made, and as `carry_out`."""
     began = time.perf_counter()
     make_folder(out)
     done = carry_out(file, progress=progress)

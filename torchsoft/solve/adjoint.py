@@ -1,9 +1,9 @@
 """Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in
 the compiled kernels.
 
-What a run was made with is fixed when it is made: the vector of parameters and the signals at its
-stages are inputs of one autograd function, and whatever these were computed from receives its
-gradient, whatever has become of the modules since.
+The inputs of a run are fixed when it is made: the vector of parameters and the signals at its
+stages are inputs of one autograd function, and the tensors that these were computed from receive
+their gradient, even where modules have changed since.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ class GradientFailed(RuntimeError):
 
 
 class Rows(NamedTuple):
-    """What of a run has a gradient at its outputs: states (T, size), and forces (T, recorded) as
+    """Differentiable outputs of a run: states (T, size), and forces (T, recorded) as
     `recorded_size` orders them."""
 
     y: Tensor
@@ -38,8 +38,8 @@ class Rows(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """A run, finished or growing: what it was made with, what it left, and its segments if anything
-    wants a gradient."""
+    """A run, finished or growing: its inputs, its results, and its segments where a gradient is
+    needed."""
 
     stepper: ImplicitStepper
     y0: Tensor
@@ -49,7 +49,7 @@ class Solved(NamedTuple):
 
     @property
     def rows(self) -> Rows:
-        """What it left, without a graph."""
+        """Results without a graph."""
         return Rows(torch.from_numpy(self.out.y), torch.from_numpy(self.out.recorded))
 
 

@@ -35,7 +35,7 @@ class Batch(Shown):
     """The runs of a batch: their trajectories, None where a run failed, and why those failed, by
     number.
 
-    What is stacked has one row a run; rows of failed runs, and times behind a run's last one, are
+    Stacked tensors have one row a run; rows of failed runs, and times behind a run's last one, are
     NaN. `mask` (runs, T) says where there is something; take losses over it: NaN times zero is NaN,
     in gradients too.
     """
@@ -143,12 +143,12 @@ def simulate_batch(
 ) -> Batch:  # fmt: skip
     """`simulate` for many runs at once, in `threads` threads, one a core by default.
 
-    What differs from run to run has one entry for each: `parameters` by name (runs, ...), y0 (runs,
-    size), dy0 (runs, size, n), `reference`, t, `knots`, and even the rig; what they share is given
-    once: one rig, t (T,), y0 (size,), one reference. Results do not depend on the number of
+    Arguments that differ from run to run have one entry for each: `parameters` by name (runs, ...),
+    y0 (runs, size), dy0 (runs, size, n), `reference`, t, `knots`, and even the rig; shared ones are
+    given once: one rig, t (T,), y0 (size,), one reference. Results do not depend on the number of
     threads. `options` are those of `simulate`, the same for every run. With gradient="discrete"
-    what is computed from the batch has a gradient by `parameters`, y0 and whatever else went in;
-    the backward sweeps run in threads too.
+    tensors computed from the batch have a gradient by `parameters`, y0 and other inputs; the
+    backward sweeps run in threads too.
 
     A run that fails, or that cannot begin with its own parameters, is reported in `failures` and by
     a warning (`SamplesFailed`), and leaves the others alone. `simulate` of that run alone says

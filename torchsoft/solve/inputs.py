@@ -1,4 +1,4 @@
-"""What a run is given: numbers in any usual form, and a start whose graph may be shared."""
+"""Inputs of a run: numbers in any usual form, and a start whose graph may be shared."""
 
 from typing import Any
 
@@ -31,7 +31,7 @@ class _Start(torch.autograd.Function):
 
 
 def freed(node: Any) -> bool:
-    """Whether what a node of autograd's graph, or one behind it, needs is gone."""
+    """Whether a node of autograd's graph, or one behind it, has lost its saved tensors."""
     seen, waiting = set(), [node]
     while waiting:
         one = waiting.pop()

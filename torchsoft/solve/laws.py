@@ -1,5 +1,5 @@
-"""A rig's laws as compiled code: each is compiled once for all models that have it, whatever their
-parameters' values.
+"""A rig's laws as compiled code: each is compiled once for all models that have it, for any values
+of their parameters.
 
 Laws of this package are known by their structure. Somebody's own code is run once more for every
 run, since nothing else tells whether a number that it reads has changed since.
@@ -50,7 +50,7 @@ def copied(
 
 
 class _Called(nn.Module):
-    """Some modules, and a function of them and of x: what a compiled law is traced from."""
+    """Some modules, and a function of them and of x, from which a compiled law is traced."""
 
     def __init__(self, function: Callable[..., Tensor], **modules: Any) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class _Called(nn.Module):
 
 
 def structure(module: object) -> Any:
-    """What decides a module's law beside its parameters' values, hashable: two modules of one
+    """Structure of a module's law, apart from its parameters' values, hashable: two modules of one
     structure have one law. None where that cannot be told: code that is neither this package's nor
     torch's, hooks, other attributes than numbers, text and functions of this package."""
     if isinstance(module, nn.Module) and type(module).__module__.startswith(
@@ -101,8 +101,7 @@ def _plain(value: object) -> bool:
 
 
 _laws: dict[Any, Law] = {}
-"""Laws that have been compiled, by what decides them: the structure of their modules, else their
-traced expressions."""
+"""Compiled laws, by the structure of their modules, else by their traced expressions."""
 
 _compiling = threading.Lock()
 

@@ -1,26 +1,26 @@
-"""What a finished run says of itself: whether its energies balance, and whether its pads are
-pressed beyond the theory."""
+"""Checks of a finished run: whether its energies balance, and whether its pads are pressed beyond
+the theory."""
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import Trajectory
 
 RESIDUAL = 0.05
 """Energy residual over the energy at the start and injected since, up to which a run passes without
-a warning: fifteen times what the hardest of the ready excitations leaves at steps of 2 ms."""
+a warning: fifteen times that of the hardest of the ready excitations at steps of 2 ms."""
 
 NEGLIGIBLE = 1e-9
 """Energy [J] too small to be judged."""
 
 SUPPLIED = 1e-9
-"""Part of that energy by which what is dissipated may fall: rounding."""
+"""Part of that energy by which the dissipated energy may fall: rounding."""
 
 COMPRESSED = 0.5
 """Part of its height by which a pad may be pressed in: linear elasticity ends well below."""
 
 
 def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
-    """Sentences on what is wrong with a finished run that has a ledger, by what they are about;
-    none if nothing is."""
+    """Sentences on the faults of a finished run that has a ledger, by their subject; none if there
+    are none."""
     run, found = trajectory, {}
     stored = sum(float(part[0].detach()) for part in run.energy.values())
     scale = max(stored + float(run.injected[-1].detach()), NEGLIGIBLE)

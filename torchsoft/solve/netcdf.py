@@ -62,7 +62,7 @@ def to_xarray(run: Trajectory) -> xr.Dataset:
 
 
 def recorded(run: Trajectory) -> list[tuple[str, Column]]:
-    """What the run left, by name."""
+    """Results of the run, by name."""
     time = ("time",)
     out: list[tuple[str, Column]] = []
     for name, value in run.channels.items():

@@ -1,4 +1,4 @@
-"""What a run of the stepper carries along and leaves behind, chunk by chunk, and how it fails."""
+"""State and results of a run of the stepper, chunk by chunk, and its failures."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,8 +12,8 @@ from torchsoft.solve.kernel.table import Array
 
 
 class SimulationFailed(RuntimeError):
-    """A run that ended early: when and why. `time` [s]; `trajectory` holds what was simulated until
-    then, if any."""
+    """A run that ended early: when and why. `time` [s]; `trajectory` holds the run until then, if
+    any."""
 
     def __init__(self, reason: str, time: float) -> None:
         super().__init__(reason)
@@ -23,7 +23,7 @@ class SimulationFailed(RuntimeError):
 
 @dataclass
 class Progress:
-    """What the stepper has produced so far: rows of the output grid, its steps, and its counters.
+    """Results of the stepper so far: rows of the output grid, its steps, and its counters.
 
     integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them.
     """
@@ -107,7 +107,7 @@ class Marching:
         self, plan: Plan, signals: Array, at_outputs: Array,
         before: tuple[Array, Array, Array, Array], rows: slice, tapes: tuple[Any, Any] | None,
     ) -> None:  # fmt: skip
-        """Note the steps that were taken, and what their derivatives need."""
+        """Note the steps that were taken, and the tape of their derivatives."""
         if len(plan.h) > 0:
             self.out.starts.append(plan.starts)
             self.out.end = float(plan.starts[-1] + plan.h[-1])

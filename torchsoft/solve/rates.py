@@ -1,5 +1,4 @@
-"""The compiled right-hand side of a rig, as a function of numpy arrays: what other integrators ask
-for."""
+"""The compiled right-hand side of a rig, as a function of numpy arrays, for other integrators."""
 
 import numpy as np
 

@@ -47,7 +47,7 @@ STEP = 2e-3
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during a run; `trajectory` holds what was simulated until then."""
+    """Ctrl-C during a run; `trajectory` holds the run until then."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         super().__init__()
@@ -65,15 +65,15 @@ def simulate(
     """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s]: tensors, numpy's arrays
     or lists, which are computed with in float64.
 
-    y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default.
+    y0 defaults to the paper's rig at rest. `reference` is followed by the rig, its own by default.
 
     Steps are chosen so that the error of each stays below rtol times the largest value so far plus
     atol, which counts nodal forces in N, lengths in mm, angles in rad; either alone brings the
     other, a tenth of rtol being atol. A motion is right long before its derivative is: rtol = 1e-3
     holds positions to 1e-4 of their range and forces to 1 %; the default, `RTOL`, ten times that
     and most derivatives to 1 %. With `step` [s] they are equal ones between the times t instead, no
-    longer than it. `knots` are the steps of another run (its `knots`), frozen: what a fit needs,
-    whose residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
+    longer than it. `knots` are the steps of another run (its `knots`), frozen, for a fit whose
+    residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
 
     gradient: with "discrete" the states, channels, forces, loads and stored energies of the result
     carry the exact gradient of the discrete run (of the steps that were taken, which are not
@@ -99,7 +99,7 @@ def simulate(
 
 
 class Task(NamedTuple):
-    """A run that may begin: what `simulate` was asked for, checked."""
+    """A run that may begin: the arguments of `simulate`, checked."""
 
     stepper: ImplicitStepper
     t: Tensor
@@ -118,7 +118,7 @@ def prepare(
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
     touch: Sequence[str] = (),
 ) -> Task:  # fmt: skip
-    """Checks what `simulate` is asked for; raises its `ValueError`s."""
+    """Checks the arguments of `simulate`; raises its `ValueError`s."""
     t = tensor("t", t)
     y0, knots, dy0 = (
         None if x is None else tensor(name, x)
@@ -151,8 +151,8 @@ def prepare(
 
 
 class RunOutcome(NamedTuple):
-    """A finished run: the states with what is needed to differentiate them, sensitivities of states
-    and of sums of forces where asked for, and its time [s]."""
+    """A finished run: the states with the tape to differentiate them, sensitivities of states and
+    of sums of forces where asked for, and its time [s]."""
 
     task: Task
     solved: Solved
@@ -171,7 +171,7 @@ def run(
     """Carry out a task by one of the compiled routes; `explained` looks for the cause of a failure,
     which takes seconds.
 
-    Raises `SimulationFailed` and `Interrupted` with what was simulated.
+    Raises `SimulationFailed` and `Interrupted` with the run so far.
     """
     stepper, t, bar = task.stepper, task.t, None
     if progress:
@@ -212,7 +212,7 @@ def run(
 def _check_wanted(
     gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool, touch: Sequence[str]
 ) -> None:
-    """Raises `ValueError` for a route that there is not, and for what belongs to another route."""
+    """Raises `ValueError` for an unknown route, and for arguments of another route."""
     if gradient not in get_args(Route):
         raise ValueError(
             f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}"
@@ -241,7 +241,7 @@ def _check_wanted(
 
 
 def _channels_of_touch(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
-    """Raises `ValueError` for what are no names of channels of touch, or of arrays of them."""
+    """Raises `ValueError` for names other than those of channels of touch, or of arrays of them."""
     known = Touch(rig)
     if not names:
         return ()

@@ -66,8 +66,8 @@ def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
     """Of a rig with massless pads about a state y (size,) at rest, pads settled, with the constant
     `reference`; constant loads out of balance there do not matter, touching and sticking points do.
 
-    Away from contact nodal forces and stretches fade by themselves, whatever the rest does: those
-    modes are left out. An angle counts by the radius of gyration.
+    Away from contact nodal forces and stretches fade by themselves, independently of the rest:
+    those modes are left out. An angle counts by the radius of gyration.
     """
     state, layout = rig.unpack(y, rig.follow(0.0, reference)), rig.layout
     acting = torch.ones(layout.size, dtype=torch.bool)

@@ -60,7 +60,7 @@ SMALLEST_TOLERANCE = 1e-10
 halved because of rounding."""
 
 NONE, START = np.zeros(0), np.zeros(3)
-"""What given steps do without: an array, and a clock."""
+"""Placeholders for given steps: an array, and a clock."""
 
 METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
@@ -140,7 +140,7 @@ class ImplicitStepper:
         stops: Array = NONE, times: Array = NONE, row: int = 0, rung: float = 0.0,
         starts: Array = NONE, h: Array = NONE, signals: Array,
     ) -> list[int]:  # fmt: skip
-        """One call of the compiled run; what it counted."""
+        """One call of the compiled run; its counts."""
         counts = np.zeros(7, np.int64)
         limits = Limits(self.tolerance, self.max_iterations, self.window)
         run = Run(
@@ -180,7 +180,7 @@ class ImplicitStepper:
         """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every
         compiled call.
 
-        The last yield is the complete run. With `segments` given, what the derivatives need is
+        The last yield is the complete run. With `segments` given, the data of the derivatives are
         appended to it, tapes for as long as they take less than `tape_bytes`, of the outputs only
         where the forces there are to be differentiated. Raises `SimulationFailed`, and `ValueError`
         for a start that is not finite.

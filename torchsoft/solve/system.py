@@ -1,9 +1,9 @@
 """A rig as the kernels take it: its laws compiled, its parameters as one vector, its lists as plain
 arrays.
 
-Everything is read from the modules when a run begins, so that what ran is what the modules were
-then, whatever becomes of them; the vector of parameters keeps its graph, and so gradients reach
-whatever the values were made of.
+Everything is read from the modules when a run begins, so that later changes of them do not matter;
+the vector of parameters keeps its graph, and so gradients reach the tensors that the values were
+made of.
 """
 
 import warnings
@@ -48,8 +48,8 @@ NOMINAL = 1e-3
 
 @contextmanager
 def independent() -> Iterator[None]:
-    """Graphs made inside keep copies of what they need backwards: what becomes of the modules does
-    not reach them."""
+    """Graphs made inside keep copies of their saved tensors: later changes of the modules do not
+    reach them."""
     with torch.autograd.graph.saved_tensors_hooks(lambda x: x.detach().clone(), lambda x: x):
         yield
 

@@ -1,5 +1,5 @@
-"""What step-size control needs to know of a rig: which errors count together and by what unit, and
-the reference's pieces."""
+"""Data of a rig for step-size control: which errors count together and by what unit, and the
+reference's pieces."""
 
 import ctypes
 from collections.abc import Callable
@@ -16,13 +16,12 @@ from torchsoft.solve.kernel.arrays import NO_SIGNALS, Errors, Signals
 from torchsoft.solve.kernel.table import Array
 
 UNITS = {"force": 1.0, "length": 1e-3, "angle": 1.0}
-"""What `atol` is counted in: nodal forces [N], displacements, stretches and positions [m], angles
-[rad]."""
+"""Units of `atol`: nodal forces [N], displacements, stretches and positions [m], angles [rad]."""
 
 
 def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
     """Parts of the state whose error is judged together: each pad's forces, each contact's
-    stretches, a body's position, its angle. A rate's error counts by what it displaces within a
+    stretches, a body's position, its angle. A rate's error counts by the displacement within a
     step. A position's size is how far it has come from y0."""
     first, last, rate, unit, size, origin = [], [], [], [], [], np.zeros(len(y0))
     layout = rig.layout
@@ -54,7 +53,7 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
 
 
 def part_name(rig: Rig, errors: Errors, number: int) -> str:
-    """What the error of a part is of, in words."""
+    """Quantity of a part's error, in words."""
     what = {
         "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
         "pose": "the pose of body", "rates": "the nodal velocities of pad",
@@ -71,7 +70,7 @@ class Followed:
     step may pass.
 
     A reference of pieces (`Profile`, `Sampled`, `Waves`) is evaluated by the kernel, any other one
-    by itself, called at every stage; what it raises then is kept in `error`.
+    by itself, called at every stage; its exceptions are kept in `error`.
     """
 
     def __init__(self, signals: Callable[[Tensor], Tensor], rig: Rig, reference: Reference) -> None:

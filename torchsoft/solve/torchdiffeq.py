@@ -179,7 +179,7 @@ def _augmented(func: Any) -> dict[str, Any]:
 
 
 def _rig_behind(func: Any) -> Any:
-    """What is integrated, inside whatever torchdiffeq has put around it."""
+    """The dynamics, inside any wrappers of torchdiffeq."""
     return _innermost(_augmented(func).get("func", _innermost(func)))
 
 

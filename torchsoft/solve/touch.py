@@ -1,10 +1,9 @@
-"""Channels of touch: what the recorded forces of a run are to sensors on pads, under them and at
-bodies.
+"""Channels of touch: recorded forces of a run as read by sensors on pads, under them and at bodies.
 
-`NAME.QUANTITY`, in an array `NAME.QUANTITY.NUMBER`: load_x, load_y, load_theta of a body (what
-contacts and pads do to it, world axes), force_x, force_y of a pad (what its base feels, in the
-base's axes; its moment is the channel M_NAME), normal and shear of a contact's points and of
-taxels, and the centre of their normal forces.
+`NAME.QUANTITY`, in an array `NAME.QUANTITY.NUMBER`: load_x, load_y, load_theta of a body (by
+contacts and pads, world axes), force_x, force_y of a pad (on its base, in the base's axes; its
+moment is the channel M_NAME), normal and shear of a contact's points and of taxels, and the centre
+of their normal forces.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,7 +41,7 @@ class Felt(NamedTuple):
         return total if self.over is None else total / self.lower(recorded)
 
     def lower(self, recorded: Tensor) -> Tensor:
-        """What a centre's moment is divided by (T,) [N]."""
+        """Divisor of a centre's moment (T,) [N]."""
         return recorded[:, torch.from_numpy(self.at)] @ torch.from_numpy(self.over) + LIGHT
 
 
@@ -126,7 +125,7 @@ class Touch:
         return name in self.single or (inside and str(int(number)) == number)
 
     def __getitem__(self, name: str) -> Felt:
-        """Raises `KeyError` naming what there is."""
+        """Raises `KeyError` naming the channels that there are."""
         if name not in self:
             raise KeyError(f"there is no channel of touch `{name}`, but there are {self.shown}")
         if name in self.single:
@@ -145,8 +144,7 @@ class Touch:
         return tuple(one for name in names for one in numbered(name) or [name])
 
     def sums(self, names: Sequence[str]) -> Sums:
-        """What the channels are made of: each one's sum, and then those that centres are divided
-        by."""
+        """Weights of the channels: each one's sum, and then the divisors of centres."""
         felt = [self[name] for name in names]
         parts = [(one.at, one.weight) for one in felt]
         parts += [(one.at, one.over) for one in felt if one.over is not None]

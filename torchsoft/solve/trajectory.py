@@ -1,5 +1,4 @@
-"""What a simulation leaves behind: times, states, nodal forces, efforts, energies, and how it was
-made."""
+"""Results of a simulation: times, states, nodal forces, efforts, energies, and their origin."""
 
 from __future__ import annotations
 
@@ -48,18 +47,18 @@ class Stats:
 class Trajectory(Shown):
     """A run sampled at t (T,) [s]. SI units, every tensor float64 and shaped (T, ...).
 
-    y: flat states (T, size). channels: what can be measured or was asked for, by key, (T,) each.
-    force: normal and friction force (T, points, 2) [N] on the points of each contact, along n and t
-    of their moving frames. recorded (T, recorded): all forces, of which `touch` makes its channels,
-    `run["skin.normal.7"]`; both None in a run that was loaded. loads: what the contacts and pads do
-    to each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement:
-    of the nodes of each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated,
+    y: flat states (T, size). channels: measurable or requested series, by key, (T,) each. force:
+    normal and friction force (T, points, 2) [N] on the points of each contact, along n and t of
+    their moving frames. recorded (T, recorded): all forces, of which `touch` makes its channels,
+    `run["skin.normal.7"]`; both None in a run that was loaded. loads: those of contacts and pads on
+    each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement: of
+    the nodes of each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated,
     supplied and `injected` [J] since t[0].
 
     units: of the channels, by key, as far as the rig knows them.
 
-    setup: meshes, outlines, contacts and actuators as they were, for pictures and files; rig: what
-    ran, None in a run that was loaded.
+    setup: meshes, outlines, contacts and actuators as they were, for pictures and files; rig: the
+    rig of the run, None in a run that was loaded.
 
     knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the
     same ones.
@@ -258,8 +257,8 @@ def save(data: xr.Dataset, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> xr.Dataset:
-    """What `save` wrote. Raises `ValueError` for any other file and for one that is damaged, and
-    `OSError`."""
+    """The run in a file of `save`. Raises `ValueError` for any other file and for one that is
+    damaged, and `OSError`."""
     import xarray as xr
 
     content = BytesIO(unsealed(path))
@@ -275,7 +274,7 @@ def channels(
     """Every channel of states (...) by its key: coordinates and rates of the bodies, signals,
     efforts, moments.
 
-    A moment is what the bonded nodes give (Eq. 35), with undeformed arms; the graph's, which a
+    A moment is that of the bonded nodes (Eq. 35), with undeformed arms; the graph's, which a
     turning base feels and which conserves power, has deformed ones.
     """
     out: dict[str, Tensor] = {}
@@ -296,7 +295,7 @@ def channels(
 
 
 def units(rig: Rig) -> dict[str, str]:
-    """SI unit of every channel, by its key; a signal's follows from what uses it."""
+    """SI unit of every channel, by its key; a signal's follows from its use."""
     out: dict[str, str] = {}
 
     def signal(name: str, unit: str) -> None:

@@ -2,8 +2,8 @@
 
 The stage's relations are differentiated as they stand (implicit function theorem) and solved
 backwards. Cotangents: phi of the nodal forces, mu of the points' forces, nu of the free
-coordinates' equations, sigma of a point's displacement, omega of its rate; "_bar" of what it is put
-behind.
+coordinates' equations, sigma of a point's displacement, omega of its rate; "_bar" marks the
+cotangent of a name.
 """
 
 from typing import Any
@@ -226,8 +226,8 @@ def inertial_state(
 
 @compiled
 def load_cotangent(s: Any, z: Any, c: int, row: int) -> float:
-    """Of the load that contact c puts on coordinate `row` of its body and its pad's base. What
-    moves an inertial pad's base is the force in the pad."""
+    """Of the load that contact c puts on coordinate `row` of its body and its pad's base. An
+    inertial pad's base is moved by the force in the pad."""
     if s.pad_v_start[s.contact_pad[c]] >= 0 and 3 <= row < 5:
         return 0.0
     return z.load[s.contact_coordinate[c, row]]
@@ -240,7 +240,7 @@ def seed(
 ) -> None:  # fmt: skip
     """Cotangents of the law's outputs at the touching points into z.out, of loads and of the pads'
     forces and moments into z.load and z.wrenches; those of the forces in inertial pads go on to
-    what they are made of."""
+    displacements and rates."""
     z.load[:], z.wrenches[:] = 0.0, 0.0
     felt, points, pads = forces_bar.size > 0, s.point_contact.size, s.pad_base.size
     if felt:

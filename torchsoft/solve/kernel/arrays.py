@@ -1,5 +1,4 @@
-"""The arrays that the kernels work on: what a rig is made of, what it follows, and the tape of a
-run.
+"""Arrays of the kernels: parts of a rig, its reference, and the tape of a run.
 
 A rig has coordinates (x, y, theta) of its bodies, three each, and last those of the ground, which
 are zero. A coordinate is free (a component of the state) or follows a signal. "At" in a name is a
@@ -204,13 +203,13 @@ NO_SIGNALS = Signals(
     0,
     np.zeros(1),
 )
-"""What given steps follow: nothing."""
+"""Reference of given steps: none."""
 
 
 @table
 class Errors(NamedTuple):
     """Parts of the state whose error is judged together: first and last component, 1 for a rate,
-    its absolute tolerance, its largest size so far; origin (size,): what sizes are counted from."""
+    its absolute tolerance, its largest size so far; origin (size,) of those sizes."""
 
     first: Index
     last: Index
@@ -228,7 +227,7 @@ NO_ERRORS = Errors(
     np.zeros(0),
     np.zeros(0),
 )
-"""What given steps are judged by: nothing."""
+"""Tolerances of given steps: none."""
 
 
 SCRATCH: dict[str, dict[str, str]] = {
@@ -379,7 +378,7 @@ class Outputs(NamedTuple):
 
 @table
 class Run(NamedTuple):
-    """Arguments of `run`, whose docstring says what they are."""
+    """Arguments of `run`, explained in its docstring."""
 
     s: Annotated[Any, System]
     s0: Annotated[Any, System]

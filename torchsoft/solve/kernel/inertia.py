@@ -31,7 +31,7 @@ def stiffness_force(s: Any, pad: int, u: Array, out: Array) -> None:
 @compiled
 def elastic_wrench(s: Any, w: Any, pad: int, y: Array, wrench: Array) -> None:
     """Force and moment in a pad, sums of K (u + tau u') at the state y with the rates in w.k: in a
-    stage of no length F - M v' would be what rounding leaves of them."""
+    stage of no length F - M v' would be rounding."""
     first, last, U = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_y_start[pad]
     strain, force = w.inertial[0, first:last], w.inertial[1, first:last]
     for i in range(last - first):
@@ -77,7 +77,7 @@ def base_velocity(s: Any, pad: int, V: Array, q: Array) -> Any:
 
 @compiled
 def couple_point(s: Any, w: Any, pad: int, k: int, c: int, K: Array, H: Array, Rv: Array) -> None:
-    """What the base's velocity does to the rate of point k, in Hc and Rv."""
+    """Contribution of the base's velocity to the rate of point k, in Hc and Rv."""
     cos, sin, base, free = w.frame[c, 0], w.frame[c, 1], s.pad_base[pad], s.body_free
     for axis in range(2):
         towards = free[base + axis]

@@ -11,8 +11,8 @@ eliminating f leaves A F = b + Hc dV with A = 1 - N^T H_u N P, and the bodies' e
 Rv dV + r. Newton's iteration, the tangent and, transposed, the adjoint solve this one block.
 
 Derivatives of a point by (u (2), body (3), base (3)): S by positions, H = T + a h S by rates of the
-stage, T by velocities; G is what a force does to (body, base), L the derivative of that by
-positions at the same force.
+stage, T by velocities; G maps a force to (body, base), L is the derivative of that by positions at
+the same force.
 """
 
 from typing import Any
@@ -85,8 +85,8 @@ def apply_law(s: Any, w: Any, k: int, stretch: float, a: float) -> None:
 
 @compiled
 def mobility_scale(s: Any, pad: int, a: float) -> float:
-    """What the stored mobility is multiplied with: sum of J / (tau + a h) over the chain, by 1 / (E
-    depth); 1 for inertial pads."""
+    """Factor of the stored mobility: sum of J / (tau + a h) over the chain, by 1 / (E depth); 1 for
+    inertial pads."""
     if s.pad_v_start[pad] >= 0:
         return 1.0
     at, n, p, total = s.pad_chain_at[pad], s.pad_branches[pad], s.p, 0.0
@@ -103,9 +103,9 @@ def softness(s: Any, pad: int) -> float:
 
 @compiled
 def set_in(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """What a stage starts from: zeta = sum of J z and sum of J z / (tau + a h) over a massless
-    pad's chain and its support (`w.low`, `w.high` come later); an inertial pad's u' without contact
-    and motion of its base."""
+    """Start of a stage: zeta = sum of J z and sum of J z / (tau + a h) over a massless pad's chain
+    and its support (`w.low`, `w.high` come later); an inertial pad's u' without contact and motion
+    of its base."""
     p = s.p
     first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
     if s.pad_v_start[pad] >= 0:
@@ -136,8 +136,8 @@ def branch_rate(s: Any, w: Any, pad: int, b: int, i: int, F: Array, y: Array, a:
 
 @compiled
 def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> None:
-    """u* and the rates without contact of the surface nodes from `low` to `high`, from what
-    `set_in` left."""
+    """u* and the rates without contact of the surface nodes from `low` to `high`, from the result
+    of `set_in`."""
     first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
     if s.pad_v_start[pad] >= 0:
         i0 = s.inertia_dof_start[pad]

@@ -1,5 +1,4 @@
-"""The small linear solves of a stage and what else is done to arrays, in place and without
-allocation.
+"""Small linear solves of a stage and other operations on arrays, in place and without allocation.
 
 Inner loops run over views from 0 on: an index that might be negative, as Python allows, keeps a
 loop from being vectorised.

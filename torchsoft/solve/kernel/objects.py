@@ -1,9 +1,9 @@
 """Object files of the kernels: found, checked, loaded and called; made where there are none.
 
 An object file is named after the sources of the kernels and a level of processors, and carries its
-checksum. A file counts only if it belongs to whoever may change this program anyway. What cannot be
-read is compiled again, which needs numba; where nothing can be written, every start compiles, and
-says so.
+checksum. A file counts only if it belongs to whoever may change this program anyway. A file that
+cannot be read is compiled again, which needs numba; where nothing can be written, every start
+compiles, and says so.
 """
 
 import ctypes
@@ -48,7 +48,7 @@ LEVELS = {
         llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     ),
 }  # fmt: skip
-"""Levels of processors: LLVM's triple, processor and features. `native` is whatever runs this."""
+"""Levels of processors: LLVM's triple, processor and features. `native` is this machine."""
 
 NEEDED = {
     "linux-x86-64-v3": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
@@ -126,7 +126,7 @@ def checksum(path: Path, content: bytes) -> bytes:
 
 
 def read(path: Path) -> bytes | None:
-    """What `write` has put there; None where that is nothing, damaged, or another user's."""
+    """Content written by `write`; None where there is none, or it is damaged or another user's."""
     if not path.is_file():
         return None
     try:

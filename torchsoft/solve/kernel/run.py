@@ -119,11 +119,12 @@ def run(r: Any) -> None:
     """Take up to h.size steps. `s` are the rig's arrays, `s0` those for a stage of no length.
 
     starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages, and the
-    steps and parts of the outputs. With `given` these say what to do. Otherwise they receive what
-    is done, from the output `row` on, until the last of t_out; the tolerances choose: clock holds
-    the time, the next step's length and the last step's error, k the rates at y. No step passes a
-    time of `stops`, whose last is t_out's. A positive `rung` [s] is the only length allowed, for
-    arrays `s` that belong to it: the call ends when the controller wants half of it or twice.
+    steps and parts of the outputs. With `given` these prescribe the steps. Otherwise they receive
+    the steps taken, from the output `row` on, until the last of t_out; the tolerances choose: clock
+    holds the time, the next step's length and the last step's error, k the rates at y. No step
+    passes a time of `stops`, whose last is t_out's. A positive `rung` [s] is the only length
+    allowed, for arrays `s` that belong to it: the call ends when the controller wants half of it or
+    twice.
 
     `tape` has two rows a step, or none. y, `integrals` and the guesses in w are advanced in place;
     after a failure they hold the last good step. With no steps the one output is that of y itself.

@@ -1,5 +1,5 @@
-"""One implicit step: SDIRK2, its running energy integrals, its dense output, and what ends a run
-early.
+"""One implicit step: SDIRK2, its running energy integrals, its dense output, and causes of an early
+end.
 
 SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable, stiffly accurate,
 of second order, both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both. The
@@ -29,7 +29,7 @@ from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
 from torchsoft.solve.kernel.table import Array
 
 TINY = 1e-60
-"""Components of the state below this are set to zero, so that what decays does not end in denormal
+"""Components of the state below this are set to zero, so that decaying ones do not become denormal
 numbers."""
 
 
@@ -77,8 +77,8 @@ def gone(s: Any, w: Any) -> int:
 
 @compiled
 def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
-    """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the
-    positive ones."""
+    """Powers [W] of the actuators, of gravity, of the drives of bodies, and the sum of the positive
+    ones."""
     at = s.pad_base.size + 2
     x, out, J = w.effort_x, w.effort, w.effort_J
     for i in range(s.act_pushed.size):
@@ -159,7 +159,7 @@ def solve_near(
 def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
     """One step of h [s] from y, which goes to its end with `integrals`; signals (2, signals, 2) are
     those of the stages, `row` the first one's on the tape. The start stays in d.y, d.integrals;
-    d.K, d.powers and d.speed receive what the stages found. Returns status and solves."""
+    d.K, d.powers and d.speed receive the stages' results. Returns status and solves."""
     s, w, d, y, integrals, tape = r.s, r.w, r.d, r.y, r.integrals, r.tape
     a, solves = GAMMA * h, 0
     put(y, d.y)

@@ -29,7 +29,7 @@ NEGLIGIBLE_PART = 1e-17
 """Part of the largest derivative of nodal forces below which a node's counts as none."""
 
 RESCAN = 64
-"""Steps between two looks for what has become negligible."""
+"""Steps between two searches for negligible derivatives."""
 
 
 @compiled
@@ -51,8 +51,8 @@ def law_derivatives(
 
 @compiled
 def find_span(s: Any, y: Array, dy: Array, span: Array) -> None:
-    """Per pad the first surface dof that is loaded or has a derivative, and the end; what is
-    negligible becomes zero."""
+    """Per pad the first surface dof that is loaded or has a derivative, and the end; negligible
+    derivatives become zero."""
     for pad in range(s.pad_base.size):
         size, start = 2 * (s.pad_node_start[pad + 1] - s.pad_node_start[pad]), s.pad_y_start[pad]
         span[pad, 0], span[pad, 1] = size, 0
@@ -342,8 +342,8 @@ def nodal_rates(s: Any, w: Any, z: Any, pad: int, a: float, m: int) -> None:
 
 @compiled
 def add_output(s: Any, w: Any, z: Any, k: int, H: Array, factor: float, out: Array) -> None:
-    """Add to `out` (m,) what the nodal rates and the velocities do to an output of the law at point
-    k, whose derivatives by them are H (8,)."""
+    """Add to `out` (m,) the effect of the nodal rates and the velocities on an output of the law at
+    point k, whose derivatives by them are H (8,)."""
     for j in range(2):
         N, slot = s.point_N[k, j], w.slot[s.point_node[k, j]]
         for o in range(2 if N != 0.0 else 0):
@@ -357,7 +357,7 @@ def add_output(s: Any, w: Any, z: Any, k: int, H: Array, factor: float, out: Arr
 @compiled
 def add_loads(s: Any, z: Any, k: int, by: Array, change: Array) -> None:
     """Add the loads `by` (6, n) times `change` (n, m) of point k on its body and its pad's base to
-    z.recorded. What moves an inertial pad's base is the force in the pad."""
+    z.recorded. An inertial pad's base is moved by the force in the pad."""
     c, start = s.point_contact[k], 2 * s.point_contact.size + 3 * s.pad_base.size
     inertial = s.pad_v_start[s.contact_pad[c]] >= 0
     for o in range(6):
