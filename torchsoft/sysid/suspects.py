@@ -54,12 +54,13 @@ def assumption_notices(checked: Checked) -> list[str]:
             for channel, size in sorted(left.items(), key=lambda item: -item[1])
         )
         out.append(f"none of {len(checks)} suspects explains {sizes}")
+    moved_on = any(c.refitted and c.suspected for c in checks)  # to another end than the fit's
     for c in checks:
         if c.kind == "numerical" and c.unchecked:
             out.append(f"it could not be checked what it does that {c.stated}: {c.unchecked}")
         elif c.kind == "numerical" and not c.suspected and c.favoured_sd > MOVED:
             label, move = c.most_moved
-            if abs(move) > MOVED:
+            if abs(move) > MOVED and not moved_on:
                 out.append(
                     f"{label} hangs on a constant of the computation: {c.stated}; if {c.otherwise} "
                     f"it would move by {abs(move):.2g} standard deviations, and the data cannot "
