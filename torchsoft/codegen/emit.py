@@ -169,7 +169,7 @@ def _engine(source: str) -> llvm.ExecutionEngine:
     module.triple = target.triple
     module.data_layout = str(machine.target_data)
     module.verify()
-    engine = llvm.create_mcjit_compiler(module, machine)
+    engine = llvm.create_mcjit_compiler(module, machine, use_lmm=True)  # see kernel.objects.load
     engine.finalize_object()
     return engine
 

@@ -209,14 +209,18 @@ def build(name: str) -> bytes:
 
 
 def load(name: str) -> Any:
-    """An entry as a function of a table's address."""
+    """An entry as a function of a table's address.
+
+    Its sections lie in one block (`use_lmm`): elsewhere they may be further apart than a relative
+    address of 32 bits reaches, in a process that has loaded gigabytes of CUDA.
+    """
     content = found(name) or build(name)
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     if llvm.address_of_symbol("log1p") is None and (path := ctypes.util.find_library("m")):
         llvm.load_library_permanently(path)
     machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine, use_lmm=True)
     engine.add_object_file(llvm.ObjectFileRef.from_data(content))
     engine.finalize_object()
     room = (ctypes.c_int64 * 1)(), (ctypes.c_int64 * 1)()  # of results and errors: there are none
