@@ -53,8 +53,6 @@ def findings(url: str) -> Iterator[str]:
     except ValueError as error:
         yield f"{MANIFEST}: its configuration is impossible: {error}"
         return
-    if not manifest.commit:
-        yield f"{MANIFEST}: no commit; the dataset was made outside a repository"
     if manifest.config_hash != config.hash:
         yield (
             f"{MANIFEST}: config_hash is {manifest.config_hash}, but the configuration's is "
