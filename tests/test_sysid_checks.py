@@ -12,7 +12,16 @@ from conftest import COARSE
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid import (
+    Problem,
+    Recording,
+    Sensor,
+    Stage,
+    Unknown,
+    identify,
+    record,
+    sensitivity,
+)
 from torchsoft.sysid.assumptions import (
     PLACE,
     Variation,
@@ -26,7 +35,7 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
-from torchsoft.sysid.refits import AMOUNTS, End, difference, joint_fit, refit, varied
+from torchsoft.sysid.refits import AMOUNTS, End, Joint, difference, joint_fit, refit, varied
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
@@ -36,6 +45,7 @@ from torchsoft.sysid.sensitivity import (
     check_assumptions,
     compared,
     doubted,
+    new_fits,
     rivals,
 )
 from torchsoft.sysid.suspects import assumption_notices
@@ -288,6 +298,33 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     assert max(found.parts, key=lambda name: found.parts[name]) == "disc.mass"
     assert 0.95 < found.parts["disc.mass"] < 1.05
     assert np.exp(found.at["pad.E"]) == pytest.approx(TRUTH["pad.E"], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("left", "cause", "tried"),
+    [(10.0, "b", ["b"]), (10.0, "nothing", ["b", "a", "law"]), (500.0, "law", ["law"])],
+)
+def test_a_joint_fit_decides_what_is_tried(left, cause, tried, monkeypatch):
+    """Where it explains the data, numbers by their part of it; where not, no number before a law."""
+    taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
+    taken.append(Variation("law", "law", "", "", vary=lambda r: r))
+    gains = {"a": 300.0, "b": 200.0, "law": 100.0}
+    checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
+    judge: Any = SimpleNamespace(
+        square=1000.0,
+        takes_nearly_all=lambda gain: gain > 900,
+        nearly=lambda one: one.gain > 900,
+        fit=lambda one, again, stated, linear: replace(
+            linear, gain=950.0 if one.name == cause else 1.0
+        ),
+    )
+    joint = Joint({}, left, {"a": 0.25, "b": 0.9})
+    monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)
+    monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
+    end: Any = SimpleNamespace(far=True)
+    problem: Any = None
+    found = [one.name for one in new_fits(problem, end, taken, "linear", judge, checks, False)]
+    assert found == tried
 
 
 @pytest.mark.parametrize(("second", "near"), [(250.0, ["a", "b"]), (80.0, [])])

@@ -166,7 +166,8 @@ def joint_fit(
     first fit began; None where there is none.
 
     A fit that lacks something may end far from the truth, where tests to first order rank suspects
-    wrongly. The joint fit ends near it, and there they rank them rightly.
+    wrongly. The joint fit ends near it, and there they rank them rightly. Where it does not explain
+    the data, none of its suspects does alone.
     """
     other, tried = problem, list[Variation]()
     for one in suspects:

@@ -215,7 +215,8 @@ def check_assumptions(
             candidates = look(suspects.values(), checks)
         if explain and candidates:
             untried = [f"a new fit with another {one.name}" for one in candidates]
-            for one in new_fits(problem, end, candidates, loss, judge, checks, progress):
+            at_end = end._replace(rtol=rtol) if explained else end  # rivals differ by little
+            for one in new_fits(problem, at_end, candidates, loss, judge, checks, progress):
                 untried.remove(f"a new fit with another {one.name}")
             untried, candidates = [], []
     except KeyboardInterrupt:  # the fit is done: what was tried is kept
@@ -243,9 +244,10 @@ def new_fits(
         if end.far:
             bar.set_description("new fit with all suspects unknown at once")
             joint = joint_fit(problem, end, candidates, loss, notify)
-            if joint is not None and judge.takes_nearly_all(judge.square - joint.left):
-                gains |= {name: part * judge.square for name, part in joint.parts.items()}
-            else:
+        if joint is not None:
+            gains |= {name: part * judge.square for name, part in joint.parts.items()}
+            if not judge.takes_nearly_all(judge.square - joint.left):  # none of them alone does
+                gains |= dict.fromkeys(joint.parts, 0.0)
                 joint = None
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, None, loss, notify)
