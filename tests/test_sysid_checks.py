@@ -305,7 +305,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     [(10.0, "b", ["b"]), (10.0, "nothing", ["b", "a", "law"]), (500.0, "law", ["law"])],
 )
 def test_a_joint_fit_decides_what_is_tried(left, cause, tried, monkeypatch):
-    """Where it explains the data, numbers by their part of it; where not, no number before a law."""
+    """Where it explains the data, numbers by their part; where not, no number before a law."""
     taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
