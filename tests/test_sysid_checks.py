@@ -312,7 +312,7 @@ def test_a_joint_fit_decides_what_is_tried(left, cause, tried, monkeypatch):
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
-        takes_nearly_all=lambda gain: gain > 900,
+        nearly_all=lambda left: left < 100,
         nearly=lambda one: one.gain > 900,
         fit=lambda one, again, stated, linear: replace(
             linear, gain=950.0 if one.name == cause else 1.0

@@ -246,7 +246,7 @@ def new_fits(
             joint = joint_fit(problem, end, candidates, loss, notify)
         if joint is not None:
             gains |= {name: part * judge.square for name, part in joint.parts.items()}
-            if not judge.takes_nearly_all(judge.square - joint.left):  # none of them alone does
+            if not judge.nearly_all(joint.left):  # none of them alone does
                 gains |= dict.fromkeys(joint.parts, 0.0)
                 joint = None
         bar.set_description("new fit with all assumptions")
@@ -336,11 +336,11 @@ class Judge:
 
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""
-        return self.explained([one]) or (one.refitted and self.takes_nearly_all(one.gain))
+        return self.explained([one]) or (one.refitted and self.nearly_all(one.left))
 
-    def takes_nearly_all(self, gain: float) -> bool:
-        """Whether a fall of the sum of squares leaves next to nothing above the noise."""
-        return gain > NEARLY * (self.square - self.dof) > 0.0
+    def nearly_all(self, left: float) -> bool:
+        """Whether a sum of squares leaves next to nothing above the noise."""
+        return self.square - left > NEARLY * (self.square - self.dof) > 0.0
 
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
