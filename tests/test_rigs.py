@@ -205,6 +205,7 @@ def test_motions_go_through_what_they_are_given(tmp_path):
     (tmp_path / "x.csv").write_text(
         "\ufefft [ms], note [mm], x_d [mm]\n0,7,1\n500,,2\n1000,7,4\n", encoding="utf-8"
     )
+    (tmp_path / "y.csv").write_text("Time (ms),Stage x (mm)\n0,1\n500,2\n1000,4\n")
     knots = {"times": (0.2, 1.0), "values": ("start", 5e-3)}
     for table, expected in (
         ({"kind": "hold"}, {0.0: 0.0, 1.0: 0.0}),
@@ -217,6 +218,8 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         {0.5: 0.0, 1.25: -1e-3 * -1, 1.0: 0.0}),
         ({"kind": "csv", "file": "x.csv", "column": "x_d", "offset": 1e-3},
         {0.0: 2e-3, 0.5: 3e-3, 1.0: 5e-3, 2.0: 5e-3}),
+        ({"kind": "csv", "file": "y.csv", "column": "Stage x", "time": "Time"},
+        {0.0: 1e-3, 0.5: 2e-3, 1.0: 4e-3}),
     ):  # fmt: skip
         x = motion(table, tmp_path)
         for time, value in expected.items():
@@ -231,7 +234,11 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         ("t [s],x_d [mm]\n0,0\n1,1\n", r"x\.csv ends at 1 s, but the run lasts until 2 s"),
         (
             "t [s],x [mm]\n0,0\n1,1\n",
-            r"x\.csv has no column `x_d \[m\]`, in this unit .*; it has `t`, `x`",
+            r"x\.csv has no column `x_d \[m\]`, in this unit .*; it has `t`, `x`; .* in `column`",
+        ),
+        (
+            "Time (s),x_d (m)\n0,0\n1,1\n",
+            r"x\.csv has no column `t \[s\]`, .*; it has `Time`, `x_d`; say which one in `time`",
         ),
         (
             "t [s],x_d [N]\n0,0\n1,1\n",
