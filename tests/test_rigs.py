@@ -17,6 +17,7 @@ from PIL import Image
 
 from torchsoft import Parameters, SoftGrasp, press, simulate
 from torchsoft.cli import main
+from torchsoft.materials.presets import from_shore_a
 from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
@@ -199,6 +200,26 @@ def motion(
     file._folder = folder or Path()
     signal = file.build().rig.reference["x_d"]
     return lambda t: float(signal(torch.tensor(t, dtype=torch.float64))[0].detach())
+
+
+def test_a_hardness_stands_for_a_modulus(tmp_path, monkeypatch, capsys):
+    """With a note of which; `init` begins with a rubber of the literature."""
+    monkeypatch.chdir(tmp_path)
+    tree = template("t").model_dump(exclude_unset=True)
+    del tree["materials"]["rubber"]["E"]
+    tree["materials"]["rubber"]["shore_a"] = 30
+    with pytest.warns(UserWarning, match=r"shore_a = 30 is taken for E = 1\.14 MPa, the estimate"):
+        file = RigFile.from_tree(tree)
+    assert file.materials["rubber"].build(tmp_path).E.item() == from_shore_a(30)
+    assert file.override(materials={"rubber": {"E": 1e6}}).assemble().parameter("materials.rubber.E") == 1e6
+    for wrong, sentence in ((90, "hardness must be from 20 to 80"), ("a", r"a number \[Shore A\]")):
+        tree["materials"]["rubber"]["shore_a"] = wrong
+        with pytest.raises(ValueError, match=rf"materials\.rubber: shore_a: .*{sentence}"):
+            RigFile.from_tree(tree)
+    assert main(["init", "skin", "--material", "Dragon Skin 30"]) == 0
+    assert RigFile.from_toml("skin.toml").build().rig.parameter("materials.rubber.E") == from_shore_a(30)
+    assert main(["init", "other", "--material", "Dragon"]) == 2
+    assert "did you mean `Dragon Skin 30`?" in capsys.readouterr().err
 
 
 def test_motions_go_through_what_they_are_given(tmp_path):

@@ -42,6 +42,7 @@ def add_commands(commands: Any) -> None:
     )
     one = add_command(commands, "init", init_rig, "write a rig file to start from", INIT)
     one.add_argument("name", metavar="NAME", help="the file's name, with or without .toml")
+    one.add_argument("--material", help="a rubber of `torchsoft material presets` for its pads")
 
 
 def run_rig(options: argparse.Namespace) -> int:
@@ -106,10 +107,14 @@ def init_rig(options: argparse.Namespace) -> int:
         return failed(
             f"NAME should be the name of a file, such as mine or mine.toml, not {options.name!r}"
         )
+    rig = template(path.stem)
+    if options.material is not None:
+        rubber = {"kind": "preset", "name": options.material, "depth": 44e-3}
+        rig = rig.override(materials={"rubber": rubber})
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write(to_toml(template(path.stem)))
+            file.write(to_toml(rig))
     except FileExistsError:
         return failed(f"{path} is there already; take another name")
     check, run = (shlex.join(["torchsoft", command, str(path)]) for command in ("check", "run"))
