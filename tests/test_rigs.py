@@ -472,6 +472,12 @@ def test_run_writes_everything(small, tmp_path, capsys):
         RigFile.model_validate_json(json.dumps(summary["file"])).model_dump()
         == RigFile.from_toml(small).model_dump()
     )
+    few = RigFile.from_toml(small).override(
+        outputs={"figures": False, "player": True, "video": "none"}
+    )
+    running.run(few, tmp_path / "few")
+    names = {path.name for path in (tmp_path / "few").iterdir()}
+    assert names == {"trajectory.nc", "summary.json", "player.html"}
 
 
 def test_what_is_wrong_is_not_run_unless_it_is_meant(small, tmp_path, capsys):

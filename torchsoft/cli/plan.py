@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, say, try_folder
+from torchsoft.cli.results import add_command, add_out, add_progress, say, try_folder
 
 PLAN = """\
 Which motion brings the rig where it is wanted?
@@ -26,7 +26,7 @@ def add_commands(commands: Any) -> None:
     said = "draw what an identification of the rig leaves unknown"
     one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=said)
     add_out(one, default=Path("out/plan"), help="folder for the results (%(default)s)")
-    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    add_progress(one)
 
 
 def plan(options: argparse.Namespace) -> int:
@@ -43,7 +43,7 @@ def plan(options: argparse.Namespace) -> int:
 
         known = load_answer(options.answer).draws(goal.draws, seed=goal.seed)
     try_folder(options.out, options.force)
-    found, written = plan_file(file, goal, known, progress=not options.no_progress)
+    found, written = plan_file(file, goal, known, progress=options.progress)
     with replacing(options.out / "motion.toml") as partial:
         partial.write_text(to_toml(located(written)), encoding="utf-8")
     write_json(options.out / "plan.json", found.summary())
