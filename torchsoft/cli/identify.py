@@ -138,7 +138,7 @@ def identify(options: argparse.Namespace) -> int:
     if result.made_by["untried"]:
         say(f"\ninterrupted; the same command continues with what is in {unfinished}", error=True)
     say(
-        f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and "
+        f"fitted in {result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and "
         f"{options.out / 'report.html'}"
     )
     return 130 if result.made_by["untried"] else 0
