@@ -14,8 +14,8 @@ motion whose knots may move (low, high, speed, after) and every number of the fi
 (low, high), [targets.NAME] (channel, value, tolerance, at) and [limits.NAME] (channel, low, high,
 since, until). With [uncertain."NUMBER"] (low, high) the plan is made for draws of them; with
 --answer, the file of an identification with `rig = "RIG.toml"`, for draws of what that leaves
-unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json and run.nc;
-the exit status is 1 where a target or limit is not kept."""
+unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json, run.nc
+and run.png; the exit status is 1 where a target or limit is not kept."""
 
 
 def add_commands(commands: Any) -> None:
@@ -32,6 +32,8 @@ def add_commands(commands: Any) -> None:
 def plan(options: argparse.Namespace) -> int:
     """Plan, and write the motion."""
     from torchsoft.files import replacing, write_json
+    from torchsoft.plot.dashboard import dashboard
+    from torchsoft.plot.figures import save
     from torchsoft.rigs.build import RigFile
     from torchsoft.rigs.goal import Goal, plan_file
     from torchsoft.rigs.written import located, to_toml
@@ -48,6 +50,7 @@ def plan(options: argparse.Namespace) -> int:
         partial.write_text(to_toml(located(written)), encoding="utf-8")
     write_json(options.out / "plan.json", found.summary())
     found.trajectory.save(options.out / "run.nc")
+    save(dashboard(found.trajectory, title=written.title), options.out / "run.png")
     say(found)
-    say(f"written to {options.out / 'motion.toml'}, plan.json and run.nc")
+    say(f"written to {options.out / 'motion.toml'}, plan.json, run.nc and run.png")
     return 0 if found.reached else 1
