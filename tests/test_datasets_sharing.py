@@ -146,13 +146,21 @@ def test_the_job_array_makes_its_part(made, half, tmp_path, monkeypatch, capsys)
 
 def test_an_estimate_is_measured_on_the_sets_own_runs(made, tmp_path, monkeypatch):
     """Of what is left; the first run, which loads kernels, does not count."""
-    pauses = iter((0.5, *3 * (0.05,)))
-    slow = lambda *_: time.sleep(next(pauses)) or {"steps": 7}
+    now, times = [0.0], iter((0.5, *4 * (0.04, 0.06)))
+    monkeypatch.setattr(generation.time, "thread_time", lambda: now[0])
+
+    def slow(*_):
+        now[0] += next(times)
+        return {"steps": 7}
+
     monkeypatch.setattr(generation, "simulate_task", slow)
     many = made[1].model_copy(update={"trajectories": 1000})
     price = estimate(many, str(tmp_path / "none"), 1)
-    assert 50.0 < price.seconds < 100.0
+    error = 2 * 0.01 * (8 / 7) ** 0.5 / 8**0.5
+    assert price.seconds == pytest.approx(1000 * (0.05 + error))
+    assert price.least == pytest.approx(1000 * (0.05 - error))
     assert price.steps == 7000
+    assert "this takes 42 to 58 seconds (7e+03 steps)" in price.sentence
     assert generation.cost(many, 1).seconds > 1000 * generation.STATICS
     assert estimate(made[1], str(made[0]), 1).seconds == 0.0
 

@@ -56,7 +56,7 @@ def code(page: Path) -> str:
     text = "\n".join(
         block for block in blocks(page, "python") if not any(part in block for part in ELSEWHERE)
     )
-    text = re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # of notebooks
+    text = re.sub(r"^[%:].*$", "", text, flags=re.MULTILINE)  # of notebooks
     for long, short in SHORTER.items():
         text = text.replace(long, short)
     return text

@@ -539,6 +539,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"materials": {"rubber": {"kind": "preset", "name": "Dragon", "depth": 1e-2}}},
         r"there is no preset `Dragon`; did you mean `Dragon Skin 30`?",
     ),
+    "hardness beside a modulus": (
+        {"materials": {"rubber": {"shore_a": 30}}},
+        r"materials\.rubber: E and shore_a each say how stiff it is; give one of them",
+    ),
     "an inertial series": (
         {"materials": {"rubber": {"kind": "prony", **RUBBER, "moduli": [1e5], "tau": [0.1]}},
          "pads": {"lower": {"inertial": True}}},

@@ -17,6 +17,7 @@ from PIL import Image
 
 from torchsoft import Parameters, SoftGrasp, press, simulate
 from torchsoft.cli import main
+from torchsoft.materials.presets import from_shore_a
 from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
@@ -201,10 +202,31 @@ def motion(
     return lambda t: float(signal(torch.tensor(t, dtype=torch.float64))[0].detach())
 
 
+def test_a_hardness_stands_for_a_modulus(tmp_path, monkeypatch, capsys):
+    """With a note of which; `init` begins with a rubber of the literature."""
+    monkeypatch.chdir(tmp_path)
+    tree = template("t").model_dump(exclude_unset=True)
+    del tree["materials"]["rubber"]["E"]
+    tree["materials"]["rubber"]["shore_a"] = 30
+    with pytest.warns(UserWarning, match=r"shore_a = 30 is taken for E = 1\.14 MPa, the estimate"):
+        file = RigFile.from_tree(tree)
+    assert file.materials["rubber"].build(tmp_path).E.item() == from_shore_a(30)
+    assert file.override(materials={"rubber": {"E": 1e6}}).assemble().parameter("materials.rubber.E") == 1e6
+    for wrong, sentence in ((90, "hardness must be from 20 to 80"), ("a", r"a number \[Shore A\]")):
+        tree["materials"]["rubber"]["shore_a"] = wrong
+        with pytest.raises(ValueError, match=rf"materials\.rubber: shore_a: .*{sentence}"):
+            RigFile.from_tree(tree)
+    assert main(["init", "skin", "--material", "Dragon Skin 30"]) == 0
+    assert RigFile.from_toml("skin.toml").build().rig.parameter("materials.rubber.E") == from_shore_a(30)
+    assert main(["init", "other", "--material", "Dragon"]) == 2
+    assert "did you mean `Dragon Skin 30`?" in capsys.readouterr().err
+
+
 def test_motions_go_through_what_they_are_given(tmp_path):
     (tmp_path / "x.csv").write_text(
         "\ufefft [ms], note [mm], x_d [mm]\n0,7,1\n500,,2\n1000,7,4\n", encoding="utf-8"
     )
+    (tmp_path / "y.csv").write_text("Time (ms),Stage x (mm)\n0,1\n500,2\n1000,4\n")
     knots = {"times": (0.2, 1.0), "values": ("start", 5e-3)}
     for table, expected in (
         ({"kind": "hold"}, {0.0: 0.0, 1.0: 0.0}),
@@ -217,6 +239,8 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         {0.5: 0.0, 1.25: -1e-3 * -1, 1.0: 0.0}),
         ({"kind": "csv", "file": "x.csv", "column": "x_d", "offset": 1e-3},
         {0.0: 2e-3, 0.5: 3e-3, 1.0: 5e-3, 2.0: 5e-3}),
+        ({"kind": "csv", "file": "y.csv", "column": "Stage x", "time": "Time"},
+        {0.0: 1e-3, 0.5: 2e-3, 1.0: 4e-3}),
     ):  # fmt: skip
         x = motion(table, tmp_path)
         for time, value in expected.items():
@@ -231,7 +255,11 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         ("t [s],x_d [mm]\n0,0\n1,1\n", r"x\.csv ends at 1 s, but the run lasts until 2 s"),
         (
             "t [s],x [mm]\n0,0\n1,1\n",
-            r"x\.csv has no column `x_d \[m\]`, in this unit .*; it has `t`, `x`",
+            r"x\.csv has no column `x_d \[m\]`, in this unit .*; it has `t`, `x`; .* in `column`",
+        ),
+        (
+            "Time (s),x_d (m)\n0,0\n1,1\n",
+            r"x\.csv has no column `t \[s\]`, .*; it has `Time`, `x_d`; say which one in `time`",
         ),
         (
             "t [s],x_d [N]\n0,0\n1,1\n",
@@ -444,6 +472,12 @@ def test_run_writes_everything(small, tmp_path, capsys):
         RigFile.model_validate_json(json.dumps(summary["file"])).model_dump()
         == RigFile.from_toml(small).model_dump()
     )
+    few = RigFile.from_toml(small).override(
+        outputs={"figures": False, "player": True, "video": "none"}
+    )
+    running.run(few, tmp_path / "few")
+    names = {path.name for path in (tmp_path / "few").iterdir()}
+    assert names == {"trajectory.nc", "summary.json", "player.html"}
 
 
 def test_what_is_wrong_is_not_run_unless_it_is_meant(small, tmp_path, capsys):

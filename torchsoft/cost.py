@@ -25,18 +25,25 @@ SHARE = 0.8
 
 
 class Cost(NamedTuple):
-    """Steps of the stepper, time [s], and memory and disk space [GiB]."""
+    """Steps of the stepper, time [s], and memory and disk space [GiB]. Of a range of times
+    `seconds` is the longest, by which work is judged, and `least` the shortest."""
 
     steps: float
     seconds: float
     memory: float
     disk: float = 0.0
+    least: float = 0.0
+
+    def part(self, share: float) -> "Cost":
+        """Of a share of the work that is done one piece after the other."""
+        steps, seconds, memory, disk, least = self
+        return Cost(share * steps, share * seconds, memory, share * disk, share * least)
 
     @property
     def sentence(self) -> str:
         disk = f", and {self.disk:.3g} GiB on the disk" if self.disk >= 1 else ""
         return (
-            f"this takes about {duration(self.seconds)} ({self.steps:.2g} steps), "
+            f"this takes {span(self.least, self.seconds)} ({self.steps:.2g} steps), "
             f"{self.memory:.2g} GiB of memory{disk}"
         )
 
@@ -101,6 +108,15 @@ def machine_memory() -> float:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     except (AttributeError, ValueError, OSError):
         return float("inf")
+
+
+def span(least: float, most: float) -> str:
+    """A range of times as people say it; with 0 for the least of them the longest alone."""
+    low, high = duration(least or most), duration(most)
+    number, _, unit = low.partition(" ")
+    if low == high:
+        return f"about {high}"
+    return f"{number if high.endswith(unit) else low} to {high}"
 
 
 def duration(seconds: float) -> str:

@@ -15,8 +15,8 @@ write into one folder: --part 2/8 makes every eighth shard from the second on, a
 by two at a time."""
 
 SLURM = """\
-Writes a job array that makes a dataset in parts to the standard output, for `sbatch`. Where some of
-it is made already, the array has the parts that are not."""
+Writes a job array that makes a dataset in parts to the standard output, for `sbatch`, and its cost to
+the screen. Where some of it is made already, the array has the parts that are not."""
 
 EXPORT = """\
 Writes a finished dataset, without its failed trajectories, in the form of another project:
@@ -100,11 +100,13 @@ def make(options: argparse.Namespace) -> int:
     from torchsoft.datasets import generate
     from torchsoft.datasets.config import Config
     from torchsoft.datasets.files import listed
+    from torchsoft.threads import cores
 
     workers = CLUSTER if options.scheduler else options.workers
+    at_once = CLUSTER if options.scheduler else min(workers, cores())
     try:
         config, mine = Config.from_toml(options.config), generate.Part(*options.part)
-        price = generate.estimate(config, options.out, workers, mine)
+        price = generate.estimate(config, options.out, at_once, mine)
         agree(price, options.yes, HELP)
         if price.seconds > BRIEF:
             say(price.sentence, error=True)
@@ -142,7 +144,9 @@ def slurm(options: argparse.Namespace) -> int:
     """Write a job array."""
     from torchsoft.datasets.slurm import job_array
 
-    say(job_array(options.config, options.out, options.parts).rstrip())
+    script, price = job_array(options.config, options.out, options.parts)
+    say(script.rstrip())
+    say(price, error=True)
     return 0
 
 

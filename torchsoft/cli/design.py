@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, failed, say, try_folder
+from torchsoft.cli.results import add_command, add_out, add_progress, failed, say, try_folder
 
 DESIGN = """\
 Which motion of the rig should be recorded?
@@ -27,7 +27,7 @@ def add_commands(commands: Any) -> None:
     )  # fmt: skip
     add_out(one, default=Path("out/design"), help="folder for the results (%(default)s)")
     one.add_argument("--workers", type=int, default=1, help="threads of the search (%(default)s)")
-    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    add_progress(one)
 
 
 def design(options: argparse.Namespace) -> int:
@@ -47,7 +47,7 @@ def design(options: argparse.Namespace) -> int:
     recorded = measured.load(data, configs[0]).problem.recordings if data else ()
     try_folder(options.out, options.force)
     chosen = choose(
-        configs[0], stated, recorded, workers=options.workers, progress=not options.no_progress
+        configs[0], stated, recorded, workers=options.workers, progress=options.progress
     )
     with replacing(options.out / "motion.toml") as partial:
         partial.write_text(to_toml(located(chosen.file)), encoding="utf-8")

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, failed, say, try_folder
+from torchsoft.cli.results import add_command, add_out, add_progress, failed, say, try_folder
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
@@ -64,7 +64,7 @@ def add_arguments(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--yes", action="store_true", help="begin even what takes hours, or much memory"
     )
-    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    add_progress(one)
     verb = one.prog.split()[-1]
     one.set_defaults(explains=verb == "explain", rehearses=verb == "rehearse")
 
@@ -113,7 +113,7 @@ def identify(options: argparse.Namespace) -> int:
                 try_folder(options.out, options.force)
             result = identify(
                 case.problem, heldout=heldout, acknowledged=case.config.acknowledged,
-                checkpoint=unfinished, progress=not options.no_progress, **fit.model_dump(),
+                checkpoint=unfinished, progress=options.progress, **fit.model_dump(),
             )  # fmt: skip
             result = replace(result, command=options.command)
             result.save(options.out / "answer.json")
@@ -138,7 +138,7 @@ def identify(options: argparse.Namespace) -> int:
     if result.made_by["untried"]:
         say(f"\ninterrupted; the same command continues with what is in {unfinished}", error=True)
     say(
-        f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and "
+        f"fitted in {result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and "
         f"{options.out / 'report.html'}"
     )
     return 130 if result.made_by["untried"] else 0
@@ -153,7 +153,7 @@ def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
     folder = unfinished.with_name(f"{unfinished.name}-laws")
     answer = compare(
         case.laws, heldout=case.config.heldout, rtol=fit.rtol, starts=fit.starts,
-        workers=fit.workers, checkpoint=folder, progress=not options.no_progress,
+        workers=fit.workers, checkpoint=folder, progress=options.progress,
     )  # fmt: skip
     answer.save(options.out / "comparison.json")
     for name in case.laws:

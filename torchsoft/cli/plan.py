@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, say, try_folder
+from torchsoft.cli.results import add_command, add_out, add_progress, say, try_folder
 
 PLAN = """\
 Which motion brings the rig where it is wanted?
@@ -14,8 +14,8 @@ motion whose knots may move (low, high, speed, after) and every number of the fi
 (low, high), [targets.NAME] (channel, value, tolerance, at) and [limits.NAME] (channel, low, high,
 since, until). With [uncertain."NUMBER"] (low, high) the plan is made for draws of them; with
 --answer, the file of an identification with `rig = "RIG.toml"`, for draws of what that leaves
-unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json and run.nc;
-the exit status is 1 where a target or limit is not kept."""
+unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json, run.nc
+and run.png; the exit status is 1 where a target or limit is not kept."""
 
 
 def add_commands(commands: Any) -> None:
@@ -26,12 +26,14 @@ def add_commands(commands: Any) -> None:
     said = "draw what an identification of the rig leaves unknown"
     one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=said)
     add_out(one, default=Path("out/plan"), help="folder for the results (%(default)s)")
-    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    add_progress(one)
 
 
 def plan(options: argparse.Namespace) -> int:
     """Plan, and write the motion."""
     from torchsoft.files import replacing, write_json
+    from torchsoft.plot.dashboard import dashboard
+    from torchsoft.plot.figures import save
     from torchsoft.rigs.build import RigFile
     from torchsoft.rigs.goal import Goal, plan_file
     from torchsoft.rigs.written import located, to_toml
@@ -43,11 +45,12 @@ def plan(options: argparse.Namespace) -> int:
 
         known = load_answer(options.answer).draws(goal.draws, seed=goal.seed)
     try_folder(options.out, options.force)
-    found, written = plan_file(file, goal, known, progress=not options.no_progress)
+    found, written = plan_file(file, goal, known, progress=options.progress)
     with replacing(options.out / "motion.toml") as partial:
         partial.write_text(to_toml(located(written)), encoding="utf-8")
     write_json(options.out / "plan.json", found.summary())
     found.trajectory.save(options.out / "run.nc")
+    save(dashboard(found.trajectory, title=written.title), options.out / "run.png")
     say(found)
-    say(f"written to {options.out / 'motion.toml'}, plan.json and run.nc")
+    say(f"written to {options.out / 'motion.toml'}, plan.json, run.nc and run.png")
     return 0 if found.reached else 1

@@ -31,6 +31,14 @@ def add_out(command: Any, **more: Any) -> None:
     )
 
 
+def add_progress(command: Any) -> None:
+    """The option on progress, which only a terminal is shown."""
+    command.add_argument(
+        "--no-progress", dest="progress", action="store_false", default=sys.stderr.isatty(),
+        help="show no progress; only a terminal is shown any",
+    )  # fmt: skip
+
+
 def say(*text: object, error: bool = False) -> None:
     """Print text without characters that a terminal obeys."""
     print(plain(" ".join(map(str, text))), file=sys.stderr if error else sys.stdout)

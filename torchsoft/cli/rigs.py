@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, failed, say, try_folder
+from torchsoft.cli.results import add_command, add_out, add_progress, failed, say, try_folder
 
 RUN = """\
 Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and
@@ -31,7 +31,7 @@ def add_commands(commands: Any) -> None:
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
     add_out(one, help="folder for the results (out/RIG)")
     one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
-    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    add_progress(one)
     one.add_argument(
         "--yes", action="store_true", help="begin without asking, however long it takes"
     )
@@ -42,6 +42,7 @@ def add_commands(commands: Any) -> None:
     )
     one = add_command(commands, "init", init_rig, "write a rig file to start from", INIT)
     one.add_argument("name", metavar="NAME", help="the file's name, with or without .toml")
+    one.add_argument("--material", help="a rubber of `torchsoft material presets` for its pads")
 
 
 def run_rig(options: argparse.Namespace) -> int:
@@ -65,7 +66,7 @@ def run_rig(options: argparse.Namespace) -> int:
     if any(one.severity == "error" for one in found) and not options.anyway:
         return failed(f"{options.file} is not run; fix what is wrong, or say --anyway")
     try_folder(out, options.force)
-    done = run(file, out, found=found, progress=not options.no_progress)
+    done = run(file, out, found=found, progress=options.progress)
     if isinstance(done.stopped, SimulationFailed):
         return failed(f"{done.stopped.reason}; what was simulated until then is in {out}")
     if done.stopped is not None:
@@ -106,10 +107,14 @@ def init_rig(options: argparse.Namespace) -> int:
         return failed(
             f"NAME should be the name of a file, such as mine or mine.toml, not {options.name!r}"
         )
+    rig = template(path.stem)
+    if options.material is not None:
+        rubber = {"kind": "preset", "name": options.material, "depth": 44e-3}
+        rig = rig.override(materials={"rubber": rubber})
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write(to_toml(template(path.stem)))
+            file.write(to_toml(rig))
     except FileExistsError:
         return failed(f"{path} is there already; take another name")
     check, run = (shlex.join(["torchsoft", command, str(path)]) for command in ("check", "run"))

@@ -241,9 +241,10 @@ def moving(data: xr.Dataset, config: Config) -> list[str]:
 
 def report(url: str, picture: Path | None = None) -> int:
     """Print every finding, sizes and counts; how many findings there are."""
-    count = 0
-    for count, finding in enumerate(check(url), 1):
+    found = list[str]()
+    for finding in check(url):
         print(finding)
+        found.append(finding)
     try:
         data = open_dataset(url, unfinished=True)
         print(summary(url, data))
@@ -254,10 +255,11 @@ def report(url: str, picture: Path | None = None) -> int:
     except (
         Exception
     ) as error:  # a damaged store has been reported above; the picture must not hide it
-        count += 1
-        print(line(f"no summary or picture: {type(error).__name__}: {error}"))
-    print("sound" if count == 0 else f"{count} findings")
-    return count
+        if str(error) not in found:
+            found.append(line(f"no summary or picture: {type(error).__name__}: {error}"))
+            print(found[-1])
+    print(f"{len(found)} finding{'s' * (len(found) > 1)}" if found else "sound")
+    return len(found)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -47,20 +47,27 @@ class Config(Table):
     """
 
     title: str
+    """of the card and of pictures"""
     description: str = ""
+    """a paragraph of the card"""
     license: str = ""
     """of the data, by its name in SPDX, such as CC-BY-4.0"""
     seed: int = Field(ge=0, le=SEED)
+    """of the design, the splits and random phases"""
     trajectories: int = Field(ge=1, le=10_000_000)
+    """of the whole set"""
     trajectories_per_shard: int = Field(16, ge=1, le=100_000)
+    """what a worker makes at once, what its memory holds, and what a file of an array holds"""
     samples_per_chunk: int = Field(250, ge=1, le=10_000_000)
+    """of one trajectory, read and decompressed at once"""
     method: Literal["sobol", "latin_hypercube"] = "sobol"
+    """design of what is drawn; a longer Sobol sequence begins with the shorter one"""
     duration: float = Field(ge=1e-3, le=1e4)
     """of every trajectory [s]; that of the rig file by default"""
     sample_interval: float = Field(5e-3, ge=1e-6, le=1.0)
     """between samples [s]; that of the rig file by default"""
     rtol: float | None = Field(None, ge=1e-9, le=1e-2)
-    """relative tolerance of the stepper, 1e-4 by default, or what the rig file says"""
+    """relative tolerance of the stepper [1]; 1e-4 by default, or what the rig file says"""
     step: float | None = Field(None, ge=1e-6, le=STEP)
     """equal steps no longer than this [s] instead"""
     settle: float = Field(0.125, ge=0, le=1e4)
@@ -75,10 +82,11 @@ class Config(Table):
     grasp_depth: Lengths = Lengths(low=1.0e-3, high=1.6e-3)
     """compression of both pads together [m]"""
     splits: Fractions = Fractions(train=0.7, validation=0.15)
+    """fractions of the trajectories; the rest is for testing"""
     fixed: dict[str, Any] = Field(default_factory=dict)
     """parameters that differ from their defaults, or from the rig file, in every trajectory"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
-    """distributions of the parameters that differ between trajectories"""
+    """distributions of the parameters that differ between trajectories, by name"""
     kinds: Annotated[tuple[Kind, ...], LISTED] = Field((), max_length=100)
     """motions of the paper's rig; those of a rig file are its own, whose numbers may be drawn"""
     rig: dict[str, Any] | None = None

@@ -4,6 +4,7 @@ Shards are shared out: a part has its own, and no two processes make one at the 
 """
 
 import math
+import statistics
 import sys
 import time
 from collections.abc import Iterator
@@ -31,11 +32,15 @@ STATICS = 0.5
 """Time [s] that a trajectory takes besides its steps: statics of the start and of the grasp,
 energies."""
 
-MANY, TRIED = 200, 3
-"""Trajectories from which on some are tried before the others, and how many."""
+MANY, TRIED = 200, 8
+"""Trajectories from which on the first are tried before the others, and how many: a power of two,
+so that a Sobol sequence has every kind among them in its proportion."""
 
 PATIENCE = 60.0
 """Time [s] that these may take."""
+
+SURE = 2.0
+"""Standard errors of their mean to both ends of the range of times."""
 
 
 class Part(NamedTuple):
@@ -66,14 +71,15 @@ def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
 
 
 def cost(
-    config: Config, workers: int, count: int | None = None, each: tuple[float, float] | None = None
-) -> Cost:
+    config: Config, workers: int, count: int | None = None,
+    each: tuple[float, float, float] | None = None,
+) -> Cost:  # fmt: skip
     """Of `count` trajectories, all by default, made by that many workers, where one takes `each`:
-    time [s] and steps, those of a usual one by default."""
+    least and longest time [s] and steps, those of a usual one by default."""
     subject = config.subject
     count = config.trajectories if count is None else count
     at_once = max(min(workers, config.shards), 1)
-    seconds, steps = usual(config) if each is None else each
+    least, most, steps = usual(config) if each is None else each
     kept = sum(  # of one trajectory [GiB]
         v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in variables(config).values()
     )
@@ -83,14 +89,16 @@ def cost(
     design = 8 * 2 * config.trajectories * subject.drawn / 2**30
     return Cost(
         steps=count * steps,
-        seconds=count * seconds / at_once,
+        seconds=count * most / at_once,
+        least=count * least / at_once,
         memory=design + shard * at_once,
         disk=kept * count,
     )
 
 
-def usual(config: Config) -> tuple[float, float]:
-    """Time [s] and steps of one trajectory by experience, rather too many."""
+def usual(config: Config) -> tuple[float, float, float]:
+    """Least and longest time [s], here one, and steps of a trajectory by experience, rather too
+    many."""
     subject = config.subject
     seconds, step = config.duration + subject.prelude, subject.steps.get("step")
     if step is not None:
@@ -98,23 +106,27 @@ def usual(config: Config) -> tuple[float, float]:
     else:  # an output between two steps takes half the time of a step
         rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
         steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
-    return steps * rig_step(subject.template) + STATICS, steps
+    return (seconds := steps * rig_step(subject.template) + STATICS), seconds, steps
 
 
-def measured(config: Config) -> tuple[float, float]:
-    """The same of some trajectories of the set in the mean, after one that loads the kernels."""
-    began, steps, design = 0.0, 0, points(config)
+def measured(config: Config) -> tuple[float, float, float]:
+    """The same of the first trajectories of the set in the mean, after one run that loads the
+    kernels: time of the processor, which other programs on the machine hardly change."""
+    design, times, steps = points(config), list[float](), 0
     with threads.single_threaded():
-        for i in range(TRIED + 1):
+        for i in (0, *range(TRIED)):
+            began = time.thread_time()
             row = simulate_task(config, task(config, i, design[i]))
-            began, steps = (began, steps + row["steps"]) if began else (time.perf_counter(), 0)
-    return (time.perf_counter() - began) / TRIED, steps / TRIED
+            steps += row["steps"] if times else 0
+            times.append(time.thread_time() - began)
+    mean, error = statistics.mean(times[1:]), SURE * statistics.stdev(times[1:]) / TRIED**0.5
+    return max(mean - error, 0.0), mean + error, steps / TRIED
 
 
 def estimate(config: Config, url: str, workers: int, part: Part = WHOLE) -> Cost:
     """What is left of a part will cost; of many trajectories, by a few of them."""
     count = sum(len(config.rows(shard)) for shard in unfinished(config, url, part))
-    tried = count >= MANY and (TRIED + 1) * usual(config)[0] < PATIENCE
+    tried = count >= MANY and (TRIED + 1) * usual(config)[1] < PATIENCE
     return cost(config, workers, count, measured(config) if tried else None)
 
 

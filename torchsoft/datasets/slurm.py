@@ -5,6 +5,7 @@ import shlex
 import sys
 from pathlib import Path
 
+from torchsoft.cost import span
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import folder
 from torchsoft.datasets.generate import Part, estimate, unfinished
@@ -30,9 +31,9 @@ exec {command} --part "$SLURM_ARRAY_TASK_ID/{parts}" --workers "${{SLURM_CPUS_PE
 """
 
 
-def job_array(path: Path, url: str, parts: int) -> str:
-    """The script for `sbatch`. Raises `ValueError` for more parts than shards, and where nothing is
-    left to be made."""
+def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
+    """The script for `sbatch`, and a sentence on its cost. Raises `ValueError` for more parts than
+    shards, and where nothing is left to be made."""
     config = Config.from_toml(path)
     lacking = set(unfinished(config, url))
     left = [i for i in range(1, parts + 1) if lacking & set(Part(i, parts).shards(config))]
@@ -43,12 +44,19 @@ def job_array(path: Path, url: str, parts: int) -> str:
         )  # fmt: skip
     out = str(here.absolute()) if (here := folder(url)) else url
     program = [sys.executable, "-m", "torchsoft", "dataset"]
-    price = estimate(config, url, 1, Part(left[0], parts))
+    whole = estimate(config, url, 1)
+    most = max(len(lacking.intersection(Part(i, parts).shards(config))) for i in left)
+    price = whole.part(most / len(lacking))
     minutes = math.ceil(max(SPARE * price.seconds, LEAST) / 60)
-    return SCRIPT.format(
+    told = (
+        f"each of {len(left)} tasks: {price.sentence}; all of them: "
+        f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk"
+    )
+    script = SCRIPT.format(
         name=f"torchsoft-{path.stem}".replace(" ", "-"), parts=parts,
         array=f"1-{parts}" if len(left) == parts else ",".join(map(str, left)),
         memory=math.ceil(BASE + 1.5 * price.memory), hours=minutes // 60, minutes=minutes % 60,
         command=shlex.join([*program, "make", str(path.absolute()), "--out", out]),
         check=shlex.join([*program, "check", out]),
     )  # fmt: skip
+    return script, told

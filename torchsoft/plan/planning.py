@@ -77,14 +77,16 @@ class Plan(Shown):
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         rows = [
-            *((name, f"{float(e[0]):+.2f} tolerances off") for name, e in self.errors.items()),
+            *((name, f"{float(e[0]):+z.2f} tolerances off") for name, e in self.errors.items()),
             *((name, f"{float(e[0]):+.2%} beyond") for name, e in self.excess.items() if e[0] > 0),
             *(("not reached", reason) for reason in self.reasons),
             *(("note", notice) for notice in self.notices),
         ]
         kept = "reached" if self.reached else "NOT reached"
+        draws = max(map(len, (*self.errors.values(), *self.excess.values())), default=1)
+        holds = f", holds in {self.holds:.0%} of {draws} draws" if draws > 1 else ""
         cost = f"{self.made_by['looks']} evaluations, {self.made_by['wall_s']:.1f} s"
-        return f"Plan: {kept}, holds in {self.holds:.0%} of draws; {cost}", rows
+        return f"Plan: {kept}{holds}; {cost}", rows
 
 
 def plan(

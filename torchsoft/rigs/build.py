@@ -75,6 +75,9 @@ class OutputsTable(Group):
         default=0.01, description="between outputs"
     )
     figures: bool = Field(default=True, description="write the figures")
+    player: bool | None = Field(
+        default=None, description="write player.html; as figures says if not given"
+    )
     snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
         default=(),
         description="times of the pictures in snapshots.png; six over the whole run if none is "

@@ -61,7 +61,8 @@ class NumberOr:
         if isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x):
             return float(x)
         said = ", ".join(f'"{word}"' for word in self.words)
-        raise ValueError(f"should be {said} or a number [{self.unit}], not {shown(x)}")
+        or_ = " or " if said else ""
+        raise ValueError(f"should be {said}{or_}a number [{self.unit}], not {shown(x)}")
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler

@@ -213,6 +213,7 @@ class CsvTable(Motion):
     kind: Literal["csv"] = "csv"
     file: str = Field(description="the file, from the folder of this one")
     column: str = Field(description="the column's name, without its unit")
+    time: str = Field(default="t", description="the name of the column of times, without its unit")
     offset: Value = Field(
         default=0.0,
         description=f'what is added; "{START}": where the coordinate that follows starts',
@@ -220,45 +221,49 @@ class CsvTable(Motion):
 
     def build(self, asked: MotionContext) -> Piecewise:
         try:
-            times, values = read_column(asked.folder / self.file, self.column, asked.unit)
+            path = asked.folder / self.file
+            times, values = read_column(path, self.column, asked.unit, self.time)
         except ValueError as error:
             raise ValueError(f"motion.{asked.name}.file: {error}") from None
         offset = asked.value("offset", self.offset)
         return Sampled(times, [offset + value for value in values])
 
 
-def read_column(path: Path, column: str, unit: str) -> tuple[list[float], list[float]]:
-    """Times [s] and values, in SI units, of a column that is to be in `unit` or one that converts
-    to it; other columns are left out. Raises `ValueError` naming the file, the row (the heading is
-    row 1) and the column.
+def read_column(
+    path: Path, column: str, unit: str, time: str = "t"
+) -> tuple[list[float], list[float]]:
+    """Times [s], under the heading `time`, and values, in SI units, of a column that is to be in
+    `unit` or one that converts to it; other columns are left out. Raises `ValueError` naming the
+    file, the row (the heading is row 1) and the column.
     """
     try:
         there = names(path)
-        for name in ("t", column):
+        for name in (time, column):
             if name not in there:
                 shown = ", ".join(f"`{line(one, 40)}`" for one in there) or "nothing"
                 raise ValueError(
-                    f"{path} has no column `{name} [{'s' if name == 't' else unit}]`, in this unit "
-                    f"or one like it; it has {shown}"
+                    f"{path} has no column `{name} [{'s' if name == time else unit}]`, in this "
+                    f"unit or one like it; it has {shown}; say which one in "
+                    f"`{'time' if name == time else 'column'}`"
                 )
-        known = {"t": UNITS["s"], column: UNITS[unit]}
+        known = {time: UNITS["s"], column: UNITS[unit]}
         table = csvfile.read(
             path, known, lambda *_: "", [name for name in there if name not in known]
         )
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from None
-    times, values = table.values["t"], table.values[column]
+    times, values = table.values[time], table.values[column]
     if len(times) < 2:
         raise ValueError(
             f"{path} has {len(times)} rows of numbers, but a motion needs two at least"
         )
-    for name, one in (("t", times), (column, values)):
+    for name, one in ((time, times), (column, values)):
         if (empty := np.flatnonzero(np.isnan(one))).size:
             raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
     if (back := np.flatnonzero(np.diff(times) <= 0)).size:
         i = back[0]
         raise ValueError(
-            f"{path}, row {table.rows[i + 1]}, column `t`: {times[i + 1]:g} s follows {times[i]:g} "
+            f"{path}, row {table.rows[i + 1]}, column `{time}`: {times[i + 1]:g} s follows {times[i]:g} "
             "s; times must increase"
         )
     return times.tolist(), values.tolist()

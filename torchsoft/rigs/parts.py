@@ -1,6 +1,7 @@
 """Bodies with their shapes, materials, pads, laws and contacts of a rig file. Another kind is one
 more entry of its union."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from torchsoft.display import suggestion
-from torchsoft.materials.presets import PRESETS
+from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.material import KINDS, Material
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, PadMesh, QuadMesh
@@ -198,7 +199,28 @@ class BodyTable(Group):
         return Body(self.mass or 1.0, shape, **given)
 
 
-OWN = tuple(table_of(part, kind, nu=0.45, rho=1100.0) for kind, part in KINDS.items())
+class RubberTable(PartTable):
+    """A material, of which `shore_a` may stand for E."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_a_modulus(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping) or "shore_a" not in data:
+            return data
+        if "E" in data:
+            raise ValueError("E and shore_a each say how stiff it is; give one of them")
+        with at_field("shore_a"):
+            hardness = NumberOr("Shore A").check(data["shore_a"])
+            E = from_shore_a(hardness)
+        warnings.warn(
+            f"shore_a = {hardness:g} is taken for E = {1e-6 * E:.3g} MPa, the estimate of Gent "
+            "(1958); where it matters, identify E or fit a test",
+            stacklevel=2,
+        )
+        return {name: x for name, x in data.items() if name != "shore_a"} | {"E": E}
+
+
+OWN = tuple(table_of(part, kind, RubberTable, nu=0.45, rho=1100.0) for kind, part in KINDS.items())
 """Tables that hold their own numbers."""
 
 

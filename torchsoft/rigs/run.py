@@ -187,6 +187,7 @@ def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]
         for name, figure in tqdm(made.items(), "figures", unit="figure", disable=not progress):
             figures.save(figure(), out / f"{name}.png")
             written.append(f"{name}.png")
+    if file.outputs.figures if file.outputs.player is None else file.outputs.player:
         player(run, out / "player.html", title=title)
         written.append("player.html")
     if file.outputs.video != "none":

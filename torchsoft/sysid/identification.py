@@ -137,10 +137,10 @@ def conclude(
             end = settle(
                 coloured.problem, runner, stage, coloured.fit, free, how.tightenings, notify
             )
-        for rtol, one in end.fits:
+        for rtol, one, ended in end.fits:
             name = "steps chosen anew" if rtol == by else "tighter tolerance"
-            stages.append(stage_entry(name, stage, rtol, one, start))
-            by = rtol
+            stages.append(stage_entry(name, stage, rtol, one, start, ended))
+            by, start = rtol, ended
         return end
 
     end = at_rest()
@@ -246,8 +246,11 @@ def conclude(
 
 def noise_entries(coloured: Coloured, stage: Stage, began: float) -> list[dict[str, Any]]:
     """The result's entries on the fits with the noise that was found."""
-    name = "with the noise that was found"
-    return [stage_entry(name, stage, stage.rtol, one, began) for one in coloured.fits]
+    name, out = "with the noise that was found", []
+    for one, ended in coloured.fits:
+        out.append(stage_entry(name, stage, stage.rtol, one, began, ended))
+        began = ended
+    return out
 
 
 def tested_assumptions(

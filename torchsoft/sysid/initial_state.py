@@ -90,6 +90,10 @@ class AtRest(NamedTuple):
     x: float | None = None
     lead: float = SETTLE
 
+    def __str__(self) -> str:
+        place = "scenario.x_C0" if self.x is None else f"x = {self.x:g} m"
+        return f"{self.lead:g} s early, the disc at rest at {place} ± {self.position_sd:g} m"
+
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
         if not isinstance(rig, SoftGrasp):
             raise ValueError(
@@ -131,6 +135,9 @@ class Standing(NamedTuple):
         pairs = zip(state.pose.items(), state.velocity.values())
         return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead)
 
+    def __str__(self) -> str:
+        return f"{self.lead:g} s early, bodies at known places, pads settled around them"
+
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
         if self.lead > 0:
             warn_of_memory(rig, self.lead)
@@ -163,6 +170,9 @@ class Known(NamedTuple):
 
     def __repr__(self) -> str:
         return f"Known({self.y0.tolist()}, {self.lead})"
+
+    def __str__(self) -> str:
+        return f"{self.lead:g} s early, in a known state"
 
 
 class HeldPads:

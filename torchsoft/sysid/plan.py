@@ -164,12 +164,14 @@ def default_plan(
 Method = Literal["gauss_newton", "lbfgs", "adam"]
 
 
-def stage_entry(name: str, stage: Stage, rtol: float, fit: Fit, began: float) -> dict[str, Any]:
-    """The result's entry on a stage that began at `began` on the clock [s]."""
+def stage_entry(
+    name: str, stage: Stage, rtol: float, fit: Fit, began: float, ended: float
+) -> dict[str, Any]:
+    """The result's entry on a stage that began and ended so on the clock [s]."""
     return {
         "name": name, "recordings": list(stage.recordings), "free": list(stage.free), "rtol": rtol,
         "evaluations": fit.evaluations, "chi2": fit.chi2, "converged": fit.converged,
-        "wall_s": clock.perf_counter() - began,
+        "wall_s": ended - began,
     }  # fmt: skip
 
 
@@ -232,7 +234,7 @@ def run_plan(
             ):
                 raise
             return end._replace(lost=lost)
-        entry = stage_entry(stage.name, stage, stage.rtol, fit, began)
+        entry = stage_entry(stage.name, stage, stage.rtol, fit, began, clock.perf_counter())
         end = PlanEnd(fit, stage, [*end.entries, entry] if end is not None else [entry])
     if end is None:
         raise ValueError("`plan` has no stages")
@@ -371,7 +373,8 @@ ROUNDS = 3
 class Settled(NamedTuple):
     """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with
     the last Jacobian; how far the steps have moved every coordinate (n,), None where that could not
-    be checked; the fits on other steps since; the residuals by a tenth of the tolerance, those of
+    be checked; the fits on other steps since, with their tolerances and when on the clock [s] they
+    ended; the residuals by a tenth of the tolerance, those of
     `at` where these could not be had; and whether the fit is `at_rest`: with steps chosen anew no
     coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
     whether the fit has converged). `rough` names the coordinates that would move although steps do
@@ -382,7 +385,7 @@ class Settled(NamedTuple):
     at: Residuals
     rtol: float
     bias: Array | None
-    fits: list[tuple[float, Fit]]
+    fits: list[tuple[float, Fit, float]]
     finer: Residuals
     at_rest: bool
     rough: tuple[str, ...] = ()
@@ -417,7 +420,7 @@ def settle(
                 problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common
             )
         if further := bool((end.x != x).any()):
-            fits.append((rtol, end))
+            fits.append((rtol, end, clock.perf_counter()))
             x, at = end.x, end.at
         return further
 

@@ -17,6 +17,7 @@ without a declaration is a finding, although intervals allow for it: a sensor ma
 wrong model.
 """
 
+import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -435,12 +436,12 @@ ROUNDS = 2
 
 class Coloured(NamedTuple):
     """A problem with the noise that was found, its fit, the noise by channel with every order that
-    was tried, and the fits on the way."""
+    was tried, and the fits on the way with when on the clock [s] they ended."""
 
     problem: Problem
     fit: Fit
     found: dict[str, NoiseFit]
-    fits: list[Fit]
+    fits: list[tuple[Fit, float]]
 
 
 def allow_for_colour(
@@ -459,7 +460,7 @@ def allow_for_colour(
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
     given = {} if undeclared else problem.noise
-    found, fits = dict[str, NoiseFit](), list[Fit]()
+    found, fits = dict[str, NoiseFit](), list[tuple[Fit, float]]()
     for number in range(ROUNDS):
         now = parts(problem, fit.at.r, which)
         found = colours(now, fit.at.J[:, free], declared)
@@ -473,7 +474,7 @@ def allow_for_colour(
         if settled(problem, fit.x, at, free):
             break
         fit = refit(problem, fit, number)
-        fits.append(fit)
+        fits.append((fit, clock.perf_counter()))
     return Coloured(problem, fit, found, fits)
 
 

@@ -124,7 +124,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
         settings = rig.settings if isinstance(rig, SoftGrasp) and seen[key] else None
         identified = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
         began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
-        start = line(repr(recording.start), 300)
+        start = line(str(recording.start), 300)
         one = RecordedRig(
             recording.name, recording.name in fitted, recording.fingerprint,
             problem.samples([recording.name]), recording.duration, start, type(rig).__qualname__,

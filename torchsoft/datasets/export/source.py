@@ -45,5 +45,5 @@ class Source(NamedTuple):
     def runs(self, rows: Sequence[int], names: Iterable[str]) -> Iterator[xr.Dataset]:
         """Some arrays of some trajectories, one after the other, in memory."""
         some = self.data[[*names]]
-        for index in tqdm(rows, unit=" trajectories", mininterval=1.0, leave=False):
+        for index in tqdm(rows, unit=" trajectories", leave=False, disable=None):
             yield some.isel(trajectory=index).load()
