@@ -13,7 +13,7 @@ import pytest
 import torch
 from conftest import f64
 
-from torchsoft import Ellipse, Prony
+from torchsoft import Ellipse
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 FOLDERS = EXPERIMENTS, EXPERIMENTS / "validation"
@@ -260,21 +260,13 @@ def test_rolling_resistance_smoke(tmp_path):
     assert {"rolling_resistance.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_the_theories_of_rolling_meet():
-    """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the
-    moving contact is the closed form's, with the same peak."""
+def test_compliance_of_a_layer_has_both_limits():
+    """Long waves compress a layer uniaxially, short ones see a half-plane."""
     theory = experiment("rolling_resistance")
     h, nu = 4e-3, 0.3
     long, deep, deeper = theory.layer_compliance(np.array([1e-3, 11.9, 12.1]) / h, h, nu)
     assert long[1, 1].real == pytest.approx(h * (1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-5)
     assert np.abs(deeper / deep * 12.1 / 11.9 - 1).max() < 1e-6
-    rubber = Prony(0.75e6, 0.2, 1100.0, 44e-3, [0.75e6], [0.05], tau_instant=1e-6)
-    at = theory.Rolling(19.37e-3, 0.25e-3, 44e-3, 1.2e8, 1.2e8)
-    speeds = [5e-3, 1e-2, 2e-2]
-    moving = [theory.moving_contact(at, rubber, 5.0, v).coefficient for v in speeds]
-    thin = [theory.winkler(at, rubber, 5.0, v)[0] for v in speeds]
-    assert moving == pytest.approx(thin, rel=0.03)
-    assert theory.peak(speeds, moving)[0] == pytest.approx(theory.peak(speeds, thin)[0], rel=0.03)
 
 
 @pytest.mark.slow
