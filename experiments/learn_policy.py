@@ -12,19 +12,19 @@ times over, from the same start, on the same environment, for the same processor
 
 The mean return of ten episodes that no training sees is measured along the way, outside of the
 clock. The last policy of the first seed becomes the weights of a controller of the rig file, which
-runs compiled and continuously, and a TorchScript program.
+runs compiled and continuously.
 
 Command: .venv/bin/python experiments/learn_policy.py [--seeds 5] [--seconds 200] [--smoke]
 Expected: the gradient is at 95 % of the last return of PPO in a fifth of the samples, and PPO ends
 4 % higher; experiments/README.md has the table. Five seeds of three methods take an hour on a core.
 """
 
-import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from time import process_time
 from typing import Any
 
@@ -37,7 +37,7 @@ from tqdm import tqdm
 from torchsoft import simulate
 from torchsoft.envs import RIG, RigEnv, reorient
 from torchsoft.envs.dynamics import limits
-from torchsoft.experiment import markdown, options, timed, write
+from torchsoft.experiment import markdown, numbers, options, timed, write
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.written import to_toml
 from torchsoft.solve.progress import SimulationFailed
@@ -75,7 +75,6 @@ class Config:
     out: Path = Path("out/learn_policy")
     seeds: int = 5
     seconds: float = 200.0  # processor time of each training
-    methods: tuple[str, ...] = ("gradient", "PPO", "CMA-ES")
     hidden: int = 32  # neurons
     horizon: int = 5  # steps of a gradient
     actors: int = 4  # episodes side by side for a gradient
@@ -347,41 +346,18 @@ def deployed(config: Config, policy: nn.Module, env: RigEnv) -> RigFile:
     return RigFile.from_toml(path)
 
 
-def exported(config: Config, policy: nn.Module) -> Path:
-    """The policy as a TorchScript program, which needs neither this file nor torchsoft."""
-    path, seen = config.out / "policy.pt", torch.randn(5, SEEN).double()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.jit.save(torch.jit.trace(policy, seen), path)
-        same = torch.equal(torch.jit.load(path)(seen), policy(seen))
-    if not same:
-        raise AssertionError(f"{path} does not act as the policy does")
-    return path
-
-
 def in_engine(config: Config, policy: nn.Module) -> dict[str, Any]:
-    """Angles that are missed where a push of 8 N passes, by the policy ten times a second and as
-    a controller of the rig file; and the wall time of a run of the latter [s]."""
-    env = environment()
-    rig, act = deployed(config, policy, env), acting(policy)
-    missed: dict[str, list[float]] = {"ten times a second": [], "in the engine": []}
-    passing = {"kind": "profile", "times": [1.0, 1.1, 1.2], "values": [0.0, 8.0, 0.0]}
-    seconds = []
+    """Angles that the policy misses, by target, as a controller of the rig file while a push of 8 N
+    passes; and the wall time of a run [s]."""
+    rig = deployed(config, policy, environment())
+    push = {"kind": "profile", "times": [1.0, 1.1, 1.2], "values": [0.0, 8.0, 0.0]}
+    missed, seconds = dict[str, float](), list[float]()
     for target in (-0.5, -0.25, 0.0, 0.25, 0.5):
-        env.reset(options={"target": {"theta": target}})
-        peak = torch.tensor([[8.0, 8.0], [0.0, 0.0]]).double()  # 1.1 s: eight steps after 0.3 s
-        env.moment = env.moment._replace(peaks=peak)  # pyright: ignore[reportOptionalMemberAccess]
-        seen, over = env.dynamics.observe(env.moment).numpy(), False
-        while not over:
-            seen, _, *ends, _ = env.step(act(seen[:SEEN]))
-            over = any(ends)
-        there = float(env.moment.y[env.dynamics.coordinates["disc.theta"]])
-        built = rig.override(motion={"theta_d": {"value": target}, "push_x": passing}).build()
+        built = rig.override(motion={"theta_d": {"value": target}, "push_x": push}).build()
         run, wall = timed(partial(simulate, built.rig, built.t, y0=built.y0, rtol=1e-3))
+        missed[str(target)] = abs(run["theta_disc"][-1].item() - target)
         seconds.append(wall)
-        for name, theta in zip(missed, (there, run["theta_disc"][-1].item())):
-            missed[name].append(abs(theta - target))
-    return {"missed_rad": missed, "run_s": float(np.median(seconds))}
+    return {"missed_rad": missed, "run_s": median(seconds)}
 
 
 def run(config: Config) -> None:
@@ -390,68 +366,56 @@ def run(config: Config) -> None:
     config.out.mkdir(parents=True, exist_ok=True)
     every, content = list[History](), dict[str, Any]()
     for seed in range(config.seeds):
-        for name in config.methods:
-            history, policy = METHODS[name](config, seed)
+        for name, method in METHODS.items():
+            history, policy = method(config, seed)
             every.append(history)
             if name == "gradient" and seed == 0:
-                exported(config, policy)
                 content["deployed"] = in_engine(config, policy)
             content |= {"trainings": [asdict(one) for one in every], "reached": reached(every)}
-            write(config, content, {"learn_policy": figure(every)}, table(every, content))
+            write(config, content, {"learn_policy": figure(every)}, table(content))
 
 
 def reached(every: Sequence[History]) -> dict[str, Any]:
-    """By method: returns at the end, and samples and seconds until the mean return is PPO's at its
-    end, for the seeds that get there."""
-    ends = [one.returns[-1] for one in every if one.method == "PPO"]
-    level = float(np.mean(ends)) if ends else float("nan")
-    out: dict[str, Any] = {"level": level}
-    for name in dict.fromkeys(one.method for one in every):
+    """By method: returns at the end, and samples and seconds until the mean return is `LEVEL` of
+    PPO's at its end, for the seeds that get there."""
+    level = LEVEL * float(np.mean([one.returns[-1] for one in every if one.method == "PPO"] or [0]))
+    out: dict[str, Any] = {}
+    for name in METHODS:
         mine = [one for one in every if one.method == name]
-        first = [next((i for i, x in enumerate(one.returns) if x >= LEVEL * level), None)
-                 for one in mine]  # fmt: skip
-        there = [(one, i) for one, i in zip(mine, first) if i is not None]
+        first = [(one, np.flatnonzero(np.array(one.returns) >= level)[:1]) for one in mine]
         out[name] = {
-            "returns": [one.returns[-1] for one in mine], "reached": len(there),
-            "samples": [one.samples[i] for one, i in there],
-            "seconds": [one.seconds[i] for one, i in there],
-        }  # fmt: skip
+            "returns": [one.returns[-1] for one in mine],
+            "samples at the end": [one.samples[-1] for one in mine],
+            "samples": [one.samples[i] for one, at in first for i in at],
+            "seconds": [one.seconds[i] for one, at in first for i in at],
+        }
     return out
 
 
-def table(every: Sequence[History], content: dict[str, Any]) -> str:
-    def middle(values: Sequence[float]) -> str:
-        spread = f" ({min(values):.0f} .. {max(values):.0f})" if len(values) > 1 else ""
-        return f"{np.median(values):.0f}{spread}" if values else "-"
-
-    found, rows = content["reached"], []
-    for name in dict.fromkeys(one.method for one in every):
-        one, mine = found[name], [h for h in every if h.method == name]
-        returns = " ".join(f"{x:.1f}" for x in sorted(one["returns"]))
-        rows.append((name, returns, middle([h.samples[-1] for h in mine]),
-                     f"{one['reached']} of {len(mine)}", middle(one["samples"]),
-                     middle(one["seconds"])))  # fmt: skip
-    head = ("method", "returns at the end", "samples", f"reach {LEVEL:.0%} of PPO's",
-            "after samples", "after seconds")  # fmt: skip
-    parts = [markdown(head, rows)]
-    if "deployed" in content:
-        rows = [(name, *(f"{1e3 * x:.0f}" for x in values))
-                for name, values in content["deployed"]["missed_rad"].items()]  # fmt: skip
-        head = ("angle missed [mrad] at a target of", "-0.5", "-0.25", "0", "0.25", "0.5 rad")
-        parts.append(markdown(head, rows))
-    return "\n\n".join(parts)
+def table(content: dict[str, Any]) -> str:
+    """A row a method, numbers of all seeds in rising order; then what the controller misses."""
+    rows = [
+        (name, *(" ".join(f"{x:.{digits}f}" for x in sorted(one[key])) or "-"
+                 for key, digits in (("returns", 1), ("samples at the end", 0), ("samples", 0),
+                                     ("seconds", 0))))
+        for name, one in content["reached"].items()
+    ]  # fmt: skip
+    head = ("method", "returns at the end", "samples", f"{LEVEL:.0%} of PPO's after samples",
+            "after seconds")  # fmt: skip
+    missed = {"missed [mrad]": {k: 1e3 * x for k, x in content["deployed"]["missed_rad"].items()}}
+    return f"{markdown(head, rows)}\n\n{numbers('angle [rad], in the engine', missed, 2)}"
 
 
 def figure(every: Sequence[History]) -> Figure:
     """Return against samples and against processor time, a line a seed."""
     fig = Figure(figsize=(7.2, 3.2), layout="constrained")
     left, right = fig.subplots(1, 2, sharey=True)
-    names = list(dict.fromkeys(one.method for one in every))
-    for one in every:
-        colour = f"C{names.index(one.method)}"
-        label = one.method if one is next(h for h in every if h.method == one.method) else None
-        left.semilogx(np.maximum(one.samples, 100), one.returns, colour, lw=1, label=label)
-        right.plot(one.seconds, one.returns, colour, lw=1)
+    for name, colour in zip(METHODS, ("C0", "C1", "C2")):
+        left.plot([], [], colour, label=name)
+        for one in every:
+            if one.method == name:
+                left.semilogx(np.maximum(one.samples, 100), one.returns, colour, lw=1)
+                right.plot(one.seconds, one.returns, colour, lw=1)
     left.set(xlabel="samples", ylabel="mean return of ten episodes")
     right.set(xlabel="processor time [s]")
     left.legend(frameon=False)
