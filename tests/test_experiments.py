@@ -99,14 +99,14 @@ def test_benchmark_smoke(tmp_path):
     config = module.Config(out=tmp_path, duration=3.0, exact=1e-6, repeats=3)
     costs = module.costs(config)
     for way in module.ways(config):
-        assert costs[way]["gradient_over_run"] < 2
-        assert costs[way]["jacobian8_over_run"] < 4
-    loose, tight, *_ = (costs[way]["errors"]["x_C"] for way in module.ways(config))
+        assert costs[way]["gradient over run"] < 2
+        assert costs[way]["Jacobian for 8 over run"] < 4
+    loose, tight, *_ = (costs[way]["x_C"] for way in module.ways(config))
     assert tight < loose
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    assert result.numbers["batches"]["trajectories"]["failures"] == 0
-    assert result.numbers["growth"][-1]["over"] == "runs of a batch"
-    assert "| 2 runs of 0.2 s | 2 |" in module.tables(result)
+    found = module.run(module.Config(out=tmp_path, smoke=True))
+    assert found["batches"]["2 runs of 0.2 s, 2 threads"]["failures"] == 0
+    assert list(found["growth"]["wall_s"]) == ["61", "121"]
+    assert "| 2 runs of 0.2 s, 2 threads |" in module.tables(found)
 
 
 @pytest.mark.slow

@@ -254,17 +254,21 @@ def rig(material: Material, load: float, element: float, v: float, length: float
 
 
 @torch.no_grad()
-def roll(material: Material, load: float, element: float, v: float, config: Config) -> Roll:
-    """One steady roll at v [m/s], measured past its transients and by theory."""
-    way, before = ELEMENTS * element, max(SETTLING, WAKES * TAU * v)
-    length = element * np.ceil((2 * MARGIN + RAMP + before + way) / element)
+def roll(
+    material: Material, load: float, element: float, v: float, fastest: float, rtol: float
+) -> Roll:
+    """One steady roll at v [m/s], measured past its transients and by theory, on a pad long enough
+    for the fastest."""
+    way = ELEMENTS * element
+    before, longest = (max(SETTLING, WAKES * TAU * speed) for speed in (v, fastest))
+    length = element * np.ceil((2 * MARGIN + RAMP + longest + way) / element)
     made = rig(material, load, element, v, length)
     start = torch.tensor([MARGIN, 0.9 * HEIGHT + RADIUS, 0.0], dtype=torch.float64)
     y0 = standing(made, resting(made, {"disc": start}, {"disc": (1,)}))
     since = (2 * RAMP + before) / v
     read = since + torch.linspace(0, way / v, ELEMENTS * READINGS + 1, dtype=torch.float64)
     t = torch.cat((torch.zeros(1, dtype=torch.float64), read))
-    run = simulate(made, t, y0=y0, rtol=config.rtol)
+    run = simulate(made, t, y0=y0, rtol=rtol)
     power = sum((energy[-1] - energy[1]).item() for energy in run.dissipated.values())
     force = torch.trapezoid(-run.loads["disc"][1:, 0], run["x_disc"][1:]).item()
     theory = moving_contact(material, load, v).coefficient
@@ -279,7 +283,7 @@ def resistance(material: Material, config: Config) -> dict[str, Any]:
     a = half_width(material, config.load_N)
     speeds = np.geomspace(config.slowest, config.fastest, config.speeds) * a / TAU
     rolls = [
-        roll(material, config.load_N, 1e-3 * config.element_mm, v, config)
+        roll(material, config.load_N, 1e-3 * config.element_mm, v, speeds[-1], config.rtol)
         for v in tqdm(speeds.tolist(), "speeds", leave=False)
     ]
     peaks = {}
@@ -302,7 +306,7 @@ def by_load(config: Config) -> dict[str, Any]:
     for load in config.loads_N:
         element = 1e-3 * min(config.element_mm, 0.5 * (load / config.load_N) ** 0.5)
         v = AT_THE_PEAK * half_width(material, load) / TAU
-        one = roll(material, load, element, v, config)
+        one = roll(material, load, element, v, v, config.rtol)
         out[f"{load:g} N"] = {"force over theory": one.force / one.theory, **one._asdict()}
     return out
 
