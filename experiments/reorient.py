@@ -24,12 +24,11 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tqdm import tqdm
 
-from torchsoft.experiment import markdown, options, write
+from torchsoft.experiment import markdown, numbers, options, write
 from torchsoft.physics.sticking import SLIPPING
 from torchsoft.plan import Plan
 from torchsoft.plan.evaluation import Evaluator, Look, Terms
@@ -197,7 +196,7 @@ def rival(method: str, file: RigFile, stated: Goal, seconds: float) -> dict[str,
     except TimeOver:
         pass
     assert best is not None
-    return errors(best[1]) | {"runs": evaluator.looks, "seconds": perf_counter() - began}
+    return errors(best[1]) | {"runs": evaluator.looks}
 
 
 def row(found: Plan) -> dict[str, Any]:
@@ -248,21 +247,20 @@ def uncertain(config: Config) -> dict[str, Any]:
 def run(config: Config) -> dict[str, Any]:
     if config.smoke:
         found = plan_file(case("ellipse", "firm"), goal(case("ellipse", "firm"), 20.0, 1e-3)).plan
-        return {"turns": {"ellipse, firm, 20": row(found)}, "plans": {"ellipse, firm, 20": found}}
+        return {"turns": {"ellipse, firm, 20": row(found)}}
     turns: dict[str, Any] = {}
-    plans: dict[str, Plan] = {}
     cases = [(body, grip, turn) for body in BODIES for grip in GRIPS for turn in TURNS]
     for body, grip, turn in tqdm(cases, desc="turns"):
-        file, name = case(body, grip), f"{body}, {grip}, {turn:.0f}"
-        plans[name] = plan_file(file, goal(file, turn, config.rtol)).plan
-        turns[name] = row(plans[name])
+        file = case(body, grip)
+        found = plan_file(file, goal(file, turn, config.rtol)).plan
+        turns[f"{body}, {grip}, {turn:.0f}"] = row(found)
     file = case("ellipse", "light")
     stated, own = goal(file, 60.0, config.rtol), turns["ellipse, light, 60"]
     by_hand = planner(rolled(file, 60.0), stated)
-    rivals = {"by hand": errors(by_hand.look(by_hand.variables.start, gradient=False))}
-    rivals |= {
+    rivals = {
         name: rival(name, file, stated, own["seconds"]) for name in ("finite differences", "CMA-ES")
     }
+    rivals["by hand"] = errors(by_hand.look(by_hand.variables.start, gradient=False))
     slippery = {}
     for mu in (SLIPPERY, TOO_SLIPPERY):
         file = case("ellipse", "light", mu)
@@ -272,7 +270,7 @@ def run(config: Config) -> dict[str, Any]:
             slippery[f"mu = {mu:g}"] = {"reached": False, "reasons": [str(refused)]}
     return {
         "turns": turns, "rivals": rivals, "little friction": slippery,
-        "uncertain": uncertain(config), "plans": plans,
+        "uncertain": uncertain(config),
     }  # fmt: skip
 
 
@@ -288,57 +286,19 @@ def table(result: dict[str, Any]) -> str:
     ]  # fmt: skip
     out = [markdown(head, rows)]
     if "rivals" in result:
-        rivals = [
-            (name, f"{one['angle_deg']:.2f}", f"{one['place_mm']:.3f}", f"{one['grip_N']:.2f}",
-             f"{one.get('runs', 1):.0f}")
-            for name, one in result["rivals"].items()
-        ]  # fmt: skip
-        out.append(markdown(
-            ("60 degrees otherwise", "angle off [deg]", "place off [mm]", "grip missing [N]",
-             "runs"), rivals,
-        ))  # fmt: skip
+        out.append(numbers("60 degrees otherwise", result["rivals"]))
         out.append(markdown(
             ("little friction", "reached", "why not"),
             [(name, "yes" if one["reached"] else "no", "; ".join(one["reasons"]) or "-")
              for name, one in result["little friction"].items()],
         ))  # fmt: skip
-        out.append(markdown(
-            ("on uncertain rigs", "holds in", "rms angle [deg]", "rms x [mm]", "rms y [mm]",
-             "planned in [s]"),
-            [(name, f"{one['holds']:.1%}", f"{one['angle_deg']:.3f}", f"{one['x_mm']:.4f}",
-              f"{one['y_mm']:.4f}", f"{one['seconds']:.0f}")
-             for name, one in result["uncertain"].items()],
-        ))  # fmt: skip
+        out.append(numbers("on uncertain rigs, rms", result["uncertain"]))
     return "\n\n".join(out)
-
-
-def figure(result: dict[str, Any]) -> Figure:
-    """Angle, place, grip and the fingers' heights over time, a line a plan."""
-    fig = Figure(figsize=(7.2, 5.4), layout="constrained")
-    axes = fig.subplots(2, 2, sharex=True).ravel()
-    for name, one in result["plans"].items():
-        r = one.trajectory
-        t = r.t.numpy()
-        for ax, values in zip(axes, (
-            np.degrees(r["theta_object"].detach().numpy()),
-            1e3 * np.hypot(r["x_object"].detach().numpy(), r["y_object"].detach().numpy()),
-            r["F_left_x"].detach(), 1e3 * r["y_left"].detach(),
-        )):  # fmt: skip
-            ax.plot(t, values, lw=1, label=name)
-    labels = ("angle [deg]", "distance from the place [mm]", "grip [N]", "left finger y [mm]")
-    for ax, label in zip(axes, labels):
-        ax.set_ylabel(label)
-    for ax in axes[2:]:
-        ax.set_xlabel("t [s]")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3,
-               frameon=False, fontsize=8)  # fmt: skip
-    return fig
 
 
 def main(config: Config) -> None:
     result = run(config)
-    content = {name: one for name, one in result.items() if name != "plans"}
-    write(config, content, {"reorient": figure(result)}, table(result))
+    write(config, result, table=table(result))
 
 
 if __name__ == "__main__":
