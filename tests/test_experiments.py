@@ -34,8 +34,7 @@ def experiment(name: str) -> ModuleType:
 
 def test_grasp_and_roll_smoke(tmp_path):
     module = experiment("grasp_and_roll")
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    module.write(result)
+    module.main(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads((tmp_path / "summary.json").read_text())
     assert numbers["y_C_grasp_mm"] == pytest.approx(23.20, abs=0.01)
     assert numbers["y_Br_hold_mm"]["max"] == pytest.approx(48.6, abs=0.002)

@@ -34,11 +34,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
-from scipy.signal import lfilter
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
-from torchsoft.experiment import COARSE, markdown, options, repeated, write
+from torchsoft.experiment import COARSE, coloured, markdown, options, repeated, write
 from torchsoft.files import replacing
 from torchsoft.rigs import RigFile
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, identify, record
@@ -131,15 +130,10 @@ def papers(config: Config, rho: float, way: Callable[..., Repetition]) -> Case:
         for name, e in motions.items()
     ]
 
-    def noise(m: int, rng: np.random.Generator) -> Any:
-        e = rng.standard_normal(m)
-        e[1:] *= (1 - rho**2) ** 0.5
-        return lfilter([1.0], [1.0, -rho], e)
-
     def repetition(seed: int) -> Repetition:
         rng, noisy = np.random.default_rng(seed), []
         for r in exact:
-            samples = {c: (t, y + RIG[c].noise * noise(len(t), rng))
+            samples = {c: (t, y + RIG[c].noise * coloured(len(t), rho, rng))
                        for c, (t, y) in r.samples.items()}  # fmt: skip
             noisy.append(replace(r, samples=samples))
         start = {name: OFF * value for name, value in truth.items()}

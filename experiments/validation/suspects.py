@@ -39,7 +39,7 @@ from torchsoft.threads import parallel_map
 sys.path.insert(0, str(Path(__file__).parent))
 
 import foreign_rigs
-from foreign_rigs import TRUTH, Made, Order, make_all
+from foreign_rigs import TRUTH, Made, Order, chosen, make_all
 
 SIX = ("contact.K_n", "contact.K_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
 KNOWN = {name: value for name, value in TRUTH.items() if name not in SIX}
@@ -159,7 +159,7 @@ class Outcome:
 
 def problem(case: Case, made: Made, seed: int) -> Problem:
     noted = foreign_rigs.Case(case.name, noted=KNOWN)
-    recording = noted.recording(case.excitation, made, seed, False)
+    recording = noted.recording(case.excitation, made, seed)
     if case.alter is not None:
         recording = case.alter(recording, np.random.default_rng(1000 + seed))
     unknowns = {name: Unknown(nominal=TRUTH[name] * 1.6 ** (-1) ** i) for i, name in enumerate(SIX)}
@@ -184,14 +184,10 @@ def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
 
 
 def run(config: Config) -> list[Outcome]:
-    names = config.only or (SMOKE if config.smoke else tuple(case.name for case in CASES))
     if config.smoke:
         config = replace(config, seeds=1, workers=1, rtol=1e-4, step=5e-5)
-    cases = [case for case in CASES if case.name in names]
-    if strange := set(names) - {case.name for case in cases}:
-        known = ", ".join(case.name for case in CASES)
-        raise ValueError(f"there is no case {min(strange)!r}; the cases are {known}")
-    made = make_all([case.order for case in cases], config.step, False, config.workers)
+    cases = chosen(CASES, config.only or (SMOKE if config.smoke else ()))
+    made = make_all([case.order for case in cases], config.step, config.workers)
     every = [(case, seed) for case in cases for seed in range(config.seeds)]
     work = parallel_map(
         lambda k: repeat(every[k][0], made[every[k][0].order], every[k][1], config),
