@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import tomlkit
 from scipy import stats
 
 from torchsoft import Parameters
@@ -49,7 +50,7 @@ from torchsoft.sysid.runs import Runner
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import identify_contact
-from identify_contact import FITTED, TRUTH
+from identify_contact import FITTED, truths
 
 RIGS = Path(__file__).parents[2] / "rigs"
 
@@ -107,8 +108,7 @@ def judged(found: Mapping[str, Estimate], truth: Mapping[str, float]) -> dict[st
 
 def papers(config: Config, rho: float, way: Callable[..., Repetition]) -> Case:
     """Repetitions of the paper's rig with noise whose neighbouring samples correlate by rho."""
-    few = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
-    truth = {name: TRUTH[name] for name in few} if config.smoke else TRUTH
+    truth = truths(config.smoke)
     nominal = Parameters().override(
         {"contact.v_s": 0.05} | ({"contact.mu_k": 0.5} if config.smoke else {}) | COARSE
     )
@@ -254,17 +254,11 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
 
 def stated(lab: Laboratory, settings: Mapping[str, Any], truth: Mapping[str, float]) -> str:
     """The identification, as a user would write it."""
-    lines = [f'rig = "{(RIGS / lab.file).as_posix()}"']
-    lines += ["[settings]", *(f"{name} = {literal(one)}" for name, one in settings.items())]
-    lines += ["[unknowns]", *(f'"{name}" = {{}}' for name in truth)]
-    return "\n".join([*lines, "[sensors]", *(f"{k}.noise = {v}" for k, v in lab.noise.items())])
-
-
-def literal(value: Any) -> str:
-    """A value in a line of TOML."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f'"{key}" = {literal(one)}' for key, one in value.items()) + "}"
-    return f'"{value}"' if isinstance(value, str) else str(value)
+    return tomlkit.dumps({
+        "rig": (RIGS / lab.file).as_posix(), "settings": settings,
+        "unknowns": {name: {} for name in truth},
+        "sensors": {name: {"noise": sd} for name, sd in lab.noise.items()},
+    })  # fmt: skip
 
 
 def measured(exact: Recording, lab: Laboratory, rng: np.random.Generator, path: Path) -> None:
