@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
-from torchsoft.experiment import COARSE, numbers, options, write
+from torchsoft.experiment import COARSE, coloured, numbers, options, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals, StepsByName
 from torchsoft.sysid.recording import Array
@@ -117,6 +117,17 @@ def start(truth: dict[str, float], seed: int) -> dict[str, float]:
     return out
 
 
+def noisy(
+    recording: Recording, seed: int | np.random.Generator, rho: float = 0.0
+) -> Recording:  # fmt: skip
+    """A recording without noise, with that of `RIG`, whose neighbouring samples correlate by
+    `rho`."""
+    rng, samples = np.random.default_rng(seed), {}
+    for channel, (t, y) in recording.samples.items():
+        samples[channel] = (t, y + RIG[channel].noise * coloured(len(t), rho, rng))
+    return replace(recording, samples=samples)
+
+
 def problem(
     recordings: list[Recording], begin: dict[str, float], sensors: dict[str, Sensor] = RIG,
     kind: type[Problem] = Problem,
@@ -148,12 +159,12 @@ def main(config: Config) -> None:
     if config.smoke:
         config = replace(config, workers=1, starts=(0,))
     truth, held = truths(config.smoke), [list(excitations(config))[-1]]
-    noisy, exact = record_all(config, 1.0), record_all(config, 0.0)
+    measured, exact = record_all(config, 1.0), record_all(config, 0.0)
     rows = list[dict[str, Any]]()
     for name, recordings, seeds, kind in (
-        ("noisy", noisy, config.starts, Problem),
+        ("noisy", measured, config.starts, Problem),
         ("noise-free", exact, config.starts, Problem),
-        ("finite differences", noisy, config.starts[:1], FiniteDifferences),
+        ("finite differences", measured, config.starts[:1], FiniteDifferences),
     ):
         for seed in seeds:
             begin = start(truth, seed)

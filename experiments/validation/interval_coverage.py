@@ -38,7 +38,7 @@ from scipy import stats
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
-from torchsoft.experiment import COARSE, coloured, markdown, options, repeated, write
+from torchsoft.experiment import COARSE, markdown, options, repeated, write
 from torchsoft.files import replacing
 from torchsoft.rigs import RigFile
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, identify, record
@@ -50,7 +50,7 @@ from torchsoft.sysid.runs import Runner
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import identify_contact
-from identify_contact import FITTED, truths
+from identify_contact import FITTED, noisy, truths
 
 RIGS = Path(__file__).parents[2] / "rigs"
 
@@ -131,13 +131,10 @@ def papers(config: Config, rho: float, way: Callable[..., Repetition]) -> Case:
     ]
 
     def repetition(seed: int) -> Repetition:
-        rng, noisy = np.random.default_rng(seed), []
-        for r in exact:
-            samples = {c: (t, y + RIG[c].noise * coloured(len(t), rho, rng))
-                       for c, (t, y) in r.samples.items()}  # fmt: skip
-            noisy.append(replace(r, samples=samples))
+        rng = np.random.default_rng(seed)
+        recordings = [noisy(one, rng, rho) for one in exact]
         start = {name: OFF * value for name, value in truth.items()}
-        return way(identify_contact.problem(noisy, start), truth, config.rtol)
+        return way(identify_contact.problem(recordings, start), truth, config.rtol)
 
     return Case(truth, repetition)
 
