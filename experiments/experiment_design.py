@@ -81,7 +81,9 @@ class Information(NamedTuple):
     inconsistency: float
 
 
-def row(catalogue: Mapping[str, Excitation], parts: Mapping[str, Information], dropped: str = "") -> Row:
+def row(
+    catalogue: Mapping[str, Excitation], parts: Mapping[str, Information], dropped: str = ""
+) -> Row:
     """The row of excitations together."""
     J, error = (np.concatenate([part[k] for part in parts.values()]) for k in (0, 1))
     sd, off = (dict(zip(NAMES, x.tolist())) for x in (standard_deviations(J), shift(J, error)))
