@@ -120,11 +120,6 @@ class Training:
         self._begin, self._next = process_time(), 0
         self._bar = tqdm(total=round(config.seconds), desc=f"{method} {seed}", unit="s")
 
-    @property
-    def late(self) -> bool:
-        """Whether the time is up."""
-        return process_time() - self._begin >= self.config.seconds
-
     def over(self, samples: int, act: Callable[[np.ndarray], np.ndarray]) -> bool:
         """Evaluate where it is time to; whether the time is up."""
         now = process_time() - self._begin
@@ -289,11 +284,7 @@ def by_evolution(config: Config, seed: int) -> tuple[History, nn.Module]:
         for one in weights:
             acts = acting(load(policy, one))
             costs.append(-float(np.mean([episode(env, acts, k) for k in seeds])))
-            samples += len(seeds) * env.limit
-            if training.late:
-                break
-        if len(costs) < len(weights):
-            continue
+        samples += len(weights) * len(seeds) * env.limit
         search.tell(weights, costs)
     return training.history, load(mean, search.mean)
 

@@ -9,9 +9,8 @@ masses of rigid parts that roll. Errors count from the closed grip on.
   kinematics  jaws under loops of their own, driven as a rigid disc would roll: what it costs not to
               see the disc
   speed       everything after the grip faster; rigid parts lag behind by a / w^2
-  friction    less of it: a disc asks for mu = I alpha / 2 R N and m a / 2 N, a shape between rigid
-              plates for max h'/h (1 + W / 2 N), with its support function h, grip N and weight W
-              (the friction cone)
+  friction    less of it: a shape between rigid plates asks for mu = max h'/h (1 + W / 2 N), with
+              its support function h, grip N and weight W (the friction cone)
   shape       ellipses of the disc's area and a rounded box: the grip turns them with F = max h'/h
               (N + W / 2) on either jaw, for which the loop needs an error F / Kp; then with the
               efforts of the run before fed forward
@@ -104,14 +103,6 @@ class Config:
         150.0  # of the loops [rad/s]; assumed, for the model has no delay that would limit it
     )
     speeds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the disc
-    disc_frictions: tuple[float, ...] = (
-        0.8,
-        0.02,
-        0.01,
-        0.005,
-        0.002,
-        0.001,
-    )  # mu_s; mu_k in proportion
     aspects: tuple[float, ...] = (1.1, 1.3, 2.0)  # of the ellipses
     frictions: tuple[float, ...] = (0.5, 0.35, 0.32, 0.3, 0.28, 0.25, 0.2)
     passes: int = 2  # runs whose efforts are fed forward, one after the other
@@ -301,15 +292,11 @@ def rigid(shape: Shape, grip: float, weight: float) -> Rigid:
 DISC, KINEMATICS, SLIPPING = "disc", "disc, by kinematics", "ellipse 1.3"
 """Runs by name; the friction of the last is varied."""
 
-FAST = 3.0
-"""Speed at which the friction of the disc is varied."""
-
 
 GROUPS = {
     "loops_alone": "{}",
     "efforts_fed_forward": "{}, efforts fed forward",
     "speeds": "disc, {} times as fast",
-    "disc_frictions": "disc, fast, mu = {}",
     "frictions": "ellipse, fed forward, mu = {}",
 }
 """Groups of runs, and what the table calls one of them."""
@@ -318,23 +305,22 @@ GROUPS = {
 @dataclass(frozen=True)
 class Result:
     """Outcomes by group and key, predictions of rigid statics by shape, lags a / w^2 [mm, deg] by
-    speed, the coefficients of friction that the fast disc asks for, and runs to be drawn."""
+    speed, and runs to be drawn."""
 
     gains: Gains
     outcomes: dict[str, dict[str, Outcome]]
     rigid: dict[str, Rigid]
     lags: dict[str, tuple[float, float]]
-    cones: dict[str, float]
     runs: dict[str, Trajectory]
 
     def content(self) -> dict[str, Any]:
-        return {
-            "gains": self.gains, "inertia_alone_mm_deg": self.lags, "disc_cones": self.cones,
-            "rigid": {name: one._asdict() for name, one in self.rigid.items()},
-        } | {
+        """What `summary.json` holds."""
+        by_group = {
             group: {key: one._asdict() for key, one in some.items()}
             for group, some in self.outcomes.items()
-        }  # fmt: skip
+        }
+        rigid = {name: one._asdict() for name, one in self.rigid.items()}
+        return {"gains": self.gains, "inertia_alone_mm_deg": self.lags, "rigid": rigid, **by_group}
 
 
 def table(result: Result) -> str:
@@ -349,10 +335,9 @@ def table(result: Result) -> str:
          x.verdict)
         for group, some in result.outcomes.items() for key, x in some.items()
     ]  # fmt: skip
-    cones = {name: one.friction for name, one in result.rigid.items()}
-    cones |= {f"disc, fast, {name}": mu for name, mu in result.cones.items()}
     asked = markdown(
-        ("rigid", "asks for a friction of"), [(name, f"{mu:.3g}") for name, mu in cones.items()]
+        ("rigid", "asks for a friction of"),
+        [(name, f"{one.friction:.3g}") for name, one in result.rigid.items()],
     )
     return f"{markdown(head, rows)}\n\n{asked}"
 
@@ -382,24 +367,19 @@ def inertia_alone(case: Case, bandwidth: float) -> tuple[float, float]:
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = replace(config, speeds=(6.0,), disc_frictions=(), aspects=(1.3,), frictions=(0.2,),
+        config = replace(config, speeds=(6.0,), aspects=(1.3,), frictions=(0.2,),
                          passes=1, rtol=1e-3)  # fmt: skip
     mesh = {"elements_x": 35, "elements_y": 2}
     gains = design(RigFile.from_toml(FILE), config.bandwidth)
     file = file_of(gains, pads={"lower": mesh, "upper": mesh}) if config.smoke else file_of(gains)
     base = case_of(file)
-    hurried, disc = faster(base, FAST), base.rig.bodies["disc"]
+    disc = base.rig.bodies["disc"]
     assert isinstance(disc.shape, Circle)
-    R, mass, inertia = disc.shape.radius.item(), disc.mass.item(), disc.inertia.item()
-    weight = base.rig.gravity.item() * mass
+    R = disc.shape.radius.item()
+    weight = base.rig.gravity.item() * disc.mass.item()
     grip = -float(base.signals["grip"](torch.tensor(base.end, dtype=torch.float64))[0].detach())
-    cones = {
-        "turning": inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip),
-        "carrying": mass * peak(hurried.signals["x_d"]) / (2 * grip),
-    }
     outcomes: dict[str, dict[str, Outcome]] = {group: {} for group in GROUPS}
-    result = Result(gains, outcomes, {DISC: rigid(disc.shape, grip, weight)}, {},
-                    cones, {})  # fmt: skip
+    result = Result(gains, outcomes, {DISC: rigid(disc.shape, grip, weight)}, {}, {})
     bar = tqdm(unit="run")
 
     def attempt(case: Case, group: str, key: object) -> Trajectory:
@@ -414,9 +394,6 @@ def run(config: Config) -> Result:
         case = faster(base, speed)
         result.lags[str(speed)] = inertia_alone(case, config.bandwidth)
         attempt(case, "speeds", speed)
-    for mu in config.disc_frictions:
-        rubbed(base, mu)
-        attempt(hurried, "disc_frictions", mu)
     for name, shape in shapes(config, R).items():
         case, result.rigid[name] = case_of(file, shape), rigid(shape, grip, weight)
         done, last = attempt(case, "loops_alone", name), outcomes["loops_alone"]
