@@ -188,15 +188,13 @@ def test_interval_coverage_smoke(tmp_path):
 
 @pytest.mark.slow
 def test_contact_points_smoke(tmp_path):
-    """Two points an element take most of the nodes out of the force along the pad; gradients are
-    exact with either."""
+    """Two points an element take most of the nodes out of the force along the pad."""
     module = experiment("contact_points")
     module.main(module.Config(out=tmp_path, smoke=True))
     cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
     nodes, between = cases["1 mm, nodes"], cases["1 mm, 2"]
     name = "static ripple of the force along the pad [mN]"
     assert between[name] < 0.3 * nodes[name]
-    assert max(case["gradient from differences over 1e-06"] for case in (nodes, between)) < 5e-5
 
 
 @pytest.mark.slow

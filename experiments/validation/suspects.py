@@ -13,15 +13,15 @@ named. About two hours on two cores.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
-from torchsoft.experiment import markdown, options, timed, write
+from torchsoft.experiment import markdown, options, repeated, timed, write
 from torchsoft.sysid import (
     RIG,
     Problem,
@@ -34,7 +34,6 @@ from torchsoft.sysid.assumptions import delayed
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import forget
 from torchsoft.sysid.suspects import LIKELY
-from torchsoft.threads import parallel_map
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -137,24 +136,27 @@ class Repetition(NamedTuple):
     explain_s: float | None
 
 
-@dataclass(frozen=True)
-class Outcome:
-    case: Case
-    repetitions: list[Repetition]
+def names_the_suspect(case: Case, one: Repetition) -> bool:
+    said = any(word in text for word in case.words for text in one.notices)
+    return said or any(name.startswith(case.suspects) for name in one.named)
 
-    def names_the_suspect(self, one: Repetition) -> bool:
-        said = any(word in text for word in self.case.words for text in one.notices)
-        return said or any(name.startswith(self.case.suspects) for name in one.named)
 
-    def worst(self, one: Repetition) -> float:
-        return max(map(abs, one.off.values()), default=0.0)
-
-    @property
-    def silent(self) -> int:
-        """Seeds of which an estimate is off without the suspect among those named."""
-        return sum(
-            self.worst(one) > OFF and not self.names_the_suspect(one) for one in self.repetitions
-        )
+def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
+    """A case in numbers; `silent`: seeds of which an estimate is off without the suspect named."""
+    named = [names_the_suspect(case, one) for one in reps]
+    worst = [max(map(abs, one.off.values()), default=0.0) for one in reps]
+    every = [z for one in reps for z in one.off.values()]
+    odds = Counter[str]()
+    for one in reps:
+        odds.update(one.named)
+    return {
+        "name": case.name, "held": sum(abs(z) < 1.96 for z in every), "of": len(every),
+        "worst": worst, "named": sum(named), "odds": {k: x / len(reps) for k, x in odds.items()},
+        "silent": sum(z > OFF and not told for z, told in zip(worst, named)),
+        "identify_s": max(one.identify_s for one in reps),
+        "explain_s": max((one.explain_s for one in reps if one.explain_s), default=None),
+        "repetitions": [one._asdict() for one in reps],
+    }  # fmt: skip
 
 
 def problem(case: Case, made: Made, seed: int) -> Problem:
@@ -183,73 +185,33 @@ def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
     return Repetition(off, named, result.notices, identify_s, explain_s)
 
 
-def run(config: Config) -> list[Outcome]:
-    if config.smoke:
-        config = replace(config, seeds=1, workers=1, rtol=1e-4, step=5e-5)
-    cases = chosen(CASES, config.only or (SMOKE if config.smoke else ()))
-    made = make_all([case.order for case in cases], config.step, config.workers)
-    every = [(case, seed) for case in cases for seed in range(config.seeds)]
-    work = parallel_map(
-        lambda k: repeat(every[k][0], made[every[k][0].order], every[k][1], config),
-        len(every), config.workers,
-    )  # fmt: skip
-    done: dict[int, Repetition] = {}
-    for k, one in tqdm(work, total=len(every), desc="identifications"):
-        done[k] = one
-        outcomes = [
-            Outcome(case, [done[j] for j, (other, _) in enumerate(every) if other is case
-                           and j in done])
-            for case in cases
-        ]  # fmt: skip
-        write(config, summary(outcomes))
-    return outcomes
-
-
-def summary(outcomes: list[Outcome]) -> dict[str, Any]:
-    return {
-        "silent": sum(one.silent for one in outcomes),
-        "cases": [
-            {
-                "name": one.case.name, "silent": one.silent,
-                "named": sum(map(one.names_the_suspect, one.repetitions)),
-                "repetitions": [rep._asdict() for rep in one.repetitions],
-            }
-            for one in outcomes
-        ],
-    }  # fmt: skip
-
-
-def table(outcomes: list[Outcome]) -> str:
+def table(cases: list[dict[str, Any]]) -> str:
     rows = []
-    for one in outcomes:
-        reps, n = one.repetitions, len(one.repetitions)
-        held = sum(abs(z) < 1.96 for rep in reps for z in rep.off.values())
-        count = sum(len(rep.off) for rep in reps)
-        worst = max((one.worst(rep) for rep in reps), default=0.0)
-        odds: dict[str, list[float]] = {}
-        for rep in reps:
-            for name, value in rep.named.items():
-                odds.setdefault(name, []).append(value)
-        said = ", ".join(
-            f"{name} ({sum(some) / n:.2g})" for name, some in
-            sorted(odds.items(), key=lambda item: -sum(item[1]))[:4]
-        )  # fmt: skip
-        explained = [rep.explain_s for rep in reps if rep.explain_s is not None]
+    for one in cases:
+        odds = sorted(one["odds"].items(), key=lambda item: -item[1])[:4]
         rows.append((
-            one.case.name, f"{held} of {count}", f"{worst:.1f}",
-            f"{sum(map(one.names_the_suspect, reps))} of {n}" if one.case.suspects + one.case.words
-            else "-",
-            said or "-", f"{np.median([rep.identify_s for rep in reps]):.0f}",
-            f"{np.median(explained):.0f}" if explained else "-", str(one.silent),
+            one["name"], f"{one['held']} of {one['of']}",
+            f"{min(one['worst']):.1f} .. {max(one['worst']):.1f}",
+            ", ".join(f"{name} ({x:.2g})" for name, x in odds) or "-",
+            f"{one['named']} of {len(one['worst'])}", f"{one['identify_s']:.0f}",
+            f"{one['explain_s']:.0f}" if one["explain_s"] else "-", one["silent"],
         ))  # fmt: skip
-    head = ("what differs", "intervals that hold", "worst error / sd", "true suspect named",
-            "named (mean odds)", "identify [s]", "explain [s]", "silent")  # fmt: skip
+    head = ("what differs", "intervals that hold", "worst error / sd", "named (mean odds)",
+            "rightly in", "identify [s]", "explain [s]", "silent")  # fmt: skip
     return markdown(head, rows)
 
 
 def main(config: Config) -> None:
-    outcomes = run(config)
-    write(config, summary(outcomes), table=table(outcomes))
+    cases = chosen(CASES, config.only or (SMOKE if config.smoke else ()))
+    if config.smoke:
+        config = replace(config, seeds=1, workers=1, rtol=1e-4, step=5e-5)
+    made = make_all([case.order for case in cases], config.step, config.workers)
+    done = list[dict[str, Any]]()
+    for case in cases:
+        one = lambda seed, case=case: repeat(case, made[case.order], seed, config)
+        done.append(summed(case, repeated(one, config.seeds, config.workers, case.name)))
+        content = {"silent": sum(row["silent"] for row in done), "cases": done}
+        write(config, content, table=table(done))
 
 
 if __name__ == "__main__":
