@@ -37,11 +37,10 @@ from torch import nn
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
 from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.experiment import COARSE, grid, numbers, options, timed, write
+from torchsoft.experiment import COARSE, at_the_points, grid, numbers, options, write
 from torchsoft.files import finite
-from torchsoft.physics.contact import ramp
 from torchsoft.physics.motion import Waves, wave
-from torchsoft.reduced.fit import Recipe, assemble, choose, fit, rollout_of, score
+from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics
@@ -77,20 +76,11 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-def law(p: Parameters) -> dict[str, dict[str, float]]:
-    """The horizontal loop as feedback of the reduced model (Eq. 33, 34)."""
-    K, R = p.control.K_81, p.control.R_80
-    x, v = ("x_C", "v_C") if p.control.senses == "disc" else ("x_Br", "v_Br")
-    return {"F_x": {"x_d": K, "x_d_dot": R, x: -K, v: -R}}
-
-
 def slipping(model: SoftGrasp, run: Trajectory) -> float:
     """Part of the touching nodes of the upper pad that slip faster than 1 mm/s, over time."""
-    with torch.no_grad():
-        at = model.evaluate(0.0, model.unpack(run.y[::20])).interfaces["U"]
-        touching = at.frame.g > 0
-        slip = ramp(at.frame.g, model.contacts["U"].law.epsilon) * at.flow[..., 1] - at.out[..., 2]
-        return float((touching & (slip.abs() > 1e-3)).sum() / touching.sum())
+    every = at_the_points(model, run.t[::20], run.y[::20])
+    depth, speed = (x.chunk(2, -1)[list(model.contacts).index("U")] for x in every)
+    return float(((depth > 0) & (speed > 1e-3)).sum() / (depth > 0).sum())
 
 
 def compared(model: ReducedModel, static: dict[tuple[str, str], float]) -> list[dict[str, Any]]:
@@ -116,7 +106,7 @@ def refit(
 
 def rollout_time(model: ReducedModel, on: Record, repeats: int = 9) -> float:
     """Wall time of a rollout [s], the least, which other work on the machine disturbs least."""
-    return min(timed(lambda: rollout_of(model, on))[1] for _ in range(repeats))
+    return min(rollout_of(model, on).wall_s for _ in range(repeats))
 
 
 @dataclass(frozen=True)
@@ -227,7 +217,7 @@ def study_stick(config: Config) -> dict[str, Any]:
     ]
     taps, recipe = tapped(grasp, config), Recipe(width=0.004, window=config.tap_time)
     problem = assemble(taps, mechanics(r), recipe)
-    choice = choose(problem, tests, recipe, config.thresholds, law(p))
+    choice = choose(problem, tests, recipe, config.thresholds, loop(taps))
     reduced = refit(taps, choice.model, recipe, config)
     full = [
         simulate(model, grid(p.scenario.duration, 2e-3), y0=whole.y0)
@@ -286,14 +276,13 @@ def sticking(model: ReducedModel) -> ReducedModel:
 def study_slip(config: Config) -> dict[str, Any]:
     train = [strokes(config, -20e-3, T).record for T in config.stroke_times]
     other = {T: strokes(config, 15e-3, T) for T in (*config.checking_times, *config.other_times)}
-    feedback = law(Parameters().override({"control.senses": "bracket"}))
     r = rolling_radius([train[int(np.argmax(config.stroke_times))]])
     recipe = Recipe(width=0.004, window=min(config.stroke_times) * 4)
     checks = [other[T].record for T in config.checking_times]
     choices = []
     for speed in config.speeds:
         problem = assemble(train, joined(mechanics(r, alike=False), friction(r, speed)), recipe)
-        choices.append(choose(problem, checks, recipe, config.thresholds, feedback, each=False))
+        choices.append(choose(problem, checks, recipe, config.thresholds, loop(train), each=False))
     errors = [choice.tried[choice.index]["nrmse"] for choice in choices]
     good = [one.model for one, error in zip(choices, errors) if error <= 1.1 * min(errors)]
     model = refit(train, min(good, key=lambda one: len(one.terms)), recipe, config)

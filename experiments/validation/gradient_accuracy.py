@@ -31,7 +31,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, hold, press, simulate
-from torchsoft.experiment import COARSE, at_the_points, markdown, options, write
+from torchsoft.experiment import COARSE, at_the_points, grid, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.solve.trajectory import channels
@@ -79,10 +79,6 @@ class Window:
     y0: Tensor
     t: Tensor
     step: float
-
-
-def linspace(start: float, end: float, step: float) -> Tensor:
-    return torch.linspace(start, end, round((end - start) / step) + 1, dtype=torch.float64)
 
 
 def states(window: Window) -> Tensor:
@@ -189,7 +185,7 @@ def stroke(mesh: dict[str, Any]) -> Window:
     x = model.unpack(y0).pose["disc"][0].item()
     still = hold(y_d=height, F_ff=-holding_force(model, y0))
     model.reference = Reference(**{**still.signals, "x_d": Profile([0.0, 0.02], [x, x - 2e-3])})
-    return Window("slip", model, y0, linspace(0.0, 6e-3, 2.5e-4), 2.5e-4)
+    return Window("slip", model, y0, grid(6e-3, 2.5e-4), 2.5e-4)
 
 
 def windows(config: Config) -> list[Window]:
@@ -202,19 +198,17 @@ def windows(config: Config) -> list[Window]:
     manipulation = grasp_and_roll(model, grasp_force=75.0 if config.smoke else None)
     y0 = manipulation.y0
     with torch.no_grad():
-        path = states(Window("path", model, y0, linspace(0.0, roll, 0.01), 2e-3))
+        path = states(Window("path", model, y0, grid(roll, 0.01), 2e-3))
     above = y0.clone()
     above[model.layout.slices["pose", "bracket"].stop - 1] += 2e-5
     lowered = SoftGrasp(model.settings)
     lowered.reference = reference(lowered, above, manipulation.grasp_force)
     return [
-        Window(
-            "stick", model, path[round(100 * early)], linspace(early, early + stick, 1e-3), 1e-3
-        ),
+        Window("stick", model, path[round(100 * early)], early + grid(stick, 1e-3), 1e-3),
         stroke(mesh),
-        Window("make-break", model, path[-1], linspace(roll, roll + broken, 2e-3), 2e-3),
-        Window("grasp", lowered, above, linspace(0.0, grasp, 2e-3), 2e-3),
-        Window("full", model, y0, linspace(0.0, config.duration, 0.01), 2e-3),
+        Window("make-break", model, path[-1], roll + grid(broken, 2e-3), 2e-3),
+        Window("grasp", lowered, above, grid(grasp, 2e-3), 2e-3),
+        Window("full", model, y0, grid(config.duration, 0.01), 2e-3),
     ]
 
 
