@@ -22,6 +22,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from sklearn.linear_model import Ridge
+from sklearn.neural_network import MLPRegressor
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
@@ -234,70 +238,30 @@ def slip_speeds(residual: Residual, given: Runs) -> tuple[float, float]:
 # the surrogate
 
 
-class Surrogate(nn.Module):
-    """Friction on both pads [sd] at the end of a history (B, T, inputs) [sd]."""
-
-    def __init__(self, inputs: int, hidden: int) -> None:
-        super().__init__()
-        self.memory = nn.GRU(inputs, hidden, batch_first=True)
-        self.last = nn.Linear(hidden, 2)
-
-    def forward(self, history: Tensor) -> Tensor:
-        return self.last(self.memory(history)[0][:, -1])
-
-
-@dataclass(frozen=True)
-class Histories:
-    """Windows: the jaws' motion (N, T, 6), and friction at their end (N, 2) [N]; and how many a
-    second the loader gave."""
-
-    motion: Tensor
-    friction: Tensor
-    per_second: float
-
-
-def histories(config: Config, url: str, split: str) -> Histories:
+def histories(config: Config, url: str, split: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """Windows of the jaws' motion (N, inputs), the friction on both pads at their end (N, 2) [N],
+    and how many a second the loader gave."""
     forces = [f"friction_force_{jaw}" for jaw in JAWS]
     windows = Trajectories(
         url, [*MOTION, *forces], split=split, window=config.window, stride=5, dtype=torch.float32
     )
-    torch.manual_seed(config.seed)
-    batches, seconds = timed(lambda: list(DataLoader(windows, batch_size=128, shuffle=True)))
-    motion = torch.cat([torch.stack([one[name] for name in MOTION], -1) for one in batches])
-    friction = torch.cat(
-        [torch.stack([one[name][:, -1].sum(-1) for name in forces], -1) for one in batches]
-    )
-    return Histories(motion, friction, len(windows) / seconds)
+    batches, seconds = timed(lambda: list(DataLoader(windows, batch_size=128)))
+    motion = [torch.cat([one[name] for name in MOTION], -1) for one in batches]
+    friction = [torch.stack([one[name][:, -1].sum(-1) for name in forces], -1) for one in batches]
+    return torch.cat(motion).numpy(), torch.cat(friction).numpy(), len(windows) / seconds
 
 
 def surrogates(config: Config, url: str) -> tuple[dict[str, float], float]:
     """Held-out error over the standard deviation of the friction, by method; windows a second."""
-    train, test = (histories(config, url, split) for split in ("train", "test"))
-    mean, sd = train.friction.mean(0), train.friction.std(0)
-    wanted, truth = ((one.friction - mean) / sd for one in (train, test))
-    middle, spread = train.motion.mean((0, 1)), train.motion.std((0, 1)).clamp(min=1e-9)
-    x, held = ((one.motion - middle) / spread for one in (train, test))
-    rows = [torch.cat((one.flatten(1), torch.ones(len(one), 1)), 1) for one in (x, held)]
-    linear = rows[1] @ torch.linalg.lstsq(rows[0], wanted, driver="gelsd").solution
-    found = {"linear": linear, "network": trained(config, x, wanted)(held).detach()}
-    return {
-        k: float((y - truth).square().mean().sqrt()) for k, y in found.items()
-    }, train.per_second
-
-
-def trained(config: Config, x: Tensor, wanted: Tensor) -> Surrogate:
-    torch.manual_seed(config.seed)
-    network = Surrogate(x.shape[-1], config.hidden)
-    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.epochs)
-    for _ in tqdm(range(config.epochs), desc="epochs of the surrogate"):
-        for part in torch.randperm(len(x)).split(128):
-            optimiser.zero_grad()
-            (network(x[part]) - wanted[part]).square().mean().backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimiser.step()
-        schedule.step()
-    return network
+    (x, friction, rate), (held, truth, _) = (histories(config, url, s) for s in ("train", "test"))
+    mean, sd = friction.mean(0), friction.std(0)
+    how: dict[str, Any] = {"max_iter": config.epochs, "random_state": config.seed, "alpha": 1e-3}
+    methods = {"linear": Ridge(), "network": MLPRegressor((config.hidden, config.hidden), **how)}
+    found = {}
+    for name, method in methods.items():
+        fitted = make_pipeline(StandardScaler(), method).fit(x, (friction - mean) / sd)
+        found[name] = float(np.sqrt(np.mean((fitted.predict(held) - (truth - mean) / sd) ** 2)))
+    return found, rate
 
 
 # all of it
