@@ -20,7 +20,7 @@ Expected: the gradient is at 95 % of the last return of PPO in a fifth of the sa
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -82,17 +82,6 @@ class Config:
     smoke: bool = False  # seconds
 
 
-@dataclass
-class History:
-    """A training: samples, processor time [s] and mean return at every evaluation."""
-
-    method: str
-    seed: int
-    samples: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    returns: list[float] = field(default_factory=list)
-
-
 def environment() -> RigEnv:
     loops = dict.fromkeys(("lower_x", "upper_x"), GAINS)
     rig = READY.override(actuators=loops | PUSHES, motion=QUIET)
@@ -112,30 +101,26 @@ def network(hidden: int, actions: int, seed: int) -> nn.Sequential:
 
 
 class Training:
-    """The clock of a training, which stops while the policy is evaluated."""
+    """Samples, processor time [s] and mean return at every evaluation of a training, whose clock
+    stops meanwhile."""
 
-    def __init__(self, config: Config, method: str, seed: int, env: RigEnv) -> None:
-        self.config, self.env, self.history = config, env, History(method, seed)
-        self._begin, self._next = process_time(), 0
-        self._bar = tqdm(total=round(config.seconds), desc=f"{method} {seed}", unit="s")
+    def __init__(self, config: Config, method: str, seed: int) -> None:
+        self.config, self.method, self.env = config, method, environment()
+        self.begin = process_time()
+        self.samples, self.seconds, self.returns = list[int](), list[float](), list[float]()
+        self.bar = tqdm(total=round(config.seconds), desc=f"{method} {seed}", unit="s")
 
     def over(self, samples: int, act: Callable[[np.ndarray], np.ndarray]) -> bool:
         """Evaluate where it is time to; whether the time is up."""
-        now = process_time() - self._begin
-        self._bar.update(min(round(now), self._bar.total) - self._bar.n)
-        over = now >= self.config.seconds
-        if over or now >= self._next * self.config.seconds / self.config.evaluations:
-            mean = float(np.mean([episode(self.env, act, 1000 + i)
-                                  for i in range(self.config.episodes)]))  # fmt: skip
-            self.history.samples.append(samples)
-            self.history.seconds.append(now)
-            self.history.returns.append(mean)
-            self._bar.set_postfix_str(f"return {mean:.2f}")
-            self._next += 1
-            self._begin = process_time() - now
-        if over:
-            self._bar.close()
-        return over
+        now, total = process_time() - self.begin, self.config.seconds
+        self.bar.update(min(round(now), self.bar.total) - self.bar.n)
+        if now >= min(1.0, len(self.samples) / self.config.evaluations) * total:
+            every = [episode(self.env, act, 1000 + i) for i in range(self.config.episodes)]
+            self.samples.append(samples)
+            self.seconds.append(now)
+            self.returns.append(float(np.mean(every)))
+            self.begin = process_time() - now
+        return now >= total
 
 
 def episode(env: RigEnv, act: Callable[[np.ndarray], np.ndarray], seed: int) -> float:
@@ -156,14 +141,14 @@ def acting(policy: nn.Module) -> Callable[[np.ndarray], np.ndarray]:
     return act
 
 
-def by_gradient(config: Config, seed: int) -> tuple[History, nn.Module]:
+def by_gradient(config: Config, seed: int) -> tuple[Training, nn.Module]:
     """Short horizons of episodes side by side; the critic tells what comes after them."""
-    env, evaluated = environment(), environment()
+    env = environment()
     policy = network(config.hidden, len(env.dynamics.actions), seed)
     critic = nn.Sequential(nn.Linear(SEEN, 64), nn.Tanh(), nn.Linear(64, 1)).double()
     slow = deepcopy(critic)
     learners = [torch.optim.Adam(one.parameters(), lr=5e-3) for one in (policy, critic)]
-    training, samples = Training(config, "gradient", seed, evaluated), 0
+    training, samples = Training(config, "gradient", seed), 0
     env.reset(seed=seed)
     moments = [begun(env) for _ in range(config.actors)]
     while not training.over(samples, acting(policy)):
@@ -179,7 +164,7 @@ def by_gradient(config: Config, seed: int) -> tuple[History, nn.Module]:
         (-total / config.actors).backward()
         nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         learners[0].step()
-        left = 1 - training.history.seconds[-1] / config.seconds
+        left = 1 - training.seconds[-1] / config.seconds
         learners[0].param_groups[0]["lr"] = 5e-3 * max(left, 0.02)
         for _ in range(8):
             learners[1].zero_grad()
@@ -189,7 +174,7 @@ def by_gradient(config: Config, seed: int) -> tuple[History, nn.Module]:
         with torch.no_grad():
             for old, new in zip(slow.parameters(), critic.parameters()):
                 old.lerp_(new, 0.2)
-    return training.history, policy
+    return training, policy
 
 
 def begun(env: RigEnv) -> Any:
@@ -236,12 +221,12 @@ def walk(env: RigEnv, policy: nn.Module, critic: nn.Module, moment: Any, horizon
     return Walk(value, now, seen, targets)
 
 
-def by_ppo(config: Config, seed: int) -> tuple[History, nn.Module]:
+def by_ppo(config: Config, seed: int) -> tuple[Training, nn.Module]:
     import gymnasium
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
 
-    env, evaluated = environment(), environment()
+    env = environment()
     part = gymnasium.spaces.Box(-np.inf, np.inf, (SEEN,), np.float32)
     short = gymnasium.wrappers.TransformObservation(env, lambda seen: seen[:SEEN], part)
     layers = {"net_arch": [config.hidden], "log_std_init": -1.0}
@@ -249,7 +234,7 @@ def by_ppo(config: Config, seed: int) -> tuple[History, nn.Module]:
         "MlpPolicy", short, learning_rate=1e-3, n_steps=400, batch_size=80, gamma=DISCOUNT,
         policy_kwargs=layers, seed=seed, device="cpu",
     )  # fmt: skip
-    training = Training(config, "PPO", seed, evaluated)
+    training = Training(config, "PPO", seed)
 
     class Watch(BaseCallback):
         def _on_step(self) -> bool:
@@ -258,7 +243,7 @@ def by_ppo(config: Config, seed: int) -> tuple[History, nn.Module]:
             )
 
     learner.learn(10**9, Watch())
-    return training.history, learner.policy
+    return training, learner.policy
 
 
 METHODS = {"gradient": by_gradient, "PPO": by_ppo}
@@ -327,18 +312,20 @@ def run(config: Config) -> None:
     if config.smoke:
         config = replace(config, seconds=3.0, seeds=1, evaluations=1, episodes=1)
     config.out.mkdir(parents=True, exist_ok=True)
-    every, content = list[History](), dict[str, Any]()
+    every, content = list[Training](), dict[str, Any]()
     for seed in range(config.seeds):
         for name, method in METHODS.items():
-            history, policy = method(config, seed)
-            every.append(history)
+            training, policy = method(config, seed)
+            every.append(training)
             if name == "gradient" and seed == 0:
                 content["deployed"] = in_engine(config, policy)
-            content |= {"trainings": [asdict(one) for one in every], "reached": reached(every)}
+            keys = ("method", "samples", "seconds", "returns")
+            trainings = [{key: getattr(one, key) for key in keys} for one in every]
+            content |= {"trainings": trainings, "reached": reached(every)}
             write(config, content, {"learn_policy": figure(every)}, table(content))
 
 
-def reached(every: Sequence[History]) -> dict[str, Any]:
+def reached(every: Sequence[Training]) -> dict[str, Any]:
     """By method: returns at the end, and samples and seconds until the mean return is `LEVEL` of
     PPO's at its end, for the seeds that get there."""
     level = LEVEL * float(np.mean([one.returns[-1] for one in every if one.method == "PPO"] or [0]))
@@ -369,7 +356,7 @@ def table(content: dict[str, Any]) -> str:
     return f"{markdown(head, rows)}\n\n{numbers('angle [rad], in the engine', missed, 2)}"
 
 
-def figure(every: Sequence[History]) -> Figure:
+def figure(every: Sequence[Training]) -> Figure:
     """Return against samples and against processor time, a line a seed."""
     fig = Figure(figsize=(7.2, 3.2), layout="constrained")
     left, right = fig.subplots(1, 2, sharey=True)

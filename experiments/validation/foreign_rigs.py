@@ -36,7 +36,6 @@ from torchsoft.sysid import (
     IdentificationResult,
     Problem,
     Recording,
-    Unknown,
     Unreachable,
     explain,
 )
@@ -47,7 +46,7 @@ TESTS = Path(__file__).parents[2] / "tests"
 sys.path[:0] = str(TESTS), str(Path(__file__).parents[1])
 
 from foreign import Numbers, simulate  # noqa: E402  # pyright: ignore[reportMissingImports]
-from identify_contact import TRUTH  # noqa: E402
+from identify_contact import TRUTH, problem  # noqa: E402
 
 C = TypeVar("C")
 
@@ -298,19 +297,12 @@ class Outcome:
     wall_s: float
 
 
-def truths(config: Config) -> dict[str, float]:
-    return {name: TRUTH[name] for name in SMOKE_UNKNOWNS} if config.smoke else TRUTH
-
-
-def unknowns(config: Config) -> dict[str, Unknown]:
+def stated(recordings: list[Recording], truth: Mapping[str, float]) -> Problem:
     """Starts off by `START`; mu_k by its ratio to mu_s."""
-    out = {
-        name: Unknown(nominal=value * START ** (-1) ** i)
-        for i, (name, value) in enumerate(truths(config).items())
-    }
-    if "contact.mu_k" in out:
-        out["contact.mu_k"] = Unknown(nominal=0.9, ratio_to="contact.mu_s", low=0.1, high=1.0)
-    return out
+    begin = {name: value * START ** (-1) ** i for i, (name, value) in enumerate(truth.items())}
+    if "contact.mu_k" in begin:
+        begin["contact.mu_k"] = 0.9 * begin["contact.mu_s"]
+    return problem(recordings, begin)
 
 
 def chosen(cases: Iterable[C], only: Sequence[str]) -> list[C]:
@@ -338,18 +330,18 @@ def study(case: Case, made: Sequence[Made], config: Config) -> Outcome:
     """Identify one case. Its runs are kept until it is done: begun again, it goes through them in
     seconds."""
     runs = config.out / f"runs-{case.name.replace(' ', '-').replace('/', '-')}"
+    truth = {name: TRUTH[name] for name in SMOKE_UNKNOWNS} if config.smoke else TRUTH
     began, rows, chi2 = perf_counter(), dict[str, dict[str, Any]](), None
     try:
         recordings = [
             case.recording(name, one, config.seed + 10 * k, config.smoke)
             for k, (name, one) in enumerate(zip(case.excitations, made))
         ]
-        problem = Problem(recordings, RIG, unknowns(config))
         found = explain(
-            problem, rtol=config.rtol, workers=config.workers, checkpoint=runs,
+            stated(recordings, truth), rtol=config.rtol, workers=config.workers, checkpoint=runs,
             progress=not config.smoke,
         )  # fmt: skip
-        rows, chi2, said = judged(found, truths(config)), found.chi2, list(found.notices)
+        rows, chi2, said = judged(found, truth), found.chi2, list(found.notices)
     except (Unreachable, ValueError) as error:
         said = [str(error)]
     named = any(word.lower() in text.lower() for word in case.cause for text in said)

@@ -209,8 +209,6 @@ class Roll(NamedTuple):
     power: float
     theory: float
     depth: float
-    residual: float
-    steps: int
 
 
 def rubbers() -> dict[str, Material]:
@@ -274,7 +272,7 @@ def roll(
     theory = moving_contact(material, load, v).coefficient
     return Roll(
         v, force / (load * way), power / (load * way), theory,
-        HEIGHT + RADIUS - run["y_disc"][1:].mean().item(), run.energy_residual_rel, run.stats.steps,
+        HEIGHT + RADIUS - run["y_disc"][1:].mean().item(),
     )  # fmt: skip
 
 

@@ -26,7 +26,6 @@ from torchsoft.sysid import (
     RIG,
     Problem,
     Recording,
-    Unknown,
     explain,
     identify,
 )
@@ -38,7 +37,7 @@ from torchsoft.sysid.suspects import LIKELY
 sys.path.insert(0, str(Path(__file__).parent))
 
 import foreign_rigs
-from foreign_rigs import TRUTH, Made, Order, chosen, make_all
+from foreign_rigs import TRUTH, Made, Order, chosen, make_all, stated
 
 SIX = ("contact.K_n", "contact.K_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
 KNOWN = {name: value for name, value in TRUTH.items() if name not in SIX}
@@ -159,23 +158,21 @@ def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def problem(case: Case, made: Made, seed: int) -> Problem:
+def stated_case(case: Case, made: Made, seed: int) -> Problem:
     noted = foreign_rigs.Case(case.name, noted=KNOWN)
     recording = noted.recording(case.excitation, made, seed)
     if case.alter is not None:
         recording = case.alter(recording, np.random.default_rng(1000 + seed))
-    unknowns = {name: Unknown(nominal=TRUTH[name] * 1.6 ** (-1) ** i) for i, name in enumerate(SIX)}
-    unknowns["contact.mu_k"] = Unknown(nominal=0.9, ratio_to="contact.mu_s", low=0.1, high=1.0)
-    return Problem([recording], RIG, unknowns)
+    return stated([recording], {name: TRUTH[name] for name in SIX})
 
 
 def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
-    stated, folder = problem(case, made, seed), config.out / f"runs-{CASES.index(case)}-{seed}"
+    one, folder = stated_case(case, made, seed), config.out / f"runs-{CASES.index(case)}-{seed}"
     how: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
-    result, identify_s = timed(lambda: identify(stated, **how))
+    result, identify_s = timed(lambda: identify(one, **how))
     explain_s = None
     if result.made_by["candidates"]:
-        result, explain_s = timed(lambda: explain(stated, **how))
+        result, explain_s = timed(lambda: explain(one, **how))
     forget(folder)
     off = {
         e.name: float(np.log(e.value / TRUTH[e.name]) / e.relative_sd)
