@@ -48,7 +48,7 @@ from torchsoft import (
     Trajectory,
 )
 from torchsoft import simulate as simulated
-from torchsoft.experiment import markdown, options, timed, write
+from torchsoft.experiment import grid, markdown, options, timed, write
 from torchsoft.physics.motion import Piecewise, evaluate
 from torchsoft.physics.statics import resting, standing
 from torchsoft.plot.animation import animate
@@ -169,7 +169,7 @@ def faster(case: Case, speed: float) -> Case:
     for name, one in case.signals.items():
         assert isinstance(one, Profile)
         signals[name] = Profile(at(one.times), one.values.detach())
-    return Case(case.rig, case.y0, signals, GRIPPED + (case.end - GRIPPED) / speed)
+    return replace(case, signals=signals, end=GRIPPED + (case.end - GRIPPED) / speed)
 
 
 def rubbed(case: Case, mu: float) -> None:
@@ -185,12 +185,8 @@ def rubbed(case: Case, mu: float) -> None:
 def fed(case: Case, run: Trajectory) -> Case:
     """The same, with the efforts of a run before fed forward."""
     efforts = {f"known_{loop}": run[f"F_{loop}"] for loop in LOOPS} | {"bear": run["F_lift"]}
-    return Case(
-        case.rig,
-        case.y0,
-        case.signals | {k: Sampled(run.t, v.detach()) for k, v in efforts.items()},
-        case.end,
-    )
+    known = {k: Sampled(run.t, v.detach()) for k, v in efforts.items()}
+    return replace(case, signals=case.signals | known)
 
 
 def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
@@ -198,7 +194,7 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
     does not see the disc: x_J = x_d +- R theta_d."""
     rig, signals = case.rig, dict(case.signals)
     start = rig.unpack(case.y0).pose
-    times = torch.linspace(0.0, case.end, 901, dtype=torch.float64)
+    times = grid(case.end, case.end / 900)
     x_d, theta_d = (signals[name](times)[0].detach() for name in ("x_d", "theta_d"))
     jaws = {}
     for jaw, sign in (("lower", 1.0), ("upper", -1.0)):
@@ -212,16 +208,14 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
         bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, actuators=jaws | own,
         gravity=gravity,
     )  # fmt: skip
-    return Case(alone, case.y0, signals, case.end)
+    return replace(case, rig=alone, signals=signals)
 
 
 def simulate(case: Case, rtol: float) -> tuple[Trajectory, str]:
     """A run every 10 ms, or what there is of it, and why it ended early."""
-    t = torch.linspace(0.0, case.end, round(100 * case.end) + 1, dtype=torch.float64)
+    t, reference = grid(case.end), Reference(**case.signals)
     try:
-        return simulated(
-            case.rig, t, y0=case.y0, reference=Reference(**case.signals), rtol=rtol
-        ), ""
+        return simulated(case.rig, t, y0=case.y0, reference=reference, rtol=rtol), ""
     except SimulationFailed as failure:
         if failure.trajectory is None:
             raise
