@@ -255,8 +255,11 @@ def surrogates(config: Config, url: str) -> tuple[dict[str, float], float]:
     """Held-out error over the standard deviation of the friction, by method; windows a second."""
     (x, friction, rate), (held, truth, _) = (histories(config, url, s) for s in ("train", "test"))
     mean, sd = friction.mean(0), friction.std(0)
-    how: dict[str, Any] = {"max_iter": config.epochs, "random_state": config.seed, "alpha": 1e-3}
-    methods = {"linear": Ridge(), "network": MLPRegressor((config.hidden, config.hidden), **how)}
+    how: dict[str, Any] = {
+        "hidden_layer_sizes": (config.hidden, config.hidden), "max_iter": config.epochs,
+        "random_state": config.seed,
+    }  # fmt: skip
+    methods = {"linear": Ridge(), "network": MLPRegressor(**how)}
     found = {}
     for name, method in methods.items():
         fitted = make_pipeline(StandardScaler(), method).fit(x, (friction - mean) / sd)

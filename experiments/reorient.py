@@ -228,7 +228,7 @@ def uncertain(config: Config) -> dict[str, Any]:
         "uncertain": {name: Range(**one) for name, one in ranges.items()},
         "draws": config.planned_draws, "seed": 1,
     })  # fmt: skip
-    over, y0 = drawn(file, robust, config.draws, seed=2)
+    _, over, y0 = drawn(file, robust, config.draws, seed=2)
     out: dict[str, Any] = {}
     for name, stated in (("nominal", plain), ("robust", robust)):
         found = plan_file(file, stated)
