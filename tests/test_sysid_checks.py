@@ -26,7 +26,7 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
-from torchsoft.sysid.refits import AMOUNTS, End, difference, joint_fit, refit, varied
+from torchsoft.sysid.refits import AMOUNTS, End, difference, ended, joint_fit, refit, varied
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
@@ -71,9 +71,8 @@ def checked(
     answer = identify(problem, plan=stages, assumptions="trusted")
     x = np.array(answer.x)
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    return check_assumptions(
-        problem, runner, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain
-    )
+    end = ended(problem, runner, x, at, free, problem.names, RTOL)
+    return check_assumptions(problem, end, doubtful=doubtful, explain=explain)
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +238,8 @@ def test_what_no_test_explains_has_candidates(
     problem, x, at = far_off
     free = problem.coordinates.free
     runner = Runner(problem.recordings)
-    found = check_assumptions(problem, runner, x, at, free, problem.names, RTOL, doubtful=True)
+    end = ended(problem, runner, x, at, free, problem.names, RTOL)
+    found = check_assumptions(problem, end, doubtful=True)
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
     assert any(": `explain` fits again with each of " in text for text in assumption_notices(found))

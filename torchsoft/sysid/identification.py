@@ -41,6 +41,7 @@ from torchsoft.sysid.plan import (
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.refits import ended
 from torchsoft.sysid.residual_tests import (
     Coloured,
     allow_for_colour,
@@ -265,10 +266,12 @@ def tested_assumptions(
     }
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
+    there = ended(
+        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, end.steps
+    )
     found = check_assumptions(
-        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, doubtful=doubtful,
-        explain=how.settings.assumptions == "explained", loss=how.loss, progress=progress,
-        own=end.steps,
+        plain, there, doubtful=doubtful, explain=how.settings.assumptions == "explained",
+        loss=how.loss, progress=progress,
     )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
