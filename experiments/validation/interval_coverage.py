@@ -36,12 +36,11 @@ import numpy as np
 import tomlkit
 from scipy import stats
 
-from torchsoft import Parameters
+from torchsoft import Parameters, csvfile
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, repeated, write
-from torchsoft.files import replacing
 from torchsoft.rigs import RigFile
-from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, identify, record
+from torchsoft.sysid import RIG, Problem, Sensor, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
 from torchsoft.sysid.measured import load
@@ -237,13 +236,17 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
     exact = record("measured", file.build(), truth, sensors, rate=RATE, rtol=EXACT, noise=0.0)
 
     def repetition(seed: int) -> Repetition:
-        with replacing(folder / f"{seed}.csv") as partial:
-            measured(exact, lab, np.random.default_rng(seed), partial)
-        one = load([folder / f"{seed}.csv"], folder / "fit.toml")
+        rng, path = np.random.default_rng(seed), folder / f"{seed}.csv"
+        columns = {"t": exact.times} | {
+            channel: y + lab.noise[channel] * rng.standard_normal(len(y))
+            for channel, (_, y) in exact.samples.items()
+        }
+        csvfile.write(path, columns, {"t": "s", **exact.units})
+        one = load([path], folder / "fit.toml")
         how: dict[str, Any] = one.config.fit.model_dump()
         how |= {} if seed < config.checked else {"assumptions": "trusted"}
         result = identify(one.problem, **how)
-        (folder / f"{seed}.csv").unlink()
+        path.unlink()
         return Repetition(judged({name: result[name] for name in truth}, truth), result.notices, [])
 
     return Case(truth, repetition)
@@ -256,15 +259,6 @@ def stated(lab: Laboratory, settings: Mapping[str, Any], truth: Mapping[str, flo
         "unknowns": {name: {} for name in truth},
         "sensors": {name: {"noise": sd} for name, sd in lab.noise.items()},
     })  # fmt: skip
-
-
-def measured(exact: Recording, lab: Laboratory, rng: np.random.Generator, path: Path) -> None:
-    """A noisy recording as a CSV file."""
-    columns = [exact.times]
-    for channel, (_, y) in exact.samples.items():
-        columns.append(y + lab.noise[channel] * rng.standard_normal(len(y)))
-    head = ",".join(["t [s]", *(f"{name} [{exact.units[name]}]" for name in exact.samples)])
-    np.savetxt(path, np.stack(columns, 1), "%.12g", ",", header=head, comments="")
 
 
 CASES: dict[str, Callable[[Config], Case]] = {

@@ -31,10 +31,10 @@ def add_commands(commands: Any) -> None:
 
 def plan(options: argparse.Namespace) -> int:
     """Plan, and write the motion."""
-    from torchsoft.files import replacing, write_json
+    from torchsoft.files import write_json
     from torchsoft.rigs.build import RigFile
     from torchsoft.rigs.goal import Goal, plan_file
-    from torchsoft.rigs.written import located, to_toml
+    from torchsoft.rigs.written import save
 
     file, goal = RigFile.from_toml(options.rig), Goal.from_toml(options.goal)
     known = None
@@ -44,8 +44,7 @@ def plan(options: argparse.Namespace) -> int:
         known = load_answer(options.answer).draws(goal.draws, seed=goal.seed)
     try_folder(options.out, options.force)
     found, written = plan_file(file, goal, known, progress=not options.no_progress)
-    with replacing(options.out / "motion.toml") as partial:
-        partial.write_text(to_toml(located(written)), encoding="utf-8")
+    save(written, options.out / "motion.toml")
     write_json(options.out / "plan.json", found.summary())
     found.trajectory.save(options.out / "run.nc")
     say(found)

@@ -582,7 +582,7 @@ class Rig(Shown, nn.Module):
             row = (
                 torch.ones(1, 1, 1, dtype=torch.float64)
                 if spin
-                else torch.eye(2, dtype=torch.float64)[None, :, COORDINATES.index(axis), None]
+                else torch.eye(2, dtype=torch.float64)[None, COORDINATES.index(axis), None]
             )
             out[f"control_{name}"] = Port(
                 Transformer({own: Block(row)}), force[..., None, None], actuator.elements, True,
