@@ -1,4 +1,4 @@
-"""CSV files of numbers under headings `name [unit]` or `name (unit)`, read in SI units, and written.
+"""CSV files of numbers under headings `name [unit]` or `name (unit)`, read in SI units, or written.
 
 Every error is a `ValueError` in a sentence that names the file, the row (the heading is row 1) and
 the column.

@@ -9,7 +9,7 @@ step and cost more than the simulator that is being reduced.
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
@@ -335,23 +335,27 @@ class ReducedModel(Shown, nn.Module):
 
     def text(self) -> list[str]:
         """One equation a line, in SI units."""
-        rates = self._sums(lambda value, term: f"{value:.4g} {_bracketed(term.text)}")
         lines = [f"{name}' = {rate}" for name, rate in self.kinematics.items()]
-        return lines + [f"{target}' = {rate}" for target, rate in rates.items()]
+        for target, pairs in self.equations().items():
+            body = " ".join(
+                f"{'+-'[value < 0]} {abs(value):.4g} {_bracketed(term.text)}"
+                for term, value in pairs
+            )
+            lines.append(f"{target}' = {body.removeprefix('+ ') or '0'}")
+        return lines
 
     def latex(self) -> str:
         """The equations of the velocities as an `aligned` block."""
-        rates = self._sums(lambda value, term: rf"{_power(value)}\,{_bracketed(term.latex)}")
-        rows = [rf"\frac{{d}}{{dt}} {symbol(name)[0]} &= {rate}" for name, rate in rates.items()]
+        rows = []
+        for target, pairs in self.equations().items():
+            body = " ".join(
+                f"{'+-'[value < 0]} {_power(abs(value))}\\,{_bracketed(term.latex)}"
+                for term, value in pairs
+            )
+            rows.append(
+                rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {body.removeprefix('+ ') or '0'}"
+            )
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
-
-    def _sums(self, written: Callable[[float, Term], str]) -> dict[str, str]:
-        """The rate of every velocity, each of its terms as it is `written` with its size."""
-        bodies = {
-            target: " ".join(f"{'+-'[x < 0]} {written(abs(x), term)}" for term, x in pairs)
-            for target, pairs in self.equations().items()
-        }
-        return {target: body.removeprefix("+ ") or "0" for target, body in bodies.items()}
 
     def coefficient_table(self) -> list[dict[str, Any]]:
         """Every coefficient with its unit and, from an ensemble, its interval."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchsoft import csvfile
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
