@@ -68,7 +68,7 @@ class Config:
     held_out: int = 24  # on which it is tried
     sweeps: int = 25  # of these
     window: int = 30  # samples that the surrogate sees, 4 ms apart
-    epochs: int = 40
+    epochs: int = 100
     hidden: int = 48
     seed: int = 0
     smoke: bool = False  # a size that takes seconds

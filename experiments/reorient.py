@@ -4,9 +4,8 @@ motion that gradients find?
 An ellipse and a rounded box between two fingers, gripped lightly and firmly, are to be turned by 60
 and 90 degrees within 1.2 s: to 0.5 degrees and 0.1 mm, with 4 N of grip at
 least. Free are the knots of five set-points: both fingers in x and y, and their lean. Every plan is
-checked by a run of a hundredth of the tolerance. One case is planned by hand (fingers roll on a
-circle of the body's mean radius), by SciPy's SLSQP with finite differences, and by CMA-ES, each in
-the seconds that the gradient took. Two have little friction: one slips, one cannot be held. A
+checked by a run of a hundredth of the tolerance. One case is planned by SciPy's SLSQP with
+finite differences, and by CMA-ES, each in the seconds that the gradient took. Two have little friction: one slips, one cannot be held. A
 nominal and a robust plan are run on 200 rigs whose pads and friction differ by what an
 identification leaves unknown.
 
@@ -52,8 +51,6 @@ TURNS = (60.0, 90.0)
 """Angles [degrees]."""
 ANGLE, PLACE = math.radians(0.5), 1e-4
 """Tolerances of the target [rad, m]."""
-KNOTS = 4
-"""Of the fingers' motions in y."""
 GRIP = 4.0
 """Least force of a finger [N]."""
 HEIGHT = 6e-3
@@ -119,18 +116,6 @@ def goal(file: RigFile, degrees: float, rtol: float) -> Goal:
         },
         "rtol": rtol,
     })  # fmt: skip
-
-
-def rolled(file: RigFile, degrees: float) -> RigFile:
-    """The motion by hand: fingers go against each other along the arc of a circle of the body's
-    mean radius, in even steps."""
-    reach = right(file) - HEIGHT
-    way = math.radians(degrees) * 0.5 * (reach + 13e-3)
-    tables = dict[str, Any]()
-    for name, sign, start in (("left_y", -1.0, 8e-3), ("right_y", 1.0, -8e-3)):
-        count = KNOTS - 1
-        tables[name] = {"values": [start + sign * way * i / count for i in range(count + 1)]}
-    return file.override(motion=tables)
 
 
 def planner(file: RigFile, stated: Goal, over: Any = None, y0: Any = None) -> Evaluator:
@@ -256,11 +241,9 @@ def run(config: Config) -> dict[str, Any]:
         turns[f"{body}, {grip}, {turn:.0f}"] = row(found)
     file = case("ellipse", "light")
     stated, own = goal(file, 60.0, config.rtol), turns["ellipse, light, 60"]
-    by_hand = planner(rolled(file, 60.0), stated)
     rivals = {
         name: rival(name, file, stated, own["seconds"]) for name in ("finite differences", "CMA-ES")
     }
-    rivals["by hand"] = errors(by_hand.look(by_hand.variables.start, gradient=False))
     slippery = {}
     for mu in (SLIPPERY, TOO_SLIPPERY):
         file = case("ellipse", "light", mu)

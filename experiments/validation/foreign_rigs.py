@@ -366,7 +366,8 @@ def table(outcomes: list[Outcome]) -> str:
         said = "; ".join(textwrap.shorten(text, 110) for text in one.warnings).replace("|", "/")
         errors = " ".join(cells)
         rows.append((one.name, errors, chi2, one.verdict, f"{one.wall_s:.0f}", said or "-"))
-    short = " ".join(name.split(".")[1] for name in TRUTH)
+    names = max((one.parameters for one in outcomes), key=len)
+    short = " ".join(name.split(".")[1] for name in names)
     head = ("case", f"errors [%] of {short}", "chi2", "verdict", "wall [s]", "warnings")
     return markdown(head, rows)
 
