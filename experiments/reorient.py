@@ -2,11 +2,11 @@
 motion that gradients find?
 
 An ellipse and a rounded box between two fingers, gripped lightly and firmly, are to be turned by 60
-and 90 degrees within 1.2 s: to 0.5 degrees and 0.1 mm, with 4 N of grip at
-least. Free are the knots of five set-points: both fingers in x and y, and their lean. Every plan is
-checked by a run of a hundredth of the tolerance. One case is planned by SciPy's SLSQP with
-finite differences, and by CMA-ES, each in the seconds that the gradient took. Two have little friction: one slips, one cannot be held. A
-nominal and a robust plan are run on 200 rigs whose pads and friction differ by what an
+and 90 degrees within 1.2 s: to 0.5 degrees and 0.1 mm, with 4 N of grip at least. Free are the
+knots of five set-points: both fingers in x and y, and their lean. Every plan is checked by a run of
+a hundredth of the tolerance. One case is planned by SciPy's SLSQP with finite differences, and by
+CMA-ES, each in the seconds that the gradient took. Two have little friction: one slips, one cannot
+be held. A nominal and a robust plan are run on 200 rigs whose pads and friction differ by what an
 identification leaves unknown.
 
 Command: .venv/bin/python experiments/reorient.py [--draws 200] [--smoke]

@@ -82,7 +82,7 @@ def coloured(count: int, rho: float, rng: np.random.Generator) -> NDArray[np.flo
     """Noise (count,) of deviation 1 whose neighbouring samples correlate by `rho`."""
     white = rng.standard_normal(count)
     white[1:] *= (1 - rho**2) ** 0.5
-    return lfilter([1.0], [1.0, -rho], white)
+    return np.asarray(lfilter([1.0], [1.0, -rho], white))
 
 
 @torch.no_grad()

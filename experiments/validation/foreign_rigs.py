@@ -22,7 +22,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,8 +47,6 @@ sys.path[:0] = str(TESTS), str(Path(__file__).parents[1])
 
 from foreign import Numbers, simulate  # noqa: E402  # pyright: ignore[reportMissingImports]
 from identify_contact import TRUTH, problem  # noqa: E402
-
-C = TypeVar("C")
 
 SMOKE_UNKNOWNS = ("contact.mu_s", "contact.K_n", "pad.E", "pad.tau")
 
@@ -305,7 +303,7 @@ def stated(recordings: list[Recording], truth: Mapping[str, float]) -> Problem:
     return problem(recordings, begin)
 
 
-def chosen(cases: Iterable[C], only: Sequence[str]) -> list[C]:
+def chosen(cases: Iterable[Any], only: Sequence[str]) -> list[Any]:
     """The cases that were asked for, or all. Raises `ValueError` for a name that is not there."""
     known = {case.name: case for case in cases}
     if strange := [name for name in only if name not in known]:

@@ -33,7 +33,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tomlkit
 from scipy import stats
 
 from torchsoft import Parameters, csvfile
@@ -45,6 +44,7 @@ from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
 from torchsoft.sysid.measured import load
 from torchsoft.sysid.runs import Runner
+from torchsoft.tables import toml_row
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -254,11 +254,10 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
 
 def stated(lab: Laboratory, settings: Mapping[str, Any], truth: Mapping[str, float]) -> str:
     """The identification, as a user would write it."""
-    return tomlkit.dumps({
-        "rig": (RIGS / lab.file).as_posix(), "settings": settings,
-        "unknowns": {name: {} for name in truth},
-        "sensors": {name: {"noise": sd} for name, sd in lab.noise.items()},
-    })  # fmt: skip
+    lines = [toml_row("rig", (RIGS / lab.file).as_posix()), "[settings]"]
+    lines += [toml_row(name, one) for name, one in settings.items()]
+    lines += ["[unknowns]", *(f'"{name}" = {{}}' for name in truth)]
+    return "\n".join([*lines, "[sensors]", *(f"{k}.noise = {v}" for k, v in lab.noise.items())])
 
 
 CASES: dict[str, Callable[[Config], Case]] = {
