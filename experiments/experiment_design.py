@@ -16,8 +16,10 @@ minutes on one core.
 """
 
 import itertools
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from identify_contact import TRUTH
@@ -28,7 +30,7 @@ from torchsoft.excitation import CATALOGUE, Excitation, Strokes, begin
 from torchsoft.experiment import markdown, options, write
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
-from torchsoft.sysid.fit import shift, standard_deviations
+from torchsoft.sysid.fit import percent, shift, standard_deviations
 from torchsoft.sysid.plan import FINER
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import Array
@@ -38,6 +40,8 @@ NAMES = tuple(TRUTH)
 CONSISTENT = 0.01
 """Difference between J and a finite difference, over their size, above which an excitation is
 dropped."""
+V_S = 0.05
+"""contact.v_s [m/s]; large, so that gross slip has a unique solution."""
 DIFFERENCE = 1e-5  # Step of that finite difference in the logarithms.
 
 
@@ -45,10 +49,8 @@ DIFFERENCE = 1e-5  # Step of that finite difference in the logarithms.
 class Config:
     out: Path = Path("out/experiment_design")
     rtol: float = 1e-5  # of the runs
-    v_s: float = 0.05  # contact.v_s [m/s]; large, so that gross slip has a unique solution
     longest: float = 6.0  # data that a combination may take [s]
     most: int = 3  # excitations in a combination
-    seed: int = 0
     smoke: bool = False  # two short excitations
 
 
@@ -67,47 +69,38 @@ class Row:
     @property
     def worst(self) -> float:
         """The largest root of both squared."""
-        return max(
-            (float(np.hypot(self.sd[name], self.shift[name])) for name in self.sd), default=np.inf
-        )
+        return max((np.hypot(self.sd[name], self.shift[name]) for name in self.sd), default=np.inf)
+
+
+class Information(NamedTuple):
+    """What an excitation shows: whitened Jacobian (m, parameters), what finer steps add to the
+    residuals (m,), and how far the Jacobian is, relatively, from a central difference."""
+
+    J: Array
+    error: Array
+    inconsistency: float
 
 
 def row(
-    names: tuple[str, ...],
-    seconds: float,
-    J: Array,
-    error: Array,
-    inconsistency: float,
-    dropped: str = "",
+    catalogue: Mapping[str, Excitation], parts: Mapping[str, Information], dropped: str = ""
 ) -> Row:
-    """The row of a Jacobian and of what finer steps add to the residuals (m,)."""
-    sd, off = standard_deviations(J), shift(J, error)
+    """The row of excitations together."""
+    J, error = (np.concatenate([part[k] for part in parts.values()]) for k in (0, 1))
+    sd, off = (dict(zip(NAMES, x.tolist())) for x in (standard_deviations(J), shift(J, error)))
+    seconds = sum(catalogue[name].duration for name in parts)
     return Row(
-        names,
-        seconds,
-        dict(zip(NAMES, sd.tolist())),
-        dict(zip(NAMES, off.tolist())),
-        inconsistency,
-        dropped,
+        tuple(parts), seconds, sd, off, max(x.inconsistency for x in parts.values()), dropped
     )
 
 
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    single: list[Row]
-    together: list[Row]
-
-
-def smoke(config: Config) -> tuple[Config, dict[str, Excitation]]:
-    roll = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.3), duration=0.9, senses="bracket")
-    jerk = Excitation(
+SMOKE = {
+    "strokes": Excitation(
+        motion=Strokes(travel=8e-3, stroke_time=0.3), duration=0.9, senses="bracket"
+    ),
+    "jerks, light": Excitation(
         motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.9, depth=3e-4, senses="bracket"
-    )
-    return Config(config.out, 1e-4, config.v_s, 2.0, 2, config.seed, True), {
-        "strokes": roll,
-        "jerks, light": jerk,
-    }
+    ),
+}
 
 
 def check(part: Residuals) -> Residuals:
@@ -117,88 +110,71 @@ def check(part: Residuals) -> Residuals:
     return part
 
 
-def assess(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
-    """Whitened Jacobian (m, parameters), what finer steps add to the residuals (m,), and how far
-    the Jacobian is, relatively, from a central difference along one direction. Raises
-    `SimulationFailed`."""
-    recording = record("one", begin(excitation, p), {}, RIG, rtol=config.rtol, noise=0.0)
+def assess(excitation: Excitation, rtol: float) -> Information:
+    """Raises `SimulationFailed`."""
+    p = Parameters().override({"contact.v_s": V_S})
+    recording = record("one", begin(excitation, p), {}, RIG, rtol=rtol, noise=0.0)
     friction = 0.5 * (
         p.contact.mu_k + p.contact.mu_s
     )  # bounds that do not cross; nothing is searched here
     apart = {"contact.mu_k": Unknown(high=friction), "contact.mu_s": Unknown(low=friction)}
     problem = Problem([recording], RIG, {name: Unknown() for name in NAMES} | apart)
-    x, v = problem.coordinates.start, np.random.default_rng(config.seed).standard_normal(len(NAMES))
+    x, v = problem.coordinates.start, np.random.default_rng(0).standard_normal(len(NAMES))
     runner = Runner(problem.recordings)
-    at, steps = problem.freeze(runner, x, ["one"], config.rtol, problem.coordinates.free)
+    at, steps = problem.freeze(runner, x, ["one"], rtol, problem.coordinates.free)
     check(at)
     ahead, behind = (
         check(problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], steps))
         for s in (1.0, -1.0)
     )
-    finer = check(problem.freeze(runner, x, ["one"], FINER * config.rtol)[0])
+    finer = check(problem.freeze(runner, x, ["one"], FINER * rtol)[0])
     slope = (ahead.r - behind.r) / (2 * DIFFERENCE)
-    return at.J, finer.r - at.r, float(np.linalg.norm(at.J @ v - slope) / np.linalg.norm(slope))
-
-
-def run(config: Config) -> Result:
-    catalogue = CATALOGUE
-    if config.smoke:
-        config, catalogue = smoke(config)
-    p = Parameters().override({"contact.v_s": config.v_s})
-    single: list[Row] = []
-    usable: dict[str, tuple[Array, Array]] = {}
-    for name, excitation in tqdm(catalogue.items(), desc="excitations"):
-        try:
-            J, error, wrong = assess(excitation, p, config)
-        except SimulationFailed as failure:
-            single.append(Row((name,), excitation.duration, {}, {}, np.inf, failure.reason))
-            continue
-        dropped = "" if wrong < CONSISTENT else f"derivatives inconsistent by {wrong:.1%}"
-        single.append(row((name,), excitation.duration, J, error, wrong, dropped))
-        if not dropped:
-            usable[name] = J, error
-    together = []
-    for count in range(2, config.most + 1):
-        for names in itertools.combinations(usable, count):
-            seconds = sum(catalogue[name].duration for name in names)
-            if seconds <= config.longest:
-                J, error = (np.concatenate([usable[name][k] for name in names]) for k in (0, 1))
-                off = max(r.inconsistency for r in single if r.names[0] in names)
-                together.append(row(names, seconds, J, error, off))
-    return Result(
-        config, sorted(single, key=lambda r: r.worst), sorted(together, key=lambda r: r.worst)
+    return Information(
+        at.J, finer.r - at.r, float(np.linalg.norm(at.J @ v - slope) / np.linalg.norm(slope))
     )
-
-
-def percent(value: float, sign: str = "") -> str:
-    """Two digits, without powers of ten."""
-    value *= 100
-    digits = ".0f" if abs(value) >= 10 else ".2g" if abs(value) >= 0.01 else ".2f"
-    return f"{value:{sign}{digits}}"
 
 
 def table(rows: list[Row]) -> str:
     lines = []
-    for row in rows:
+    for one in rows:
         cells = [
-            f"{percent(row.sd[name])} ({percent(row.shift[name], sign='+')})"
-            if row.sd.get(name, np.inf) < 1
+            f"{percent(one.sd[name])} ({percent(one.shift[name])})" if one.sd.get(name, 1) < 1
             else "-"
             for name in NAMES
-        ]
-        off = row.dropped or f"{row.inconsistency:.0e}"
-        lines.append((" + ".join(row.names), f"{row.seconds:.1f}", *cells, off))
+        ]  # fmt: skip
+        off = one.dropped or f"{one.inconsistency:.0e}"
+        lines.append((" + ".join(one.names), f"{one.seconds:.1f}", *cells, off))
     return markdown(
         ("excitation", "s", *(name.split(".")[1] for name in NAMES), "derivative off by"), lines
     )
 
 
 def main(config: Config) -> None:
-    result = run(config)
-    rows = {"single": result.single, "together": result.together[:20]}
-    summary = {name: [asdict(row) for row in some] for name, some in rows.items()}
-    tables = f"{table(result.single)}\n\n{table(result.together[:8])}"
-    write(result.config, summary, table=tables)
+    catalogue = CATALOGUE
+    if config.smoke:
+        catalogue, config = SMOKE, replace(config, rtol=1e-4, longest=2.0, most=2)
+    single, usable = list[Row](), dict[str, Information]()
+    for name, excitation in tqdm(catalogue.items(), desc="excitations"):
+        try:
+            found = assess(excitation, config.rtol)
+        except SimulationFailed as failure:
+            single.append(Row((name,), excitation.duration, {}, {}, np.inf, failure.reason))
+            continue
+        wrong = found.inconsistency
+        dropped = "" if wrong < CONSISTENT else f"derivatives inconsistent by {wrong:.1%}"
+        single.append(row(catalogue, {name: found}, dropped))
+        if not dropped:
+            usable[name] = found
+    together = [
+        row(catalogue, {name: usable[name] for name in names})
+        for count in range(2, config.most + 1)
+        for names in itertools.combinations(usable, count)
+        if sum(catalogue[name].duration for name in names) <= config.longest
+    ]
+    single, together = (sorted(some, key=lambda r: r.worst) for some in (single, together))
+    rows = {"single": single, "together": together[:20]}
+    summary = {name: [asdict(one) for one in some] for name, some in rows.items()}
+    write(config, summary, table=f"{table(single)}\n\n{table(together[:8])}")
 
 
 if __name__ == "__main__":

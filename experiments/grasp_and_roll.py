@@ -7,40 +7,30 @@ Eq. 20-30, controllers Eq. 31-34, contact Eq. 8-13, bracket moment Eq. 35. The p
 friction numbers: with the default set friction stays locked in, with the "paper-like" set (K_t =
 100 N/m) it fades in the grasp, as the paper reports. Both are run.
 
-Command: .venv/bin/python experiments/grasp_and_roll.py [--friction paper-like] [--fidelity
-inertial] [--smoke] Expected (default set; the paper's number in brackets): grasping force 80.66 N;
-x_C(10 s) = 40.000 mm (40); y_C in the grasp 23.199 mm (23.20); y_Br between 48.565 and 48.600 mm
-(48.6); theta(10 s) = 1.090 rad, anticlockwise, -0.0035 rad at the end; peak speed 4.40 mm/s; peak
-F_x 0.42 N; peak bracket moment 1.55 N.m; 11 nodes of each pad in contact; energy residual 3e-5.
-About 20 s on one core with figures and animation; each simulation takes 2 s of that.
+Command: .venv/bin/python experiments/grasp_and_roll.py [--table] [--smoke]
+Expected (default set; the paper's number in brackets): grasping force 80.66 N; x_C(10 s) = 40.000
+mm (40); y_C in the grasp 23.199 mm (23.20); y_Br between 48.565 and 48.600 mm (48.6); theta(10 s) =
+1.090 rad, anticlockwise, -0.0035 rad at the end; peak speed 4.40 mm/s; peak F_x 0.42 N; peak
+bracket moment 1.55 N.m; 11 nodes of each pad in contact; energy residual 3e-5. About 20 s on one
+core with figures and animation; each simulation takes 2 s of that.
 """
 
 import json
-import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchsoft import (
-    Interrupted,
-    NoEquilibrium,
-    Parameters,
-    SimulationFailed,
-    SoftGrasp,
-    Trajectory,
-    simulate,
-)
-from torchsoft.experiment import COARSE, markdown, options
-from torchsoft.experiment import write as write_files
-from torchsoft.plot import diagram as drawn
-from torchsoft.plot import figures as draw
+from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
+from torchsoft.experiment import COARSE, grid, markdown, options, write
+from torchsoft.plot import diagram
 from torchsoft.plot.animation import animate
-from torchsoft.plot.dashboard import dashboard as draw_run
+from torchsoft.plot.dashboard import dashboard
+from torchsoft.plot.figures import snapshots
 from torchsoft.plot.player import player
 from torchsoft.scenario import grasp_and_roll
 
@@ -49,13 +39,6 @@ from torchsoft.scenario import grasp_and_roll
 class Config:
     out: Path = Path("out/grasp_and_roll")  # folder for everything that is written
     rtol: float = 1e-5  # relative tolerance of the stepper
-    duration: float | None = None  # simulated time [s]; the whole manipulation (30 s) if not given
-    friction: Literal["default", "paper-like"] = "default"
-    """friction set; with the default one, the paper-like one is run as well and compared"""
-    fidelity: Literal["massless", "inertial"] | None = (
-        None  # of the pads; as in the parameters (massless) if not given
-    )
-    config: Path | None = None  # TOML file of parameters, a table per group
     animation: bool = True  # write the animation
     table: bool = False  # only print the table of the summary that is already in `out`
     smoke: bool = False  # 0.6 s on a coarse mesh
@@ -63,80 +46,34 @@ class Config:
 
 @dataclass(frozen=True)
 class Run:
-    """One manipulation, up to what ended it early in `stopped`, if anything did."""
+    """One manipulation."""
 
     friction: str
     model: SoftGrasp
     trajectory: Trajectory
-    grasp_force: float | None
-    stopped: SimulationFailed | Interrupted | None = None
-
-
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    runs: dict[str, Run]
-
-    @property
-    def stopped(self) -> SimulationFailed | Interrupted | None:
-        return next((run.stopped for run in self.runs.values() if run.stopped), None)
-
-
-def parameters(config: Config, friction: str) -> Parameters:
-    changes: dict[str, Any] = dict(COARSE) if config.smoke else {}
-    if config.fidelity:
-        changes["pad.fidelity"] = config.fidelity
-    if friction == "paper-like":
-        changes["contact.K_t"] = Parameters.paper_like().contact.K_t
-    return (Parameters.from_toml(config.config) if config.config else Parameters()).override(
-        changes
-    )
+    grasp_force: float
 
 
 def output_times(duration: float) -> Tensor:
     """A 10 ms grid, and the instants 0.125 s and 0.375 s of Figs. 14 and 16 [s]."""
-    if not duration > 0:
-        raise ValueError(f"`duration` must be positive, but is {duration} s")
-    grid = torch.linspace(0, duration, max(2, round(duration / 0.01) + 1), dtype=torch.float64)
-    more = [t for t in (0.125, 0.375) if t < duration and (grid - t).abs().min() > 1e-6]
-    return torch.cat((grid, torch.tensor(more, dtype=torch.float64))).sort().values
+    return torch.cat((grid(duration), torch.tensor([0.125, 0.375], dtype=torch.float64))).sort()[0]
 
 
-def manipulate(config: Config, friction: str) -> Run:
+def manipulate(config: Config, friction: str, changes: dict[str, Any]) -> Run:
     """Find the grasping force and run the manipulation with one friction set."""
-    model = SoftGrasp(parameters(config, friction))
-    t = output_times(
-        model.settings.scenario.duration if config.duration is None else config.duration
-    )
+    model = SoftGrasp(Parameters().override(changes | (COARSE if config.smoke else {})))
+    t = output_times(0.6 if config.smoke else model.settings.scenario.duration)
     print(f"{friction} friction: finding the grasping force", flush=True)
-    try:
-        manipulation = grasp_and_roll(model, rtol=config.rtol)
-    except SimulationFailed as failure:
-        return Run(friction, model, failure.trajectory, None, failure)
-    force = manipulation.grasp_force
-    print(f"{friction} friction: {force:.3f} N hold the bracket; rolling", flush=True)
-    try:
-        return Run(
-            friction,
-            model,
-            simulate(model, t, y0=manipulation.y0, rtol=config.rtol, progress=True),
-            force,
-        )
-    except (SimulationFailed, Interrupted) as stop:
-        return Run(friction, model, stop.trajectory, force, stop)
+    m = grasp_and_roll(model, rtol=config.rtol)
+    print(f"{friction} friction: {m.grasp_force:.3f} N hold the bracket; rolling", flush=True)
+    run = simulate(model, t, y0=m.y0, rtol=config.rtol, progress=True)
+    return Run(friction, model, run, m.grasp_force)
 
 
-def run(config: Config) -> Result:
-    """The chosen friction set, and the paper-like one beside the default. Ends with the run that
-    stops early."""
-    if config.smoke:
-        config = replace(config, duration=0.6)
-    runs = {}
-    for friction in dict.fromkeys((config.friction, "paper-like")):
-        runs[friction] = manipulate(config, friction)
-        if runs[friction].stopped:
-            break
-    return Result(config, runs)
+def run(config: Config) -> tuple[Run, Run]:
+    """The default and the paper-like friction set."""
+    paper_like = {"contact.K_t": Parameters.paper_like().contact.K_t}
+    return manipulate(config, "default", {}), manipulate(config, "paper-like", paper_like)
 
 
 def summary(run: Run) -> dict[str, Any]:
@@ -179,12 +116,6 @@ def summary(run: Run) -> dict[str, Any]:
     }
 
 
-def summaries(result: Result) -> dict[str, Any]:
-    """`summary.json`: the chosen friction set at the top, the other under "paper_like"."""
-    first, *others = map(summary, result.runs.values())
-    return first | {"paper_like": others[0] if others else None}
-
-
 ROWS = (  # what, published value, key, format
     ("x_C(0 s) [mm]", "60", "x_C_mm.0", ".3f"),
     ("x_C(10 s) [mm]", "40", "x_C_mm.10", ".3f"),
@@ -211,7 +142,7 @@ ROWS = (  # what, published value, key, format
 
 
 def table(numbers: Mapping[str, Any]) -> str:
-    """The published values beside the run's, as Markdown."""
+    """The published values beside the runs', as Markdown."""
 
     def cell(source: Mapping[str, Any], key: str, form: str) -> str:
         value: Any = source
@@ -223,7 +154,7 @@ def table(numbers: Mapping[str, Any]) -> str:
             return {1: "anticlockwise", -1: "clockwise", 0: "none"}[value]
         return f"{value:{form}}" + (f" ({source['newton_per_step']:.2f})" if key == "steps" else "")
 
-    columns = [numbers] + ([numbers["paper_like"]] if numbers["paper_like"] else [])
+    columns = numbers, numbers["paper_like"]
     head = ("", "paper", *(f"{c['friction']} friction" for c in columns))
     return markdown(
         head,
@@ -231,71 +162,47 @@ def table(numbers: Mapping[str, Any]) -> str:
     )
 
 
-def figures(result: Result) -> dict[str, Figure]:
+def figures(run: Run) -> dict[str, Figure]:
     """Every figure by its file's name."""
-    first = next(iter(result.runs.values()))
-    trajectory = first.trajectory
+    trajectory = run.trajectory
     out = {
-        "dashboard": draw_run(trajectory, title="Grasp and roll"),
-        "snapshots": draw.snapshots(trajectory, title="Grasp and roll (paper: Fig. 16)"),
-        "multibond": drawn.multibond_graph(first.model),
+        "dashboard": dashboard(trajectory, title="Grasp and roll"),
+        "snapshots": snapshots(trajectory, title="Grasp and roll (paper: Fig. 16)"),
+        "multibond": diagram.multibond_graph(run.model),
     }
     for time, number in ((0.125, 14), (5.0, 15)):
         if time <= trajectory.t[-1]:
-            out[f"force_distribution_{time:g}s"] = draw_run(
+            out[f"force_distribution_{time:g}s"] = dashboard(
                 trajectory, only=("scene", "contact U", "contact L"), time=time,
                 title=f"Contact forces at {time:g} s (paper: Fig. {number})",
             )  # fmt: skip
     return out
 
 
-def write(result: Result) -> None:
-    """Everything into `out`: data first; pictures only of runs that were not stopped."""
-    config, first = result.config, next(iter(result.runs.values()))
+def save(config: Config, runs: tuple[Run, Run]) -> None:
+    """Everything into `out`, the paper-like friction set under "paper_like" in the summary."""
+    first, other = runs
     config.out.mkdir(parents=True, exist_ok=True)
-    for friction, done in result.runs.items():
-        name = "trajectory.nc" if done is first else f"trajectory_{friction.replace('-', '_')}.nc"
-        done.trajectory.save(config.out / name)
-    (config.out / "multibond.dot").write_text(drawn.dot(first.model), encoding="utf-8")
-    content = summaries(result)
-    if result.stopped:
-        write_files(config, content)
-        return
-    write_files(config, content, figures(result), table(content))
+    first.trajectory.save(config.out / "trajectory.nc")
+    other.trajectory.save(config.out / "trajectory_paper_like.nc")
+    (config.out / "multibond.dot").write_text(diagram.dot(first.model), encoding="utf-8")
+    content = summary(first) | {"paper_like": summary(other)}
+    write(config, content, figures(first), table(content))
     if config.animation:
-        frames = 12 if config.smoke else 150
-        title = "Grasp and roll; the first half second in slow motion"
         animate(
-            first.trajectory, config.out / "animation.gif", frames=frames, title=title,
-            follow="disc.x", slow=0.5, progress=True,
+            first.trajectory, config.out / "animation.gif", frames=12 if config.smoke else 150,
+            title="Grasp and roll; the first half second in slow motion", follow="disc.x",
+            slow=0.5, progress=True,
         )  # fmt: skip
         player(first.trajectory, config.out / "player.html", title="Grasp and roll")
 
 
-def main() -> None:
-    config = options(Config, __doc__)
-    try:
-        if config.table:
-            print(table(json.loads((config.out / "summary.json").read_text(encoding="utf-8"))))
-            return
-        result = run(config)
-    except KeyboardInterrupt:  # nothing was simulated yet but trials of the grasp
-        sys.exit(130)
-    except (ValueError, OSError, NoEquilibrium) as error:
-        sys.exit(f"error: {error}")
-    try:
-        write(result)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    if isinstance(result.stopped, SimulationFailed):
-        sys.exit(
-            f"the simulation failed: {result.stopped.reason}\nwhat was simulated until then is in "
-            f"{config.out}"
-        )
-    if result.stopped:
-        print("interrupted: the files hold what was simulated until then", file=sys.stderr)
-        sys.exit(130)
+def main(config: Config) -> None:
+    if config.table:
+        print(table(json.loads((config.out / "summary.json").read_text(encoding="utf-8"))))
+    else:
+        save(config, run(config))
 
 
 if __name__ == "__main__":
-    main()
+    main(options(Config, __doc__))

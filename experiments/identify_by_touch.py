@@ -29,12 +29,14 @@ from torchsoft import Parameters, SoftGrasp, Taxels
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.physics.motion import Reference
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, identify, record
+from torchsoft.sysid import RIG, Problem, Recording, identify, record
 from torchsoft.sysid.fit import percent, standard_deviations
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Sensor, by_channel
 
+FITTED = "strokes"
+"""Recording of the two identifications."""
 SKIN = Taxels("L", 3e-3, count=40, spread=1e-3)
 SETS = {
     "poses and F_x": {name: sensor for name, sensor in RIG.items() if name != "F_y"},
@@ -60,21 +62,9 @@ WITH = {
 class Config:
     out: Path = Path("out/identify_by_touch")
     rtol: float = 1e-5  # of the runs that are fitted
-    v_s: float = 0.05  # contact.v_s [m/s], known
     motions: tuple[str, ...] = ("slow roll", "strokes", "deep pressing", "light shaking")
-    fitted: str = "strokes"  # recording of the two identifications
     repeats: int = 7  # timings of a Jacobian
-    seed: int = 0
     smoke: bool = False  # one short motion on a coarse mesh, four parameters
-
-
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    truth: dict[str, float]
-    deviations: dict[str, dict[str, dict[str, float]]]  # by motion, sensors and parameter
-    fits: dict[str, IdentificationResult]
-    cost: dict[str, float]
 
 
 def rig(settings: Parameters, reference: Reference | None = None) -> SoftGrasp:
@@ -89,10 +79,10 @@ def sensors(*sets: str) -> dict[str, Sensor]:
 
 def recording(config: Config, truth: dict[str, float], name: str, motion: Excitation) -> Recording:
     """What all sensors give, with noise."""
-    nominal = Parameters().override({"contact.v_s": config.v_s} | (COARSE if config.smoke else {}))
+    nominal = Parameters().override({"contact.v_s": 0.05} | (COARSE if config.smoke else {}))
     planned = begin(motion, nominal)
     felt = rig(planned.rig.settings, planned.rig.reference)
-    return record(name, planned._replace(rig=felt), truth, sensors(*SETS), seed=config.seed)
+    return record(name, planned._replace(rig=felt), truth, sensors(*SETS))
 
 
 def problem(data: Recording, sets: tuple[str, ...], start: dict[str, float]) -> Problem:
@@ -124,15 +114,14 @@ def cost(config: Config, data: Recording, truth: dict[str, float]) -> dict[str, 
     return {"without_s": without, "with_taxels_s": with_row, "ratio": with_row / without}
 
 
-def run(config: Config) -> Result:
+def main(config: Config) -> None:
     few = ("pad.E", "contact.K_n", "contact.mu_s", "contact.mu_k")
     truth = {name: TRUTH[name] for name in few} if config.smoke else TRUTH
     motions = {name: CATALOGUE[name] for name in config.motions}
     if config.smoke:
-        short = Excitation(
-            motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9, senses="bracket"
-        )
-        motions, config = {"strokes": short}, replace(config, repeats=1)
+        short = Strokes(travel=8e-3, stroke_time=0.2)
+        motions = {FITTED: Excitation(motion=short, duration=0.9, senses="bracket")}
+        config = replace(config, repeats=1)
     recordings = {name: recording(config, truth, name, motion) for name, motion in motions.items()}
     deviations = {
         name: {
@@ -143,48 +132,33 @@ def run(config: Config) -> Result:
         }
         for name, data in recordings.items()
     }
-    random, fits = np.random.default_rng(config.seed), {}
+    random, fits, chi2 = np.random.default_rng(0), dict[str, Any](), dict[str, float]()
     start = {k: v * float(random.uniform(1 / 1.5, 1.5)) for k, v in truth.items()}
-    if "contact.mu_k" in start:
-        start["contact.mu_k"] = min(start["contact.mu_k"], 0.95 * start["contact.mu_s"])
+    start["contact.mu_k"] = min(start["contact.mu_k"], 0.95 * start["contact.mu_s"])
     for label in ("poses and F_x", "+ taxels"):
-        stated = problem(recordings[config.fitted], WITH[label], start)
-        fits[label] = identify(stated, rtol=config.rtol, assumptions="trusted")
-        print(f"\n{config.fitted}, {label}", fits[label].table(), *fits[label].notices, sep="\n")
-    return Result(
-        config, dict(truth), deviations, fits, cost(config, recordings[config.fitted], truth)
-    )
-
-
-def main(config: Config) -> None:
-    result = run(config)
+        stated = problem(recordings[FITTED], WITH[label], start)
+        found = identify(stated, rtol=config.rtol, assumptions="trusted")
+        print(f"\n{FITTED}, {label}", found.table(), *found.notices, sep="\n")
+        chi2[label] = found.chi2
+        fits[label] = {
+            name: {
+                "truth": value, "estimate": found[name].value, "seen": found[name].identifiable,
+                "error_in_sd": (found[name].last / value - 1) / found[name].relative_sd,
+            }
+            for name, value in truth.items()
+        }  # fmt: skip
+    seconds = cost(config, recordings[FITTED], truth)
+    content = {"relative_sd": deviations, "fits": fits, "chi2": chi2, "jacobian": seconds}
     rows = [
         (motion, label, *(percent(sd) for sd in sds.values()))
-        for motion, by in result.deviations.items()
+        for motion, by in deviations.items()
         for label, sds in by.items()
     ]
-    fits = {
-        label: {
-            e.name: {
-                "truth": result.truth[e.name], "estimate": e.value, "last": e.last,
-                "relative_sd": e.relative_sd, "seen": e.identifiable,
-                "error_in_sd": (e.last / result.truth[e.name] - 1) / e.relative_sd,
-            }
-            for e in found.estimates if e.name in result.truth
-        }
-        for label, found in result.fits.items()
-    }  # fmt: skip
-    content = {
-        "relative_sd": result.deviations,
-        "fits": fits,
-        "chi2": {label: found.chi2 for label, found in result.fits.items()},
-        "jacobian": result.cost,
-    }
-    head = ("motion", "sensors", *(name.split(".")[1] for name in result.truth))
-    write(result.config, content, table=markdown(head, rows))
+    head = ("motion", "sensors", *(name.split(".")[1] for name in truth))
+    write(config, content, table=markdown(head, rows))
     print(
-        f"a Jacobian with {SKIN.count} taxels takes {result.cost['with_taxels_s']:.3g} s, "
-        f"{result.cost['ratio']:.2f} times one without"
+        f"a Jacobian with {SKIN.count} taxels takes {seconds['with_taxels_s']:.3g} s, "
+        f"{seconds['ratio']:.2f} times one without"
     )
 
 

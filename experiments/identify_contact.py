@@ -18,13 +18,14 @@ identification takes some 45 runs with sensitivities and 20 without.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
-from torchsoft.experiment import COARSE, markdown, options, write
+from torchsoft.experiment import COARSE, coloured, numbers, options, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals, StepsByName
 from torchsoft.sysid.recording import Array
@@ -43,47 +44,10 @@ DIFFERENCE = 1e-4  # Step of the finite differences in the logarithms.
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/identify_contact")
-    rtol: float = 1e-5  # of the fit's last stage; nothing else says how long its steps are
-    data_rtol: float = 1e-6  # of the runs that data are made of
-    v_s: float = 0.05  # contact.v_s [m/s], known
-    starts: tuple[int, ...] = (
-        0,
-        1,
-    )  # seeds of the starts: every parameter off by a factor of 2 to 3, up or down
+    rtol: float = 1e-5  # of the fit's last stage; data have a tenth of it
+    starts: tuple[int, ...] = (0, 1)  # seeds of the starts
     workers: int = 2
-    noise_seed: int = 0
-    baseline: bool = True  # identify by finite differences as well, from the first start
     smoke: bool = False  # four parameters from two short recordings on a coarse mesh
-
-
-@dataclass(frozen=True)
-class Case:
-    """One identification, what it was given, and how far off it is."""
-
-    name: str
-    noise: float
-    start: dict[str, float]
-    found: IdentificationResult
-
-    def parameters(self, truth: dict[str, float]) -> dict[str, dict[str, object]]:
-        out = {}
-        for name, value in truth.items():
-            e = self.found[name]
-            out[name] = {
-                "truth": value, "start": self.start[name], "estimate": e.value, "ci95": e.ci95,
-                "relative_sd": e.relative_sd,
-                "relative_error": None if e.value is None else e.value / value - 1,
-                "seen": e.identifiable,
-            }  # fmt: skip
-        return out
-
-
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    truth: dict[str, float]
-    cases: list[Case]
-    problem: Problem
 
 
 class FiniteDifferences(Problem):
@@ -127,39 +91,41 @@ def excitations(config: Config) -> dict[str, Excitation]:
     }
 
 
-def truths(config: Config) -> dict[str, float]:
+def truths(smoke: bool) -> dict[str, float]:
     few = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
-    return {name: TRUTH[name] for name in few} if config.smoke else TRUTH
+    return {name: TRUTH[name] for name in few} if smoke else TRUTH
 
 
 def record_all(config: Config, noise: float) -> list[Recording]:
     """What the rig gives; the last one is to be predicted."""
-    coarse = COARSE if config.smoke else {}
-    nominal = Parameters().override({"contact.v_s": config.v_s} | coarse)
-    if config.smoke:
-        nominal = nominal.override({"contact.mu_k": 0.5})
+    coarse = COARSE | {"contact.mu_k": 0.5} if config.smoke else {}
+    nominal = Parameters().override({"contact.v_s": 0.05} | coarse)
+    how: dict[str, Any] = {"rtol": 0.1 * config.rtol, "noise": noise}
     return [
-        record(
-            name,
-            begin(e, nominal),
-            truths(config),
-            RIG,
-            rtol=config.data_rtol,
-            noise=noise,
-            seed=config.noise_seed + k,
-        )
+        record(name, begin(e, nominal), truths(config.smoke), RIG, seed=k, **how)
         for k, (name, e) in enumerate(excitations(config).items())
     ]
 
 
-def start(config: Config, seed: int) -> dict[str, float]:
+def start(truth: dict[str, float], seed: int) -> dict[str, float]:
     """Every parameter off by a factor of 2 to 3; mu_k not above mu_s."""
     rng, out = np.random.default_rng(seed), {}
-    for name, value in truths(config).items():
+    for name, value in truth.items():
         out[name] = float(value * rng.uniform(2.0, 3.0) ** rng.choice((-1.0, 1.0)))
     if "contact.mu_k" in out:
         out["contact.mu_k"] = min(out["contact.mu_k"], 0.95 * out["contact.mu_s"])
     return out
+
+
+def noisy(
+    recording: Recording, seed: int | np.random.Generator, rho: float = 0.0
+) -> Recording:  # fmt: skip
+    """A recording without noise, with that of `RIG`, whose neighbouring samples correlate by
+    `rho`."""
+    rng, samples = np.random.default_rng(seed), {}
+    for channel, (t, y) in recording.samples.items():
+        samples[channel] = (t, y + RIG[channel].noise * coloured(len(t), rho, rng))
+    return replace(recording, samples=samples)
 
 
 def problem(
@@ -176,90 +142,60 @@ def problem(
     return kind(recordings, sensors, unknowns)
 
 
-def run(config: Config) -> Result:
-    config = replace(config, workers=1, starts=(0,)) if config.smoke else config
-    held = [list(excitations(config))[-1]]
-    cases: list[Case] = []
-    noisy, exact = record_all(config, 1.0), record_all(config, 0.0)
-
-    def case(name: str, noise: float, seed: int, kind: type[Problem] = Problem) -> Problem:
-        begin = start(config, seed)
-        stated = problem(noisy if noise else exact, begin, kind=kind)
-        print(
-            f"\n{name}, start {seed}: off by factors of",
-            *(f"{v / truths(config)[k]:.2f}" for k, v in begin.items()),
-        )
-        folder = config.out / f"runs-{name.replace(' ', '-')}-{seed}"
-        found = identify(
-            stated,
-            rtol=config.rtol,
-            workers=config.workers,
-            heldout=held,
-            checkpoint=folder,
-            progress=not config.smoke,
-        )
-        forget(folder)
-        cases.append(Case(name, noise, begin, found))
-        print(found.table(), *found.notices, sep="\n")
-        return stated
-
-    last = None
-    for seed in config.starts:
-        last = case("noisy", 1.0, seed)
-    for seed in config.starts:
-        case("noise-free", 0.0, seed)
-    if config.baseline:
-        case("finite differences", 1.0, config.starts[0], FiniteDifferences)
-    assert last is not None
-    return Result(config, truths(config), cases, last)
+def compared(found: IdentificationResult, truth: dict[str, float], begin: dict[str, float]) -> Any:
+    """Estimates beside the truth, by parameter."""
+    out = {}
+    for name, value in truth.items():
+        e = found[name]
+        out[name] = {
+            "truth": value, "start": begin[name], "estimate": e.value, "ci95": e.ci95,
+            "relative_sd": e.relative_sd, "relative_error": e.last / value - 1,
+            "seen": e.identifiable,
+        }  # fmt: skip
+    return out
 
 
 def main(config: Config) -> None:
-    result = run(config)
-    config = result.config
-    report(
-        [c.found for c in result.cases if c.name == "noisy"][-1],
-        result.problem,
-        config.out / "report.html",
-    )
-    rows = []
-    for case in result.cases:
-        cost = case.found.cost
-        rows.append(
-            {
-                "case": case.name, "noise": case.noise, "parameters": case.parameters(result.truth),
-                "chi2": case.found.chi2, "heldout_nrmse": case.found.heldout,
-                "stages": case.found.stages, "notices": case.found.notices,
-                **{k: cost[k] for k in ("data_seconds", "simulations", "jacobians", "wall_s")},
-            }
-        )  # fmt: skip
-    wall = {row["case"]: row["wall_s"] for row in reversed(rows)}
-    summary = {
-        "noise": {channel: sensor.noise for channel, sensor in RIG.items()},
-        "cases": rows,
-        "baseline_over_exact": wall["finite differences"] / wall["noisy"]
-        if "finite differences" in wall
-        else None,
-    }
-    cells = []
-    for case, row in zip(result.cases, rows):
-        some = [case.found[name] for name in result.truth]
-        error, sd = (
-            max(abs(e.last / result.truth[e.name] - 1) for e in some),
-            max(e.relative_sd for e in some),
-        )
-        cells.append(
-            (
-                case.name,
-                f"{error:.2%}",
-                f"{sd:.2%}",
-                row["simulations"],
-                row["jacobians"],
-                f"{row['wall_s']:.0f}",
-            )
-        )
-    head = ("case", "worst error", "worst predicted sd", "simulations", "Jacobians", "wall [s]")
-    write(config, summary, table=markdown(head, cells))
+    if config.smoke:
+        config = replace(config, workers=1, starts=(0,))
+    truth, held = truths(config.smoke), [list(excitations(config))[-1]]
+    measured, exact = record_all(config, 1.0), record_all(config, 0.0)
+    rows = list[dict[str, Any]]()
+    for name, recordings, seeds, kind in (
+        ("noisy", measured, config.starts, Problem),
+        ("noise-free", exact, config.starts, Problem),
+        ("finite differences", measured, config.starts[:1], FiniteDifferences),
+    ):
+        for seed in seeds:
+            begin = start(truth, seed)
+            factors = (f"{v / truth[k]:.2f}" for k, v in begin.items())
+            print(f"\n{name}, start {seed}: off by factors of", *factors)
+            folder = config.out / f"runs-{name.replace(' ', '-')}-{seed}"
+            stated = problem(recordings, begin, kind=kind)
+            found = identify(
+                stated, rtol=config.rtol, workers=config.workers, heldout=held, checkpoint=folder,
+                progress=not config.smoke,
+            )  # fmt: skip
+            forget(folder)
+            print(found.table(), *found.notices, sep="\n")
+            if name == "noisy":
+                report(found, stated, config.out / "report.html")
+            rows.append(
+                {
+                    "case": name, "parameters": compared(found, truth, begin), "chi2": found.chi2,
+                    "heldout_nrmse": found.heldout, "notices": found.notices, **found.cost,
+                }
+            )  # fmt: skip
+    cells = {
+        f"{row['case']}, {i}": {
+            "worst error": max(abs(one["relative_error"]) for one in row["parameters"].values()),
+            "worst predicted sd": max(one["relative_sd"] for one in row["parameters"].values()),
+            "simulations": row["simulations"], "Jacobians": row["jacobians"],
+            "wall [s]": row["wall_s"],
+        }
+        for i, row in enumerate(rows)
+    }  # fmt: skip
+    write(config, {"cases": rows}, table=numbers("case", cells, 3))
 
 
 if __name__ == "__main__":

@@ -21,22 +21,20 @@ anywhere, "cannot tell" where they do not. A quarter of an hour on two cores.
 """
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearSolid
 from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes, begin
-from torchsoft.experiment import COARSE, markdown, options, timed, write
+from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
-from torchsoft.sysid.compare import Evidence, FittedLaw, compare, fitted
+from torchsoft.sysid.compare import Evidence, compare, fitted
 from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.runs import Runner
-from torchsoft.threads import parallel_map
 
 NOMINAL = Parameters().override(
     {"contact.v_s": 0.05, "contact.mu_s": 0.7, "contact.mu_k": 0.6} | COARSE
@@ -145,14 +143,11 @@ def draw(setting: str, number: int, seed: int) -> Case:
     """The law by turns, parameters at random about the nominal ones."""
     rng = np.random.default_rng([seed, list(SETTINGS).index(setting), number])
     law = SETTINGS[setting].laws[number % 2]
-    nominal = {
-        name: NOMINAL.table()[name]["value"]
-        for name in ("pad.E", "contact.mu_s", "pad.tau", "contact.K_n")
-    }
-    near = {name: value for name, value in nominal.items() if name in UNKNOWNS[law]}
+    table = NOMINAL.table()
     truth = {
-        name: value * float(np.exp(0.1 * rng.standard_normal())) for name, value in near.items()
-    }
+        name: table[name]["value"] * float(np.exp(0.1 * rng.standard_normal()))
+        for name in ("pad.E", "contact.mu_s", "pad.tau", "contact.K_n") if name in UNKNOWNS[law]
+    }  # fmt: skip
     if law == "smooth":
         truth["contact.mu_k"] = truth["contact.mu_s"] * float(rng.uniform(0.6, 0.85))
     if law == "solid":
@@ -171,12 +166,12 @@ def data(case: Case, noise: float) -> Recording:
     )
 
 
-def problems(case: Case, recording: Recording, kind: type[Problem] = Problem) -> dict[str, Problem]:
+def problems(case: Case, recording: Recording) -> dict[str, Problem]:
     """Both laws, begun with nominal parameters."""
     setting, out = SETTINGS[case.setting], {}
     for law in setting.laws:
         rig = BUILDS[law](setting.excitation.settings(NOMINAL), recording.rig.reference)
-        out[law] = kind([replace(recording, rig=rig)], setting.sensors, UNKNOWNS[law])
+        out[law] = Problem([replace(recording, rig=rig)], setting.sensors, UNKNOWNS[law])
     return out
 
 
@@ -225,12 +220,6 @@ class Judged:
         return "right" if self.said.law == self.case.law else "wrong"
 
 
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    judged: list[Judged]
-
-
 def counts(config: Config) -> dict[str, int]:
     """Cases by motion."""
     if config.smoke:
@@ -246,72 +235,53 @@ def judge(case: Case) -> Judged:
     found, wall = timed(
         lambda: compare(laws, plans={name: plan(one) for name, one in laws.items()})
     )
-    exact = problems(case, data(case, 0.0))
-    wrong = next(name for name in exact if name != case.law)
-    left = Evidence(
-        fit(wrong, exact[wrong]), Runner(exact[wrong].recordings), exact[wrong].names, []
+    wrong, exact = next(
+        one for one in problems(case, data(case, 0.0)).items() if one[0] != case.law
     )
+    runner, names = Runner(exact.recordings), exact.names
+    fit = fitted(wrong, exact, runner, names, plan(exact), RTOL, 1, False)
+    left = Evidence(fit, runner, names, [])
     return Judged(case, float(np.linalg.norm(left.fitted.r)), found, wall)
 
 
-def fit(name: str, problem: Problem) -> FittedLaw:
-    """One law, as `compare` fits it."""
-    return fitted(
-        name, problem, Runner(problem.recordings), problem.names, plan(problem), RTOL, 1, False
-    )
-
-
-def run(config: Config) -> Result:
-    config = replace(config, workers=1) if config.smoke else config
-    cases = [
-        draw(name, k, config.seed) for name, number in counts(config).items() for k in range(number)
-    ]
-    work = parallel_map(lambda k: judge(cases[k]), len(cases), config.workers)
-    done = dict(tqdm(work, desc="cases", total=len(cases), disable=config.smoke))
-    return Result(config, [done[k] for k in range(len(cases))])
-
-
-def rows(result: Result) -> list[dict]:
+def summed(judged: Sequence[Judged], motions: Iterable[str]) -> list[dict[str, Any]]:
     """By motion, then for all data that can tell, and all that cannot, by D."""
-    groups = {
-        name: [one for one in result.judged if one.case.setting == name]
-        for name in counts(result.config)
-    }
-    groups |= {
-        "motions that show the difference": [
-            one for one in result.judged if one.case.setting in TELLING
-        ],
-        f"D of {ENOUGH:g} or more": [one for one in result.judged if one.apart >= ENOUGH],
-        f"D below {ENOUGH:g}": [one for one in result.judged if one.apart < ENOUGH],
-    }
+    groups = {name: [one for one in judged if one.case.setting == name] for name in motions}
+    groups["motions that show the difference"] = [
+        one for one in judged if one.case.setting in TELLING
+    ]
+    groups[f"D of {ENOUGH:g} or more"] = [one for one in judged if one.apart >= ENOUGH]
+    groups[f"D below {ENOUGH:g}"] = [one for one in judged if one.apart < ENOUGH]
     out = []
     for name, some in groups.items():
         answers, D = Counter(one.answer for one in some), [one.apart for one in some]
-        spread = [float(v) for v in np.quantile(D, [0, 0.5, 1])] if D else []
         told = {key: answers[key] for key in ANSWERS}
-        wall = float(np.median([one.wall_s for one in some])) if some else None
-        out.append({"group": name, "cases": len(some), **told, "D": spread, "median_wall_s": wall})
+        spread = np.quantile(D, [0, 0.5, 1]).tolist() if D else []
+        out.append({"group": name, "cases": len(some), **told, "D": spread})
     return out
 
 
 def main(config: Config) -> None:
-    result = run(config)
-    summed = rows(result)
-    cells = []
-    for row in summed:
-        D = " / ".join(f"{v:.2g}" for v in row["D"])
-        cells.append((row["group"], row["cases"], D, *(row[k] for k in ANSWERS)))
-    table = markdown(("data", "cases", "D least / median / most", *ANSWERS), cells)
-    cases = [
+    config = replace(config, workers=1) if config.smoke else config
+    motions = counts(config)
+    cases = [draw(name, k, config.seed) for name, number in motions.items() for k in range(number)]
+    judged = repeated(lambda k: judge(cases[k]), len(cases), config.workers, "cases")
+    groups = summed(judged, motions)
+    rows = [
+        (row["group"], row["cases"], " / ".join(f"{v:.2g}" for v in row["D"]),
+         *(row[answer] for answer in ANSWERS))
+        for row in groups
+    ]  # fmt: skip
+    table = markdown(("data", "cases", "D least / median / most", *ANSWERS), rows)
+    every = [
         {
             "motion": one.case.setting, "law": one.case.law, "truth": one.case.truth,
             "seed": one.case.seed, "D": one.apart, "answer": one.answer, "wall_s": one.wall_s,
-            "verdict": one.said.verdict, "laws": [asdict(law) for law in one.said.laws],
-            "against": [asdict(v) for v in one.said.against],
+            "verdict": one.said.verdict,
         }
-        for one in result.judged
+        for one in judged
     ]  # fmt: skip
-    write(result.config, {"groups": summed, "cases": cases}, table=table)
+    write(config, {"groups": groups, "cases": every}, table=table)
 
 
 if __name__ == "__main__":

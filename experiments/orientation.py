@@ -9,9 +9,8 @@ masses of rigid parts that roll. Errors count from the closed grip on.
   kinematics  jaws under loops of their own, driven as a rigid disc would roll: what it costs not to
               see the disc
   speed       everything after the grip faster; rigid parts lag behind by a / w^2
-  friction    less of it: a disc asks for mu = I alpha / 2 R N and m a / 2 N, a shape between rigid
-              plates for max h'/h (1 + W / 2 N), with its support function h, grip N and weight W
-              (the friction cone)
+  friction    less of it: a shape between rigid plates asks for mu = max h'/h (1 + W / 2 N), with
+              its support function h, grip N and weight W (the friction cone)
   shape       ellipses of the disc's area and a rounded box: the grip turns them with F = max h'/h
               (N + W / 2) on either jaw, for which the loop needs an error F / Kp; then with the
               efforts of the run before fed forward
@@ -49,7 +48,7 @@ from torchsoft import (
     Trajectory,
 )
 from torchsoft import simulate as simulated
-from torchsoft.experiment import markdown, options, timed, write
+from torchsoft.experiment import grid, markdown, options, timed, write
 from torchsoft.physics.motion import Piecewise, evaluate
 from torchsoft.physics.statics import resting, standing
 from torchsoft.plot.animation import animate
@@ -95,6 +94,22 @@ class Case:
     end: float  # of the run [s]
 
 
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/orientation")
+    position_mm: float = 0.1  # tolerance of the centre
+    angle_deg: float = 0.5  # and of the orientation
+    bandwidth: float = (
+        150.0  # of the loops [rad/s]; assumed, for the model has no delay that would limit it
+    )
+    speeds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the disc
+    aspects: tuple[float, ...] = (1.1, 1.3, 2.0)  # of the ellipses
+    frictions: tuple[float, ...] = (0.5, 0.35, 0.32, 0.3, 0.28, 0.25, 0.2)
+    passes: int = 2  # runs whose efforts are fed forward, one after the other
+    rtol: float = 1e-4
+    smoke: bool = False  # a size that takes seconds
+
+
 class Outcome(NamedTuple):
     """A run in numbers: errors from `GRIPPED` on, largest and where everything is at rest, and what
     pushed."""
@@ -106,10 +121,8 @@ class Outcome(NamedTuple):
     friction: float  # largest sum of the friction forces at a pad over that of the normal ones
     effort: float  # largest effort of the loop on theta [N]
     opening_mm: float  # largest change of the distance between the jaws
+    verdict: str  # "within" or "beyond" the tolerance, or "lost"
     stopped: str  # why the run ended early; empty if it did not
-
-    def within(self, position_mm: float, angle_deg: float) -> bool:
-        return not self.stopped and self.position_mm <= position_mm and self.angle_deg <= angle_deg
 
 
 def file_of(gains: Gains, **groups: dict[str, Any]) -> RigFile:
@@ -117,12 +130,8 @@ def file_of(gains: Gains, **groups: dict[str, Any]) -> RigFile:
     zero at first."""
     loops = {loop: {"feed_forward": f"known_{loop}"} for loop in LOOPS}
     zero = {f"known_{loop}": {"kind": "profile", "times": [0.0], "values": [0.0]} for loop in LOOPS}
-    return (
-        RigFile.from_toml(FILE)
-        .override(**groups)
-        .override(actuators=loops, motion=zero)
-        .override(actuators=gains)
-    )
+    file = RigFile.from_toml(FILE).override(**groups)
+    return file.override(actuators=loops, motion=zero).override(actuators=gains)
 
 
 def case_of(file: RigFile, shape: Shape | None = None) -> Case:
@@ -160,7 +169,7 @@ def faster(case: Case, speed: float) -> Case:
     for name, one in case.signals.items():
         assert isinstance(one, Profile)
         signals[name] = Profile(at(one.times), one.values.detach())
-    return Case(case.rig, case.y0, signals, GRIPPED + (case.end - GRIPPED) / speed)
+    return replace(case, signals=signals, end=GRIPPED + (case.end - GRIPPED) / speed)
 
 
 def rubbed(case: Case, mu: float) -> None:
@@ -176,12 +185,8 @@ def rubbed(case: Case, mu: float) -> None:
 def fed(case: Case, run: Trajectory) -> Case:
     """The same, with the efforts of a run before fed forward."""
     efforts = {f"known_{loop}": run[f"F_{loop}"] for loop in LOOPS} | {"bear": run["F_lift"]}
-    return Case(
-        case.rig,
-        case.y0,
-        case.signals | {k: Sampled(run.t, v.detach()) for k, v in efforts.items()},
-        case.end,
-    )
+    known = {k: Sampled(run.t, v.detach()) for k, v in efforts.items()}
+    return replace(case, signals=case.signals | known)
 
 
 def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
@@ -189,7 +194,7 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
     does not see the disc: x_J = x_d +- R theta_d."""
     rig, signals = case.rig, dict(case.signals)
     start = rig.unpack(case.y0).pose
-    times = torch.linspace(0.0, case.end, 901, dtype=torch.float64)
+    times = grid(case.end, case.end / 900)
     x_d, theta_d = (signals[name](times)[0].detach() for name in ("x_d", "theta_d"))
     jaws = {}
     for jaw, sign in (("lower", 1.0), ("upper", -1.0)):
@@ -200,22 +205,17 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
     own = {name: rig.actuators[name] for name in ("lift", "grip")}
     gravity = rig.gravity.item()
     alone = Rig(
-        bodies=rig.bodies,
-        pads=rig.pads,
-        contacts=rig.contacts,
-        actuators=jaws | own,
+        bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, actuators=jaws | own,
         gravity=gravity,
-    )
-    return Case(alone, case.y0, signals, case.end)
+    )  # fmt: skip
+    return replace(case, rig=alone, signals=signals)
 
 
 def simulate(case: Case, rtol: float) -> tuple[Trajectory, str]:
     """A run every 10 ms, or what there is of it, and why it ended early."""
-    t = torch.linspace(0.0, case.end, round(100 * case.end) + 1, dtype=torch.float64)
+    t, reference = grid(case.end), Reference(**case.signals)
     try:
-        return simulated(
-            case.rig, t, y0=case.y0, reference=Reference(**case.signals), rtol=rtol
-        ), ""
+        return simulated(case.rig, t, y0=case.y0, reference=reference, rtol=rtol), ""
     except SimulationFailed as failure:
         if failure.trajectory is None:
             raise
@@ -229,7 +229,7 @@ def errors(case: Case, run: Trajectory) -> tuple[Tensor, Tensor]:
     return MM * torch.hypot(x, y), DEGREES * theta
 
 
-def outcome(case: Case, run: Trajectory, stopped: str = "") -> Outcome:
+def outcome(case: Case, run: Trajectory, stopped: str, config: Config) -> Outcome:
     position, angle = errors(case, run)
     later = run.t >= GRIPPED - 1e-9
     angle, effort = (
@@ -247,11 +247,14 @@ def outcome(case: Case, run: Trajectory, stopped: str = "") -> Outcome:
         for f in run.force.values()
     ]
     opening = run["y_upper"].detach() - run["y_lower"].detach()
+    off = float(position[later].max()), float(angle[later].max())
+    within = off[0] <= config.position_mm and off[1] <= config.angle_deg
     return Outcome(
-        float(position[later].max()), float(angle[later].max()), float(position[rests].max()),
+        *off, float(position[rests].max()),
         float(angle[rests].max()), float(torch.stack(share).max()),
         float(effort.detach()[later].abs().max()),
-        MM * float((opening - opening[run.at(GRIPPED)])[later].abs().max()), stopped,
+        MM * float((opening - opening[run.at(GRIPPED)])[later].abs().max()),
+        "lost" if stopped else "within" if within else "beyond", stopped,
     )  # fmt: skip
 
 
@@ -280,43 +283,14 @@ def rigid(shape: Shape, grip: float, weight: float) -> Rigid:
     return Rigid(F / grip, F, 2 * MM * float(np.abs(h - h[-1]).max()))
 
 
-DISC, KINEMATICS = "disc", "disc, by kinematics"
-
-
-@dataclass(frozen=True)
-class Config:
-    out: Path = Path("out/orientation")
-    position_mm: float = 0.1  # tolerance of the centre
-    angle_deg: float = 0.5  # and of the orientation
-    bandwidth: float = (
-        150.0  # of the loops [rad/s]; assumed, for the model has no delay that would limit it
-    )
-    speeds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the disc
-    disc_speed: float = 3.0  # at which its friction is varied
-    disc_frictions: tuple[float, ...] = (
-        0.8,
-        0.02,
-        0.01,
-        0.005,
-        0.002,
-        0.001,
-    )  # mu_s; mu_k in proportion
-    aspects: tuple[float, ...] = (1.1, 1.3, 2.0)  # of the ellipses
-    slipping_aspect: float = 1.3  # of the one whose friction is varied
-    frictions: tuple[float, ...] = (0.5, 0.35, 0.32, 0.3, 0.28, 0.25, 0.2)
-    box: bool = True  # a square box, corners rounded to half of its half-width
-    passes: int = 2  # runs whose efforts are fed forward, one after the other
-    rtol: float = 1e-4
-    animation: bool = True
-    frames: int = 90
-    smoke: bool = False  # a size that takes seconds
+DISC, KINEMATICS, SLIPPING = "disc", "disc, by kinematics", "ellipse 1.3"
+"""Runs by name; the friction of the last is varied."""
 
 
 GROUPS = {
     "loops_alone": "{}",
     "efforts_fed_forward": "{}, efforts fed forward",
     "speeds": "disc, {} times as fast",
-    "disc_frictions": "disc, fast, mu = {}",
     "frictions": "ellipse, fed forward, mu = {}",
 }
 """Groups of runs, and what the table calls one of them."""
@@ -325,21 +299,22 @@ GROUPS = {
 @dataclass(frozen=True)
 class Result:
     """Outcomes by group and key, predictions of rigid statics by shape, lags a / w^2 [mm, deg] by
-    speed, the coefficients of friction that the fast disc asks for, and runs to be drawn."""
+    speed, and runs to be drawn."""
 
-    config: Config
     gains: Gains
-    grip: float  # [N]
     outcomes: dict[str, dict[str, Outcome]]
     rigid: dict[str, Rigid]
     lags: dict[str, tuple[float, float]]
-    cones: dict[str, float]
     runs: dict[str, Trajectory]
 
-    def verdict(self, one: Outcome) -> str:
-        if one.stopped:
-            return "lost"
-        return "within" if one.within(self.config.position_mm, self.config.angle_deg) else "beyond"
+    def content(self) -> dict[str, Any]:
+        """What `summary.json` holds."""
+        by_group = {
+            group: {key: one._asdict() for key, one in some.items()}
+            for group, some in self.outcomes.items()
+        }
+        rigid = {name: one._asdict() for name, one in self.rigid.items()}
+        return {"gains": self.gains, "inertia_alone_mm_deg": self.lags, "rigid": rigid, **by_group}
 
 
 def table(result: Result) -> str:
@@ -351,13 +326,12 @@ def table(result: Result) -> str:
     rows = [
         (GROUPS[group].format(key), f"{x.position_mm:.4f}", f"{x.angle_deg:.3f}",
          f"{x.rest_mm:.4f}", f"{x.rest_deg:.4f}", f"{x.friction:.3g}", f"{x.effort:.3g}",
-         result.verdict(x))
+         x.verdict)
         for group, some in result.outcomes.items() for key, x in some.items()
     ]  # fmt: skip
-    cones = {name: one.friction for name, one in result.rigid.items()}
-    cones |= {f"disc, fast, {name}": mu for name, mu in result.cones.items()}
     asked = markdown(
-        ("rigid", "asks for a friction of"), [(name, f"{mu:.3g}") for name, mu in cones.items()]
+        ("rigid", "asks for a friction of"),
+        [(name, f"{one.friction:.3g}") for name, one in result.rigid.items()],
     )
     return f"{markdown(head, rows)}\n\n{asked}"
 
@@ -370,11 +344,12 @@ def peak(signal: Any) -> float:
 
 
 def shapes(config: Config, R: float) -> dict[str, Shape]:
+    """Ellipses of the disc's area, and a square box with corners rounded to half."""
     found: dict[str, Shape] = {
         f"ellipse {k:g}": Ellipse(R * k**0.5, R / k**0.5) for k in config.aspects
     }
-    side = 0.9 * R
-    return found | ({"rounded box": RoundedBox(side, side, side / 2)} if config.box else {})
+    box = {} if config.smoke else {"rounded box": RoundedBox(0.9 * R, 0.9 * R, 0.45 * R)}
+    return found | box
 
 
 def inertia_alone(case: Case, bandwidth: float) -> tuple[float, float]:
@@ -386,30 +361,24 @@ def inertia_alone(case: Case, bandwidth: float) -> tuple[float, float]:
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = replace(config, speeds=(6.0,), disc_frictions=(), aspects=(1.3,), frictions=(0.2,),
-            box=False, passes=1,
-                         rtol=1e-3, frames=2)  # fmt: skip
+        config = replace(config, speeds=(6.0,), aspects=(1.3,), frictions=(0.2,),
+                         passes=1, rtol=1e-3)  # fmt: skip
     mesh = {"elements_x": 35, "elements_y": 2}
     gains = design(RigFile.from_toml(FILE), config.bandwidth)
     file = file_of(gains, pads={"lower": mesh, "upper": mesh}) if config.smoke else file_of(gains)
     base = case_of(file)
-    hurried, disc = faster(base, config.disc_speed), base.rig.bodies["disc"]
+    disc = base.rig.bodies["disc"]
     assert isinstance(disc.shape, Circle)
-    R, mass, inertia = disc.shape.radius.item(), disc.mass.item(), disc.inertia.item()
-    weight = base.rig.gravity.item() * mass
+    R = disc.shape.radius.item()
+    weight = base.rig.gravity.item() * disc.mass.item()
     grip = -float(base.signals["grip"](torch.tensor(base.end, dtype=torch.float64))[0].detach())
-    cones = {
-        "turning": inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip),
-        "carrying": mass * peak(hurried.signals["x_d"]) / (2 * grip),
-    }
     outcomes: dict[str, dict[str, Outcome]] = {group: {} for group in GROUPS}
-    result = Result(config, gains, grip, outcomes, {DISC: rigid(disc.shape, grip, weight)}, {},
-                    cones, {})  # fmt: skip
+    result = Result(gains, outcomes, {DISC: rigid(disc.shape, grip, weight)}, {}, {})
     bar = tqdm(unit="run")
 
     def attempt(case: Case, group: str, key: object) -> Trajectory:
         done, stopped = simulate(case, config.rtol)
-        outcomes[group][str(key)] = outcome(case, done, stopped)
+        outcomes[group][str(key)] = outcome(case, done, stopped, config)
         bar.update()
         return done
 
@@ -419,9 +388,6 @@ def run(config: Config) -> Result:
         case = faster(base, speed)
         result.lags[str(speed)] = inertia_alone(case, config.bandwidth)
         attempt(case, "speeds", speed)
-    for mu in config.disc_frictions:
-        rubbed(base, mu)
-        attempt(hurried, "disc_frictions", mu)
     for name, shape in shapes(config, R).items():
         case, result.rigid[name] = case_of(file, shape), rigid(shape, grip, weight)
         done, last = attempt(case, "loops_alone", name), outcomes["loops_alone"]
@@ -430,7 +396,7 @@ def run(config: Config) -> Result:
                 break
             case, last = fed(case, done), outcomes["efforts_fed_forward"]
             done = result.runs[name] = attempt(case, "efforts_fed_forward", name)
-        if name == f"ellipse {config.slipping_aspect:g}" and not last[name].stopped:
+        if name == SLIPPING and not last[name].stopped:
             case = fed(case, done)
             for mu in config.frictions:
                 rubbed(case, mu)
@@ -439,38 +405,20 @@ def run(config: Config) -> Result:
     return result
 
 
-def summary(result: Result) -> dict[str, Any]:
-    """What `summary.json` holds."""
-    return {
-        "gains": result.gains,
-        "grip_N": result.grip,
-        "rigid": {name: one._asdict() for name, one in result.rigid.items()},
-        "inertia_alone_mm_deg": result.lags,
-        "disc_cones": result.cones,
-    } | {
-        group: {key: one._asdict() | {"verdict": result.verdict(one)} for key, one in some.items()}
-        for group, some in result.outcomes.items()
-    }
-
-
 def main(config: Config) -> None:
     result, wall = timed(lambda: run(config))
     stills = snapshots(
         result.runs[DISC], (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), title="A disc turned, then carried"
     )
-    write(result.config, summary(result) | {"wall_s": wall}, {"snapshots": stills}, table(result))
-    aspect = f"ellipse {config.slipping_aspect:g}"
-    videos = {
-        "orientation.gif": (DISC, "A disc turned by 90 degrees between two jaws, then carried"),
-        "ellipse.gif": (
-            aspect, f"{aspect.capitalize()}, with efforts fed forward: the jaws give way",
-        ),
-    }  # fmt: skip
-    for file, (name, title) in videos.items():
-        if config.animation and name in result.runs:
+    write(config, result.content() | {"wall_s": wall}, {"snapshots": stills}, table(result))
+    for file, name, title in (
+        ("orientation.gif", DISC, "A disc turned by 90 degrees between two jaws, then carried"),
+        ("ellipse.gif", SLIPPING, f"{SLIPPING}, with efforts fed forward: the jaws give way"),
+    ):
+        if name in result.runs:
             animate(
-                result.runs[name], config.out / file, frames=result.config.frames, title=title,
-                follow="disc.theta",
+                result.runs[name], config.out / file, frames=2 if config.smoke else 90,
+                title=title, follow="disc.theta",
             )  # fmt: skip
 
 

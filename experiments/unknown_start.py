@@ -22,13 +22,12 @@ from pathlib import Path
 import identify_contact
 import numpy as np
 import torch
-from identify_contact import TRUTH
+from identify_contact import TRUTH, noisy
 from scipy import stats
-from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.excitation import CATALOGUE, begin
-from torchsoft.experiment import COARSE, markdown, options, timed, write
+from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
 from torchsoft.sysid import (
     RIG,
     AtRest,
@@ -45,7 +44,6 @@ from torchsoft.sysid import (
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
-from torchsoft.threads import parallel_map
 
 CUTS = {
     "mid-roll": ("strokes", 0.85),
@@ -91,15 +89,11 @@ class Price:
 
 @dataclass(frozen=True)
 class Result:
-    config: Config
+    """By case the fits of all seeds, the price, and what comes of assuming rest."""
+
     found: dict[str, list[IdentificationResult]]
     prices: dict[str, Price]
     rest: dict[str, dict[str, object]]
-    wall: dict[str, float]
-    """Median seconds of a fit, by case."""
-
-    def shown(self, case: str) -> list[str]:
-        return [name for name, sd in self.prices[case].unknown.items() if sd < SHOWN]
 
 
 def cut(case: str, config: Config) -> Cut:
@@ -124,13 +118,6 @@ def sought(config: Config) -> dict[str, float]:
 
 def known(config: Config) -> dict[str, float]:
     return {name: value for name, value in TRUTH.items() if name not in sought(config)}
-
-
-def noisy(recording: Recording, seed: int) -> Recording:
-    rng, samples = np.random.default_rng(seed), {}
-    for channel, (t, y) in recording.samples.items():
-        samples[channel] = (t, y + RIG[channel].noise * rng.standard_normal(len(t)))
-    return replace(recording, samples=samples)
 
 
 def problem(recording: Recording, config: Config, off: float) -> Problem:
@@ -161,18 +148,13 @@ def price(cut: Cut, config: Config) -> Price:
     _, exact = timed(lambda: stated.residuals(runner, x, stated.names, steps, free))
     _, plain = timed(lambda: stated.residuals(runner, x, stated.names, steps))
     other = problem(replace(recording, start=Known(cut.y0, start.lead)), config, 1.0)
-    better = other.residuals(
-        Runner(other.recordings),
-        other.coordinates.start,
-        other.names,
-        config.rtol,
-        other.coordinates.free,
-    )
-    sds = [
+    c = other.coordinates
+    better = other.residuals(Runner(other.recordings), c.start, other.names, config.rtol, c.free)
+    unknown, known = (
         {name: deviation(p, J, name) for name in sought(config)}
         for p, J in ((stated, at.J), (other, better.J))
-    ]
-    return Price(sds[0], sds[1], len(x), exact, plain * (len(x) + 1))
+    )
+    return Price(unknown, known, len(x), exact, plain * (len(x) + 1))
 
 
 def deviation(stated: Problem, J: Array, name: str) -> float:
@@ -199,73 +181,56 @@ def holds(found: IdentificationResult, name: str) -> bool:
     """Whether the 95 % interval holds the truth; one that is not given holds it if the standard
     deviation says so."""
     e = found[name]
-    if e.ci95 is None:
-        return abs(np.log(e.last / TRUTH[name])) <= 1.96 * e.relative_sd
-    return e.ci95[0] <= TRUTH[name] <= e.ci95[1]
+    low, high = e.ci95 or (e.last * np.exp(sign * 1.96 * e.relative_sd) for sign in (-1, 1))
+    return bool(low <= TRUTH[name] <= high)
 
 
 def run(config: Config) -> Result:
     config = replace(config, seeds=1, workers=1) if config.smoke else config
     cuts = {case: cut(case, config) for case in (["hidden history"] if config.smoke else CUTS)}
-    prices = {case: price(one, config) for case, one in cuts.items()}
-    rest = {case: at_rest(one, config) for case, one in cuts.items()}
-    jobs = [(case, seed) for case in cuts for seed in range(config.seeds)]
 
-    def work(k: int) -> tuple[IdentificationResult, float]:
-        case, seed = jobs[k]
-        return timed(
-            lambda: fit(estimate_initial_state(noisy(cuts[case].recording, seed), RIG), config)
-        )
+    def fits(case: str, one: Cut) -> list[IdentificationResult]:
+        known = lambda seed: estimate_initial_state(noisy(one.recording, seed), RIG)
+        return repeated(lambda seed: fit(known(seed), config), config.seeds, config.workers, case)
 
-    done = tqdm(parallel_map(work, len(jobs), config.workers), desc="fits", total=len(jobs))
-    fits = {jobs[k]: one for k, one in done}
-    found = {case: [fits[case, seed][0] for seed in range(config.seeds)] for case in cuts}
-    wall = {
-        case: float(np.median([fits[case, seed][1] for seed in range(config.seeds)]))
-        for case in cuts
-    }
-    return Result(config, found, prices, rest, wall)
+    return Result(
+        {case: fits(case, one) for case, one in cuts.items()},
+        {case: price(one, config) for case, one in cuts.items()},
+        {case: at_rest(one, config) for case, one in cuts.items()},
+    )
 
 
 def main(config: Config) -> None:
-    result = run(config)
-    cases, cells, n = {}, [], result.config.seeds
+    result, cases, cells = run(config), {}, []
     for case, found in result.found.items():
         at, rows = result.prices[case], {}
-        for name in at.unknown:
-            inside, shown = sum(holds(one, name) for one in found), name in result.shown(case)
-            own = stats.binomtest(inside, n).proportion_ci(0.95)
+        for name, sd in at.unknown.items():
+            inside = sum(holds(one, name) for one in found)
+            own = stats.binomtest(inside, len(found)).proportion_ci(0.95)
             rows[name] = {
-                "shown": shown, "inside": inside, "ci95": [own.low, own.high],
-                "sd_unknown": at.unknown[name], "sd_known": at.known[name],
-                "price": at.unknown[name] / at.known[name],
+                "shown": sd < SHOWN, "inside": inside, "ci95": [own.low, own.high],
+                "sd_unknown": sd, "sd_known": at.known[name],
                 "errors": [
                     float(np.log(one[name].last / TRUTH[name])) / one[name].relative_sd
                     for one in found
                 ],
             }  # fmt: skip
             cells.append(
-                (case, name, f"{at.unknown[name]:.1%}", f"{at.known[name]:.1%}",
-                f"{rows[name]['price']:.2f}",
-                 f"{inside} of {n}" if shown else "not shown")
+                (case, name, f"{sd:.1%}", f"{at.known[name]:.1%}", f"{sd / at.known[name]:.2f}",
+                 f"{inside} of {len(found)}" if sd < SHOWN else "not shown")
             )  # fmt: skip
         cases[case] = {
-            "parameters": rows, "coordinates": at.coordinates, "fit_s": result.wall[case],
-            "jacobian_s": at.exact_s, "jacobian_by_differences_s": at.differences_s,
-            "assuming_rest": result.rest[case], "notices": [one.notices for one in found],
+            "parameters": rows, "coordinates": at.coordinates, "jacobian_s": at.exact_s,
+            "jacobian_by_differences_s": at.differences_s, "assuming_rest": result.rest[case],
+            "notices": [one.notices for one in found],
         }  # fmt: skip
-    head = (
-        "recording",
-        "parameter",
-        "predicted sd",
-        "start known",
-        "price",
-        "intervals that hold the truth",
-    )
-    table = markdown(head, cells)
-    for case, rest in result.rest.items():
-        print(f"\n{case}, rest assumed: {rest['library']}")
-    write(result.config, {"cases": cases}, table=table)
+        print(
+            f"\n{case}: {at.coordinates} unknowns, a Jacobian in {at.exact_s:.2g} s, by "
+            f"differences in {at.differences_s:.2g} s\nrest assumed: {result.rest[case]}"
+        )
+    head = ("recording", "parameter", "predicted sd", "start known", "price",
+            "intervals that hold the truth")  # fmt: skip
+    write(config, {"cases": cases}, table=markdown(head, cells))
 
 
 if __name__ == "__main__":

@@ -168,7 +168,7 @@ def test_a_run_that_fails_leaves_the_others_alone(start):
         ({"parameters": {"contact.K_n": K_n + 0j}}, "float64"),
         (
             {"parameters": {"contact.K_n": K_n}, "gradient": "continuous"},
-            "a batch takes gradient='none'",
+            "`gradient` must be one of none, discrete, forward",
         ),
         ({"parameters": {"contact.K_n": K_n}, "rtol": -1.0}, "`rtol` must be positive"),
         *(

@@ -13,7 +13,7 @@ import pytest
 import torch
 from conftest import f64
 
-from torchsoft import Ellipse, Prony
+from torchsoft import Ellipse
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 FOLDERS = EXPERIMENTS, EXPERIMENTS / "validation"
@@ -34,8 +34,7 @@ def experiment(name: str) -> ModuleType:
 
 def test_grasp_and_roll_smoke(tmp_path):
     module = experiment("grasp_and_roll")
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    module.write(result)
+    module.main(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads((tmp_path / "summary.json").read_text())
     assert numbers["y_C_grasp_mm"] == pytest.approx(23.20, abs=0.01)
     assert numbers["y_Br_hold_mm"]["max"] == pytest.approx(48.6, abs=0.002)
@@ -64,7 +63,7 @@ def test_pad_fidelity_smoke(tmp_path):
     stroke; the mesh moves the grasp by little, eta not at all."""
     module = experiment("pad_fidelity")
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    slow, fast, mesh, eta = result.differences.values()
+    slow, fast, mesh, eta = result.values()
     assert slow["y_C"]["difference"] < 0.02  # [um]
     assert slow["F_y"]["difference"] < 10  # [mN]
     assert fast["x_C"]["difference"] > slow["x_C"]["difference"]
@@ -74,11 +73,9 @@ def test_pad_fidelity_smoke(tmp_path):
 
 
 def test_step_accuracy_smoke(tmp_path):
-    """Motion, forces and gradients come nearer with the tolerance; the table and the figure hold
-    every way."""
+    """Motion, forces and gradients come nearer with the tolerance; the table holds every way."""
     module = experiment("step_accuracy")
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    (rows,) = result.motions.values()
+    (rows,) = module.run(module.Config(out=tmp_path, smoke=True)).values()
     loose, tight, equal = rows.values()
     for name in ("x_C", "F_y", "gradient"):
         assert tight[name] < loose[name]
@@ -88,7 +85,6 @@ def test_step_accuracy_smoke(tmp_path):
     assert loose["steps"] < tight["steps"]
     assert equal["refused"] == 0
     assert module.table(rows).count("|\n") == 4
-    assert len(module.figure(result).axes) == 1
 
 
 @pytest.mark.slow
@@ -99,14 +95,14 @@ def test_benchmark_smoke(tmp_path):
     config = module.Config(out=tmp_path, duration=3.0, exact=1e-6, repeats=3)
     costs = module.costs(config)
     for way in module.ways(config):
-        assert costs[way]["gradient_over_run"] < 2
-        assert costs[way]["jacobian8_over_run"] < 4
-    loose, tight, *_ = (costs[way]["errors"]["x_C"] for way in module.ways(config))
+        assert costs[way]["gradient over run"] < 2
+        assert costs[way]["Jacobian for 8 over run"] < 4
+    loose, tight, *_ = (costs[way]["x_C"] for way in module.ways(config))
     assert tight < loose
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    assert result.numbers["batches"]["trajectories"]["failures"] == 0
-    assert result.numbers["growth"][-1]["over"] == "runs of a batch"
-    assert "| 2 runs of 0.2 s | 2 |" in module.tables(result)
+    found = module.run(module.Config(out=tmp_path, smoke=True))
+    assert found["batches"]["2 runs of 0.2 s, 2 threads"]["failures"] == 0
+    assert list(found["growth"]["wall_s"]) == ["61", "121"]
+    assert "| 2 runs of 0.2 s, 2 threads |" in module.tables(found)
 
 
 @pytest.mark.slow
@@ -192,15 +188,13 @@ def test_interval_coverage_smoke(tmp_path):
 
 @pytest.mark.slow
 def test_contact_points_smoke(tmp_path):
-    """Two points an element take most of the nodes out of the force along the pad; gradients are
-    exact with either."""
+    """Two points an element take most of the nodes out of the force along the pad."""
     module = experiment("contact_points")
     module.main(module.Config(out=tmp_path, smoke=True))
     cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
     nodes, between = cases["1 mm, nodes"], cases["1 mm, 2"]
     name = "static ripple of the force along the pad [mN]"
     assert between[name] < 0.3 * nodes[name]
-    assert max(case["gradient from differences over 1e-06"] for case in (nodes, between)) < 5e-5
 
 
 @pytest.mark.slow
@@ -260,21 +254,13 @@ def test_rolling_resistance_smoke(tmp_path):
     assert {"rolling_resistance.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_the_theories_of_rolling_meet():
-    """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the
-    moving contact is the closed form's, with the same peak."""
+def test_compliance_of_a_layer_has_both_limits():
+    """Long waves compress a layer uniaxially, short ones see a half-plane."""
     theory = experiment("rolling_resistance")
     h, nu = 4e-3, 0.3
     long, deep, deeper = theory.layer_compliance(np.array([1e-3, 11.9, 12.1]) / h, h, nu)
     assert long[1, 1].real == pytest.approx(h * (1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-5)
     assert np.abs(deeper / deep * 12.1 / 11.9 - 1).max() < 1e-6
-    rubber = Prony(0.75e6, 0.2, 1100.0, 44e-3, [0.75e6], [0.05], tau_instant=1e-6)
-    at = theory.Rolling(19.37e-3, 0.25e-3, 44e-3, 1.2e8, 1.2e8)
-    speeds = [5e-3, 1e-2, 2e-2]
-    moving = [theory.moving_contact(at, rubber, 5.0, v).coefficient for v in speeds]
-    thin = [theory.winkler(at, rubber, 5.0, v)[0] for v in speeds]
-    assert moving == pytest.approx(thin, rel=0.03)
-    assert theory.peak(speeds, moving)[0] == pytest.approx(theory.peak(speeds, thin)[0], rel=0.03)
 
 
 @pytest.mark.slow
@@ -310,11 +296,9 @@ def test_a_policy_becomes_a_controller(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_learn_policy_smoke(tmp_path):
     module = experiment("learn_policy")
     module.run(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads((tmp_path / "summary.json").read_text())
     assert {one["method"] for one in numbers["trainings"]} == set(module.METHODS)
-    assert all(x < 2 for part in numbers["deployed"]["missed_rad"].values() for x in part)
-    assert torch.jit.load(tmp_path / "policy.pt")(f64(*[0.0] * 6)).shape == (3,)
+    assert all(x < 2 for x in numbers["deployed"]["missed_rad"].values())

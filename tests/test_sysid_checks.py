@@ -35,7 +35,7 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
-from torchsoft.sysid.refits import AMOUNTS, End, Joint, difference, joint_fit, refit, varied
+from torchsoft.sysid.refits import AMOUNTS, End, Joint, difference, ended, joint_fit, refit, varied
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
@@ -81,9 +81,8 @@ def checked(
     answer = identify(problem, plan=stages, assumptions="trusted")
     x = np.array(answer.x)
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    return check_assumptions(
-        problem, runner, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain
-    )
+    end = ended(problem, runner, x, at, free, problem.names, RTOL)
+    return check_assumptions(problem, end, doubtful=doubtful, explain=explain)
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +248,8 @@ def test_what_no_test_explains_has_candidates(
     problem, x, at = far_off
     free = problem.coordinates.free
     runner = Runner(problem.recordings)
-    found = check_assumptions(problem, runner, x, at, free, problem.names, RTOL, doubtful=True)
+    end = ended(problem, runner, x, at, free, problem.names, RTOL)
+    found = check_assumptions(problem, end, doubtful=True)
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
     assert any(": `explain` fits again with each of " in text for text in assumption_notices(found))
@@ -262,7 +262,7 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     problem, x, at = far_off
     runner = Runner(problem.recordings)
     base, steps = problem.freeze(runner, x, problem.names, RTOL)
-    end = End(x, at, problem.coordinates.free, problem.names, base, steps, RTOL, runner)
+    end = End(x, at, problem.coordinates.free, problem.names, base, steps, RTOL, runner, RTOL)
     law = next(
         one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction"
     )
@@ -285,7 +285,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     runner, c = Runner(problem.recordings), problem.coordinates
     x = c.start + [0.7, -0.7]
     at, steps = problem.freeze(runner, x, problem.names, RTOL, c.free)
-    end = End(x, at, c.free, problem.names, at, steps, RTOL, runner)
+    end = End(x, at, c.free, problem.names, at, steps, RTOL, runner, RTOL)
     suspects = [
         one
         for one in assumptions(problem.recordings, set(TRUTH))

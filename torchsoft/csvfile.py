@@ -1,4 +1,4 @@
-"""CSV files of numbers under headings `name [unit]` or `name (unit)`, read in SI units.
+"""CSV files of numbers under headings `name [unit]` or `name (unit)`, read in SI units, or written.
 
 Every error is a `ValueError` in a sentence that names the file, the row (the heading is row 1) and
 the column.
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.files import check_file
+from torchsoft.files import check_file, replacing
 from torchsoft.tables import line, shown
 
 LARGEST = 2e9
@@ -66,6 +66,14 @@ def read(
     columns = np.array(values).reshape(len(rows), len(names)).T
     left_out = tuple(name_and_unit(cell)[0] for cell, one in zip(first, head) if one is None)
     return Numbers(dict(zip(names, columns)), rows, left_out)
+
+
+def write(path: Path, columns: Mapping[str, NDArray[np.float64]], units: Mapping[str, str]) -> None:
+    """Write columns (n,) by name, with their units in the heading."""
+    head = ",".join(f"{name} [{units[name]}]" for name in columns)
+    with replacing(path) as partial:
+        table = np.stack(list(columns.values()), 1)
+        np.savetxt(partial, table, "%.12g", ",", header=head, comments="", encoding="utf-8")
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:

@@ -9,9 +9,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 import tyro
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import lfilter
 from torch import Tensor
 from tqdm import tqdm
 
@@ -73,6 +76,13 @@ def repeated(found: Callable[[int], T], count: int, workers: int, label: str) ->
     """Results of so many seeds, in their order, with progress."""
     work = tqdm(parallel_map(found, count, workers), desc=label, total=count)
     return [one for _, one in sorted(work, key=lambda pair: pair[0])]
+
+
+def coloured(count: int, rho: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Noise (count,) of deviation 1 whose neighbouring samples correlate by `rho`."""
+    white = rng.standard_normal(count)
+    white[1:] *= (1 - rho**2) ** 0.5
+    return np.asarray(lfilter([1.0], [1.0, -rho], white))
 
 
 @torch.no_grad()

@@ -223,9 +223,9 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def write_json(path: str | Path, content: Any, indent: int = 2) -> None:
+def write_json(path: str | Path, content: Any) -> None:
     """Write a JSON file, with null for numbers that are not finite."""
     with replacing(path) as partial:
         partial.write_text(
-            json.dumps(finite(content), indent=indent, allow_nan=False) + "\n", encoding="utf-8"
+            json.dumps(finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8"
         )

@@ -178,8 +178,9 @@ def line(text: Any, length: int = 600) -> str:
 def toml_value(value: Any) -> str:
     """A value in TOML: a table in one line, a list, a number or text."""
     if isinstance(value, Table):
-        rows = ", ".join(toml_row(name, getattr(value, name)) for name in type(value).model_fields)
-        return f"{{{rows}}}"
+        value = {name: getattr(value, name) for name in type(value).model_fields}
+    if isinstance(value, dict):
+        return f"{{{', '.join(toml_row(name, one) for name, one in value.items())}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(toml_value(one) for one in value)}]"
     return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

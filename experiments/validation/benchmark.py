@@ -7,7 +7,7 @@ noisy machine:
 - the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7;
 - over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 adds;
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
-- growth with the surface nodes and the size of a batch, with fitted exponents;
+- growth with the surface nodes, with a fitted exponent;
 - with `--peers` the same equations under scipy's, torchdiffeq's and diffrax's integrators over a
   window in mid-roll. All call the compiled right-hand side (`torchsoft.solve.rates`). Every method
   is run by a series of tolerances, from loose to tight, until it is as exact as the stepper, in the
@@ -25,20 +25,22 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from scipy.integrate import odeint, solve_ivp
+from scipy.integrate import solve_ivp
 from step_accuracy import EIGHT, errors
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, simulate, simulate_batch
-from torchsoft.experiment import grid, markdown, options, timed, write
+from torchsoft.experiment import grid, markdown, numbers, options, timed, write
 from torchsoft.scenario import Manipulation, grasp_and_roll
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.rates import Rates
+
+T = TypeVar("T")
 
 GRASP_FORCE = 80.66  # That holds the grasp of the usual rig [N]; it need not be searched for.
 
@@ -94,105 +96,68 @@ def tasks(
     }
 
 
-def interleaved(tasks: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
+def interleaved(tasks: Mapping[str, Callable[[], T]], repeats: int) -> dict[str, list[T]]:
     """What each task returns, so many times in turns after one warm-up each: noise that comes and
     goes hits them all."""
     for task in tasks.values():
         task()
-    out: dict[str, list[float]] = {name: [] for name in tasks}
+    out: dict[str, list[T]] = {name: [] for name in tasks}
     for _ in range(repeats):
         for name, task in tasks.items():
             out[name].append(task())
     return out
 
 
-def own_batch(
+def batch(
     m: Manipulation, config: Config, count: int, duration: float, threads: int
-) -> Callable[[], int]:
-    """A batch in which every run has its own stiffness, dashpot and retardation time, up to 20 % to
-    either side of the model's; it returns how many failed."""
+) -> tuple[int, float]:
+    """Failures and wall time [s] of a batch in which every run has its own stiffness, dashpot and
+    retardation time, up to 20 % to either side of the model's."""
     part, t = torch.linspace(0.8, 1.2, count, dtype=torch.float64), grid(duration)
-    names = ("contact.K_n", "contact.R_t", "pad.tau")
     own = {
         name: m.model.parameter(name).detach() * part.roll(i * count // 3)
-        for i, name in enumerate(names)
+        for i, name in enumerate(("contact.K_n", "contact.R_t", "pad.tau"))
     }
-    how: dict[str, Any] = {
-        "y0": m.y0,
-        "parameters": own,
-        "threads": threads,
-        "rtol": config.rtols[0],
-    }
-    return lambda: len(simulate_batch(m.model, t, **how).failures)
-
-
-def batches(config: Config) -> dict[str, Any]:
-    """Simulated seconds per wall second of long and of short runs on one and two threads."""
-    m, failures = prepare(), dict[str, int]()
-    sizes = {
-        "trajectories": (config.trajectories, config.batch_duration),
-        "short runs": (config.short_runs, config.short_duration),
-    }
-
-    def task(name: str, threads: int) -> Callable[[], float]:
-        batch = own_batch(m, config, *sizes[name], threads)
-
-        def one() -> float:
-            failures[name], wall = timed(batch)
-            return wall
-
-        return one
-
-    every = interleaved(
-        {f"{name}, {n}": task(name, n) for name in sizes for n in (1, 2)},
-        max(1, config.repeats // 2),
+    run, wall = timed(
+        lambda: simulate_batch(
+            m.model, t, y0=m.y0, parameters=own, threads=threads, rtol=config.rtols[0]
+        )
     )
-    out: dict[str, Any] = {}
-    for name, (count, duration) in sizes.items():
-        seconds = {str(threads): median(every[f"{name}, {threads}"]) for threads in (1, 2)}
-        out[name] = {
-            "runs": count, "simulated_s": duration, "failures": failures[name], "wall_s": seconds,
-            "simulated_per_wall": {threads: count * duration / s for threads, s in seconds.items()},
-            "runs_per_wall_s": {threads: count / s for threads, s in seconds.items()},
-            "two_threads_over_one": seconds["1"] / seconds["2"],
+    return len(run.failures), wall
+
+
+def batches(config: Config) -> dict[str, dict[str, float]]:
+    """Simulated seconds per wall second of long and of short runs on one and two threads."""
+    m, out = prepare(), dict[str, dict[str, float]]()
+    sizes = [
+        (config.trajectories, config.batch_duration),
+        (config.short_runs, config.short_duration),
+    ]
+    cases = [(*size, threads) for size in sizes for threads in (1, 2)]
+    every = interleaved(
+        {str(case): partial(batch, m, config, *case) for case in cases}, max(1, config.repeats // 2)
+    )
+    for (count, duration, threads), some in zip(cases, every.values()):
+        wall = median(seconds for _, seconds in some)
+        out[f"{count} runs of {duration:g} s, {threads} threads"] = {
+            "wall time [s]": wall, "simulated s per wall s": count * duration / wall,
+            "failures": max(failures for failures, _ in some),
         }  # fmt: skip
     return out
 
 
-def growth(config: Config) -> list[dict[str, Any]]:
-    """Median wall times [s] of a run over the mesh and of a batch over its runs, at the loosest
-    tolerance, and the slopes of their logarithms by least squares."""
-    rtol, repeats, m = config.rtols[0], min(config.repeats, 3), prepare()
+def growth(config: Config) -> dict[str, Any]:
+    """Median wall times [s] of a run by the surface nodes of a pad, at the loosest tolerance, and
+    the slope of their logarithms by least squares."""
 
-    def run(elements_x: int) -> Callable[[], object]:
-        made, t = prepare(elements_x), grid(config.batch_duration)
-        return lambda: simulate(made.model, t, y0=made.y0, rtol=rtol)
+    def run(elements_x: int) -> Callable[[], float]:
+        m, t = prepare(elements_x), grid(config.batch_duration)
+        return lambda: timed(lambda: simulate(m.model, t, y0=m.y0, rtol=config.rtols[0]))[1]
 
-    out = []
-    meshes, counts = (
-        {n + 1: run(n) for n in config.elements_x},
-        (2, 4) if config.smoke else (4, 16, 64, 256),
-    )
-    for over, tasks in {
-        "surface nodes of a pad": meshes,
-        "runs of a batch": {n: own_batch(m, config, n, config.short_duration, 1) for n in counts},
-    }.items():
-        times = interleaved(
-            {str(n): lambda task=task: timed(task)[1] for n, task in tasks.items()}, repeats
-        )
-        wall = [median(some) for some in times.values()]
-        exponent = float(np.polyfit(np.log(list(tasks)), np.log(wall), 1)[0])
-        out.append({"over": over, "values": list(tasks), "wall_s": wall, "exponent": exponent})
-    return out
-
-
-def growth_table(every: list[dict[str, Any]]) -> str:
-    """One row a measurement, with the exponents."""
-    rows = [
-        (one["over"], value, f"{wall:.3g}", f"{one['exponent']:.2f}")
-        for one in every for value, wall in zip(one["values"], one["wall_s"])
-    ]  # fmt: skip
-    return markdown(("growth with", "value", "wall time [s]", "exponent"), rows)
+    times = interleaved({str(n + 1): run(n) for n in config.elements_x}, min(config.repeats, 3))
+    wall = {nodes: median(some) for nodes, some in times.items()}
+    nodes, seconds = np.log(list(map(float, wall))), np.log(list(wall.values()))
+    return {"wall_s": wall, "exponent": float(np.polyfit(nodes, seconds, 1)[0])}
 
 
 BEGIN = 2.0  # Where the window of the other integrators begins [s].
@@ -214,6 +179,10 @@ class Attempt:
 
     def as_exact(self, goal: "Attempt") -> bool:
         return self.position_nm <= goal.position_nm and self.force <= goal.force
+
+
+Solver = Callable[[float], Array]
+"""A method: the integration (T, size) at a relative tolerance."""
 
 
 class Window:
@@ -238,54 +207,38 @@ class Window:
         )
         self.f = Rates(self.model)
 
-    def attempt(
-        self, method: str, rtol: float, solve: Callable[[], Array], repeats: int
-    ) -> Attempt:
+    def attempt(self, method: str, rtol: float, solver: Solver, repeats: int) -> Attempt:
         """Run and time one method, in the first run with what it compiles."""
         self.f.calls, lost = 0, Attempt(method, rtol, np.inf, 0, np.inf, np.inf)
         try:
-            y = solve()
+            y = solver(rtol)
         except (RuntimeError, AssertionError):  # a trial state without forces, or steps of nothing
             return lost
         if y.shape != self.exact.shape:  # given up on the way
             return lost
-        calls, wall = self.f.calls, median(timed(solve)[1] for _ in range(repeats))
+        calls, wall = self.f.calls, median(timed(partial(solver, rtol))[1] for _ in range(repeats))
         off = np.abs(y - self.exact)
         largest = np.linalg.norm(self.exact[:, self.pads], axis=1).max()
         force = float(np.linalg.norm(off[:, self.pads], axis=1).max() / largest)
         return Attempt(method, rtol, wall, calls, 1e9 * float(off[:, self.place].max()), force)
 
 
-Solver = Callable[[float], Callable[[], Array]]
-"""A method: the integration (T, size) at a relative tolerance."""
-
-
 def scipy_solvers(w: Window) -> dict[str, Solver]:
-    """scipy's own: LSODA by its Fortran loop, the others by `solve_ivp`; they difference the
-    Jacobian themselves."""
+    """scipy's own, which difference the Jacobian themselves."""
     y0, t = w.y0.numpy(), w.t.numpy()
 
-    def ivp(method: str) -> Solver:
+    def solver(method: str) -> Solver:
+        how: dict[str, Any] = {"method": method, "t_eval": t}
         return lambda rtol: (
-            lambda: (
-                solve_ivp(
-                    w.f, (t[0], t[-1]), y0, method=method, t_eval=t, rtol=rtol, atol=rtol * w.size
-                ).y.T
-            )
+            solve_ivp(w.f, (t[0], t[-1]), y0, rtol=rtol, atol=rtol * w.size, **how).y.T
         )
 
-    lsoda: Solver = lambda rtol: (
-        lambda: odeint(w.f, y0, t, tfirst=True, rtol=rtol, atol=rtol * w.size, mxstep=100_000)
-    )
-    return {"scipy LSODA": lsoda} | {
-        f"scipy {name}": ivp(name) for name in ("BDF", "Radau", "RK23", "RK45")
-    }
+    return {f"scipy {name}": solver(name) for name in ("LSODA", "BDF", "Radau", "RK23", "RK45")}
 
 
 def torchdiffeq_solvers(w: Window) -> dict[str, Solver]:
-    """torchdiffeq's explicit methods on the compiled right-hand side; it has no adaptive implicit
-    one."""
-    from torchdiffeq import odeint as integrate
+    """torchdiffeq's explicit methods; it has no adaptive implicit one."""
+    from torchdiffeq import odeint
 
     def f(t: Tensor, y: Tensor) -> Tensor:
         return torch.from_numpy(w.f(float(t), y.numpy()))
@@ -293,10 +246,10 @@ def torchdiffeq_solvers(w: Window) -> dict[str, Solver]:
     def solver(method: str) -> Solver:
         def solve(rtol: float) -> Array:
             atol: Any = rtol * torch.from_numpy(w.size)
-            out: Any = integrate(f, w.y0, w.t, rtol=rtol, atol=atol, method=method)
+            out: Any = odeint(f, w.y0, w.t, rtol=rtol, atol=atol, method=method)
             return out.numpy()
 
-        return lambda rtol: lambda: solve(rtol)
+        return solve
 
     return {f"torchdiffeq {name}": solver(name) for name in ("adaptive_heun", "bosh3", "dopri5")}
 
@@ -310,37 +263,22 @@ def diffrax_solvers(w: Window) -> dict[str, Solver]:
     import jax  # pyright: ignore[reportMissingImports]
 
     jax.config.update("jax_enable_x64", True)
-    shape, size = jax.ShapeDtypeStruct(w.size.shape, np.float64), jax.numpy.asarray(w.size)
+    shape, t = jax.ShapeDtypeStruct(w.size.shape, np.float64), w.t.numpy()
 
-    def rhs(t: Any, y: Any) -> Any:
-        return jax.pure_callback(
-            lambda t, y: w.f(float(t), np.asarray(y)), shape, t, y, vmap_method="sequential"
-        )
+    def f(t: Any, y: Any, _: Any) -> Any:
+        call = lambda t, y: w.f(float(t), np.asarray(y))
+        return jax.pure_callback(call, shape, t, y, vmap_method="sequential")
 
-    term, t, y0 = (
-        diffrax.ODETerm(lambda t, y, _: rhs(t, y)),
-        w.t.numpy(),
-        jax.numpy.asarray(w.y0.numpy()),
-    )
-
-    def solver(make: Any) -> Solver:
+    def solver(method: Any) -> Solver:
         @jax.jit
         def integrate(y: Any, rtol: Any) -> Any:
-            control = diffrax.PIDController(rtol=rtol, atol=rtol * size)
-            saved = diffrax.SaveAt(ts=jax.numpy.asarray(t))
             return diffrax.diffeqsolve(
-                term,
-                make(),
-                t[0],
-                t[-1],
-                1e-4,
-                y,
-                saveat=saved,
-                stepsize_controller=control,
-                max_steps=100_000,
-            ).ys
+                diffrax.ODETerm(f), method(), t[0], t[-1], 1e-4, y, max_steps=100_000,
+                saveat=diffrax.SaveAt(ts=t),
+                stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol * w.size),
+            ).ys  # fmt: skip
 
-        return lambda rtol: lambda: np.asarray(integrate(y0, rtol))
+        return lambda rtol: np.asarray(integrate(w.y0.numpy(), rtol))
 
     made = [diffrax.Heun, diffrax.Bosh3, diffrax.Tsit5]
     return {f"diffrax {one.__name__}": solver(one) for one in made}
@@ -352,15 +290,15 @@ def peers(config: Config) -> dict[str, Any]:
     w, repeats = Window(config), min(config.repeats, 3)
     solvers = scipy_solvers(w) | torchdiffeq_solvers(w) | diffrax_solvers(w)
 
-    def own(rtol: float) -> Array:
+    def ours(rtol: float) -> Array:
         return simulate(w.model, w.t, y0=w.y0, rtol=rtol).y.numpy()
 
-    goals = {rtol: w.attempt(OURS, rtol, partial(own, rtol), 9) for rtol in config.rtols}
+    goals = {rtol: w.attempt(OURS, rtol, ours, 9) for rtol in config.rtols}
     hardest, attempts = goals[min(goals)], dict[str, list[Attempt]]()
     for name, solver in tqdm(solvers.items(), unit="integrator", leave=False):
         attempts[name] = []
         for rtol in RTOLS[:: 2 if config.smoke else 1]:
-            attempts[name].append(w.attempt(name, rtol, solver(rtol), repeats))
+            attempts[name].append(w.attempt(name, rtol, solver, repeats))
             if attempts[name][-1].as_exact(hardest):
                 break
     out: dict[str, Any] = {"window_s": config.window, "begin_s": BEGIN, "equal": {}}
@@ -377,144 +315,77 @@ def peers(config: Config) -> dict[str, Any]:
     return out
 
 
-def peers_table(numbers: dict[str, Any]) -> str:
+def peers_table(found: dict[str, Any]) -> str:
     """One table for every accuracy."""
     head = (
         "integrator", "its rtol", "wall time [s] per simulated s", "over torchsoft",
         "right-hand sides", "error of place [nm]", "error of forces [1]",
     )  # fmt: skip
+    keys = ("rtol", "wall_per_simulated", "over_torchsoft", "calls", "position_nm", "force")
     out = []
-    for way, rows in numbers["equal"].items():
+    for way, rows in found["equal"].items():
         lines = [
-            (
-                name, f"{one['rtol']:.2g}", f"{one['wall_per_simulated']:.3g}",
-                f"{one['over_torchsoft']:.3g}", one["calls"] if name != OURS else "",
-                f"{one['position_nm']:.2g}", f"{one['force']:.1e}",
-            ) if one is not None else (name, "", "not reached", "", "", "", "")
+            (name, *(f"{one[key]:.3g}" if one else "not reached" for key in keys))
             for name, one in rows.items()
-        ]  # fmt: skip
+        ]
         out.append(f"As exact as torchsoft at {way}\n\n{markdown(head, lines)}")
     return "\n\n".join(out)
-
-
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    numbers: dict[str, Any]
 
 
 def costs(config: Config) -> dict[str, Any]:
     """Times of the three tasks by every way, with errors."""
     m, t = prepare(), grid(config.duration)
     exact = simulate(m.model, t, y0=m.y0, rtol=config.exact)
-    every = {
-        (way, name): task
-        for way, steps in ways(config).items()
-        for name, task in tasks(m, t, steps).items()
-    }
     times = interleaved(
-        {f"{way}, {name}": lambda task=task: timed(task)[1] for (way, name), task in every.items()},
+        {
+            f"{way}, {name}": lambda task=task: timed(task)[1]
+            for way, steps in ways(config).items()
+            for name, task in tasks(m, t, steps).items()
+        },
         config.repeats,
     )
-    out: dict[str, Any] = {"timings": times}
+    out: dict[str, Any] = {}
     for way, steps in ways(config).items():
         one = simulate(m.model, t, y0=m.y0, **steps)
-        seconds = {
-            name: median(times[f"{way}, {name}"]) for name in ("run", "gradient", "jacobian")
-        }
-        part = lambda name, seconds=seconds: seconds[name] / seconds["run"]
+        run, gradient, jacobian = (
+            median(times[f"{way}, {name}"]) for name in ("run", "gradient", "jacobian")
+        )
         out[way] = {
-            "seconds": seconds, "steps": one.stats.steps, "solves": one.stats.newton_iterations,
-            "errors": errors(one, exact), "gradient_total_over_run": part("gradient"),
-            "gradient_over_run": part("gradient") - 1, "jacobian8_total_over_run": part("jacobian"),
-            "jacobian8_over_run": part("jacobian") - 1,
+            "run [s]": run, "steps": one.stats.steps, "solves": one.stats.newton_iterations,
+            **errors(one, exact), "gradient over run": gradient / run - 1,
+            "Jacobian for 8 over run": jacobian / run - 1,
         }  # fmt: skip
     return out
 
 
-def run(config: Config) -> Result:
+def run(config: Config) -> dict[str, Any]:
     if config.smoke:
         config = replace(
             config, duration=0.5, exact=1e-5, repeats=1, trajectories=2, batch_duration=0.2,
             short_runs=3, short_duration=0.05, elements_x=(60, 120), window=5e-3,
         )  # fmt: skip
     parts: dict[str, Callable[[Config], Any]] = {
-        "costs": costs,
-        "batches": batches,
-        "growth": growth,
-    }
+        "costs": costs, "batches": batches, "growth": growth,
+    }  # fmt: skip
     parts |= {"peers": peers} if config.peers else {}
-    return Result(config, {name: part(config) for name, part in tqdm(parts.items(), unit="part")})
+    return {name: part(config) for name, part in tqdm(parts.items(), unit="part")}
 
 
-def worst(errors: dict[str, float]) -> dict[str, float]:
-    """The largest errors of the motion and of the forces."""
-    parts = {"motion": ("x_C", "y_C", "theta"), "forces": ("F_x", "F_y")}
-    return {part: max(errors[name] for name in names) for part, names in parts.items()}
-
-
-def cost_table(config: Config, numbers: dict[str, Any]) -> str:
-    """Every way with its times and errors."""
-    head = (
-        "steps by", "run [s]", "error of motion [1]", "error of forces [1]",
-        "gradient: sweep over run", "total",
-        "Jacobian for 8: added over run", "total",
-    )  # fmt: skip
-    rows = []
-    for way in ways(config):
-        one = numbers["costs"][way]
-        motion, forces = worst(one["errors"]).values()
-        ratios = (
-            "gradient_over_run",
-            "gradient_total_over_run",
-            "jacobian8_over_run",
-            "jacobian8_total_over_run",
-        )
-        run_s = f"{one['seconds']['run']:.3g}"
-        rows.append(
-            (way, run_s, f"{motion:.1e}", f"{forces:.1e}", *(f"{one[r]:.2f}" for r in ratios))
-        )
-    return markdown(head, rows)
-
-
-def batch_table(numbers: dict[str, Any]) -> str:
-    """Both batches on one and two threads."""
-    head = (
-        "batch",
-        "threads",
-        "wall time [s]",
-        "simulated s per wall s",
-        "runs per wall s",
-        "failures",
-    )
-    return markdown(
-        head,
-        [
-            (
-                f"{one['runs']} runs of {one['simulated_s']:g} s", threads,
-                f"{one['wall_s'][threads]:.3g}", f"{one['simulated_per_wall'][threads]:.3g}",
-                f"{one['runs_per_wall_s'][threads]:.3g}", one["failures"],
-            )
-            for one in numbers["batches"].values() for threads in ("1", "2")
-        ],
-    )  # fmt: skip
-
-
-def tables(result: Result) -> str:
+def tables(found: dict[str, Any]) -> str:
     """All tables."""
-    numbers = result.numbers
+    grown = found["growth"]
     parts = [
-        cost_table(result.config, numbers),
-        batch_table(numbers),
-        growth_table(numbers["growth"]),
+        numbers("steps by; errors over the range", found["costs"], 2),
+        numbers("batch", found["batches"], 3),
+        numbers("run by surface nodes [s]", {f"~ n^{grown['exponent']:.2f}": grown["wall_s"]}, 3),
     ]
-    return "\n\n".join([*parts, peers_table(numbers["peers"])] if "peers" in numbers else parts)
+    return "\n\n".join([*parts, peers_table(found["peers"])] if "peers" in found else parts)
 
 
-def main() -> None:
-    result = run(options(Config, __doc__))
-    write(result.config, result.numbers, table=tables(result))
+def main(config: Config) -> None:
+    found = run(config)
+    write(config, found, table=tables(found))
 
 
 if __name__ == "__main__":
-    main()
+    main(options(Config, __doc__))

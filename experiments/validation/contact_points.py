@@ -8,14 +8,10 @@ and 0.5 mm elements; a ripple is half of the peak-to-peak.
             the lower pad and of y_C (the upper pad stays centred over the disc)
   rolling   the manipulation: peak of F_x, its ripple between 5 and 7 s less a cubic trend, theta,
             energy residual
-  gradient  of y_C and theta after 0.3 s of pressing and rolling, from several places, by K_n, E and
-            K_t: the adjoint's largest difference from central differences over 1e-6 (is it exact?)
-            and over 1 % (is it the trend?)
 
 Command: .venv/bin/python experiments/validation/contact_points.py [--smoke]
-Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN; gradient off
-the trend by up to 15 / 5 / 2 / 2 %. Nodes 0.5 mm apart: 16 mN, 10 %. About seven minutes on one
-core.
+Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN. Nodes 0.5 mm
+apart: 16 mN. Some three minutes on one core.
 """
 
 from dataclasses import dataclass, replace
@@ -28,13 +24,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
+from torchsoft import Parameters, SoftGrasp, press, simulate
 from torchsoft.experiment import grid, numbers, options, write
-from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll
 
 Key = tuple[int, int]  # elements along the pad, contact points an element
-TRAINED = ("contact.K_n", "pad.E", "contact.K_t")
 
 
 @dataclass(frozen=True)
@@ -47,11 +41,6 @@ class Config:
     points: tuple[int, ...] = (0, 1, 2, 3, 4)  # contact points an element; 0 is one on every node
     node_mm: float = 60.0  # place of a node [mm]
     places: int = 21  # of the disc, equally spaced over 1 mm from there
-    gradient_mm: tuple[float, ...] = (
-        0.0,
-        0.35,
-        0.7,
-    )  # starts of the runs with gradients, from there [mm]
     duration: float = 10.0  # of the manipulation [s]
     window: tuple[float, float] = (5.0, 7.0)  # in which the ripple of F_x is taken [s]
     smoke: bool = False  # a size that takes seconds
@@ -89,64 +78,26 @@ def static(config: Config, case: Key) -> dict[str, float]:
     }
 
 
-def gradient(case: Key, x: float) -> dict[float, float]:
-    """Largest relative difference of the adjoint from central differences, by their relative step;
-    x [m]: start."""
-    model = build(*case, {"scenario.x_C0": x})
-    t, y = grid(0.3, 0.1), model.settings.scenario.y_Br_grasp
-    y0 = press(model, y).detach()
-    reference = Reference(x_d=Profile([0.0, 0.3], [x, x - 2e-3]),
-        y_d=Profile([0.0, 0.3], [y, y - 2e-4]),
-                          F_ff=Profile([0.0], [-holding_force(model, y0)]))  # fmt: skip
-
-    def ends(model: SoftGrasp, route: Any = "none") -> Tensor:
-        run = simulate(
-            model, t, y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=route
-        )
-        return torch.stack((run["y_C"][-1], run["theta"][-1]))
-
-    wanted = [model.parameter(name) for name in TRAINED]
-    exact = [
-        torch.stack(torch.autograd.grad(end, wanted, retain_graph=True))
-        for end in ends(model, "discrete")
-    ]
-    errors = {1e-6: 0.0, 1e-2: 0.0}
-    for d, (i, p) in product(errors, enumerate(wanted)):
-        up, down = (ends(build(*case, {TRAINED[i]: p.item() * (1 + sign * d)})) for sign in (1, -1))
-        slopes = (up - down) / (2 * d * p.item())
-        errors[d] = max(errors[d], (torch.stack(exact)[:, i] / slopes - 1).abs().max().item())
-    return errors
-
-
 def run(config: Config) -> dict[str, dict[str, float]]:
     """Numbers of every case by its label."""
     if config.smoke:
-        config = replace(config, elements_x=(120,), points=(0, 2), places=5, gradient_mm=(0.0,),
-            duration=0.8,
+        config = replace(config, elements_x=(120,), points=(0, 2), places=5, duration=0.8,
                          window=(0.5, 0.8))  # fmt: skip
     out = {}
     for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
         m = grasp_and_roll(build(*case))
         rolled = simulate(m.model, grid(config.duration, 5e-3), y0=m.y0)
         F_x = rolled["F_x"]
-        errors = [gradient(case, 1e-3 * (config.node_mm + x)) for x in config.gradient_mm]
-        out[f"{120 / case[0]:g} mm, {case[1] or 'nodes'}"] = (
-            static(config, case)
-            | {
-                "peak of F_x [mN]": 1e3 * F_x.abs().max().item(),
-                "ripple of F_x [mN]": 1e3 * ripple(rolled.t, F_x, config.window),
-                "theta at the end [rad]": rolled["theta"][-1].item(),
-                "energy residual, relative": rolled.energy_residual_rel,
-                "points that touch at the end": sum(
-                    (force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()
-                ),
-                "Newton iterations a step": rolled.stats.newton_per_step,
-            }
-            | {
-                f"gradient from differences over {d:g}": max(e[d] for e in errors)
-                for d in errors[0]
-            }
-        )
+        out[f"{120 / case[0]:g} mm, {case[1] or 'nodes'}"] = static(config, case) | {
+            "peak of F_x [mN]": 1e3 * F_x.abs().max().item(),
+            "ripple of F_x [mN]": 1e3 * ripple(rolled.t, F_x, config.window),
+            "theta at the end [rad]": rolled["theta"][-1].item(),
+            "energy residual, relative": rolled.energy_residual_rel,
+            "points that touch at the end": sum(
+                (force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()
+            ),
+            "Newton iterations a step": rolled.stats.newton_per_step,
+        }
     return out
 
 

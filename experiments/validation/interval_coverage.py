@@ -34,23 +34,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
-from scipy.signal import lfilter
 
-from torchsoft import Parameters
+from torchsoft import Parameters, csvfile
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, repeated, write
-from torchsoft.files import replacing
 from torchsoft.rigs import RigFile
-from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, identify, record
+from torchsoft.sysid import RIG, Problem, Sensor, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
 from torchsoft.sysid.measured import load
 from torchsoft.sysid.runs import Runner
+from torchsoft.tables import toml_row
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import identify_contact
-from identify_contact import FITTED, TRUTH
+from identify_contact import FITTED, noisy, truths
 
 RIGS = Path(__file__).parents[2] / "rigs"
 
@@ -108,8 +107,7 @@ def judged(found: Mapping[str, Estimate], truth: Mapping[str, float]) -> dict[st
 
 def papers(config: Config, rho: float, way: Callable[..., Repetition]) -> Case:
     """Repetitions of the paper's rig with noise whose neighbouring samples correlate by rho."""
-    few = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
-    truth = {name: TRUTH[name] for name in few} if config.smoke else TRUTH
+    truth = truths(config.smoke)
     nominal = Parameters().override(
         {"contact.v_s": 0.05} | ({"contact.mu_k": 0.5} if config.smoke else {}) | COARSE
     )
@@ -131,19 +129,11 @@ def papers(config: Config, rho: float, way: Callable[..., Repetition]) -> Case:
         for name, e in motions.items()
     ]
 
-    def noise(m: int, rng: np.random.Generator) -> Any:
-        e = rng.standard_normal(m)
-        e[1:] *= (1 - rho**2) ** 0.5
-        return lfilter([1.0], [1.0, -rho], e)
-
     def repetition(seed: int) -> Repetition:
-        rng, noisy = np.random.default_rng(seed), []
-        for r in exact:
-            samples = {c: (t, y + RIG[c].noise * noise(len(t), rng))
-                       for c, (t, y) in r.samples.items()}  # fmt: skip
-            noisy.append(replace(r, samples=samples))
+        rng = np.random.default_rng(seed)
+        recordings = [noisy(one, rng, rho) for one in exact]
         start = {name: OFF * value for name, value in truth.items()}
-        return way(identify_contact.problem(noisy, start), truth, config.rtol)
+        return way(identify_contact.problem(recordings, start), truth, config.rtol)
 
     return Case(truth, repetition)
 
@@ -246,13 +236,17 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
     exact = record("measured", file.build(), truth, sensors, rate=RATE, rtol=EXACT, noise=0.0)
 
     def repetition(seed: int) -> Repetition:
-        with replacing(folder / f"{seed}.csv") as partial:
-            measured(exact, lab, np.random.default_rng(seed), partial)
-        one = load([folder / f"{seed}.csv"], folder / "fit.toml")
+        rng, path = np.random.default_rng(seed), folder / f"{seed}.csv"
+        columns = {"t": exact.times} | {
+            channel: y + lab.noise[channel] * rng.standard_normal(len(y))
+            for channel, (_, y) in exact.samples.items()
+        }
+        csvfile.write(path, columns, {"t": "s", **exact.units})
+        one = load([path], folder / "fit.toml")
         how: dict[str, Any] = one.config.fit.model_dump()
         how |= {} if seed < config.checked else {"assumptions": "trusted"}
         result = identify(one.problem, **how)
-        (folder / f"{seed}.csv").unlink()
+        path.unlink()
         return Repetition(judged({name: result[name] for name in truth}, truth), result.notices, [])
 
     return Case(truth, repetition)
@@ -260,26 +254,10 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
 
 def stated(lab: Laboratory, settings: Mapping[str, Any], truth: Mapping[str, float]) -> str:
     """The identification, as a user would write it."""
-    lines = [f'rig = "{(RIGS / lab.file).as_posix()}"']
-    lines += ["[settings]", *(f"{name} = {literal(one)}" for name, one in settings.items())]
+    lines = [toml_row("rig", (RIGS / lab.file).as_posix()), "[settings]"]
+    lines += [toml_row(name, one) for name, one in settings.items()]
     lines += ["[unknowns]", *(f'"{name}" = {{}}' for name in truth)]
     return "\n".join([*lines, "[sensors]", *(f"{k}.noise = {v}" for k, v in lab.noise.items())])
-
-
-def literal(value: Any) -> str:
-    """A value in a line of TOML."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f'"{key}" = {literal(one)}' for key, one in value.items()) + "}"
-    return f'"{value}"' if isinstance(value, str) else str(value)
-
-
-def measured(exact: Recording, lab: Laboratory, rng: np.random.Generator, path: Path) -> None:
-    """A noisy recording as a CSV file."""
-    columns = [exact.times]
-    for channel, (_, y) in exact.samples.items():
-        columns.append(y + lab.noise[channel] * rng.standard_normal(len(y)))
-    head = ",".join(["t [s]", *(f"{name} [{exact.units[name]}]" for name in exact.samples)])
-    np.savetxt(path, np.stack(columns, 1), "%.12g", ",", header=head, comments="")
 
 
 CASES: dict[str, Callable[[Config], Case]] = {

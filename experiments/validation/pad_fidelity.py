@@ -39,12 +39,6 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    differences: dict[str, dict[str, dict[str, float]]]
-
-
 def signals(run: Trajectory) -> dict[str, Tensor]:
     out = {
         name: run["bracket_moment" if name == "M_Br" else name]
@@ -86,43 +80,32 @@ def compare(
     return out
 
 
-def run(config: Config) -> Result:
+def run(config: Config) -> dict[str, dict[str, dict[str, float]]]:
     duration, fine = (0.8, config.step) if config.smoke else (config.duration, config.step / 4)
     force, inertial = grasp_and_roll(SoftGrasp()).grasp_force, {"pad.fidelity": "inertial"}
-    finer = {"pad.elements_x": 240, "pad.elements_y": 8}
-    return Result(
-        config,
-        {
-            "manipulation": compare(inertial, duration, config.step, force),
-            "stroke of 20 mm in 0.5 s": compare(inertial, 1.6, fine, force, 0.5),
-            "240 x 8 elements": compare(finer, min(duration, 10.0), config.step, force),
-            "eta = 0": compare({"contact.eta": 0.0}, min(duration, 10.0), config.step, force),
-        },
-    )
+    finer, some = {"pad.elements_x": 240, "pad.elements_y": 8}, min(duration, 10.0)
+    return {
+        "manipulation": compare(inertial, duration, config.step, force),
+        "stroke of 20 mm in 0.5 s": compare(inertial, 1.6, fine, force, 0.5),
+        "240 x 8 elements": compare(finer, some, config.step, force),
+        "eta = 0": compare({"contact.eta": 0.0}, some, config.step, force),
+    }
 
 
-def table(result: Result) -> str:
+def table(differences: dict[str, dict[str, dict[str, float]]]) -> str:
     """A Markdown table, one row an output."""
-    cases = list(result.differences)
     rows = []
     for name, (unit, _) in UNITS.items():
-        cells = [result.differences[case].get(name) for case in cases]
-        shown = ((c and f"{c['difference']:.3g} | {c['relative']:.1e}") or " | " for c in cells)
+        cells = [one.get(name) for one in differences.values()]
+        shown = (f"{c['difference']:.3g} ({c['relative']:.1e})" if c else "" for c in cells)
         rows.append((name, unit, *shown))
-    return markdown(
-        (
-            "output",
-            "unit",
-            *(column for case in cases for column in (f"{case}: difference", "of range")),
-        ),
-        rows,
-    )
+    return markdown(("difference (of range)", "unit", *differences), rows)
 
 
-def main() -> None:
-    result = run(options(Config, __doc__))
-    write(result.config, {"differences": result.differences}, table=table(result))
+def main(config: Config) -> None:
+    differences = run(config)
+    write(config, {"differences": differences}, table=table(differences))
 
 
 if __name__ == "__main__":
-    main()
+    main(options(Config, __doc__))

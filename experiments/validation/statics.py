@@ -26,8 +26,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, press
-from torchsoft.experiment import numbers, options
-from torchsoft.experiment import write as write_files
+from torchsoft.experiment import numbers, options, write
 from torchsoft.paper.equilibrium import holding_force
 
 MILLI, MICRO = 1e3, 1e6
@@ -145,19 +144,10 @@ def run(config: Config) -> Result:
     return Result(config, meshes, {f"{k:g}": curves[default, k] for k in config.stiffenings})
 
 
-def successive(curves: dict[str, Curve]) -> dict[str, dict[str, float]]:
-    """Relative difference of the force from the next finer (or stiffer) curve: at the full grasp,
-    and the largest."""
-    out = {}
-    for (name, coarse), (_, fine) in pairwise(curves.items()):
-        difference = (coarse.force / fine.force - 1).abs()
-        out[name] = {"full_grasp": difference[-1].item(), "largest": difference.max().item()}
-    return out
-
-
 def full_grasp(curves: dict[str, Curve]) -> dict[str, dict[str, float]]:
-    """The last point of every curve."""
-    return {
+    """The last point of every curve, and the relative difference of its force from the next finer
+    (or stiffer) curve's."""
+    rows = {
         name: {
             "force_N": c.force[-1].item(),
             "y_C_mm": MILLI * c.y_C[-1].item(),
@@ -167,25 +157,24 @@ def full_grasp(curves: dict[str, Curve]) -> dict[str, dict[str, float]]:
         }
         for name, c in curves.items()
     }
+    for one, following in pairwise(rows.values()):
+        one["to the next"] = abs(one["force_N"] / following["force_N"] - 1)
+    return rows
 
 
 def table(result: Result) -> str:
-    """The full grasps as Markdown tables, with the relative difference from the next row."""
-    out = []
-    for name, family in result.families.items():
-        rows = full_grasp(family.curves)
-        for key, step in successive(family.curves).items():
-            rows[key]["to the next"] = step["full_grasp"]
-        out.append(f"{numbers(name, rows, 5)}\n\nlimit: {family.limit:.2f} N")
-    return "\n\n".join(out)
+    """The full grasps as Markdown tables."""
+    return "\n\n".join(
+        f"{numbers(name, full_grasp(family.curves), 5)}\n\nlimit: {family.limit:.2f} N"
+        for name, family in result.families.items()
+    )
 
 
 def summary(result: Result) -> dict[str, Any]:
     """What `summary.json` holds."""
-    out: dict[str, Any] = {
+    return {
         name: {
             "full_grasp": full_grasp(family.curves),
-            "relative_difference_to_the_next": successive(family.curves),
             "force_limit_N": family.limit,
             "curves": {
                 key: {k: v.tolist() for k, v in asdict(c).items()}
@@ -194,18 +183,12 @@ def summary(result: Result) -> dict[str, Any]:
         }
         for name, family in result.families.items()
     }
-    return out
 
 
-def write(result: Result) -> None:
-    """`summary.json` and `table.md` in the configured folder."""
-    write_files(result.config, summary(result), table=table(result))
-
-
-def main() -> None:
-    result = run(options(Config, __doc__))
-    write(result)
+def main(config: Config) -> None:
+    result = run(config)
+    write(config, summary(result), table=table(result))
 
 
 if __name__ == "__main__":
-    main()
+    main(options(Config, __doc__))

@@ -19,7 +19,6 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -55,12 +54,6 @@ class Config:
     roll: float = 10.0  # of the manipulation [s]
     repeats: int = 3  # timings of which the median is taken
     smoke: bool = False  # a size that takes seconds
-
-
-@dataclass(frozen=True)
-class Result:
-    config: Config
-    motions: dict[str, dict[str, dict[str, Any]]]
 
 
 class Motion(NamedTuple):
@@ -104,7 +97,7 @@ def errors(run: Trajectory, exact: Trajectory) -> dict[str, float]:
     }
 
 
-def run(config: Config) -> Result:
+def run(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     if config.smoke:
         config = Config(
             out=config.out, rtols=(1e-3, 1e-5), steps_ms=(2.0,), exact=1e-7, repeats=1, smoke=True
@@ -132,7 +125,7 @@ def run(config: Config) -> Result:
                 "gradient": off.max().item(),
                 "gradients": dict(zip(EIGHT, off.tolist())),
             }
-    return Result(config, out)
+    return out
 
 
 COLUMNS = (
@@ -154,27 +147,11 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     return numbers("", {key: {name: row[name] for name in COLUMNS} for key, row in rows.items()}, 3)
 
 
-def figure(result: Result) -> Figure:
-    """Accuracy against cost: of a motion, a force and the gradients."""
-    fig = Figure(figsize=(4.5 * len(result.motions), 4), layout="constrained")
-    for ax, (title, rows) in zip(
-        fig.subplots(1, len(result.motions), squeeze=False)[0], result.motions.items()
-    ):
-        for kind, line in (("rtol", "o-"), ("step", "o--")):
-            chosen = [row for key, row in rows.items() if key.startswith(kind)]
-            for name, colour in (("theta", "k"), ("F_x", "b"), ("gradient", "r")):
-                cost, error = zip(*((row["wall_s"], row[name]) for row in chosen))
-                ax.loglog(cost, error, line, color=colour, ms=3, label=f"{name}, by {kind}")
-        ax.set(title=title, xlabel="wall time of the run [s]", ylabel="largest relative error [1]")
-    fig.axes[0].legend(fontsize=8)
-    return fig
-
-
-def main() -> None:
-    result = run(options(Config, __doc__))
-    tables = "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in result.motions.items())
-    write(result.config, {"motions": result.motions}, {"step_accuracy": figure(result)}, tables)
+def main(config: Config) -> None:
+    found = run(config)
+    tables = "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in found.items())
+    write(config, {"motions": found}, table=tables)
 
 
 if __name__ == "__main__":
-    main()
+    main(options(Config, __doc__))

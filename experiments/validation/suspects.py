@@ -13,35 +13,31 @@ named. About two hours on two cores.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from time import perf_counter, process_time
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
-from tqdm import tqdm
 
-from torchsoft.experiment import markdown, options, write
+from torchsoft.experiment import markdown, options, repeated, timed, write
 from torchsoft.sysid import (
     RIG,
-    IdentificationResult,
     Problem,
     Recording,
-    Unknown,
     explain,
     identify,
 )
 from torchsoft.sysid.assumptions import delayed
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import forget
 from torchsoft.sysid.suspects import LIKELY
-from torchsoft.threads import parallel_map
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 import foreign_rigs
-from foreign_rigs import TRUTH, Made, Order, make_all
+from foreign_rigs import TRUTH, Made, Order, chosen, make_all, stated
 
 SIX = ("contact.K_n", "contact.K_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
 KNOWN = {name: value for name, value in TRUTH.items() if name not in SIX}
@@ -53,28 +49,20 @@ Alter = Callable[[Recording, np.random.Generator], Recording]
 """A fault of a sensor or of what is noted down, put into a recording."""
 
 
-def scaled(channel: str, factor: float) -> Alter:
+def reading(channel: str, fault: Callable[[Array, np.random.Generator], Array]) -> Alter:
+    """A fault in the readings of one channel."""
+
     def alter(recording: Recording, rng: np.random.Generator) -> Recording:
         t, y = recording.samples[channel]
-        return replace(recording, samples=recording.samples | {channel: (t, factor * y)})
+        return replace(recording, samples=recording.samples | {channel: (t, fault(y, rng))})
 
     return alter
 
 
-def in_steps(channel: str, q: float) -> Alter:
-    def alter(recording: Recording, rng: np.random.Generator) -> Recording:
-        t, y = recording.samples[channel]
-        return replace(recording, samples=recording.samples | {channel: (t, q * np.round(y / q))})
-
-    return alter
-
-
-def with_outliers(recording: Recording, rng: np.random.Generator) -> Recording:
-    t, y = recording.samples["F_y"]
-    hit = rng.choice(len(t), 4, replace=False)
-    y = y.copy()
+def with_outliers(y: Array, rng: np.random.Generator) -> Array:
+    y, hit = y.copy(), rng.choice(len(y), 4, replace=False)
     y[hit] += 15 * RIG["F_y"].noise * rng.choice([-1.0, 1.0], 4)
-    return replace(recording, samples=recording.samples | {"F_y": (t, y)})
+    return y
 
 
 def late(recording: Recording, rng: np.random.Generator) -> Recording:
@@ -112,12 +100,14 @@ CASES = (
     Case("tilt of 2 mrad", ("gravity_tilt",), differs={"tilt": 2e-3}),
     Case("nu +4.44 %", ("pad.nu",), differs={"nu": 0.47}),
     Case("disc mass +5 %", ("disc.mass",), differs={"mass": 1.05 * 0.4065}),
-    Case("gain of F_x 3 %", ("gain F_x",), alter=scaled("F_x", 1.03)),
+    Case("gain of F_x 3 %", ("gain F_x",), alter=reading("F_x", lambda y, _: 1.03 * y)),
     Case("set-points 1.5 ms late", ("clock of the set-points",), alter=late),
     Case(
-        "theta in steps of 2 mrad", words=("theta comes in steps",), alter=in_steps("theta", 2e-3)
+        "theta in steps of 2 mrad",
+        words=("theta comes in steps",),
+        alter=reading("theta", lambda y, _: 2e-3 * np.round(y / 2e-3)),
     ),
-    Case("outliers in F_y", words=("outliers",), alter=with_outliers),
+    Case("outliers in F_y", words=("outliers",), alter=reading("F_y", with_outliers)),
     Case("gentle roll", excitation="gentle roll"),
 )
 SMOKE = ("inertia +5 %",)
@@ -136,7 +126,7 @@ class Config:
 
 class Repetition(NamedTuple):
     """One seed: errors over standard deviations of what is identifiable, by name; suspects with
-    their odds; notices; processor time [s] of `identify` and, where it was called, of `explain`."""
+    their odds; notices; seconds of `identify` and, where it was called, of `explain`."""
 
     off: dict[str, float]
     named: dict[str, float]
@@ -145,48 +135,44 @@ class Repetition(NamedTuple):
     explain_s: float | None
 
 
-@dataclass(frozen=True)
-class Outcome:
-    case: Case
-    repetitions: list[Repetition]
-
-    def names_the_suspect(self, one: Repetition) -> bool:
-        said = any(word in text for word in self.case.words for text in one.notices)
-        return said or any(name.startswith(self.case.suspects) for name in one.named)
-
-    def worst(self, one: Repetition) -> float:
-        return max(map(abs, one.off.values()), default=0.0)
-
-    @property
-    def silent(self) -> int:
-        """Seeds of which an estimate is off without the suspect among those named."""
-        return sum(
-            self.worst(one) > OFF and not self.names_the_suspect(one) for one in self.repetitions
-        )
+def names_the_suspect(case: Case, one: Repetition) -> bool:
+    said = any(word in text for word in case.words for text in one.notices)
+    return said or any(name.startswith(case.suspects) for name in one.named)
 
 
-def problem(case: Case, made: Made, seed: int) -> Problem:
+def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
+    """A case in numbers; `silent`: seeds of which an estimate is off without the suspect named."""
+    named = [names_the_suspect(case, one) for one in reps]
+    worst = [max(map(abs, one.off.values()), default=0.0) for one in reps]
+    every = [z for one in reps for z in one.off.values()]
+    odds = Counter[str]()
+    for one in reps:
+        odds.update(one.named)
+    return {
+        "name": case.name, "held": sum(abs(z) < 1.96 for z in every), "of": len(every),
+        "worst": worst, "named": sum(named), "odds": {k: x / len(reps) for k, x in odds.items()},
+        "silent": sum(z > OFF and not told for z, told in zip(worst, named)),
+        "identify_s": max(one.identify_s for one in reps),
+        "explain_s": max((one.explain_s for one in reps if one.explain_s), default=None),
+        "repetitions": [one._asdict() for one in reps],
+    }  # fmt: skip
+
+
+def stated_case(case: Case, made: Made, seed: int) -> Problem:
     noted = foreign_rigs.Case(case.name, noted=KNOWN)
-    recording = noted.recording(case.excitation, made, seed, False)
+    recording = noted.recording(case.excitation, made, seed)
     if case.alter is not None:
         recording = case.alter(recording, np.random.default_rng(1000 + seed))
-    unknowns = {name: Unknown(nominal=TRUTH[name] * 1.6 ** (-1) ** i) for i, name in enumerate(SIX)}
-    unknowns["contact.mu_k"] = Unknown(nominal=0.9, ratio_to="contact.mu_s", low=0.1, high=1.0)
-    return Problem([recording], RIG, unknowns)
+    return stated([recording], {name: TRUTH[name] for name in SIX})
 
 
 def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
-    stated, folder = problem(case, made, seed), config.out / f"runs-{CASES.index(case)}-{seed}"
-    begin = process_time() if config.workers == 1 else perf_counter()
-
-    def clock() -> float:
-        return (process_time() if config.workers == 1 else perf_counter()) - begin
-
-    result: IdentificationResult = identify(stated, rtol=config.rtol, checkpoint=folder)
-    identify_s, explain_s = clock(), None
+    one, folder = stated_case(case, made, seed), config.out / f"runs-{CASES.index(case)}-{seed}"
+    how: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
+    result, identify_s = timed(lambda: identify(one, **how))
+    explain_s = None
     if result.made_by["candidates"]:
-        result = explain(stated, rtol=config.rtol, checkpoint=folder)
-        explain_s = clock() - identify_s
+        result, explain_s = timed(lambda: explain(one, **how))
     forget(folder)
     off = {
         e.name: float(np.log(e.value / TRUTH[e.name]) / e.relative_sd)
@@ -196,99 +182,33 @@ def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
     return Repetition(off, named, result.notices, identify_s, explain_s)
 
 
-def run(config: Config) -> list[Outcome]:
-    names = config.only or (SMOKE if config.smoke else tuple(case.name for case in CASES))
-    if config.smoke:
-        config = replace(config, seeds=1, workers=1, rtol=1e-4, step=5e-5)
-    cases = [case for case in CASES if case.name in names]
-    if strange := set(names) - {case.name for case in cases}:
-        known = ", ".join(case.name for case in CASES)
-        raise ValueError(f"there is no case {min(strange)!r}; the cases are {known}")
-    made = make_all([case.order for case in cases], config.step, False, config.workers)
-    every = [(case, seed) for case in cases for seed in range(config.seeds)]
-    work = parallel_map(
-        lambda k: repeat(every[k][0], made[every[k][0].order], every[k][1], config),
-        len(every), config.workers,
-    )  # fmt: skip
-    done: dict[int, Repetition] = {}
-    for k, one in tqdm(work, total=len(every), desc="identifications"):
-        done[k] = one
-        outcomes = [
-            Outcome(case, [done[j] for j, (other, _) in enumerate(every) if other is case
-                           and j in done])
-            for case in cases
-        ]  # fmt: skip
-        write(config, summary(outcomes))
-    return outcomes
-
-
-def summary(outcomes: list[Outcome]) -> dict[str, Any]:
-    return {
-        "silent": sum(one.silent for one in outcomes),
-        "cases": [
-            {
-                "name": one.case.name, "silent": one.silent,
-                "named": sum(map(one.names_the_suspect, one.repetitions)),
-                "repetitions": [rep._asdict() for rep in one.repetitions],
-            }
-            for one in outcomes
-        ],
-    }  # fmt: skip
-
-
-def table(outcomes: list[Outcome]) -> str:
+def table(cases: list[dict[str, Any]]) -> str:
     rows = []
-    for one in outcomes:
-        reps, n = one.repetitions, len(one.repetitions)
-        held = sum(abs(z) < 1.96 for rep in reps for z in rep.off.values())
-        count = sum(len(rep.off) for rep in reps)
-        worst = max((one.worst(rep) for rep in reps), default=0.0)
-        odds: dict[str, list[float]] = {}
-        for rep in reps:
-            for name, value in rep.named.items():
-                odds.setdefault(name, []).append(value)
-        said = ", ".join(
-            f"{name} ({sum(some) / n:.2g})" for name, some in
-            sorted(odds.items(), key=lambda item: -sum(item[1]))[:4]
-        )  # fmt: skip
-        explained = [rep.explain_s for rep in reps if rep.explain_s is not None]
+    for one in cases:
+        odds = sorted(one["odds"].items(), key=lambda item: -item[1])[:4]
         rows.append((
-            one.case.name, f"{held} of {count}", f"{worst:.1f}",
-            f"{sum(map(one.names_the_suspect, reps))} of {n}" if one.case.suspects + one.case.words
-            else "-",
-            said or "-", f"{np.median([rep.identify_s for rep in reps]):.0f}",
-            f"{np.median(explained):.0f}" if explained else "-", str(one.silent),
+            one["name"], f"{one['held']} of {one['of']}",
+            f"{min(one['worst']):.1f} .. {max(one['worst']):.1f}",
+            ", ".join(f"{name} ({x:.2g})" for name, x in odds) or "-",
+            f"{one['named']} of {len(one['worst'])}", f"{one['identify_s']:.0f}",
+            f"{one['explain_s']:.0f}" if one["explain_s"] else "-", one["silent"],
         ))  # fmt: skip
-    head = ("what differs", "intervals that hold", "worst error / sd", "true suspect named",
-            "named (mean odds)", "identify [s]", "explain [s]", "silent")  # fmt: skip
+    head = ("what differs", "intervals that hold", "worst error / sd", "named (mean odds)",
+            "rightly in", "identify [s]", "explain [s]", "silent")  # fmt: skip
     return markdown(head, rows)
 
 
-def figure(outcomes: list[Outcome]) -> Figure:
-    """Errors over standard deviations, filled where the true suspect is named."""
-    fig = Figure(figsize=(7.0, 0.34 * len(outcomes) + 1.2), layout="constrained")
-    axes = fig.subplots()
-    axes.axvspan(-1.96, 1.96, color="0.92")
-    for k, one in enumerate(outcomes):
-        for rep in one.repetitions:
-            named = one.names_the_suspect(rep)
-            z = np.clip(list(rep.off.values()), -60, 60)
-            axes.plot(
-                z, np.full(len(z), k), "o" if named else "x", ms=4, alpha=0.6,
-                color="C0" if named else "C3",
-            )  # fmt: skip
-    axes.set_xscale("symlog", linthresh=3)
-    axes.set_yticks(range(len(outcomes)), [one.case.name for one in outcomes])
-    axes.set(xlabel="error over its standard deviation", ylim=(len(outcomes) - 0.5, -0.5))
-    axes.plot([], [], "o", color="C0", label="true suspect named")
-    axes.plot([], [], "x", color="C3", label="none, or another")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    return fig
-
-
 def main(config: Config) -> None:
-    outcomes = run(config)
-    write(config, summary(outcomes), {"suspects": figure(outcomes)}, table(outcomes))
+    cases = chosen(CASES, config.only or (SMOKE if config.smoke else ()))
+    if config.smoke:
+        config = replace(config, seeds=1, workers=1, rtol=1e-4, step=5e-5)
+    made = make_all([case.order for case in cases], config.step, config.workers)
+    done = list[dict[str, Any]]()
+    for case in cases:
+        one = lambda seed, case=case: repeat(case, made[case.order], seed, config)
+        done.append(summed(case, repeated(one, config.seeds, config.workers, case.name)))
+        content = {"silent": sum(row["silent"] for row in done), "cases": done}
+        write(config, content, table=table(done))
 
 
 if __name__ == "__main__":

@@ -36,9 +36,9 @@ def design(options: argparse.Namespace) -> int:
     data = [file for file in options.files if file.suffix != ".toml"]
     if len(configs) != 1:
         return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
-    from torchsoft.files import replacing, write_json
+    from torchsoft.files import write_json
     from torchsoft.plot.figures import save
-    from torchsoft.rigs.written import located, to_toml
+    from torchsoft.rigs import written
     from torchsoft.sysid import measured
     from torchsoft.sysid.figures import design_figure
     from torchsoft.sysid.rig_design import choose
@@ -49,8 +49,7 @@ def design(options: argparse.Namespace) -> int:
     chosen = choose(
         configs[0], stated, recorded, workers=options.workers, progress=options.progress
     )
-    with replacing(options.out / "motion.toml") as partial:
-        partial.write_text(to_toml(located(chosen.file)), encoding="utf-8")
+    written.save(chosen.file, options.out / "motion.toml")
     write_json(options.out / "design.json", chosen.summary())
     say(chosen.table())
     if chosen.found is not None:

@@ -31,12 +31,12 @@ def add_commands(commands: Any) -> None:
 
 def plan(options: argparse.Namespace) -> int:
     """Plan, and write the motion."""
-    from torchsoft.files import replacing, write_json
+    from torchsoft.files import write_json
+    from torchsoft.plot import figures
     from torchsoft.plot.dashboard import dashboard
-    from torchsoft.plot.figures import save
     from torchsoft.rigs.build import RigFile
     from torchsoft.rigs.goal import Goal, plan_file
-    from torchsoft.rigs.written import located, to_toml
+    from torchsoft.rigs.written import save
 
     file, goal = RigFile.from_toml(options.rig), Goal.from_toml(options.goal)
     known = None
@@ -46,11 +46,10 @@ def plan(options: argparse.Namespace) -> int:
         known = load_answer(options.answer).draws(goal.draws, seed=goal.seed)
     try_folder(options.out, options.force)
     found, written = plan_file(file, goal, known, progress=options.progress)
-    with replacing(options.out / "motion.toml") as partial:
-        partial.write_text(to_toml(located(written)), encoding="utf-8")
+    save(written, options.out / "motion.toml")
     write_json(options.out / "plan.json", found.summary())
     found.trajectory.save(options.out / "run.nc")
-    save(dashboard(found.trajectory, title=written.title), options.out / "run.png")
+    figures.save(dashboard(found.trajectory, title=written.title), options.out / "run.png")
     say(found)
     say(f"written to {options.out / 'motion.toml'}, plan.json, run.nc and run.png")
     return 0 if found.reached else 1

@@ -166,12 +166,10 @@ class SoftGrasp(Rig):
         assert shape is not None
         return shape
 
-    def touch_height(self, y_C: Tensor | float, theta: float = 0.0) -> Tensor:
+    def touch_height(self, y_C: Tensor | float) -> Tensor:
         """Height of the bracket's centre [m] at which its undeformed pad just touches the object at
         the height y_C [m]."""
-        angle = torch.tensor(theta, dtype=torch.float64)
-        up = torch.stack((angle.sin(), angle.cos()))  # the world's y in the object's frame
-        p = self._settings
+        up, p = torch.tensor([0.0, 1.0], dtype=torch.float64), self._settings
         return y_C + self.shape.support(up) + p.pad.height + p.bracket.cm_height
 
 

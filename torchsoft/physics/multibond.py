@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import networkx as nx
-import torch
 from torch import Tensor
 
 
@@ -92,11 +91,6 @@ def net_efforts(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) ->
             signed = effort if port.source else -effort
             total[name] = total[name] + signed if name in total else signed
     return total
-
-
-def identity(width: int, like: Tensor, sign: float = 1.0) -> Tensor:
-    """A constant block: sign times the identity, for every bond."""
-    return sign * torch.eye(width, dtype=like.dtype, device=like.device)[None]
 
 
 def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx.DiGraph:

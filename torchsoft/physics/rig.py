@@ -16,7 +16,7 @@ from torchsoft.display import Shown, suggestion
 from torchsoft.physics.condensed import free_rates, nodal, nodal_forces
 from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
 from torchsoft.physics.motion import Reference
-from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
+from torchsoft.physics.multibond import Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
 from torchsoft.physics.shapes import parameter
@@ -449,11 +449,9 @@ class Rig(Shown, nn.Module):
         u: Tensor,
         u_dot: Tensor,
         which: Tensor | None = None,
-        stage: float = 0.0,
     ) -> Tensor:
         """Inputs x (..., points, 9) of a contact's law: u and u_dot (..., points, 2) are the
-        points' own, in the base's frame. `which` takes some of the points; `stage` is the law's a h
-        [s]."""
+        points' own, in the base's frame. `which` takes some of the points."""
         contact = self.contacts[key]
         u, u_dot = torch.broadcast_tensors(u, u_dot)
         X, weight, s = self.pads[contact.pad].point_positions, self.weight(key), state.stretch[key]
@@ -476,7 +474,7 @@ class Rig(Shown, nn.Module):
             (r_C[..., 2:] - r_B[..., 2:]) * one,
             s * one,
             weight * one,
-            stage * one,
+            0.0 * one,
         )
         return torch.cat(
             [part if part.ndim == d.ndim else part[..., None] for part in (w, *parts)], -1
@@ -584,7 +582,7 @@ class Rig(Shown, nn.Module):
             row = (
                 torch.ones(1, 1, 1, dtype=torch.float64)
                 if spin
-                else identity(2, force)[:, COORDINATES.index(axis), None]
+                else torch.eye(2, dtype=torch.float64)[None, COORDINATES.index(axis), None]
             )
             out[f"control_{name}"] = Port(
                 Transformer({own: Block(row)}), force[..., None, None], actuator.elements, True,

@@ -20,7 +20,20 @@ PEAK = 35 / 16
 """Largest over mean speed of the 7th-order profile."""
 
 
-class Bounds(Table):
+class Range(Table):
+    """Values from `low` to `high` [their unit]."""
+
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> Self:
+        if self.low >= self.high:
+            raise ValueError(f"low = {self.low:g} must be below high = {self.high:g}")
+        return self
+
+
+class Bounds(Range):
     """Bounds of a signal of the reference: values from `low` to `high` [its unit], at `speed` [its
     unit/s] at most.
 
@@ -28,17 +41,9 @@ class Bounds(Table):
     least time between two.
     """
 
-    low: float
-    high: float
     speed: float = Field(gt=0)
     after: float = 0.0
     shortest: float | None = Field(default=None, gt=0)
-
-    @model_validator(mode="after")
-    def _is_ordered(self) -> Self:
-        if self.low >= self.high:
-            raise ValueError(f"low = {self.low:g} must be below high = {self.high:g}")
-        return self
 
 
 def profile(reference: Reference, name: str) -> Profile:

@@ -7,29 +7,18 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
+from torch import Tensor
 
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
-from torchsoft.plan.knots import knots
+from torchsoft.plan.knots import Range, knots
 from torchsoft.plan.planning import RTOL, Method, Robust
 from torchsoft.plan.variables import Free
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.tables import SEED, Table, from_toml
-
-
-class Range(Table):
-    """Values of a parameter of the rig, from `low` to `high` [its unit]."""
-
-    low: float
-    high: float
-
-    @model_validator(mode="after")
-    def _is_ordered(self) -> Self:
-        if self.low >= self.high:
-            raise ValueError(f"low = {self.low:g} must be below high = {self.high:g}")
-        return self
-
 
 Name = Annotated[str, Field(min_length=1)]
 
@@ -91,22 +80,23 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def drawn(
     file: RigFile, goal: Goal, count: int, seed: int, known: Draws | None = None
-) -> tuple[dict[str, Any], Any]:
-    """Uncertain numbers by name (1 + count, ...), the stated ones first, and the starts (1 + count,
-    size) of rigs that have them; those of `known` as they are drawn there. Raises `ValueError`."""
-    rng, rows, starts, known = np.random.default_rng(seed), [], [], known or {}
+) -> tuple[BuiltRig[Rig], dict[str, Tensor], Tensor]:
+    """The rig with the stated numbers; uncertain numbers by name (1 + count, ...), the stated ones
+    first, those of `known` as they are drawn there; and the starts (1 + count, size) of rigs that
+    have them. Raises `ValueError`."""
+    rng, every, known = np.random.default_rng(seed), list[BuiltRig[Rig]](), known or {}
     if twice := known.keys() & goal.uncertain.keys():
         raise ValueError(f"uncertain.{min(twice)} is drawn by the identification; leave it out")
-    names = [*goal.uncertain, *known]
     for i in range(1 + count):
         values = {name: rng.uniform(one.low, one.high) for name, one in goal.uncertain.items()}
         values = (values if i else {}) | {name: float(one[i]) for name, one in known.items()}
         with at_field("uncertain"):
-            built = (file.override(**nested(values)) if values else file).build()
-        rows.append({name: built.rig.parameter(name).detach() for name in names})
-        starts.append(built.y0)
-    over = {name: torch.stack([row[name] for row in rows]) for name in names}
-    return over, torch.stack(starts)
+            every.append((file.override(**nested(values)) if values else file).build())
+    over = {
+        name: torch.stack([one.rig.parameter(name).detach() for one in every])
+        for name in (*goal.uncertain, *known)
+    }
+    return every[0], over, torch.stack([one.y0 for one in every])
 
 
 def plan_file(
@@ -123,8 +113,11 @@ def plan_file(
         estimates = nested({name: float(one[0]) for name, one in known.items()})
         with at_field("uncertain"):
             file = file.override(**estimates)
-    built, uncertain = file.build(), goal.uncertain or known
-    over, y0 = drawn(file, goal, goal.draws, goal.seed, known) if uncertain else ({}, built.y0)
+    if goal.uncertain or known:
+        built, over, y0 = drawn(file, goal, goal.draws, goal.seed, known)
+    else:
+        built = file.build()
+        over, y0 = {}, built.y0
     found = plan(
         built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits, y0=y0,
         over=over, robust=goal.robust, method=goal.method, iterations=goal.iterations,

@@ -7,6 +7,7 @@ from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
 
+from torchsoft.files import replacing
 from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import Group, NumberOr
@@ -27,6 +28,12 @@ def to_toml(file: RigFile) -> str:
         elif isinstance(value, Group):
             lines += ["", *heading(type(value)), *section(value, name, kinds(field), seen)]
     return "\n".join(lines) + "\n"
+
+
+def save(file: RigFile, path: Path) -> None:
+    """Write the file in another folder, whole or not at all; files that it names stay theirs."""
+    with replacing(path) as partial:
+        partial.write_text(to_toml(located(file)), encoding="utf-8")
 
 
 def heading(table: type[Group]) -> list[str]:

@@ -21,7 +21,7 @@ from torchsoft.solve.adjoint import TAPE_BYTES, attached
 from torchsoft.solve.laws import copied
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import Route, RunOutcome, prepare, run
+from torchsoft.solve.simulate import RunOutcome, prepare, run
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.threads import cores, parallel_map, single_threaded
 
@@ -165,11 +165,6 @@ def simulate_batch(
     rigs, ts, y0s, references, every_knots, dy0s, count = _spread(
         rig, t, parameters, y0, reference, knots, dy0
     )
-    gradient: Route = options.get("gradient", "none")
-    if gradient not in ("none", "discrete", "forward"):
-        raise ValueError(
-            f"a batch takes gradient='none', 'discrete' or 'forward', not {gradient!r}"
-        )
     began, threads = (
         clock.perf_counter(),
         min(count, cores() if threads is None else whole("threads", threads, 1)),

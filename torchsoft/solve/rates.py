@@ -12,32 +12,29 @@ from torchsoft.solve.progress import Integrals, SimulationFailed
 from torchsoft.solve.system import Compiled
 from torchsoft.solve.tolerances import Followed
 
+LIMITS = Limits(1e-10, 40, 2e-3)
+"""Newton's tolerance [N] and iterations, and how near [m] a point has to be to count as one that
+may touch."""
+
 
 class Rates:
     """dy/dt = f(t, y) of a rig and its reference as they are now, compiled: tens of microseconds a
     call.
 
-    The same as `rig.forward` to Newton's `tolerance` [N], for one state y (size,) of numpy. `calls`
+    The same as `rig.forward` to Newton's tolerance, for one state y (size,) of numpy. `calls`
     counts. An object keeps scratch of its own and the last forces as Newton's guess: one thread may
-    call it at a time. `margin` [m] is how near a point has to be to count as one that may touch.
+    call it at a time.
 
     Raises `NotImplementedError` for inertial pads.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        reference: Reference | None = None,
-        *,
-        tolerance: float = 1e-10,
-        margin: float = 2e-3,
-    ) -> None:
+    def __init__(self, rig: Rig, reference: Reference | None = None) -> None:
         compiled = Compiled(rig)
         if compiled.inertial:
             raise NotImplementedError(
                 "the rates of inertial pads are not compiled for single states; use `rig.forward`"
             )
-        self._system, self._limits = compiled.system(1.0), Limits(tolerance, 40, margin)
+        self._system, self._limits = compiled.system(1.0), LIMITS
         self._work = room("Work", self._system, compiled.layout.size, columns=1)
         followed = rig.reference if reference is None else reference
         self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)

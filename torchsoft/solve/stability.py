@@ -95,8 +95,8 @@ def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
 
 @torch.no_grad()
 def loop_modes(model: SoftGrasp) -> Tensor:
-    """Eigenvalues [1/s] of the linearised closed loop in the grasp, complex (size,), the least
-    stable first.
+    """Eigenvalues [1/s] of the linearised closed loop in the grasp, complex, the least stable
+    first.
 
     The grasp is the frictionless equilibrium at the scenario's y_Br(t_g), with every touching node
     sticking. Raises `NoEquilibrium` when that grasp does not exist.
@@ -106,8 +106,7 @@ def loop_modes(model: SoftGrasp) -> Tensor:
     reference = hold(
         x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y)
     )
-    modes = torch.linalg.eigvals(linearised(model, y, reference))
-    return modes[modes.real.argsort(descending=True)]
+    return modes(model, y, reference).values
 
 
 def describe_instability(model: SoftGrasp) -> str:

@@ -41,6 +41,7 @@ from torchsoft.sysid.plan import (
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.refits import ended
 from torchsoft.sysid.residual_tests import (
     Coloured,
     allow_for_colour,
@@ -137,10 +138,10 @@ def conclude(
             end = settle(
                 coloured.problem, runner, stage, coloured.fit, free, how.tightenings, notify
             )
-        for rtol, one, ended in end.fits:
+        for rtol, one, at in end.fits:
             name = "steps chosen anew" if rtol == by else "tighter tolerance"
-            stages.append(stage_entry(name, stage, rtol, one, start, ended))
-            by, start = rtol, ended
+            stages.append(stage_entry(name, stage, rtol, one, start, at))
+            by, start = rtol, at
         return end
 
     end = at_rest()
@@ -247,9 +248,9 @@ def conclude(
 def noise_entries(coloured: Coloured, stage: Stage, began: float) -> list[dict[str, Any]]:
     """The result's entries on the fits with the noise that was found."""
     name, out = "with the noise that was found", []
-    for one, ended in coloured.fits:
-        out.append(stage_entry(name, stage, stage.rtol, one, began, ended))
-        began = ended
+    for one, at in coloured.fits:
+        out.append(stage_entry(name, stage, stage.rtol, one, began, at))
+        began = at
     return out
 
 
@@ -268,10 +269,12 @@ def tested_assumptions(
     }
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
+    there = ended(
+        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, end.steps
+    )
     found = check_assumptions(
-        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, doubtful=doubtful,
-        explain=how.settings.assumptions == "explained", loss=how.loss, progress=progress,
-        own=end.steps,
+        plain, there, doubtful=doubtful, explain=how.settings.assumptions == "explained",
+        loss=how.loss, progress=progress,
     )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J

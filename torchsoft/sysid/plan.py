@@ -83,15 +83,13 @@ def tie_ratios(problem: Problem, x: Array) -> Array:
     return x
 
 
-def visible(
-    J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK
-) -> NDArray[np.bool_]:
-    """The largest set, found greedily, whose members are all known to better than `limit` when the
-    rest is held."""
+def visible(J: Array, candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The largest set, found greedily, whose members are all known to better than `FIRST_LOOK` when
+    the rest is held."""
     out = candidates.copy()
     while out.any():
         sd = standard_deviations(J[:, out])
-        if sd.max() <= limit:
+        if sd.max() <= FIRST_LOOK:
             break
         out[np.flatnonzero(out)[sd.argmax()]] = False
     return out

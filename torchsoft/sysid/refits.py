@@ -35,7 +35,7 @@ HALVINGS = 10
 class End(NamedTuple):
     """A fit in whose place another is held: coordinates x (n,), residuals there, the free
     coordinates (n,), the recordings that were fitted, residuals and steps of runs by the tolerance
-    `rtol`, and what makes runs."""
+    `rtol`, the maker of runs, and the tolerance of the fit itself, `finest`."""
 
     x: Array
     at: Residuals
@@ -45,6 +45,7 @@ class End(NamedTuple):
     steps: Mapping[str, Frozen]
     rtol: float
     runner: Runner
+    finest: float
 
     @property
     def far(self) -> bool:
@@ -61,13 +62,13 @@ def ended(
     variations: `USUAL`, or that of the fit, if runs are lost with it; or with `at`, by its `own`
     steps, where no others have a run."""
     if own is not None:
-        return End(x, at, free, tuple(which), at, own, rtol, runner)
+        return End(x, at, free, tuple(which), at, own, rtol, runner, rtol)
     usual = max(rtol, USUAL)
     base, steps = problem.freeze(runner, x, which, usual)
     if base.lost and usual > rtol:
         usual = rtol
         base, steps = problem.freeze(runner, x, which, rtol)
-    return End(x, at, free, tuple(which), base, steps, usual, runner)
+    return End(x, at, free, tuple(which), base, steps, usual, runner, rtol)
 
 
 EARLY = 2e-3

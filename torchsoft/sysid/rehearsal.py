@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsoft.files import replacing
+from torchsoft import csvfile
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
@@ -63,12 +63,10 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
         followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
         columns = {"t": made.times} | dict(zip(rig.signals, followed))
         columns |= {channel: y for channel, (_, y) in made.samples.items()}
-        headings = {of: heading for heading, of in known.headings.items()}
-        head = ",".join(f"{headings.get(one, one)} [{known.units[one]}]" for one in columns)
+        called = {of: heading for heading, of in known.headings.items()}
+        units = {called.get(one, one): known.units[one] for one in columns}
         paths.append(out / f"{name}.csv")
-        with replacing(paths[-1]) as partial:
-            table = np.stack(list(columns.values()), 1)
-            np.savetxt(partial, table, "%.12g", ",", header=head, comments="", encoding="utf-8")
+        csvfile.write(paths[-1], dict(zip(units, columns.values())), units)
     own = [
         entry.model_copy(update={"name": path.stem, "file": None, "files": ()})
         for entry, path in zip(entries, paths)

@@ -24,12 +24,11 @@ from tqdm import tqdm
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
 from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
-from torchsoft.sysid.prediction import FailedRun, Frozen
-from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.prediction import FailedRun
+from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, extended
-from torchsoft.sysid.refits import End, Refit, difference, ended, joint_fit, refit
+from torchsoft.sysid.refits import End, Refit, difference, joint_fit, refit
 from torchsoft.sysid.residual_tests import LEVEL, parts
-from torchsoft.sysid.runs import Runner
 from torchsoft.tables import Number, plain
 
 EVIDENT = 20.0
@@ -177,19 +176,16 @@ class Checked(NamedTuple):
 
 
 def check_assumptions(
-    problem: Problem, runner: Runner, x: Array, at: Residuals, free: NDArray[np.bool_],
-    which: Sequence[str], rtol: float, *, doubtful: bool = False, explain: bool = False,
-    loss: Loss = "linear", progress: bool = False, own: Mapping[str, Frozen] | None = None,
+    problem: Problem, end: End, *, doubtful: bool = False, explain: bool = False,
+    loss: Loss = "linear", progress: bool = False,
 ) -> Checked:  # fmt: skip
-    """Tests of the assumptions at the estimates x (n,), to first order, where `at` holds residuals
-    and Jacobian of the recordings `which`, by the fit's `own` steps where no others have a run.
+    """Tests of the assumptions at the end of a fit, to first order.
 
     With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other,
     until one explains the misfit: a test to first order says little where a fit has run far off.
     """
-    end = ended(problem, runner, x, at, free, which, rtol, own)
     candidates, explained = list[Variation](), False
-    recordings = [recording for recording in problem.recordings if recording.name in which]
+    recordings = [recording for recording in problem.recordings if recording.name in end.which]
     taken = assumptions(recordings, set(problem.coordinates.names))
     judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
     untried = [one.name for one in taken if one.vary is not None]
@@ -215,13 +211,13 @@ def check_assumptions(
             candidates = look(suspects.values(), checks)
         if explain and candidates:
             untried = [f"a new fit with another {one.name}" for one in candidates]
-            at_end = end._replace(rtol=rtol) if explained else end  # rivals differ by little
-            for one in new_fits(problem, at_end, candidates, loss, judge, checks, progress):
+            exact = end._replace(rtol=end.finest) if explained else end  # rivals differ by little
+            for one in new_fits(problem, exact, candidates, loss, judge, checks, progress):
                 untried.remove(f"a new fit with another {one.name}")
             untried, candidates = [], []
     except KeyboardInterrupt:  # the fit is done: what was tried is kept
         candidates = []
-    rows = np.stack(columns, 1) if columns else np.zeros((len(at.r), 0))
+    rows = np.stack(columns, 1) if columns else np.zeros((len(end.at.r), 0))
     names = tuple(one.name for one in candidates)
     done = Checked([*checks.values()], rows, judge.J, tuple(untried), names)
     return compared(done, judge) if explained or not candidates else done
