@@ -1,7 +1,6 @@
 """Datasets of rig files: any number of their tables is drawn, by its name, and all that holds for
 the paper's rig holds for them."""
 
-import copy
 import re
 import tomllib
 from pathlib import Path
@@ -128,11 +127,17 @@ def made(tmp_path_factory):
 
 
 def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a store, the manifest included."""
     return {
-        str(path.relative_to(folder)): re.sub(rb'"(commit|digest)": "\w*"', b"", path.read_bytes())
+        str(path.relative_to(folder)): same_commit(path.read_bytes())
         for path in folder.rglob("*")
         if path.is_file()
     }
+
+
+def same_commit(data: bytes) -> bytes:
+    """Without the commit, and so the digest: the repository may move on during a test."""
+    return re.sub(rb'"(commit|digest)": "\w*"', b"", data)
 
 
 def sound(url: Path) -> bool:
@@ -269,14 +274,10 @@ def tree(folder: Path) -> Any:
          "mass.choices: Tuple should have at least 1"),
         (("parameters", "bodies.disc.mass"), {"mean": 0.4},
          "parameters.bodies.disc.mass.sd is missing"),
-        (("parameters", "bodies.disc.mass"), {"mean": 0.4, "sd": 0.0},
-         "sd should be greater than 0"),
         (("parameters", "bodies.disc.mass"), {"mean": 0.4, "sd": 0.01, "low": 0.5},
          "low = 0.5 should be below high = 0.44"),
         (("parameters", "bodies.disc.mass"), {"mean": 0.4, "sd": 0.01, "low": 1.5, "high": 1.6},
          "next to nothing of mean = 0.4"),
-        (("parameters", "bodies.disc.mass"), {"low": "a", "high": 1.0},
-         "parameters.bodies.disc.mass.low should be a valid number, not 'a'"),
         (("parameters", "laws.dry.friction.mu_k"), {"low": 0.75, "high": 0.9},
          r"mu_k.high = 0.9: impossible: laws.dry.friction: mu_k must not exceed mu_s"),
         (("parameters", "laws.dry.friction.mu_k", "ratio_to"), "laws.dry.friction.mu",
@@ -313,8 +314,7 @@ def tree(folder: Path) -> Any:
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_by_its_name(tmp_path, place, value, message):
-    config = copy.deepcopy(tree(tmp_path))
-    inner = config
+    inner = config = tree(tmp_path)
     for key in place[:-1]:
         inner = inner[key]
     inner[place[-1]] = value
@@ -330,17 +330,6 @@ def test_names_that_two_arrays_would_have_are_refused(tmp_path):
     config["rig"]["actuators"]["x"]["setpoint"] = "steps"
     with pytest.raises(InvalidTable, match="two arrays of the dataset would be called `steps`"):
         Config.model_validate(config)
-
-
-def test_fields_of_a_rig_file_need_one():
-    paper = tomllib.loads(
-        (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
-    )
-    with pytest.raises(InvalidTable, match=r"channels is of a rig file, and there is none"):
-        Config.model_validate(paper | {"channels": ["x_C"]})
-    paper["parameters"]["pad.E"]["ratio_to"] = "pad.nu"
-    with pytest.raises(InvalidTable, match=r"parameters.pad.E.ratio_to is of a rig file"):
-        Config.model_validate(paper)
 
 
 def test_normal_and_chosen_numbers_have_their_distributions():
