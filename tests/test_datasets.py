@@ -4,10 +4,10 @@ import json
 import os
 import pickle
 import re
+import resource
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +29,7 @@ from torchsoft.datasets import simulation
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import Manifest, StoreError, digest, record, record_key, write_bytes
-from torchsoft.datasets.generate import Serial, generate, local_processes, local_workers, main
+from torchsoft.datasets.generate import Serial, generate, local_processes, main
 from torchsoft.datasets.reader import Trajectories, open_dataset
 from torchsoft.datasets.simulation import Task, points, simulate_task, split, task
 from torchsoft.datasets.writer import Store, create, laid_out, open_or_create
@@ -105,13 +105,11 @@ def test_a_sobol_design_is_a_prefix_of_a_longer_one(tmp_path):
     np.testing.assert_array_equal(points(short), points(long)[:5])
 
 
-@pytest.mark.parametrize(
-    "workers", [local_workers, pytest.param(local_processes, marks=pytest.mark.slow)]
-)
-def test_threads_and_processes_make_the_same_bytes_behind_a_url(made, tmp_path, workers):
+@pytest.mark.slow
+def test_processes_make_the_same_bytes(made, tmp_path):
     folder, config = made
-    with workers(2) as executor:
-        assert generate(config, (tmp_path / "set").as_uri(), executor, 2, progress=False) == 0
+    with local_processes(2) as executor:
+        assert generate(config, str(tmp_path / "set"), executor, 2, progress=False) == 0
     assert contents(tmp_path / "set") == contents(folder)
 
 
@@ -436,8 +434,8 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(made,
         partial.write_bytes(content["theta/zarr.json"])
         open_or_create(str(folder), config)
         assert list(folder.rglob("*.partial")) == [partial]
-    generate(config, str(folder), Serial(), progress=False)
-    assert contents(folder) == contents(made[0])
+    create(str(tmp_path / "other"), config)
+    assert contents(folder) == contents(tmp_path / "other")
 
 
 def test_whoever_lays_a_folder_out_later_changes_nothing(made, tmp_path):
@@ -517,40 +515,24 @@ def test_an_unwritable_folder_is_refused(made):
 
 
 @pytest.mark.slow
-def test_a_file_size_limit_is_said_and_costs_nothing(made, tmp_path):
+def test_a_file_size_limit_is_said_and_costs_nothing(made, tmp_path, capfd):
     """The operating system's own refusal, in the middle of a shard; without the limit the same
     command finishes."""
-    path, limit = (
-        write_config(tmp_path),
-        max(len(data) for name, data in contents(made[0]).items() if "/c/" in name) // 3,
-    )
+    largest = max(len(data) for name, data in contents(made[0]).items() if "/c/" in name)
+    command = [str(write_config(tmp_path)), "--out", str(tmp_path / "set"), "--workers", "0"]
     open_or_create(str(tmp_path / "set"), made[1])
-    command = [
-        "-m",
-        "torchsoft.datasets.generate",
-        str(path),
-        "--out",
-        str(tmp_path / "set"),
-        "--workers",
-        "0",
-    ]
-    limited = (
-        f"import resource, runpy, sys; sys.argv = {command[1:]}; import "
-        "torchsoft.datasets.generate as g; "
-        + (
-            f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); "
-            "sys.exit(g.main(sys.argv[1:]))"
-        )
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 2, run.stderr
-    assert "error: " in run.stderr
-    assert "a file outgrew the limit on file sizes" in run.stderr
-    assert "Traceback" not in run.stderr
+
+    def limited() -> int:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest // 3, largest // 3))
+        return main(command)
+
+    assert ended(fork(limited)) == 2
+    said = capfd.readouterr().err
+    assert "error: " in said
+    assert "a file outgrew the limit on file sizes" in said
+    assert "Traceback" not in said
     assert Store(str(tmp_path / "set"), made[1]).unfinished() == [0, 1, 2]
-    assert main(command[2:]) == 0
+    assert main(command) == 0
     assert contents(tmp_path / "set") == contents(made[0])
 
 

@@ -207,7 +207,7 @@ def test_it_is_sound_and_resumes_to_the_same_bytes_without_the_rig_file(made, tm
     again = Config.model_validate(Manifest.read(str(folder)).config)
     assert again.hash == config.hash
     with local_workers(2) as executor:
-        generate(again, str(tmp_path / "set"), executor, 2, progress=False)
+        generate(again, (tmp_path / "set").as_uri(), executor, 2, progress=False)
     assert contents(tmp_path / "set") == contents(folder)
     (tmp_path / "set" / "finished" / "1.sha256").unlink()
     (tmp_path / "set" / "x_disc" / "c" / "1" / "0").write_bytes(b"half")

@@ -23,6 +23,7 @@ PAGES = [
 ]
 SHORTER = {
     "torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 101",
+    '["light shaking"], nominal': '["light shaking"].model_copy(update={"duration": 0.9}), nominal',
     'theta"][1000]': 'theta"][50]',
     "x[1000]": "x[100]",
     "[500, :": "[50, :",

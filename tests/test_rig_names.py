@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from conftest import nested
 from test_controllers import file as controlled
 from torch import nn
 
@@ -41,12 +42,6 @@ def numbers(tree: Any, name: str = "") -> Iterator[tuple[str, float]]:
             yield from numbers(value, f"{name}_{k}")
     elif isinstance(tree, float):
         yield name, tree
-
-
-def nested(name: str, value: float) -> dict[str, Any]:
-    """The settings `name = value`."""
-    group, _, rest = name.partition(".")
-    return {group: nested(rest, value) if rest else value}
 
 
 def values(rig: Rig) -> dict[str, float]:

@@ -2,13 +2,13 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from test_sysid_rigs import replaced
 
 from torchsoft import simulate
 from torchsoft.cli import main
@@ -107,10 +107,6 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
     file._folder = tmp_path
     whole: Any = located(file.override(motion={"x_d": column})).motion["x_d"]
     assert whole.file == str(tmp_path / "x.csv")
-
-
-def replaced(old: str, new: str) -> Callable[[str], str]:
-    return lambda text: text.replace(old, new)
 
 
 @pytest.mark.parametrize(

@@ -157,11 +157,6 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
         lambda text: text + '[pads]\nkind = "kelvin_voigt"\n',
         "pads are of the paper's rig; say it in the rig file",
     ),
-    "missing": (
-        TOML,
-        lambda text: text + "[missing]\nF_ff = 0.0\n",
-        "missing are of the paper's rig",
-    ),
     "no file": (TOML, replaced('"rig.toml"', '"none.toml"'), "rig: none.toml: No such file"),
     "bad file": ("rig.toml", replaced("mass = 0.25", "mas = 0.25"), "rig: .*`mas` is not known"),
     "settings": (TOML, replaced("table.elements_x", "table.elements"), "settings.*`elements`"),
@@ -169,11 +164,6 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
         TOML,
         replaced("lead = 0.0", "position_sd = 1e-3"),
         "position_sd is of the paper's rig",
-    ),
-    "columns": (
-        TOML,
-        replaced('camera = "x_disc"', 'camera = "x_dsk"'),
-        "columns.camera = 'x_dsk'",
     ),
     "unit": (CSV, replaced("camera (mm)", "camera (kg)"), "column `camera` cannot be in 'kg'"),
     "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: did you mean `y_disc`"),
@@ -256,7 +246,6 @@ def test_a_rehearsal_says_what_an_experiment_would_identify(folder):
             (),
             "`F_lft_x` is not a channel of the rig of `rehearsal`; did you mean",
         ),
-        (replaced("duration = 0.6", "duration = 0"), (), "rehearsal.duration"),
     ],
 )
 def test_what_cannot_be_rehearsed_is_refused(folder, change, more, words, capsys):

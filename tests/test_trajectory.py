@@ -19,7 +19,6 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
-from torchsoft.display import nearest, suggestion
 from torchsoft.physics.setup import von_mises
 from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.rigs.written import template
@@ -311,11 +310,3 @@ def test_help_is_one_page():
     assert (Path(torchsoft.__file__).parent / "py.typed").is_file()
     assert {"Rig", "simulate", "simulate_batch", "Trajectory"} < set(dir(torchsoft))
     assert all(hasattr(torchsoft, name) for name in dir(torchsoft))
-
-
-def test_the_nearest_name():
-    assert nearest("x_c", ["x_d", "x_C", "y_C"]) == "x_C"
-    assert nearest("pad.Young", ["pad.nu", "pad.E"]) is None
-    assert nearest("contact.mu", ["contact.mu_s", "pad.nu"]) == "contact.mu_s"
-    assert suggestion("q", ["a", "b"], "there are") == "there are a, b"
-    assert suggestion("a", [], "there are") == "there are none"
