@@ -310,7 +310,6 @@ def tree(folder: Path) -> Any:
         (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
         (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),
         (("rig", "bodies", "disc", "symbol"), "disc/1", "cannot be the name of an array"),
-        (("rig",), 3, "rig should be a table, not 3"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_by_its_name(tmp_path, place, value, message):

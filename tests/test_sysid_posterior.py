@@ -108,8 +108,7 @@ def test_the_density_that_nuts_sees_has_its_gradient(kind, scale):
         np.testing.assert_allclose(gradient, by, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", ["normal", "log-normal"])
-@pytest.mark.parametrize("scale", ["log", "linear"])
+@pytest.mark.parametrize(("kind", "scale"), [("normal", "log"), ("log-normal", "linear")])
 def test_without_data_nuts_gives_the_prior_back(kind, scale):
     """Whatever the coordinate's scale: densities of values, not of coordinates."""
     pytest.importorskip("nutpie")

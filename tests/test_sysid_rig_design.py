@@ -116,7 +116,6 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
         (replaced("x_upper = ", "x_uper = "), "limits.x_uper = .* did you mean `x_upper`\\?"),
         (replaced("twist.motion", "twist.motions"), "design.candidates.twist: `motions` is not"),
         (replaced("theta_d = {low", "theta = {low"), "no Profile called `theta`"),
-        (replaced("[design.bounds]", "[design.bound]"), "bound"),
         (
             lambda text: text.replace("0.4, -0.4", "9.0, -9.0").replace("0.2, 0.0", "9.0, 0.0"),
             "no candidate can be made: .* the body was lost",
