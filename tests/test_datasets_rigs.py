@@ -262,8 +262,6 @@ def tree(folder: Path) -> Any:
         (("parameters", "materials.silicone.E"), {"low": 1.0, "high": 2.0},
          r"parameters.materials.silicone.E: `materials.silicone.E` is not in the rig file: "
          "materials has rubber"),
-        (("parameters", "materials.rubber.Young"), {"low": 1.0, "high": 2.0},
-         "materials.rubber has kind, E, nu"),
         (("parameters", "motion.y_d.values.7"), {"low": 1.0, "high": 2.0},
          "motion.y_d.values has 0, 1"),
         (("parameters", "materials.rubber.nu"), {"low": 0.3, "high": 0.7},
@@ -293,7 +291,6 @@ def tree(folder: Path) -> Any:
          "bodies.disc.theta.low = 0: it changes the coordinates and energies of the rig"),
         (("parameters", "contacts.above.pad"), {"low": 0.0, "high": 1.0},
          "is no number, but 'upper'"),
-        (("parameters", "controllers.lift.gain"), {"low": 0.0, "high": 1.0}, "is no number"),
         (("parameters", "outputs.duration"), {"low": 0.1, "high": 0.2},
          "`outputs.duration` has no part in a dataset, whose own duration and sample_interval"),
         (("parameters", "pads.lower.elements_x"), {"low": 1.0, "high": 2.0},

@@ -173,7 +173,6 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan):
             {"bounds": {"F_ff": Bounds(low=-9, high=0, speed=1, after=0.2)}},
             "`F_ff` has no knot after 0.2 s",
         ),
-        ({"bounds": {"z_d": Bounds(low=0, high=1, speed=1)}}, "no Profile called `z_d`"),
         (
             {"bounds": {"x_d": Bounds(low=0, high=1, speed=1, after=-1)}},
             "must have a knot at or before after = -1 s",
