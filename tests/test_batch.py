@@ -146,7 +146,6 @@ def test_a_run_that_fails_leaves_the_others_alone(start):
     assert "pad.E" in str(batch.failures[2]) or "E` must be from 1" in str(batch.failures[2])
     assert batch.mask.sum(1).tolist() == [9, 0, 0]
     batch["theta"][batch.mask].sum().backward()
-    assert E.grad is not None
     assert E.grad.isfinite().all()
     assert E.grad[1] == E.grad[2] == 0.0 != E.grad[0]
 

@@ -187,7 +187,6 @@ def test_other_pads_and_contacts_are_kept_whole(tmp_path, fixed, points, stores)
 def set_value(name: str, where: tuple[Any, ...], value: Any) -> Callable[[Path], None]:
     def change(folder: Path) -> None:
         array = zarr.open_group(str(folder), mode="r+")[name]
-        assert isinstance(array, zarr.Array)
         array[where] = value
 
     return change

@@ -23,7 +23,7 @@ def changed(place: tuple[str | int, ...], value: Any) -> Any:
     tree = copy.deepcopy(SMOKE)
     inner = tree
     for key in place[:-1]:
-        inner = inner[key]  # pyright: ignore[reportArgumentType]
+        inner = inner[key]
     inner[place[-1]] = value
     return tree
 

@@ -64,7 +64,6 @@ def test_the_bounds_of_a_parameter_can_be_asked_for():
     model = SoftGrasp()
     for name in NAMES:
         declared = model.quantity(name)
-        assert declared is not None
         low, high = declared.low, declared.high
         assert low < Parameters().table()[name]["value"] < high < INF
         check(name, Parameters().table()[name]["value"], "here")

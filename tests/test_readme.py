@@ -69,7 +69,7 @@ def commands(page: Path) -> list[str]:
 
 
 def having(content: object) -> list[Path]:
-    return [page for page in PAGES if content(page)]  # pyright: ignore[reportCallIssue]
+    return [page for page in PAGES if content(page)]
 
 
 def name(page: Path) -> str:
@@ -92,7 +92,7 @@ def test_python_runs(page, folder):
     names: dict[str, object] = {}
     exec(code(page), names)
     if page.stem == "running":
-        assert names["s"].sensitivities.shape == (101, 10, 2)  # pyright: ignore[reportAttributeAccessIssue]
+        assert names["s"].sensitivities.shape == (101, 10, 2)
         assert (folder / "rolling.nc").stat().st_size > 0
 
 

@@ -121,7 +121,6 @@ def test_ensembles_give_intervals_and_leave_the_global_generator(motions):
     again = fit(assemble(rough, mechanics(R), recipe), recipe)
     assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
     assert model.intervals == again.intervals
-    assert model.intervals is not None
     for row in model.coefficient_table():
         low, high = row["interval"]
         assert low < row["value"] < high

@@ -79,7 +79,6 @@ def test_a_gain_is_differentiated_and_set_by_its_name():
     t = torch.linspace(0.0, 0.3, 7, dtype=torch.float64)
     how: dict[str, Any] = {"knots": simulate(rig, t, y0=y0).knots}
     by = simulate(rig, t, y0=y0, gradient="forward", wrt=[name], rigid=True, **how)
-    assert by.sensitivities is not None
     ends = []
     for gain in (400.04, 399.96):
         other = controlled().override(**nested(name, gain)).build().rig
@@ -94,7 +93,7 @@ def test_a_gain_is_differentiated_and_set_by_its_name():
 def test_gains_have_units_and_bounds():
     rig = controlled(pushes=["bracket.x", "bracket.y"]).assemble()
     for name, unit in (("gain_1_1", "N/m"), ("gain_2_3", "N.s/m")):
-        assert (found := rig.quantity(f"controllers.jaw.{name}")) is not None
+        found = rig.quantity(f"controllers.jaw.{name}")
         assert (found.unit, found.low) == (unit, -1e12)
 
 

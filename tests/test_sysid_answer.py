@@ -232,7 +232,6 @@ def test_other_files_are_refused_with_a_sentence(path, tmp_path, text):
 @pytest.mark.filterwarnings("ignore:not identifiable")
 def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path):
     mine, its = result.model("second"), load_answer(path).model("second")
-    assert isinstance(its, SoftGrasp)
     for name, value in mine.named_parameters():
         if not name.startswith("reference."):
             assert torch.equal(its.parameter(name), value), name

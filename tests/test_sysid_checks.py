@@ -164,7 +164,6 @@ def made_by(
     other: Recording | None, data: Recording, sensors: dict[str, Sensor] = SENSORS
 ) -> Recording:
     """The samples that another rig would have given, with noise."""
-    assert other is not None
     run, rng = predict(other.begin(), TRUTH, other.grid(False), (), 1e-6), np.random.default_rng(0)
     samples = {}
     for channel, sensor in sensors.items():
@@ -248,8 +247,6 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     as_stated, again = (
         refit(problem, end, one, "linear", lambda chi2: None) for one in (None, law)
     )
-    assert as_stated is not None
-    assert again is not None
     assert as_stated.fit.chi2 > 1e3  # nothing can be done with smooth friction
     assert again.fit.chi2 < 2  # on steps as coarse as those of the checks
     for name, value in TRUTH.items():
@@ -271,7 +268,6 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
         if one.name in ("disc.mass", "pad.nu", "contact.eta", "mesh")
     ]
     found = joint_fit(problem, end, suspects, "linear", lambda chi2: None)
-    assert found is not None
     assert found.left < 1.1 * len(at.r)
     assert found.parts.keys() == {"disc.mass", "pad.nu", "contact.eta"}
     assert max(found.parts, key=lambda name: found.parts[name]) == "disc.mass"
@@ -325,7 +321,6 @@ def test_a_number_is_varied_as_far_as_there_is_a_rig():
         one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "disc.radius"
     )
     other = varied(problem, problem.names, one)
-    assert isinstance(other, Problem)
     radius = next(a for a in other.coordinates.all if a.name == "disc.radius")
     reach = AMOUNTS * one.step / one.nominal
     assert radius.high == pytest.approx((1 + reach) * radius.nominal)
@@ -397,7 +392,6 @@ def test_extensions_are_suspects():
 def test_every_pad_is_meshed_anew_where_it_was():
     data = recorded(excitation=BRIEF)
     other = remeshed(data, 2, 3)
-    assert other is not None
     for name, pad in data.rig.pads.items():
         new = other.rig.pads[name]
         assert (new.mesh.elements_x, new.mesh.elements_y, new.points) == (120, 4, 3)
@@ -447,7 +441,7 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
         calls.append(args)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return difference(*args)  # pyright: ignore[reportArgumentType]
+        return difference(*args)
 
     monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
     problem = Problem([recorded(excitation=BRIEF)], SENSORS, {name: Unknown() for name in TRUTH})

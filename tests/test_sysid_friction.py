@@ -47,7 +47,6 @@ def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftG
 
 def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGrasp]) -> Recording:
     """The same samples, of another rig."""
-    assert isinstance(recording.rig, SoftGrasp)
     return replace(recording, rig=build(recording.rig.settings, recording.rig.reference))
 
 

@@ -177,7 +177,6 @@ refused."""
 
 def opposite(recording: Recording) -> Profile:
     feed = recording.rig.reference["F_ff"]
-    assert isinstance(feed, Profile)
     return Profile(feed.times, -feed.values.detach())
 
 
@@ -321,7 +320,6 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(
 ):
     one = at_rows(recordings["rolling"], 500.0, rates=True)
     x_d = one.rig.reference["x_d"]
-    assert isinstance(x_d, Sampled)
     for factor, words in ((-1.0, "its sign looks opposite"), (1e3, "it is 1e+03 times that")):
         other: Any = Sampled(x_d.times, x_d.values.detach(), factor * x_d.rates)
         (found,) = setpoint_findings(noted(one, x_d=other), SENSORS)
@@ -334,7 +332,6 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(
 def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings):
     one = at_rows(recordings["shaking"], 1000.0, rates=True)
     x_d = one.rig.reference["x_d"]
-    assert isinstance(x_d, Sampled)
     other: Any = Sampled(1.001 * x_d.times, x_d.values.detach(), x_d.rates)
     found = list(setpoint_findings(noted(one, x_d=other), SENSORS))
     assert [f.code for f in found] == ["rate of x_d"]
