@@ -43,7 +43,7 @@ theta_disc.noise = 5e-4
 x_lower.noise = 1e-5
 F_lift.noise = 0.05
 [design]
-iterations = 8
+iterations = 4
 rtol = 1e-3
 limits.x_upper = [-0.03, 0.05]
 [design.candidates]
@@ -90,7 +90,7 @@ def test_the_designed_motion_is_a_rig_file_that_runs(out):
     assert motion.values[0] == 0.0
     assert 0 < max(abs(np.array(motion.values) - [0.0, 0.4, -0.4, 0.0])) < 0.2
     assert max(map(abs, motion.values)) <= 0.5 + 1e-9
-    assert written["made_by"]["iterations"] == 8
+    assert written["made_by"]["iterations"] == 4
     began, *later = [visit["value"] for visit in written["history"]]
     assert min(later) < began
     assert (out / "out" / "design.png").stat().st_size > 10_000
