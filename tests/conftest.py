@@ -7,7 +7,18 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchsoft import Body, Parameters, Reference, Rig, SoftGrasp, hold, press, register_method
+from torchsoft import (
+    Body,
+    Parameters,
+    Reference,
+    Rig,
+    SmoothSlip,
+    SoftContact,
+    SoftGrasp,
+    hold,
+    press,
+    register_method,
+)
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.state import State
 
@@ -44,6 +55,18 @@ def paper_settings(recording: Any) -> Parameters:
     """Of a recording of the paper's rig."""
     assert isinstance(recording.rig, SoftGrasp)
     return recording.rig.settings
+
+
+def nested(name: str, value: Any) -> dict[str, Any]:
+    """A tree with a value by a dotted name, `__` for a dot."""
+    for part in reversed(name.replace("__", ".").split(".")):
+        value = {part: value}
+    return value
+
+
+def dry(**how: Any) -> SoftContact:
+    """A contact with smooth slip."""
+    return SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), **how)
 
 
 def times(end: float, n: int) -> Tensor:

@@ -61,7 +61,6 @@ def assert_power_balanced(start: Start, seed: int, t: float = 0.01) -> None:
     transformer is dual."""
     rig, y, now = start[0], at_random(start, seed).requires_grad_(), f64(t)[0].requires_grad_()
     H = sum(stored(rig, rig.unpack(y, t=now)).values())
-    assert isinstance(H, Tensor)
     by_y, by_t = torch.autograd.grad(H, (y, now), allow_unused=True)
     with torch.no_grad():
         state, rate = rig.unpack(y, t=now), rig(now, y)
@@ -260,7 +259,6 @@ def assert_gradients_exact(
         touch=felt, dy0=torch.cat(
             (torch.zeros(len(y0), len(wanted), dtype=torch.float64), shake[:, None]), -1),
     )  # fmt: skip
-    assert forward.sensitivities is not None
     of_forces = torch.stack([forward.touch_sensitivities[name] for name in felt], 1)
     by_forward = {
         "motion": torch.einsum("ti,tin->n", weights, forward.sensitivities[1:]),

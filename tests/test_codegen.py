@@ -22,9 +22,10 @@ def _call_all(value, linearise, pullback, x, p, w, out, again, J, p_bar):
     call_pullback(pullback, x, p, w, p_bar)
 
 
-def _compiled_results(law, x, p, w):
-    out, again, p_bar = np.empty(law.outputs), np.empty(law.outputs), np.zeros(law.parameters)
-    J = np.empty((law.linear, law.differentiated))
+def _compiled_results(law, x, p, w, start=0.0):
+    """Value, Jacobian, and what the pullback adds to the start."""
+    out, again = np.empty(law.outputs), np.empty(law.outputs)
+    J, p_bar = np.empty((law.linear, law.differentiated)), np.full(law.parameters, start)
     _call_all(law.value, law.linearise, law.pullback, x, p, w, out, again, J, p_bar)
     np.testing.assert_array_equal(out, again)
     return out, J, p_bar
@@ -154,7 +155,7 @@ ELEMENTWISE = {  # of u, any numbers, and v, positive numbers
 }
 OF_ONE = (
     "abs sign sgn sin cos tan atan deg2rad rad2deg tanh sinh cosh exp expm1 erf sigmoid relu "
-    "square reciprocal floor"
+    "square floor"
 )
 ELEMENTWISE |= {
     name: lambda u, v, name=name: getattr(torch, name)(u) * v for name in OF_ONE.split()
@@ -216,11 +217,16 @@ WHOLE = {  # of a (2, 3), b (3, 2), c (3,)
 }
 
 
+KINK = 0.0, 0.5, -0.5, 1.0, -1.0
+"""Places of u at which operations have their kinks."""
+
+
 @pytest.mark.parametrize("name", ELEMENTWISE)
 def test_an_elementwise_operation_equals_torch(name):
     law = lambda x, p: ELEMENTWISE[name](x * p["scale"], 0.1 + x * x)
     parameters = {"scale": torch.tensor([1.0, 0.8, 1.2, -0.9], dtype=torch.float64)}
-    _assert_equal_to_torch(law, _points(4, 8), parameters, value_tolerance=4e-15)
+    points = [*_points(4, 8), *(torch.eye(1, 4)[0].double() * kink for kink in KINK)]
+    _assert_equal_to_torch(law, points, parameters, value_tolerance=4e-15)
 
 
 @pytest.mark.parametrize("name", WHOLE)
@@ -278,22 +284,11 @@ def test_a_place_outside_a_table_is_its_first(place):
 
 
 KINKS = {
-    "abs": lambda x: x.abs(),
-    "sign": lambda x: x.sign(),
-    "relu": lambda x: x.relu(),
-    "leaky_relu": lambda x: F.leaky_relu(x, 0.2),
-    "elu": lambda x: F.elu(x, 0.6),
-    "clamp": lambda x: x.clamp(0.0, 1.0),
-    "clamp_min": lambda x: x.clamp(min=0),
-    "hardtanh": lambda x: F.hardtanh(x, 0.0, 1.0),
-    "maximum": lambda x: torch.maximum(x, 2 * x),
     "minimum": lambda x: torch.minimum(x, 2 * x),
     "norm": lambda x: x.norm() * torch.ones(2, dtype=torch.float64),
     "atan2": lambda x: torch.atan2(x, x * 2),
     "square": lambda x: x**2 + x**1.5,
     "prod": lambda x: x * x.prod() + x.prod(),
-    "where": lambda x: torch.where(x > 0, x, 3 * x),
-    "floor": lambda x: x.floor() * x,
     "power of zero": lambda x: x.pow(torch.tensor([0.0, 2.0]).double()) + (x + 1).pow(x),
 }
 
@@ -336,9 +331,8 @@ def test_an_output_of_zero_weight_leaves_no_trace_in_the_pullback():
     assert p_bar[0] == 0.0
 
 
-def test_detach_passes_the_value_and_stops_the_derivative():
-    law = lambda x, p: x.detach() * x + (p["a"] * x).detach() + p["a"].detach() * p["a"]
-    _assert_equal_to_torch(law, _points(3), _numbers(a=0.4))
+def _detached(x, p):
+    return x.detach() * x + (p["a"] * x).detach() + p["a"].detach() * p["a"]
 
 
 def _under_no_grad(x, p):
@@ -357,7 +351,7 @@ def _by_a_slope(x, p):
     return slope * x
 
 
-@pytest.mark.parametrize("law", [_under_no_grad, _by_a_slope])
+@pytest.mark.parametrize("law", [_detached, _under_no_grad, _by_a_slope])
 def test_where_torch_records_no_derivative_a_law_has_none(law):
     _assert_equal_to_torch(law, _points(3), _numbers(a=0.4))
 
@@ -365,16 +359,10 @@ def test_where_torch_records_no_derivative_a_law_has_none(law):
 def test_leading_outputs_and_inputs_are_chosen_and_the_pullback_accumulates():
     law = lambda x, p: torch.cat([x * p["a"], x**2])
     compiled = compile_law(law, _points(3)[0], _numbers(a=2.0), linear=2, differentiated=1)
-    x, p, p_bar, J = np.array([1.0, 2.0, 3.0]), np.array([2.0]), np.array([10.0]), np.empty((2, 1))
-    _call_all(
-        *_addresses(compiled), x, p, np.array([1.0, 10.0]), np.empty(6), np.empty(6), J, p_bar
-    )
+    x, w = np.array([1.0, 2.0, 3.0]), np.array([1.0, 10.0])
+    _, J, p_bar = _compiled_results(compiled, x, np.array([2.0]), w, start=10.0)
     np.testing.assert_array_equal(J, [[2.0], [0.0]])
     assert p_bar[0] == 10 + 1 + 20
-
-
-def _addresses(law):
-    return law.value, law.linearise, law.pullback
 
 
 def test_laws_without_parameters_or_inputs_or_outputs_work():
@@ -384,12 +372,6 @@ def test_laws_without_parameters_or_inputs_or_outputs_work():
     out, J, p_bar = _compiled_results(empty, np.zeros(0), np.array([3.0]), np.array([2.0]))
     assert (out[0], J.shape, p_bar[0]) == (3.0, (1, 0), 2.0)
     assert compile_law(lambda x, p: x[:0], torch.ones(2).double(), {}).outputs == 0
-
-
-def _in_place(x, p):
-    y = torch.zeros(2, dtype=torch.float64)
-    y[0] = x[0]
-    return y
 
 
 class _Straight(torch.autograd.Function):
@@ -421,9 +403,7 @@ REFUSED = {
     "copy": (lambda x, p: torch.tensor([x[0], x[1]], dtype=torch.float64), "tensor"),
     "mask": (lambda x, p: x[x > 0], r"places that depend on values"),
     "in-place": (lambda x, p: x.clone().add_(1), "in-place operation aten.add_"),
-    "write": (_in_place, "in-place operation aten.copy_"),
     "float32": (lambda x, p: x.to(torch.float32).double(), "float32"),
-    "int32": (lambda x, p: x * (x > 0).sum().to(torch.int32), "int32"),
     "bits": (lambda x, p: x * (x.argmin() & 1), "bitwise_and"),
     "whole quotient": (lambda x, p: x * (x.argmin() // 2), "floor_divide"),
     "place": (

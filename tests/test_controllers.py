@@ -5,15 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from test_rig_parts import coarse_tree
 from torch import nn
 
-from torchsoft import (
-    StateFeedback,
-)
+from torchsoft import StateFeedback
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
-from torchsoft.rigs.written import template, to_toml
+from torchsoft.rigs.written import to_toml
 
 KP, KD = 1.2e5, 440.0
 
@@ -26,10 +25,7 @@ def test_coordinates_without_set_points_are_regulated():
 
 def file(**changes: Any) -> RigFile:
     """The ready template, coarse, with one controller in the place of its loops."""
-    tree = template("t").model_dump(exclude_unset=True)
-    tree["pads"] = {
-        name: pad | {"elements_x": 40, "elements_y": 2} for name, pad in tree["pads"].items()
-    }
+    tree = coarse_tree()
     tree["actuators"] = {"press": {"pushes": "bracket.y", "feed_forward": "press"}}
     tree["controllers"] = {
         "jaw": {
@@ -48,10 +44,7 @@ def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path):
     read = RigFile.from_toml(tmp_path / "rig.toml")
     assert read.model_dump() == asked.model_dump()
     assert [str(one) for one in check(read) if one.severity != "note"] == []
-    loops = template("t").override(
-        pads={name: {"elements_x": 40, "elements_y": 2} for name in ("lower", "upper")},
-        outputs={"duration": 0.6, "interval": 0.02},
-    )
+    loops = RigFile.from_tree(coarse_tree() | {"outputs": {"duration": 0.6, "interval": 0.02}})
     runs = [running.carry_out(one).trajectory for one in (read, loops)]
     assert "F_jaw_bracket_x" in runs[0].units
     for name in ("x_disc", "theta_disc", "y_bracket"):

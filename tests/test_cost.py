@@ -3,11 +3,11 @@ right order."""
 
 import re
 import time
-import tomllib
 from pathlib import Path
 from unittest import mock
 
 import pytest
+from test_datasets_config import SMOKE
 
 from torchsoft import PadMesh, Parameters, SoftGrasp
 from torchsoft.cli import main
@@ -18,9 +18,6 @@ from torchsoft.physics.mesh import unit_compliance
 from torchsoft.rigs.run import condensing_time
 from torchsoft.rigs.written import template, to_toml
 
-SMOKE = tomllib.loads(
-    (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
-)
 CHEAP, LONG, LARGE = Cost(1e4, 60.0, 0.1), Cost(1e9, 2e5, 0.1), Cost(1e4, 60.0, 1e6)
 
 

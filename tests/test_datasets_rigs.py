@@ -1,7 +1,6 @@
 """Datasets of rig files: any number of their tables is drawn, by its name, and all that holds for
 the paper's rig holds for them."""
 
-import copy
 import re
 import tomllib
 from pathlib import Path
@@ -128,11 +127,17 @@ def made(tmp_path_factory):
 
 
 def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a store, the manifest included."""
     return {
-        str(path.relative_to(folder)): re.sub(rb'"(commit|digest)": "\w*"', b"", path.read_bytes())
+        str(path.relative_to(folder)): same_commit(path.read_bytes())
         for path in folder.rglob("*")
         if path.is_file()
     }
+
+
+def same_commit(data: bytes) -> bytes:
+    """Without the commit, and so the digest: the repository may move on during a test."""
+    return re.sub(rb'"(commit|digest)": "\w*"', b"", data)
 
 
 def sound(url: Path) -> bool:
@@ -202,7 +207,7 @@ def test_it_is_sound_and_resumes_to_the_same_bytes_without_the_rig_file(made, tm
     again = Config.model_validate(Manifest.read(str(folder)).config)
     assert again.hash == config.hash
     with local_workers(2) as executor:
-        generate(again, str(tmp_path / "set"), executor, 2, progress=False)
+        generate(again, (tmp_path / "set").as_uri(), executor, 2, progress=False)
     assert contents(tmp_path / "set") == contents(folder)
     (tmp_path / "set" / "finished" / "1.sha256").unlink()
     (tmp_path / "set" / "x_disc" / "c" / "1" / "0").write_bytes(b"half")
@@ -257,8 +262,6 @@ def tree(folder: Path) -> Any:
         (("parameters", "materials.silicone.E"), {"low": 1.0, "high": 2.0},
          r"parameters.materials.silicone.E: `materials.silicone.E` is not in the rig file: "
          "materials has rubber"),
-        (("parameters", "materials.rubber.Young"), {"low": 1.0, "high": 2.0},
-         "materials.rubber has kind, E, nu"),
         (("parameters", "motion.y_d.values.7"), {"low": 1.0, "high": 2.0},
          "motion.y_d.values has 0, 1"),
         (("parameters", "materials.rubber.nu"), {"low": 0.3, "high": 0.7},
@@ -269,14 +272,10 @@ def tree(folder: Path) -> Any:
          "mass.choices: Tuple should have at least 1"),
         (("parameters", "bodies.disc.mass"), {"mean": 0.4},
          "parameters.bodies.disc.mass.sd is missing"),
-        (("parameters", "bodies.disc.mass"), {"mean": 0.4, "sd": 0.0},
-         "sd should be greater than 0"),
         (("parameters", "bodies.disc.mass"), {"mean": 0.4, "sd": 0.01, "low": 0.5},
          "low = 0.5 should be below high = 0.44"),
         (("parameters", "bodies.disc.mass"), {"mean": 0.4, "sd": 0.01, "low": 1.5, "high": 1.6},
          "next to nothing of mean = 0.4"),
-        (("parameters", "bodies.disc.mass"), {"low": "a", "high": 1.0},
-         "parameters.bodies.disc.mass.low should be a valid number, not 'a'"),
         (("parameters", "laws.dry.friction.mu_k"), {"low": 0.75, "high": 0.9},
          r"mu_k.high = 0.9: impossible: laws.dry.friction: mu_k must not exceed mu_s"),
         (("parameters", "laws.dry.friction.mu_k", "ratio_to"), "laws.dry.friction.mu",
@@ -292,7 +291,6 @@ def tree(folder: Path) -> Any:
          "bodies.disc.theta.low = 0: it changes the coordinates and energies of the rig"),
         (("parameters", "contacts.above.pad"), {"low": 0.0, "high": 1.0},
          "is no number, but 'upper'"),
-        (("parameters", "controllers.lift.gain"), {"low": 0.0, "high": 1.0}, "is no number"),
         (("parameters", "outputs.duration"), {"low": 0.1, "high": 0.2},
          "`outputs.duration` has no part in a dataset, whose own duration and sample_interval"),
         (("parameters", "pads.lower.elements_x"), {"low": 1.0, "high": 2.0},
@@ -309,12 +307,10 @@ def tree(folder: Path) -> Any:
         (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
         (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),
         (("rig", "bodies", "disc", "symbol"), "disc/1", "cannot be the name of an array"),
-        (("rig",), 3, "rig should be a table, not 3"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_by_its_name(tmp_path, place, value, message):
-    config = copy.deepcopy(tree(tmp_path))
-    inner = config
+    inner = config = tree(tmp_path)
     for key in place[:-1]:
         inner = inner[key]
     inner[place[-1]] = value
@@ -330,17 +326,6 @@ def test_names_that_two_arrays_would_have_are_refused(tmp_path):
     config["rig"]["actuators"]["x"]["setpoint"] = "steps"
     with pytest.raises(InvalidTable, match="two arrays of the dataset would be called `steps`"):
         Config.model_validate(config)
-
-
-def test_fields_of_a_rig_file_need_one():
-    paper = tomllib.loads(
-        (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
-    )
-    with pytest.raises(InvalidTable, match=r"channels is of a rig file, and there is none"):
-        Config.model_validate(paper | {"channels": ["x_C"]})
-    paper["parameters"]["pad.E"]["ratio_to"] = "pad.nu"
-    with pytest.raises(InvalidTable, match=r"parameters.pad.E.ratio_to is of a rig file"):
-        Config.model_validate(paper)
 
 
 def test_normal_and_chosen_numbers_have_their_distributions():

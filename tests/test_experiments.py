@@ -1,9 +1,9 @@
 """Every experiment at smoke size, and the number it stands for."""
 
-import importlib.util
 import json
 import math
 import sys
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from types import ModuleType
@@ -22,13 +22,8 @@ sys.path[:0] = map(str, FOLDERS)  # as for a script; modules of an experiment li
 
 def experiment(name: str) -> ModuleType:
     """The experiment's file as a module; the folder is not a package."""
-    (path,) = (folder / f"{name}.py" for folder in FOLDERS if (folder / f"{name}.py").exists())
-    spec = importlib.util.spec_from_file_location(f"experiment_{name}", path)
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
+    module = import_module(name)
+    assert Path(str(module.__file__)).parent in FOLDERS
     return module
 
 

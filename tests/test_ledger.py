@@ -41,7 +41,7 @@ def test_hard_motions_pass_at_the_default_step_and_at_what_is_advised(name):
     begun.rig.reference = towards(begun.rig, Profile([0.6, 0.7, 0.8], [0.06, 0.08, 0.06]))
     (text,) = told(begun.rig, t=t, y0=begun.y0, step=0.05)
     assert "the energies of the run do not balance" in text
-    advised = float(re.search(r"try steps of (\S+) s", text)[1])  # pyright: ignore[reportOptionalSubscript]
+    advised = float(re.search(r"try steps of (\S+) s", text)[1])
     assert told(begun.rig, t=t, y0=begun.y0, step=advised) == []
 
 

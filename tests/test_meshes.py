@@ -30,7 +30,7 @@ from torchsoft import (
     PadMesh,
     QuadMesh,
 )
-from torchsoft.physics.mesh import Array, Mesh, banded, lame_moduli
+from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 
 ROUNDING = 1e-12
 """Relative to the largest entry: two assemblies of the same integrals, in another order of
@@ -304,16 +304,6 @@ def test_work_converges_with_the_square_of_the_spacing(make, pressure, nu, bound
     low, high = (1.7, np.inf) if pressure is ON_TIP else (1.9, 2.2)
     assert np.all((low < order) & (order < high))
     assert errors[-1] < bound
-
-
-def test_banded_storage_holds_the_whole_matrix():
-    mesh = PadMesh(0.02, 4e-3, 7, 3, bonded_sides=True)
-    lame_lambda, lame_mu = lame_moduli(1.0, 0.4)
-    K = mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1])
-    ab = banded(K)
-    n = ab.shape[1]
-    lower = sum(np.diag(ab[k, : n - k], -k) for k in range(len(ab)))
-    assert np.abs(lower + np.tril(lower, -1).T - K).max() < ROUNDING * np.abs(K).max()
 
 
 # --- files

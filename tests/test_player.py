@@ -47,7 +47,7 @@ def test_the_file_holds_everything(run, tmp_path):
     """And asks for nothing: no address, no module, no other file."""
     run.animate(tmp_path / "run.html", frames=20, title="</script><script>alert(1)</script>")
     text = (tmp_path / "run.html").read_text(encoding="utf-8")
-    data = json.loads(re.search(r"const data = (\{.*\});\n", text)[1])  # pyright: ignore[reportOptionalSubscript]
+    data = json.loads(re.search(r"const data = (\{.*\});\n", text)[1])
     shell = text.replace(json.dumps(data), "")
     assert text.count("</script>") == 1
     assert not re.search(r"https?://|src=|import |fetch\(|XMLHttp|@import|url\(", shell)
@@ -137,7 +137,7 @@ def test_an_element_tells_its_stress(page, run):
     page.act({"type": "pointerMove", "x": round(x), "y": round(y), "origin": "viewport"})
     tip = page.run("return document.getElementById('tip').textContent")
     assert f"pad L, element {element}" in tip
-    pressure = float(re.search(r"pressure\s+([-\d.e]+) kPa", tip)[1])  # pyright: ignore[reportOptionalSubscript]
+    pressure = float(re.search(r"pressure\s+([-\d.e]+) kPa", tip)[1])
     assert pressure == pytest.approx(-1e-3 * stress[element, :3].mean(), rel=1e-3, abs=0.01)
     page.run("document.getElementById('fit').click()")
 

@@ -23,6 +23,7 @@ PAGES = [
 ]
 SHORTER = {
     "torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 101",
+    '["light shaking"], nominal': '["light shaking"].model_copy(update={"duration": 0.9}), nominal',
     'theta"][1000]': 'theta"][50]',
     "x[1000]": "x[100]",
     "[500, :": "[50, :",
@@ -68,7 +69,7 @@ def commands(page: Path) -> list[str]:
 
 
 def having(content: object) -> list[Path]:
-    return [page for page in PAGES if content(page)]  # pyright: ignore[reportCallIssue]
+    return [page for page in PAGES if content(page)]
 
 
 def name(page: Path) -> str:
@@ -91,7 +92,7 @@ def test_python_runs(page, folder):
     names: dict[str, object] = {}
     exec(code(page), names)
     if page.stem == "running":
-        assert names["s"].sensitivities.shape == (101, 10, 2)  # pyright: ignore[reportAttributeAccessIssue]
+        assert names["s"].sensitivities.shape == (101, 10, 2)
         assert (folder / "rolling.nc").stat().st_size > 0
 
 

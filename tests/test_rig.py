@@ -2,51 +2,19 @@
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, random_state, turning
+from conftest import coarse, f64, grasped, turning
 
 from torchsoft import (
-    PD,
-    Actuator,
     Body,
     Circle,
-    Contact,
     Ellipse,
-    KelvinVoigt,
-    Pad,
-    PadMesh,
     Rig,
     RoundedBox,
-    SmoothSlip,
-    SoftContact,
     SoftGrasp,
     hold,
 )  # fmt: skip
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import NAMES
-
-
-def test_a_rig_of_lists_is_the_papers():
-    """The same parts put together by hand have the same right-hand side."""
-    model, p = coarse(), coarse().settings
-    rubber = KelvinVoigt(p.pad.E, p.pad.nu, p.pad.rho, p.pad.tau, p.pad.depth)
-    c, k = p.contact, p.control
-    law = SoftContact(c.K_n, c.R_n, c.K_t, c.R_t, friction=SmoothSlip(c.mu_s, c.mu_k, c.v_s, c.eta))
-    mesh = PadMesh(p.pad.length, p.pad.height, p.pad.elements_x, p.pad.elements_y)
-    rig = Rig(
-        bodies={"disc": Body(p.disc.mass, Circle(p.disc.radius)),
-        "bracket": Body(p.bracket.mass, theta=0.0, weighted=False)}, pads={"L": Pad(mesh, rubber),
-              "U": Pad(mesh, rubber, base="bracket",
-              origin=(-p.pad.length / 2, -p.bracket.cm_height), mirrored=True)},
-        contacts={"U": Contact("U", "disc", law), "L": Contact("L", "disc", law)},
-        actuators={"x": Actuator("disc.x", "bracket.x", PD(k.K_81, k.R_80), setpoint="x_d"),
-                   "y": Actuator("bracket.y", "bracket.y", PD(k.K_98, k.R_99), setpoint="y_d",
-                   feed_forward="F_ff")},
-        reference=model.reference,
-    )  # fmt: skip
-    y = random_state(model, 4)
-    with torch.no_grad():
-        assert torch.equal(rig(0.0, y), model(0.0, y))
-
 
 # names
 # ----------------------------------------------------------------------

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from conftest import coarse, f64, turning
+from conftest import RUBBER, coarse, dry, f64, turning
 from torch import Tensor
 
 from torchsoft import (
@@ -16,12 +16,10 @@ from torchsoft import (
     Pad,
     PadMesh,
     Rig,
-    SoftContact,
     SoftGrasp,
     press,
 )
 from torchsoft.paper.rig import NAMES
-from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import settled
@@ -133,12 +131,7 @@ def test_the_same_bits_come_again_from_other_threads_too():
 
 def test_two_bodies_on_one_pad_and_a_chain_of_branches():
     """Every branch carries the contacts' forces, and a body feels the dent of its neighbour."""
-    rubber = StandardLinearSolid(
-        E=7.5e5, E_instant=1.5e6, nu=0.45, rho=1100.0, tau=0.01, depth=0.044
-    )
-    law = SoftContact(
-        1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), node_spacing=2e-3
-    )
+    rubber, law = StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.01), dry(node_spacing=2e-3)
     rig = Rig(
         bodies={name: Body(0.4, Circle(0.01)) for name in "ab"},
         pads={"P": Pad(PadMesh(0.12, 4.59e-3, 60, 2), rubber)},
@@ -165,21 +158,17 @@ def test_refusals():
     state = shaken(model)
     with pytest.raises(NotImplementedError, match="inertial"):
         around(coarse(pad__fidelity="inertial"), state)
-    with pytest.raises(
-        ValueError, match=r"`pose` must be given by the names \['disc', 'bracket'\]"
-    ):
-        settled(model, {"disc": state.pose["disc"]}, state.velocity, state.stretch)
-    with pytest.raises(ValueError, match="61 finite numbers"):
-        settled(
-            model,
-            state.pose,
-            state.velocity,
-            state.stretch | {"L": torch.full((61,), torch.nan).double()},
-        )
-    with pytest.raises(ValueError, match="3 finite numbers"):
-        settled(model, state.pose | {"disc": f64(0.0, 0.0)}, state.velocity, state.stretch)
+    unknown = state.stretch | {"L": torch.full((61,), torch.nan).double()}
+    far = {name: torch.full_like(s, 1e-3) for name, s in state.stretch.items()}
+    away = state.pose | {"disc": f64(0.06, 0.01, 0.0)}
+    for changed, kind, message in (
+        ({"pose": {"disc": state.pose["disc"]}}, ValueError,
+         r"`pose` must be given by the names \['disc', 'bracket'\]"),
+        ({"stretch": unknown}, ValueError, "61 finite numbers"),
+        ({"pose": state.pose | {"disc": f64(0.0, 0.0)}}, ValueError, "3 finite numbers"),
+        ({"pose": away, "stretch": far}, NoEquilibrium, "`L` does not settle"),
+    ):  # fmt: skip
+        with pytest.raises(kind, match=message):
+            around(model, state._replace(**changed))
     with torch.inference_mode(), pytest.raises(ValueError, match="inference_mode"):
         around(model, state)
-    far = {name: torch.full_like(s, 1e-3) for name, s in state.stretch.items()}
-    with pytest.raises(NoEquilibrium, match="`L` does not settle"):
-        settled(model, state.pose | {"disc": f64(0.06, 0.01, 0.0)}, state.velocity, far)

@@ -30,7 +30,7 @@ T = times(0.02, 11)
 
 def rolled(model: SoftGrasp, **options: object):
     """A short run from the grasp, the disc moving."""
-    return simulate(model, T, y0=grasped(model, (0.05, 0.0)), step=2e-3, **options)  # pyright: ignore[reportArgumentType]
+    return simulate(model, T, y0=grasped(model, (0.05, 0.0)), step=2e-3, **options)
 
 
 # what runs is what is saved
@@ -118,7 +118,7 @@ class Simulated(nn.Module):
     def forward(self, y0: Tensor) -> Tensor:
         return simulate(self.model, T, y0=y0, step=2e-3, gradient="discrete", **self.options)[
             "theta"
-        ][-1]  # pyright: ignore
+        ][-1]
 
 
 def test_gradients_reach_the_tensors_of_a_functional_call():
@@ -160,7 +160,7 @@ def test_parametrized_parameters_get_their_gradients(owner, name):
     parametrize.register_parametrization(owner(logarithmic), name, Exp())
     value = getattr(owner(plain), name)
     (expected,) = torch.autograd.grad(Simulated(plain)(y0), value)
-    log = owner(logarithmic).parametrizations[name].original  # pyright: ignore
+    log = owner(logarithmic).parametrizations[name].original
     (got,) = torch.autograd.grad(Simulated(logarithmic)(y0), log)
     assert float(expected) != 0
     assert float(got) == pytest.approx(float(expected * value.detach()), rel=1e-8)
@@ -233,7 +233,7 @@ def test_what_is_saved_is_what_ran():
     said = lambda: simulate(model, T, y0=y0).made_by
     parametrize.register_parametrization(model.contact, "K_t", Exp())
     with torch.no_grad():
-        model.contact.parametrizations.K_t.original.add_(0.1)  # pyright: ignore
+        model.contact.parametrizations.K_t.original.add_(0.1)
     assert said()["parameters"]["contact.K_t"] == model.contact.K_t.item() != 1.2e5
     model.load_state_dict(other.state_dict(), strict=False)
     assert said()["parameters"]["contact.K_n"] == 2e5
@@ -281,7 +281,7 @@ def made_and_run() -> list[Tensor]:
         *run.channels.values(),
         *run.energy.values(),
     ]
-    return [*parts, *gradients, forward.sensitivities]  # pyright: ignore[reportReturnType]
+    return [*parts, *gradients, forward.sensitivities]
 
 
 @pytest.fixture(scope="module")

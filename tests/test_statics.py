@@ -73,11 +73,6 @@ def test_force_and_contact_grow_with_compression(result):
         assert float(curve.compression[-1]) == pytest.approx(1.5e-3, abs=1e-15)
 
 
-def test_half_width_is_interpolated_between_nodes(statics):
-    x = torch.linspace(-5, 5, 11, dtype=torch.float64)
-    assert float(statics.half_width(x, 2.3 - x.abs())) == pytest.approx(2.3, rel=1e-14)
-
-
 def test_files(statics, result):
     numbers = json.loads(json.dumps(statics.summary(result), allow_nan=False))
     same = numbers["mesh"]["full_grasp"]["120 x 4"], numbers["penalty"]["full_grasp"]["1"]

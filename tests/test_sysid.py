@@ -2,7 +2,7 @@
 resuming."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +15,7 @@ from conftest import COARSE
 from torchsoft import Parameters, Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.sysid import (
+    RIG,
     Problem,
     Recording,
     Sensor,
@@ -39,16 +40,7 @@ BASE = Parameters().override(COARSE)
 RTOL = 1e-4
 TRUSTED: dict[str, Any] = {"assumptions": "trusted"}
 """Nothing but the fit."""
-NOISE = {
-    "x_C": 1e-5,
-    "y_C": 1e-5,
-    "theta": 5e-4,
-    "x_Br": 1e-5,
-    "y_Br": 1e-5,
-    "F_x": 0.1,
-    "F_y": 0.1,
-}
-SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
+SENSORS = RIG
 GRASP: dict[str, Any] = {"grasp_time": 0.2, "settle": 0.05, "senses": "bracket"}
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.65, **GRASP)
 SHAKE = Excitation(
@@ -99,14 +91,16 @@ def check_derivatives(
     near: float,
     h: float = 1e-5,
     adjoint: float = 1e-8,
+    only: Sequence[str] = (),
 ) -> None:
-    """Columns of the Jacobian against central differences, of `near` [1]; the gradient of the
-    adjoint against the Jacobian's. A larger h [1] passes kinks of contact."""
+    """Columns of the Jacobian, or only some of them, against central differences, of `near` [1];
+    the gradient of the adjoint against the Jacobian's. A larger h [1] passes kinks of contact."""
     free, which, runner = problem.coordinates.free, problem.names, Runner(problem.recordings)
     chosen, steps = problem.freeze(runner, x, which, rtol)
     at = problem.residuals(runner, x, which, steps, free)
     assert np.abs(at.r - chosen.r).max() < 1e-6
-    for i, label in enumerate(problem.coordinates.labels):
+    for label in only or problem.coordinates.labels:
+        i = problem.coordinates.labels.index(label)
         ahead, behind = (
             problem.residuals(runner, x + s * h * np.eye(len(x))[i], which, steps).r
             for s in (1, -1)
@@ -121,14 +115,16 @@ def check_derivatives(
     )
 
 
+SHORT = Excitation(
+    motion=Strokes(travel=8e-3, stroke_time=0.1), duration=0.25, grasp_time=0.1, settle=0.0
+)
+
+
 @pytest.mark.parametrize("fidelity", ["massless", pytest.param("inertial", marks=pytest.mark.slow)])
 def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity):
     """The starting displacements are held, also where a pad's elasticity changes."""
     p = BASE.override({"pad.fidelity": fidelity})
-    short = Excitation(
-        motion=Strokes(travel=8e-3, stroke_time=0.1), duration=0.25, grasp_time=0.1, settle=0.0
-    )
-    data = record("short", begin(short, p), {"pad.E": 0.9e6}, SENSORS)
+    data = record("short", begin(SHORT, p), {"pad.E": 0.9e6}, SENSORS)
     unknowns = {"pad.E": Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), "pad.tau": Unknown()}
     problem = Problem([data], SENSORS, unknowns)
     check_derivatives(problem, problem.coordinates.start, RTOL, 1e-5, h=3e-6)
@@ -141,7 +137,6 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes, shak
         e = answer[name]
         assert e.identifiable
         assert e.value == pytest.approx(TRUTH[name], rel=1e-3)
-        assert e.ci95 is not None
         assert e.ci95[0] < TRUTH[name] < e.ci95[1]
     assert answer.converged
     assert answer.chi2 < 1e-3
@@ -188,7 +183,6 @@ def test_what_the_data_do_not_determine_is_not_a_number():
     assert mu_k.value is None
     assert mu_k.ci95 is None
     assert E.identifiable
-    assert E.ci95 is not None
     assert E.ci95[0] < BASE.pad.E < E.ci95[1]
     assert any("contact.mu_k" in notice for notice in answer.notices)
     assert not answer.directions[-1].identifiable
@@ -347,7 +341,6 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes):
             lambda: problem(sensors={"omega": Sensor(noise=1.0)}),
             "samples of `omega`",
         ),
-        (lambda: problem(unknowns={}), "nothing to identify"),
         (lambda: problem(unknowns={"pad.E": Unknown(fixed=True)}), "nothing to identify"),
         (lambda: problem(unknowns={"pad.length": Unknown()}), "`pad.length` cannot be identified"),
         (lambda: identify(problem(), heldout=["strokes"]), "`heldout`"),
@@ -373,7 +366,7 @@ def test_data_out_of_reach_name_the_recording():
         identify(problem, plan=[Stage("all", ("strokes",), ("pad.E",), 1e-3)])
 
 
-def test_a_plan_ends_where_a_finer_stage_cannot_begin(strokes, monkeypatch):
+def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
     """The fit is kept, says so, and is tested on its own steps."""
     freeze, first = Problem.freeze, iter([True])
 
@@ -383,7 +376,8 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(strokes, monkeypatch):
         return at._replace(lost=lost), steps
 
     monkeypatch.setattr(Problem, "freeze", failing)
-    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=0.8e6)})
+    data = record("strokes", begin(SHORT, BASE), {"pad.E": TRUTH["pad.E"]}, SENSORS, noise=0.0)
+    problem = Problem([data], SENSORS, {"pad.E": Unknown(nominal=0.8e6)})
     plan = [Stage(f"by {rtol}", ("strokes",), ("pad.E",), rtol) for rtol in (1e-3, 1e-4)]
     answer = identify(problem, plan=plan)
     assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.05)
@@ -406,19 +400,11 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(strokes, monkeypatch):
     [
         ({"loss": "huber", "method": "lbfgs"},
          "^the method 'lbfgs' has no robust loss: for loss = 'huber' take"),
-        ({"loss": "cauchy", "method": "adam"}, "^the method 'adam' has no robust loss"),
-        ({"loss": "Huber"}, "^loss should be 'linear', .* or 'arctan', not 'Huber'"),
-        ({"method": "LBFGS"}, "^method should be 'gauss_newton', 'lbfgs' or 'adam', not 'LBFGS'"),
         ({"assumptions": "check"}, "^assumptions should be 'checked', 'explained' or 'trusted', "
                                    "not 'check'"),
-        ({"seed": -1}, "^seed should be greater than or equal to 0, not -1"),
-        ({"rtol": "1e-5"}, "^rtol should be a valid number, not '1e-5'"),
         ({"rtol": float("nan")}, "^rtol should be a finite number, not nan"),
-        ({"workers": 1.5}, "^workers should be a valid integer, not 1.5"),
-        ({"tightenings": -1}, "^tightenings should be greater than or equal to 0, not -1"),
         ({"starts": 0}, "^starts should be greater than or equal to 1, not 0"),
         ({"starts": 3, "plan": []}, "^`starts` and `rtol` are those of the default plan"),
-        ({"rtol": 1e-7, "plan": []}, "^`starts` and `rtol` are those of the default plan"),
     ],
 )  # fmt: skip
 def test_what_a_fit_cannot_honour_is_refused_before_it(strokes, how, message):
@@ -430,13 +416,12 @@ def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes):
     problem = Problem(
         [strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known()
     )
-    stage = Stage("all", ("strokes",), ("pad.E",), 1e-3, starts=4)
+    stage = Stage("all", ("strokes",), ("pad.E",), 1e-3, starts=3)
     free = np.array([c.name == "pad.E" for c in problem.coordinates.all])
     points = sobol(problem, problem.coordinates.start, free, stage, 0)
     low, high = problem.coordinates.bounds
-    assert len(points) == 3
+    assert len({p.tobytes() for p in points}) == len(points) == 2
     assert all((low <= p).all() and (p <= high).all() for p in points)
-    assert len({p.tobytes() for p in points}) == 3
     answer = identify(problem, plan=[stage], **TRUSTED)
     assert answer["pad.E"].last == pytest.approx(TRUTH["pad.E"], rel=0.05)
 
@@ -497,5 +482,3 @@ def test_a_sampled_set_point_follows_the_profile_it_was_taken_from():
         slope = (sampled(between[1:-1] + step)[0] - sampled(between[1:-1] - step)[0]) / (2 * step)
         assert float((slope - got_rate[1:-1]).abs().max()) < 1e-6
     assert float(sampled(torch.tensor([5.0], dtype=torch.float64))[0]) == pytest.approx(-5e-3)
-    with pytest.raises(ValueError, match="`rates`"):
-        Sampled([0.0, 1.0], [0.0, 1.0], [0.0])

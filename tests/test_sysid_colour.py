@@ -24,7 +24,7 @@ STAGE = Stage("all", ("strokes",), ("pad.E", "pad.tau"), 1e-4)
 
 
 def sensors(colour: str = "white") -> dict[str, Sensor]:
-    return {channel: Sensor(noise=noise, colour=colour) for channel, noise in NOISE.items()}  # pyright: ignore[reportArgumentType]
+    return {channel: Sensor(noise=noise, colour=colour) for channel, noise in NOISE.items()}
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 should be recorded next."""
 
 from dataclasses import replace
+from itertools import cycle, repeat
 from typing import Any
 
 import numpy as np
@@ -76,10 +77,8 @@ def test_for_one_parameter_the_criteria_are_one():
     assert values == pytest.approx([np.log(0.2)] * 3)
 
 
-@pytest.mark.parametrize(
-    ("sensors", "rel"), [({}, 1e-3), ({"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}, 1e-3)]
-)
-def test_slopes_are_those_of_differences(plan, sensors, rel, monkeypatch):
+@pytest.mark.parametrize("sensors", [{}, {"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}])
+def test_slopes_are_those_of_differences(plan, sensors, monkeypatch):
     """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted
     beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
@@ -95,7 +94,7 @@ def test_slopes_are_those_of_differences(plan, sensors, rel, monkeypatch):
     assert at.peaks["F_y"] > 1
     ahead, behind = (one.evaluate(z + s * h * direction, x, at.steps) for s in (1, -1))
     wanted = (ahead.value + ahead.cost - behind.value - behind.cost) / (2 * h)
-    assert slopes @ direction == pytest.approx(wanted, rel=rel)
+    assert slopes @ direction == pytest.approx(wanted, rel=1e-3)
 
 
 def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
@@ -174,7 +173,6 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan):
             {"bounds": {"F_ff": Bounds(low=-9, high=0, speed=1, after=0.2)}},
             "`F_ff` has no knot after 0.2 s",
         ),
-        ({"bounds": {"z_d": Bounds(low=0, high=1, speed=1)}}, "no Profile called `z_d`"),
         (
             {"bounds": {"x_d": Bounds(low=0, high=1, speed=1, after=-1)}},
             "must have a knot at or before after = -1 s",
@@ -194,11 +192,6 @@ def test_what_does_not_fit_is_refused(problem, changes, message):
     given: dict[str, Any] = {"plan": "plan", "bounds": BOUNDS} | changes
     with pytest.raises(ValueError, match=message):
         design(problem, **given)
-
-
-def test_bounds_are_checked():
-    with pytest.raises(ValueError, match="low = 1 must be below high = 0"):
-        Bounds(low=1, high=0, speed=1)
 
 
 @pytest.fixture(scope="session")
@@ -261,11 +254,10 @@ def test_any_rig_with_profiles():
 
 def test_what_cannot_be_run_is_left(problem, monkeypatch):
     """In the search; the motion given is refused."""
-    look, count = Planner.evaluate, [0]
+    look, lost = Planner.evaluate, cycle([False, False, True])
 
     def sometimes(self: Planner, *given: Any) -> Any:
-        count[0] += 1
-        if count[0] % 3 == 0:
+        if next(lost):
             raise SimulationFailed("the disc was lost", 0.1)
         return look(self, *given)
 
@@ -273,21 +265,16 @@ def test_what_cannot_be_run_is_left(problem, monkeypatch):
     found = design(problem, "plan", BOUNDS, iterations=2)
     assert any("could not be run" in notice for notice in found.notices)
     assert found.made_by["iterations"] == 2
-    monkeypatch.setattr(Planner, "evaluate", never)
+    lost = repeat(True)
     with pytest.raises(ValueError, match="the motion given cannot be run"):
         design(problem, "plan", BOUNDS, iterations=3)
 
 
-def never(self: Planner, *given: Any) -> Any:
-    raise SimulationFailed("the disc was lost", 0.1)
-
-
 def test_an_interruption_leaves_the_best_so_far(problem, monkeypatch):
-    slopes, count = Planner.slopes, [0]
+    slopes, stops = Planner.slopes, iter([False, False, True])
 
     def interrupted(self: Planner, *given: Any) -> Array:
-        count[0] += 1
-        if count[0] == 3:
+        if next(stops):
             raise KeyboardInterrupt
         return slopes(self, *given)
 

@@ -1,8 +1,8 @@
 """A friction law of the user's own, with parameters that `Parameters` does not have, identified
 like any other."""
 
-import importlib.util
 import pickle
+import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -16,10 +16,10 @@ from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.physics.contact import SlipLaw, at_once
 from torchsoft.physics.shapes import parameter
-from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid import RIG, Problem, Recording, Stage, Unknown, identify, record
 
 BASE = Parameters().override(COARSE)
-SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
+SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
 JERKS = Excitation(
     motion=Strokes(travel=30e-3, stroke_time=0.1),
     duration=0.6,
@@ -47,7 +47,6 @@ def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftG
 
 def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGrasp]) -> Recording:
     """The same samples, of another rig."""
-    assert isinstance(recording.rig, SoftGrasp)
     return replace(recording, rig=build(recording.rig.settings, recording.rig.reference))
 
 
@@ -136,12 +135,7 @@ def test_a_checkpoint_of_another_law_is_not_read(jerks, tmp_path):
         path = tmp_path / f"{number}" / "laws.py"
         path.parent.mkdir()
         path.write_text(f"def law(E, F_N, R):\n    return {text}\n")
-        spec = importlib.util.spec_from_file_location("laws", path)
-        assert spec is not None
-        assert spec.loader is not None
-        laws = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(laws)
-        builds.append(partial(plain, law=laws.law))
+        builds.append(partial(plain, law=runpy.run_path(str(path))["law"]))
     prints = [built(jerks, build).fingerprint for build in builds]
     assert len(set(prints)) == len(builds) == 11
     assert prints == [built(jerks, build).fingerprint for build in builds]

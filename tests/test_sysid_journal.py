@@ -51,7 +51,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 def journal(folder: Path, print_: str = "a") -> Journal:
-    return Journal(folder, [SimpleNamespace(fingerprint=print_)])  # pyright: ignore[reportArgumentType]
+    return Journal(folder, [SimpleNamespace(fingerprint=print_)])
 
 
 def files(folder: Path) -> list[Path]:
@@ -116,7 +116,7 @@ def test_a_result_of_another_run_is_noticed(tmp_path):
 
 def test_an_archive_is_no_pickle():
     assert same(decoded(encoded(PREDICTION)), PREDICTION)
-    content = encoded(FailedRun(np.array([{}], dtype=object), 0.0))  # pyright: ignore[reportArgumentType]
+    content = encoded(FailedRun(np.array([{}], dtype=object), 0.0))
     with pytest.raises(ValueError, match="allow_pickle"):
         decoded(content)
 

@@ -2,11 +2,12 @@
 command continues."""
 
 import csv
-import importlib.util
 import re
+import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,6 @@ BAD: dict[str, tuple[Change, str]] = {
         put(1, X_C, "x_c [mm]"),
         r"`x_c` is not known: did you mean `x_C`\?.* ignore = \['x_c'\]; .*columns are t, x_d",
     ),
-    "misspelt column": (put(1, F_FF, "Fff [N]"), r"`Fff` is not known: did you mean `F_ff`\?"),
     "another column": (put(1, X_C, "Ventil"),
         r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
     "no feed-forward": (
@@ -150,7 +150,6 @@ BAD: dict[str, tuple[Change, str]] = {
     "text": (put(9, X_C, "n/a"), r"data\.csv, row 9, column `x_C`: 'n/a' is not a finite number; "
                                  r"leave the cell empty"),
     "nan": (put(9, F_Y, "NaN"), r"row 9, column `F_y`: 'NaN' is not a finite number"),
-    "grouped digits": (put(9, F_Y, "1_0"), r"row 9, column `F_y`: '1_0' is not a finite number"),
     "digits of another script": (put(9, F_Y, "１２"),
         r"row 9, column `F_y`: '１２' is not a finite number"),
     "times of a clock": (scale(T, 1.0, 1.7e9),
@@ -167,7 +166,6 @@ BAD: dict[str, tuple[Change, str]] = {
         r"has 7 rows of numbers, but needs at least 10"),
     "mm under m": (put(1, X_C, "x_C [m]"),
         r"row 2, column `x_C`: 60.54 m is not plausible, .* between -0.12 and 0.24 m"),
-    "one spike": (put(30, Y_BR, "500"), r"row 30, column `y_Br`: 0.5 m is not plausible"),
     "another start": (scale(X_C, 1.0, 5.0),
         r"row 2, column `x_C`: it begins at 0.065\d* m, but scenario.x_C0 is 0.0603 m"),
     "another sign": (scale(X_C, -1.0),
@@ -212,14 +210,10 @@ BAD_CONFIG = {
         r"rig\.toml: unknowns: `contact.K` cannot be identified"),
     "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"),
         r"settings of `data`: contact\.vs is not known here"),
-    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"),
-        r"of `data`: contact\.v_s should be .*, not -1"),
     "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1],
         r"of `data`: disc should be a table, not 3"),
     "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"),
         r"touch .* at 46.92 mm \(twice pad.height"),
-    "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"),
-        r"fit\.rtol should be greater than or equal to 1e-08, not -1"),
     "a disc that fits nowhere": (
         CONFIG.replace('unknowns."pad.E"]\nnominal = 0.7e6', 'unknowns."disc.radius"]'),
         r"unknowns\.disc\.radius\.low = 0\.001937 is impossible: the disc does not fit",
@@ -229,8 +223,6 @@ BAD_CONFIG = {
     r"sensors\.theta\.delay should be less than"),
     "no such column": ('ignore = ["Temp"]\n' + CONFIG,
         r"rig\.toml, ignore: no file has a column `Temp`"),
-    "another constant": (CONFIG + "[missing]\nF_x = 0.0\n",
-        r"rig\.toml: missing\.F_x is not known here"),
     "another kind of start": (CONFIG + '[start]\nkind = "flying"\n',
         r"start\.kind should be one of 'rest', 'moving', not 'fl"),
     "a start that is hardly uncertain": (
@@ -245,6 +237,10 @@ BAD_CONFIG = {
     "soft at first": (
         CONFIG + '[pads]\nkind = "standard_linear_solid"\nE_instant = 1e5\n',
         r"rig\.toml, recording `data`: pads\.E_instant = 100000 must be above pad\.E = 750000",
+    ),
+    "more than all": (
+        CONFIG + '[pads]\nkind = "generalised_kelvin"\nJ = [0.8, 0.5]\ntau = [1, 2]\n',
+        r"pads: the fractions J sum to 1\.3, above one",
     ),
     "laws without likelihood": (
         CONFIG + 'loss = "huber"\n[compare.coulomb.settings]\ncontact.friction = "coulomb"\n',
@@ -333,11 +329,7 @@ def test_every_unit_is_understood(tmp_path, name):
 @pytest.fixture(scope="module")
 def made():
     """The example's own script, and a short recording."""
-    spec = importlib.util.spec_from_file_location("make", EXAMPLE / "make.py")
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    script = SimpleNamespace(**runpy.run_path(str(EXAMPLE / "make.py")))
     sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
     excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4,
         depth=1.2e-3, senses="bracket",
@@ -698,40 +690,18 @@ def test_competing_laws_have_the_same_data(loaded):
 
 
 @pytest.mark.parametrize(
-    ("pads", "message"),
+    ("pads", "symbol", "bound"),
     [
-        ('kind = "prony"\nmoduli = [2e5, 1e5]\ntau = [2e-3, 0.01]', ""),
-        ('kind = "generalised_kelvin"\nJ = [0.3, 0.2]\ntau = [2e-3, 0.01]', ""),
-        (
-            'kind = "prony"\nmoduli = [2e5, 1e5]\ntau = [2e-3]',
-            "a series needs as many `moduli` as `tau`, from 1 to 20",
-        ),
-        (
-            'kind = "prony"\nmoduli = [2e5]\ntau = [1e-5]',
-            "pads: tau_instant = 0.0001 s must be below the shortest tau",
-        ),
-        (
-            'kind = "generalised_kelvin"\nJ = [0.8, 0.5]\ntau = [1, 2]',
-            "pads: the fractions J sum to 1.3, above one",
-        ),
-        (
-            'kind = "prony"\nmoduli = [-2e5]\ntau = [1.0]',
-            "pads.moduli.0 should be greater than or equal to",
-        ),
+        ('kind = "prony"\nmoduli = [2e5, 1e5]', "E", ""),
+        ('kind = "generalised_kelvin"\nJ = [0.3, 0.2]', "J", "\nhigh = 0.7"),
     ],
 )
-def test_pads_may_be_of_any_series(loaded, pads, message):
+def test_pads_may_be_of_any_series(loaded, pads, symbol, bound):
     """Of the relaxed modulus `pad.E`; their coefficients may be unknown."""
-    symbol, bound = ("E", "") if "prony" in pads else ("J", "\nhigh = 0.7")
     config = CONFIG.replace(
         '[unknowns."contact.K_n"]\nnominal = 1e5', f'[unknowns."pad.{symbol}_1"]{bound}'
     )
-    config = f"{config}[pads]\n{pads}\n"
-    if message:
-        with pytest.raises(ValueError, match=re.escape(message)):
-            loaded(config=config)
-        return
-    problem = loaded(config=config).problem
+    problem = loaded(config=f"{config}[pads]\n{pads}\ntau = [2e-3, 0.01]\n").problem
     assert set(problem.unknowns) == {f"pad.{symbol}_1", "pad.E"}
     one = problem.recordings[0]
     assert one.rig.pads["L"].material.branches == 3

@@ -211,31 +211,15 @@ def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss():
 
 def test_saturated_samples_and_ends_that_cannot_be_tested():
     parts, r, J = Case(0).fitted()
-    quiet = np.where(
-        np.arange(len(r)) % 3 == 0, 0.0, r
-    )  # a third is saturated, far beyond the range
-    some = []
-    for p in parts:
-        inside = p.rows % 3 != 0
-        some.append(
-            p._replace(
-                t=p.t[inside],
-                rows=p.rows[inside],
-                raw=p.raw[inside],
-                reading=p.reading[inside],
-                saturated=100,
-            )
-        )
-    assert not [
-        f
-        for f in judge_residuals(some, quiet, np.where((quiet == 0)[:, None], 0.0, J))
-        if f.alarming
-    ]
+    quiet = np.where(np.arange(len(r)) % 3 == 0, 0.0, r)  # a third is far beyond the range
+    cut = lambda p, rows: {name: getattr(p, name)[rows] for name in ("t", "rows", "raw", "reading")}
+    some = [p._replace(**cut(p, p.rows % 3 != 0), saturated=100) for p in parts]
+    judged = judge_residuals(some, quiet, np.where((quiet == 0)[:, None], 0.0, J))
+    assert not any(f.alarming for f in judged)
     assert not colours(some, J)
-    short = judge_residuals([p._replace(t=p.t[:3], rows=np.arange(3 * i, 3 * i + 3), raw=p.raw[:3],
-        reading=p.reading[:3])
-                   for i, p in enumerate(parts)], r[:18], np.zeros((18, 4)))  # fmt: skip
-    assert not [f for f in short if f.alarming]
+    short = [p._replace(**cut(p, slice(3)) | {"rows": np.arange(3 * i, 3 * i + 3)})
+             for i, p in enumerate(parts)]  # fmt: skip
+    assert not any(f.alarming for f in judge_residuals(short, r[:18], np.zeros((18, 4))))
 
 
 def test_a_prior_that_the_data_contradict_is_named():

@@ -182,8 +182,9 @@ def test_losses_are_scipys(loss):
     assert np.abs(prior.x - 2.0).max() < 0.1  # however far off, a prior is no outlier
 
 
-@pytest.mark.parametrize("loss", ROBUST)
-@pytest.mark.parametrize("bad", [0.0, 0.1])
+@pytest.mark.parametrize(
+    ("loss", "bad"), [*((loss, 0.0) for loss in ROBUST), ("huber", 0.1), ("cauchy", 0.1)]
+)
 def test_robust_covariance_is_that_of_many_fits(loss, bad):
     """With Gaussian noise, at the efficiency that its reach was made for; and with one outlier in
     ten, ten times as large."""

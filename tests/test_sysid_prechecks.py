@@ -3,7 +3,7 @@ that do get none."""
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -111,104 +111,84 @@ def late(by: float) -> Callable[[Any, Any], Any]:
     return lambda t, y: CubicSpline(t, y)(np.maximum(t - by, t[0]))
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """What is wrong with a recording of one of the motions, and what is said of it."""
-
-    motion: str
-    change: Callable[[Recording], Recording]
-    what: str
-    words: str
-    grave: bool
-
-
 NO_F = {"F_x": None, "F_y": None}
-MISTAKES = {
-    "sign of a force": Mistake(
+MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]] = {
+    "sign of a force": (
         "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x",
         "F_x looks as if its sign were opposite", True
     ),
-    "sign of a force that only a run tells": Mistake(
+    "sign of a force that only a run tells": (
         "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y",
         "correlation with a run from the start", True
     ),
-    "sign of an angle": Mistake(
+    "sign of an angle": (
         "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta",
         "theta looks as if its sign were opposite",
                                                                             True
     ),
-    "sign of a rate": Mistake(
-        "shaking", lambda r: changed(r, omega=scaled(-1)), "sign of omega",
-        "omega looks as if its sign were opposite",
-                                                                            True
-    ),
-    "millinewtons": Mistake(
+    "millinewtons": (
         "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x",
         "millinewtons taken for newtons", True
     ),
-    "degrees": Mistake(
+    "degrees": (
         "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta",
         "degrees taken for radians", True
     ),
-    "radians": Mistake(
-        "rolling", lambda r: changed(r, theta=scaled(1 / 57.3)), "unit of theta",
-        "radians taken for degrees",
-                                                                                  True
-    ),
-    "the disc's set-point taken for the bracket's": Mistake(
+    "the disc's set-point taken for the bracket's": (
         "about the disc", lambda r: noted(r, {"control.senses": "bracket"}), "control.senses",
         'set-point of the disc, not of the bracket (say control.senses = "disc")',
         True,
     ),
-    "the bracket's taken for the disc's": Mistake(
+    "the bracket's taken for the disc's": (
         "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses",
         "of the bracket, not of the disc", True
     ),
-    "the bracket's taken for the disc's, no forces": Mistake(
+    "the bracket's taken for the disc's, no forces": (
         "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F),
         "control.senses", "x_Br follows it to", True
     ),
-    "the bracket's taken for the disc's, the disc alone": Mistake(
+    "the bracket's taken for the disc's, the disc alone": (
         "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F, x_Br=None),
         "control.senses", "x_C does not follow it", True,
     ),
-    "exchanged columns": Mistake(
+    "exchanged columns": (
         "rolling", lambda r: changed(r, x_C=lambda t, x: r.samples["x_Br"][1], x_Br=lambda t,
         x: r.samples["x_C"][1]), "control.senses", "or are x_Br and x_C exchanged?", True,
     ),
-    "no force fed forward": Mistake(
+    "no force fed forward": (
         "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff",
         "was a force fed forward that F_ff does",
                                                                            False
     ),
-    "its sign": Mistake(
+    "its sign": (
         "pressing", lambda r: noted(r, F_ff=opposite(r)), "F_ff",
         "was a force fed forward that F_ff does", False
     ),
-    "a zero": Mistake(
+    "a zero": (
         "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x",
         "zeros and set-points right?", False
     ),
 }  # fmt: skip
 
 
+"""What is wrong with a recording of one of the motions, what is said of it, and whether it is
+refused."""
+
+
 def opposite(recording: Recording) -> Profile:
     feed = recording.rig.reference["F_ff"]
-    assert isinstance(feed, Profile)
     return Profile(feed.times, -feed.values.detach())
 
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_gets_the_sentence_that_helps(recordings, runs, name):
-    mistake = MISTAKES[name]
-    one = mistake.change(recordings[mistake.motion])
-    found = looked_at(
-        one, runs[mistake.motion] if one.rig is recordings[mistake.motion].rig else None
-    )
-    assert [f.code for f in found] == [mistake.what]
-    assert mistake.words in found[0].message, found[0].message
-    assert found[0].message.startswith(f"recording `{mistake.motion}`: ")
-    assert (found[0].severity == "error") == mistake.grave
+    motion, change, what, words, grave = MISTAKES[name]
+    one = change(recordings[motion])
+    (found,) = looked_at(one, runs[motion] if one.rig is recordings[motion].rig else None)
+    assert found.code == what
+    assert words in found.message, found.message
+    assert found.message.startswith(f"recording `{motion}`: ")
+    assert (found.severity == "error") == grave
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -340,7 +320,6 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(
 ):
     one = at_rows(recordings["rolling"], 500.0, rates=True)
     x_d = one.rig.reference["x_d"]
-    assert isinstance(x_d, Sampled)
     for factor, words in ((-1.0, "its sign looks opposite"), (1e3, "it is 1e+03 times that")):
         other: Any = Sampled(x_d.times, x_d.values.detach(), factor * x_d.rates)
         (found,) = setpoint_findings(noted(one, x_d=other), SENSORS)
@@ -353,7 +332,6 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(
 def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings):
     one = at_rows(recordings["shaking"], 1000.0, rates=True)
     x_d = one.rig.reference["x_d"]
-    assert isinstance(x_d, Sampled)
     other: Any = Sampled(1.001 * x_d.times, x_d.values.detach(), x_d.rates)
     found = list(setpoint_findings(noted(one, x_d=other), SENSORS))
     assert [f.code for f in found] == ["rate of x_d"]

@@ -34,7 +34,7 @@ def test_variance_of_residuals_above_the_stated_one_widens_the_profile():
         optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, variance=4.0), ["p1"]
     )
     (usual,) = profiles(optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0), ["p1"])
-    np.testing.assert_allclose(np.log(wide.ci95), 2 * np.log(usual.ci95), rtol=1e-6)  # type: ignore[arg-type]
+    np.testing.assert_allclose(np.log(wide.ci95), 2 * np.log(usual.ci95), rtol=1e-6)
 
 
 def test_a_curved_profile_has_the_exact_ends_and_says_that_the_covariance_has_others():
@@ -117,8 +117,6 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     np.testing.assert_allclose(o.x, result.x)
     (E,) = profiles(o, ["pad.E"])
     low, high = E.ci95
-    assert low is not None
-    assert high is not None
     assert low < 0.75e6 < high
     assert high - E.best > 1.3 * (
         E.best - low

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, RUBBER, dry
 from scipy import stats
 from scipy.optimize import least_squares
 from test_sysid import check_derivatives
@@ -23,8 +23,6 @@ from torchsoft import (
     Profile,
     Reference,
     Rig,
-    SmoothSlip,
-    SoftContact,
     simulate,
 )
 from torchsoft.excitation import Excitation, Strokes, begin
@@ -133,14 +131,7 @@ def jaws():
         PadMesh(length=60e-3, height=4.59e-3, elements_x=30, elements_y=2),
         ("lower", "upper"),
     )
-    rubber = KelvinVoigt(E=0.75e6, nu=0.45, rho=1100.0, tau=10e-3, depth=44e-3)
-    law = SoftContact(
-        K_n=1.2e5,
-        R_n=440.0,
-        K_t=1.2e5,
-        R_t=440.0,
-        friction=SmoothSlip(0.8, 0.7, v_s=0.05, eta=10.0),
-    )
+    rubber, law = KelvinVoigt(**RUBBER, tau=0.01), dry()
     driven: dict[str, Any] = {"x": "driven", "y": "driven", "theta": "driven"}
     motion = {f"{jaw}.{axis}": Profile([0.0], [0.0]) for jaw in names for axis in driven}
     motion["upper.y"] = Profile([0.0, 0.06], [47.92e-3, 46.92e-3])

@@ -212,7 +212,6 @@ def test_the_page_holds_what_the_answer_holds(page, full):
     )
     for e in known:
         for value in (e.value, *(e.ci95 or ())):
-            assert value is not None
             assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "").replace(
                 "−", "-"
             )
@@ -388,7 +387,6 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(found, tmp
 
 
 def tabulated(*given: Any) -> Page:
-    assert PAGES.loader is not None
     macros, _, _ = PAGES.loader.get_source(PAGES, "report.html")[0].partition("<!doctype html>")
     made = PAGES.from_string(f"{macros}{{{{ table(*given) }}}}")
     return Page(made.render(given=given, kept=kept, cell=cell))
@@ -456,7 +454,6 @@ def texts(figure: Figure) -> list[tuple[str, Any]]:
             beyond |= {id(tick.label1) for tick in axis.get_minor_ticks()}
     out = []
     for text in figure.findobj(Text):
-        assert isinstance(text, Text)
         if text.get_visible() and text.get_text().strip() and id(text) not in beyond:
             out.append((text.get_text(), text.get_window_extent(canvas.get_renderer())))
     return out
@@ -478,7 +475,6 @@ FIGURES: dict[str, Callable[[IdentificationResult, Problem], Figure | None]] = {
 @pytest.mark.parametrize("which", FIGURES)
 def test_no_text_of_a_picture_is_cut_or_overlaps(full, found, which):
     figure = FIGURES[which](full, found[1])
-    assert figure is not None
     drawn, (width, height) = texts(figure), figure.canvas.get_width_height()
     assert len(drawn) > 5
     for i, (text, box) in enumerate(drawn):

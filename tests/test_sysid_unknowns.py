@@ -86,7 +86,6 @@ def test_bounds_that_are_not_given_end_where_the_parameters_do():
         ({"pad__E": {"scale": "linear"}}, "needs `low` and `high`"),
         ({"pad__E": {"nominal": -1.0}}, "needs nominal > 0"),
         ({"contact__mu_k": {"ratio_to": "friction"}}, "ratio_to = 'friction'"),
-        ({"pad__E": {"young": 1.0}}, "young"),
         ({"pad__Young": {}}, r"^unknowns: `pad\.Young` cannot be identified; known: .*pad\."),
     ],
 )

@@ -87,8 +87,8 @@ def falling(body: Any = None, law: Any = None, mesh: Any = None, points: Any = 0
 
 def acting(**how: Any) -> Any:
     model = coarse(pad__elements_x=24)
-    model.actuators["x"] = Actuator(**PUSH | how)  # pyright: ignore
-    del model.control["x"]  # pyright: ignore
+    model.actuators["x"] = Actuator(**PUSH | how)
+    del model.control["x"]
     return simulate(model, T)
 
 
