@@ -249,7 +249,8 @@ def new_fits(
         as_stated = refit(problem, end, None, loss, notify)
         bar.update()
         enough = 0.0
-        order = sorted(candidates, key=lambda one: -gains[one.name])
+        blind = end.far and joint is None  # gains to first order say little
+        order = sorted(candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name]))
         for number, one in enumerate(order if as_stated is not None else (), 1):
             if gains[one.name] < enough:
                 return
