@@ -7,27 +7,22 @@ split, and are held against its test split:
 - a **residual** inside the simulator: mu(v), a network of the slip speed in the friction law,
   learned from noisy x and theta of the disc by the gradient of whole runs; besides it a coefficient
   that is constant, as it is and fitted the same way;
-- a **surrogate** instead of it: the friction on both pads from 120 ms of the jaws' motion, beside
-  linear regression.
+- a **surrogate** instead of it: the friction on both pads, which a skin of normal taxels does not
+  feel, from 120 ms of the jaws' motion and of those taxels.
 
 Command: .venv/bin/python experiments/learn_dynamics.py [--smoke]
 Expected: see experiments/README.md. About five minutes on one core.
 """
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.linear_model import Ridge
-from sklearn.neural_network import MLPRegressor
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
@@ -37,7 +32,7 @@ from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.config import Config as Dataset
 from torchsoft.datasets.generate import Serial, generate
 from torchsoft.envs import RIG
-from torchsoft.experiment import at_the_points, markdown, options, timed, write
+from torchsoft.experiment import at_the_points, markdown, options, write
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.written import to_toml
 from torchsoft.solve.progress import SimulationFailed
@@ -52,6 +47,9 @@ NOISE = {"x_disc": 10e-6, "theta_disc": 0.5e-3}
 
 SCALE = {"x_disc": 0.2e-3, "theta_disc": 10e-3}
 """Misfits [m, rad] that count as one."""
+
+TAXEL, TAXELS, TAXEL_NOISE = 6e-3, 8, 0.02
+"""Width [m] and number of each skin's, and the standard deviation [N] of what they feel."""
 
 SWEEPS = 4
 """Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta +
@@ -70,7 +68,7 @@ class Config:
     held_out: int = 24  # on which it is tried
     sweeps: int = 25  # of these
     window: int = 30  # samples that the surrogate sees, 4 ms apart
-    epochs: int = 100
+    epochs: int = 40
     hidden: int = 48
     seed: int = 0
     smoke: bool = False  # a size that takes seconds
@@ -240,35 +238,95 @@ def slip_speeds(residual: Residual, given: Runs) -> tuple[float, float]:
 # the surrogate
 
 
-def histories(config: Config, url: str, split: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Windows of the jaws' motion (N, inputs), the friction on both pads at their end (N, 2) [N],
-    and how many a second the loader gave."""
-    forces = [f"friction_force_{jaw}" for jaw in JAWS]
+class Surrogate(nn.Module):
+    """Friction on both pads [sd] at the end of a history (B, T, inputs) [sd]."""
+
+    def __init__(self, inputs: int, hidden: int) -> None:
+        super().__init__()
+        self.memory = nn.GRU(inputs, hidden, batch_first=True)
+        self.last = nn.Linear(hidden, 2)
+
+    def forward(self, history: Tensor) -> Tensor:
+        return self.last(self.memory(history)[0][:, -1])
+
+
+@dataclass(frozen=True)
+class Histories:
+    """Windows: the jaws' motion (N, T, 6), taxels (N, T, 16) [N], friction at their end (N, 2)
+    [N]; and how many a second the loader gave."""
+
+    motion: Tensor
+    touch: Tensor
+    friction: Tensor
+    per_second: float
+
+
+def histories(config: Config, url: str, split: str) -> Histories:
+    forces = [f"{sort}_force_{jaw}" for sort in ("normal", "friction") for jaw in JAWS]
     windows = Trajectories(
         url, [*MOTION, *forces], split=split, window=config.window, stride=5, dtype=torch.float32
     )
-    batches, seconds = timed(lambda: list(DataLoader(windows, batch_size=128)))
-    motion = [torch.cat([one[name] for name in MOTION], -1) for one in batches]
-    friction = [torch.stack([one[name][:, -1].sum(-1) for name in forces], -1) for one in batches]
-    return torch.cat(motion).numpy(), torch.cat(friction).numpy(), len(windows) / seconds
+    places = [open_dataset(url)[f"{jaw}_places"].values[:, 0] for jaw in JAWS]
+    bins = [torch.from_numpy(np.clip(x // TAXEL + TAXELS // 2, 0, TAXELS - 1)).long()
+            for x in places]  # fmt: skip
+    torch.manual_seed(config.seed)
+    motion, touch, friction = list[Tensor](), list[Tensor](), list[Tensor]()
+    begin = perf_counter()
+    batches = list(DataLoader(windows, batch_size=128, shuffle=True))
+    per_second = len(windows) / (perf_counter() - begin)
+    for batch in batches:
+        motion.append(torch.stack([batch[name] for name in MOTION], -1))
+        felt = [
+            torch.zeros(*batch[f"normal_force_{jaw}"].shape[:2], TAXELS).index_add(
+                -1, at, batch[f"normal_force_{jaw}"])
+            for jaw, at in zip(JAWS, bins)
+        ]  # fmt: skip
+        touch.append(torch.cat(felt, -1))
+        friction.append(torch.stack(
+            [batch[f"friction_force_{jaw}"][:, -1].sum(-1) for jaw in JAWS], -1))  # fmt: skip
+    all_touch = torch.cat(touch)
+    noise = TAXEL_NOISE * torch.randn(all_touch.shape)
+    return Histories(torch.cat(motion), all_touch + noise, torch.cat(friction), per_second)
 
 
 def surrogates(config: Config, url: str) -> tuple[dict[str, float], float]:
-    """Held-out error over the standard deviation of the friction, by method; windows a second."""
-    (x, friction, rate), (held, truth, _) = (histories(config, url, s) for s in ("train", "test"))
-    mean, sd = friction.mean(0), friction.std(0)
-    how: dict[str, Any] = {
-        "hidden_layer_sizes": (config.hidden, config.hidden), "max_iter": config.epochs,
-        "random_state": config.seed,
+    """Held-out error over the standard deviation of the friction, by method and senses; windows a
+    second."""
+    train, test = (histories(config, url, split) for split in ("train", "test"))
+    senses = {
+        "motion": lambda one: one.motion, "touch": lambda one: one.touch,
+        "motion and touch": lambda one: torch.cat((one.motion, one.touch), -1),
     }  # fmt: skip
-    methods = {"linear": Ridge(), "network": MLPRegressor(**how)}
-    found = {}
-    for name, method in methods.items():
-        with warnings.catch_warnings():  # the epochs end the fit
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            fitted = make_pipeline(StandardScaler(), method).fit(x, (friction - mean) / sd)
-        found[name] = float(np.sqrt(np.mean((fitted.predict(held) - (truth - mean) / sd) ** 2)))
-    return found, rate
+    mean, sd = train.friction.mean(0), train.friction.std(0)
+    wanted, truth = (train.friction - mean) / sd, (test.friction - mean) / sd
+    out: dict[str, float] = {}
+    for name, of in senses.items():
+        middle, spread = of(train).mean((0, 1)), of(train).std((0, 1)).clamp(min=1e-9)
+        x, held = ((of(one) - middle) / spread for one in (train, test))
+        flat = [torch.cat((one.flatten(1), torch.ones(len(one), 1)), 1).double()
+                for one in (x, held)]  # fmt: skip
+        ridge = flat[0].T @ flat[0] + 1e-2 * len(x) * torch.eye(flat[0].shape[1]).double()
+        linear = flat[1] @ torch.linalg.solve(ridge, flat[0].T @ wanted.double())
+        out[f"linear, {name}"] = float((linear - truth).square().mean().sqrt())
+        network = trained(config, x, wanted)
+        with torch.no_grad():
+            out[f"network, {name}"] = float((network(held) - truth).square().mean().sqrt())
+    return out, train.per_second
+
+
+def trained(config: Config, x: Tensor, wanted: Tensor) -> Surrogate:
+    torch.manual_seed(config.seed)
+    network = Surrogate(x.shape[-1], config.hidden)
+    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.epochs)
+    for _ in tqdm(range(config.epochs), desc="epochs of the surrogate"):
+        for part in torch.randperm(len(x)).split(128):
+            optimiser.zero_grad()
+            (network(x[part]) - wanted[part]).square().mean().backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimiser.step()
+        schedule.step()
+    return network
 
 
 # all of it
@@ -297,7 +355,7 @@ def run(config: Config) -> tuple[dict[str, Any], Figure]:
     found |= {"mu_error_mean": float(off.mean()), "mu_error_max": float(off.max()),
               "slip_mm_s": [1e3 * low, 1e3 * high]}  # fmt: skip
     found["surrogate"], found["windows_per_second"] = surrogates(config, url)
-    return found, figure(network, fitted, (low, high))
+    return found, figure(network, fitted, (low, high), found)
 
 
 def table(found: dict[str, Any]) -> str:
@@ -316,17 +374,21 @@ def table(found: dict[str, Any]) -> str:
     ))  # fmt: skip
 
 
-def figure(network: Residual, fitted: Residual, slip: Sequence[float]) -> Figure:
-    """The learned friction coefficients beside the true one."""
-    fig = Figure(figsize=(4.5, 3.0), layout="constrained")
-    axes, v = fig.subplots(), torch.linspace(0, 1.3 * slip[1], 200, dtype=torch.float64)
-    axes.axvspan(1e3 * slip[0], 1e3 * slip[1], color="0.86", label="slip speeds in the data")
+def figure(network: Residual, fitted: Residual, slip: Sequence[float], found: Any) -> Figure:
+    """The learned friction coefficients beside the true one, and the surrogates' errors."""
+    fig = Figure(figsize=(7.2, 3.0), layout="constrained")
+    left, right = fig.subplots(1, 2)
+    v = torch.linspace(0, 1.3 * slip[1], 200, dtype=torch.float64)
+    left.axvspan(1e3 * slip[0], 1e3 * slip[1], color="0.86", label="slip speeds in the data")
     with torch.no_grad():
-        axes.plot(1e3 * v, true_mu(network.truth, v), "k-", label="truth")
-        axes.plot(1e3 * v, fitted.law.mu(v), "C0:", label="constant, fitted")
-        axes.plot(1e3 * v, network.law.mu(v), "C1--", label="network")
-    axes.set(xlabel="slip speed [mm/s]", ylabel="friction coefficient [1]", ylim=(0, 1))
-    axes.legend(frameon=False)
+        left.plot(1e3 * v, true_mu(network.truth, v), "k-", label="truth")
+        left.plot(1e3 * v, fitted.law.mu(v), "C0:", label="constant, fitted")
+        left.plot(1e3 * v, network.law.mu(v), "C1--", label="network")
+    left.set(xlabel="slip speed [mm/s]", ylabel="friction coefficient [1]", ylim=(0, 1))
+    left.legend(frameon=False)
+    names = list(found["surrogate"])
+    right.barh(names[::-1], [100 * found["surrogate"][name] for name in names[::-1]])
+    right.set(xlabel="friction held out: error / sd [%]")
     return fig
 
 

@@ -2,28 +2,29 @@
 
 Two soft jaws on soft loops bring a disc to an angle that each episode draws, while it is pushed and
 turned by forces that the policy does not see. A network of one hidden layer sees the disc, its
-velocity and the goal ten times a second, and sets both set-points and the grip. It learns twice, on
-the same environment, for the same processor time of a core:
+velocity and the goal ten times a second, and sets both set-points and the grip. It learns three
+times over, from the same start, on the same environment, for the same processor time of a core:
 
 - by gradient: analytic gradients over horizons of a few steps, closed by a critic (Xu et al.,
   Accelerated policy learning with parallel differentiable simulation, 2022);
-- by PPO of stable-baselines3.
+- by PPO of stable-baselines3;
+- by CMA-ES of pycma, on the weights.
 
 The mean return of ten episodes that no training sees is measured along the way, outside of the
 clock. The last policy of the first seed becomes the weights of a controller of the rig file, which
-runs compiled and continuously.
+runs compiled and continuously, and a TorchScript program.
 
 Command: .venv/bin/python experiments/learn_policy.py [--seeds 5] [--seconds 200] [--smoke]
 Expected: the gradient is at 95 % of the last return of PPO in a fifth of the samples, and PPO ends
-4 % higher; experiments/README.md has the table. Five seeds of two methods take 40 minutes.
+4 % higher; experiments/README.md has the table. Five seeds of three methods take an hour on a core.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 from time import process_time
 from typing import Any
 
@@ -36,7 +37,7 @@ from tqdm import tqdm
 from torchsoft import simulate
 from torchsoft.envs import RIG, RigEnv, reorient
 from torchsoft.envs.dynamics import limits
-from torchsoft.experiment import markdown, numbers, options, timed, write
+from torchsoft.experiment import markdown, options, timed, write
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.written import to_toml
 from torchsoft.solve.progress import SimulationFailed
@@ -74,12 +75,24 @@ class Config:
     out: Path = Path("out/learn_policy")
     seeds: int = 5
     seconds: float = 200.0  # processor time of each training
+    methods: tuple[str, ...] = ("gradient", "PPO", "CMA-ES")
     hidden: int = 32  # neurons
     horizon: int = 5  # steps of a gradient
     actors: int = 4  # episodes side by side for a gradient
     episodes: int = 10  # of an evaluation
     evaluations: int = 10  # along a training
     smoke: bool = False  # seconds
+
+
+@dataclass
+class History:
+    """A training: samples, processor time [s] and mean return at every evaluation."""
+
+    method: str
+    seed: int
+    samples: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
 
 
 def environment() -> RigEnv:
@@ -101,26 +114,35 @@ def network(hidden: int, actions: int, seed: int) -> nn.Sequential:
 
 
 class Training:
-    """Samples, processor time [s] and mean return at every evaluation of a training, whose clock
-    stops meanwhile."""
+    """The clock of a training, which stops while the policy is evaluated."""
 
-    def __init__(self, config: Config, method: str, seed: int) -> None:
-        self.config, self.method, self.env = config, method, environment()
-        self.begin = process_time()
-        self.samples, self.seconds, self.returns = list[int](), list[float](), list[float]()
-        self.bar = tqdm(total=round(config.seconds), desc=f"{method} {seed}", unit="s")
+    def __init__(self, config: Config, method: str, seed: int, env: RigEnv) -> None:
+        self.config, self.env, self.history = config, env, History(method, seed)
+        self._begin, self._next = process_time(), 0
+        self._bar = tqdm(total=round(config.seconds), desc=f"{method} {seed}", unit="s")
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return process_time() - self._begin >= self.config.seconds
 
     def over(self, samples: int, act: Callable[[np.ndarray], np.ndarray]) -> bool:
         """Evaluate where it is time to; whether the time is up."""
-        now, total = process_time() - self.begin, self.config.seconds
-        self.bar.update(min(round(now), self.bar.total) - self.bar.n)
-        if now >= min(1.0, len(self.samples) / self.config.evaluations) * total:
-            every = [episode(self.env, act, 1000 + i) for i in range(self.config.episodes)]
-            self.samples.append(samples)
-            self.seconds.append(now)
-            self.returns.append(float(np.mean(every)))
-            self.begin = process_time() - now
-        return now >= total
+        now = process_time() - self._begin
+        self._bar.update(min(round(now), self._bar.total) - self._bar.n)
+        over = now >= self.config.seconds
+        if over or now >= self._next * self.config.seconds / self.config.evaluations:
+            mean = float(np.mean([episode(self.env, act, 1000 + i)
+                                  for i in range(self.config.episodes)]))  # fmt: skip
+            self.history.samples.append(samples)
+            self.history.seconds.append(now)
+            self.history.returns.append(mean)
+            self._bar.set_postfix_str(f"return {mean:.2f}")
+            self._next += 1
+            self._begin = process_time() - now
+        if over:
+            self._bar.close()
+        return over
 
 
 def episode(env: RigEnv, act: Callable[[np.ndarray], np.ndarray], seed: int) -> float:
@@ -141,14 +163,14 @@ def acting(policy: nn.Module) -> Callable[[np.ndarray], np.ndarray]:
     return act
 
 
-def by_gradient(config: Config, seed: int) -> tuple[Training, nn.Module]:
+def by_gradient(config: Config, seed: int) -> tuple[History, nn.Module]:
     """Short horizons of episodes side by side; the critic tells what comes after them."""
-    env = environment()
+    env, evaluated = environment(), environment()
     policy = network(config.hidden, len(env.dynamics.actions), seed)
     critic = nn.Sequential(nn.Linear(SEEN, 64), nn.Tanh(), nn.Linear(64, 1)).double()
     slow = deepcopy(critic)
     learners = [torch.optim.Adam(one.parameters(), lr=5e-3) for one in (policy, critic)]
-    training, samples = Training(config, "gradient", seed), 0
+    training, samples = Training(config, "gradient", seed, evaluated), 0
     env.reset(seed=seed)
     moments = [begun(env) for _ in range(config.actors)]
     while not training.over(samples, acting(policy)):
@@ -164,7 +186,7 @@ def by_gradient(config: Config, seed: int) -> tuple[Training, nn.Module]:
         (-total / config.actors).backward()
         nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         learners[0].step()
-        left = 1 - training.seconds[-1] / config.seconds
+        left = 1 - training.history.seconds[-1] / config.seconds
         learners[0].param_groups[0]["lr"] = 5e-3 * max(left, 0.02)
         for _ in range(8):
             learners[1].zero_grad()
@@ -174,7 +196,7 @@ def by_gradient(config: Config, seed: int) -> tuple[Training, nn.Module]:
         with torch.no_grad():
             for old, new in zip(slow.parameters(), critic.parameters()):
                 old.lerp_(new, 0.2)
-    return training, policy
+    return training.history, policy
 
 
 def begun(env: RigEnv) -> Any:
@@ -221,12 +243,12 @@ def walk(env: RigEnv, policy: nn.Module, critic: nn.Module, moment: Any, horizon
     return Walk(value, now, seen, targets)
 
 
-def by_ppo(config: Config, seed: int) -> tuple[Training, nn.Module]:
+def by_ppo(config: Config, seed: int) -> tuple[History, nn.Module]:
     import gymnasium
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
 
-    env = environment()
+    env, evaluated = environment(), environment()
     part = gymnasium.spaces.Box(-np.inf, np.inf, (SEEN,), np.float32)
     short = gymnasium.wrappers.TransformObservation(env, lambda seen: seen[:SEEN], part)
     layers = {"net_arch": [config.hidden], "log_std_init": -1.0}
@@ -234,7 +256,7 @@ def by_ppo(config: Config, seed: int) -> tuple[Training, nn.Module]:
         "MlpPolicy", short, learning_rate=1e-3, n_steps=400, batch_size=80, gamma=DISCOUNT,
         policy_kwargs=layers, seed=seed, device="cpu",
     )  # fmt: skip
-    training = Training(config, "PPO", seed)
+    training = Training(config, "PPO", seed, evaluated)
 
     class Watch(BaseCallback):
         def _on_step(self) -> bool:
@@ -243,10 +265,41 @@ def by_ppo(config: Config, seed: int) -> tuple[Training, nn.Module]:
             )
 
     learner.learn(10**9, Watch())
-    return training, learner.policy
+    return training.history, learner.policy
 
 
-METHODS = {"gradient": by_gradient, "PPO": by_ppo}
+def by_evolution(config: Config, seed: int) -> tuple[History, nn.Module]:
+    """Weights that are drawn, two episodes each, the same for all of a generation."""
+    import cma
+
+    env, evaluated = environment(), environment()
+    policy = network(config.hidden, len(env.dynamics.actions), seed)
+    start = nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()
+    how = {"seed": seed + 1, "popsize": 16, "verbose": -9, "CMA_diagonal": True}
+    search = cma.CMAEvolutionStrategy(start, 0.2, how)
+    training, samples, mean = Training(config, "CMA-ES", seed, evaluated), 0, deepcopy(policy)
+    draws = np.random.default_rng(seed)
+
+    def load(one: nn.Module, weights: np.ndarray) -> nn.Module:
+        nn.utils.vector_to_parameters(torch.from_numpy(weights), one.parameters())
+        return one
+
+    while not training.over(samples, acting(load(mean, search.mean))):
+        weights, seeds = search.ask(), draws.integers(2**30, size=2).tolist()
+        costs = []
+        for one in weights:
+            acts = acting(load(policy, one))
+            costs.append(-float(np.mean([episode(env, acts, k) for k in seeds])))
+            samples += len(seeds) * env.limit
+            if training.late:
+                break
+        if len(costs) < len(weights):
+            continue
+        search.tell(weights, costs)
+    return training.history, load(mean, search.mean)
+
+
+METHODS = {"gradient": by_gradient, "PPO": by_ppo, "CMA-ES": by_evolution}
 
 
 def weights(policy: nn.Module, env: RigEnv) -> dict[str, np.ndarray]:
@@ -294,78 +347,111 @@ def deployed(config: Config, policy: nn.Module, env: RigEnv) -> RigFile:
     return RigFile.from_toml(path)
 
 
+def exported(config: Config, policy: nn.Module) -> Path:
+    """The policy as a TorchScript program, which needs neither this file nor torchsoft."""
+    path, seen = config.out / "policy.pt", torch.randn(5, SEEN).double()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.save(torch.jit.trace(policy, seen), path)
+        same = torch.equal(torch.jit.load(path)(seen), policy(seen))
+    if not same:
+        raise AssertionError(f"{path} does not act as the policy does")
+    return path
+
+
 def in_engine(config: Config, policy: nn.Module) -> dict[str, Any]:
-    """Angles that the policy misses, by target, as a controller of the rig file while a push of 8 N
-    passes; and the wall time of a run [s]."""
-    rig = deployed(config, policy, environment())
-    push = {"kind": "profile", "times": [1.0, 1.1, 1.2], "values": [0.0, 8.0, 0.0]}
-    missed, seconds = dict[str, float](), list[float]()
+    """Angles that are missed where a push of 8 N passes, by the policy ten times a second and as
+    a controller of the rig file; and the wall time of a run of the latter [s]."""
+    env = environment()
+    rig, act = deployed(config, policy, env), acting(policy)
+    missed: dict[str, list[float]] = {"ten times a second": [], "in the engine": []}
+    passing = {"kind": "profile", "times": [1.0, 1.1, 1.2], "values": [0.0, 8.0, 0.0]}
+    seconds = []
     for target in (-0.5, -0.25, 0.0, 0.25, 0.5):
-        built = rig.override(motion={"theta_d": {"value": target}, "push_x": push}).build()
+        env.reset(options={"target": {"theta": target}})
+        peak = torch.tensor([[8.0, 8.0], [0.0, 0.0]]).double()  # 1.1 s: eight steps after 0.3 s
+        env.moment = env.moment._replace(peaks=peak)  # pyright: ignore[reportOptionalMemberAccess]
+        seen, over = env.dynamics.observe(env.moment).numpy(), False
+        while not over:
+            seen, _, *ends, _ = env.step(act(seen[:SEEN]))
+            over = any(ends)
+        there = float(env.moment.y[env.dynamics.coordinates["disc.theta"]])
+        built = rig.override(motion={"theta_d": {"value": target}, "push_x": passing}).build()
         run, wall = timed(partial(simulate, built.rig, built.t, y0=built.y0, rtol=1e-3))
-        missed[str(target)] = abs(run["theta_disc"][-1].item() - target)
         seconds.append(wall)
-    return {"missed_rad": missed, "run_s": median(seconds)}
+        for name, theta in zip(missed, (there, run["theta_disc"][-1].item())):
+            missed[name].append(abs(theta - target))
+    return {"missed_rad": missed, "run_s": float(np.median(seconds))}
 
 
 def run(config: Config) -> None:
     if config.smoke:
         config = replace(config, seconds=3.0, seeds=1, evaluations=1, episodes=1)
     config.out.mkdir(parents=True, exist_ok=True)
-    every, content = list[Training](), dict[str, Any]()
+    every, content = list[History](), dict[str, Any]()
     for seed in range(config.seeds):
-        for name, method in METHODS.items():
-            training, policy = method(config, seed)
-            every.append(training)
+        for name in config.methods:
+            history, policy = METHODS[name](config, seed)
+            every.append(history)
             if name == "gradient" and seed == 0:
+                exported(config, policy)
                 content["deployed"] = in_engine(config, policy)
-            keys = ("method", "samples", "seconds", "returns")
-            trainings = [{key: getattr(one, key) for key in keys} for one in every]
-            content |= {"trainings": trainings, "reached": reached(every)}
-            write(config, content, {"learn_policy": figure(every)}, table(content))
+            content |= {"trainings": [asdict(one) for one in every], "reached": reached(every)}
+            write(config, content, {"learn_policy": figure(every)}, table(every, content))
 
 
-def reached(every: Sequence[Training]) -> dict[str, Any]:
-    """By method: returns at the end, and samples and seconds until the mean return is `LEVEL` of
-    PPO's at its end, for the seeds that get there."""
-    level = LEVEL * float(np.mean([one.returns[-1] for one in every if one.method == "PPO"] or [0]))
-    out: dict[str, Any] = {}
-    for name in METHODS:
+def reached(every: Sequence[History]) -> dict[str, Any]:
+    """By method: returns at the end, and samples and seconds until the mean return is PPO's at its
+    end, for the seeds that get there."""
+    ends = [one.returns[-1] for one in every if one.method == "PPO"]
+    level = float(np.mean(ends)) if ends else float("nan")
+    out: dict[str, Any] = {"level": level}
+    for name in dict.fromkeys(one.method for one in every):
         mine = [one for one in every if one.method == name]
-        first = [(one, np.flatnonzero(np.array(one.returns) >= level)[:1]) for one in mine]
+        first = [next((i for i, x in enumerate(one.returns) if x >= LEVEL * level), None)
+                 for one in mine]  # fmt: skip
+        there = [(one, i) for one, i in zip(mine, first) if i is not None]
         out[name] = {
-            "returns": [one.returns[-1] for one in mine],
-            "samples at the end": [one.samples[-1] for one in mine],
-            "samples": [one.samples[i] for one, at in first for i in at],
-            "seconds": [one.seconds[i] for one, at in first for i in at],
-        }
+            "returns": [one.returns[-1] for one in mine], "reached": len(there),
+            "samples": [one.samples[i] for one, i in there],
+            "seconds": [one.seconds[i] for one, i in there],
+        }  # fmt: skip
     return out
 
 
-def table(content: dict[str, Any]) -> str:
-    """A row a method, numbers of all seeds in rising order; then what the controller misses."""
-    rows = [
-        (name, *(" ".join(f"{x:.{digits}f}" for x in sorted(one[key])) or "-"
-                 for key, digits in (("returns", 1), ("samples at the end", 0), ("samples", 0),
-                                     ("seconds", 0))))
-        for name, one in content["reached"].items()
-    ]  # fmt: skip
-    head = ("method", "returns at the end", "samples", f"{LEVEL:.0%} of PPO's after samples",
-            "after seconds")  # fmt: skip
-    missed = {"missed [mrad]": {k: 1e3 * x for k, x in content["deployed"]["missed_rad"].items()}}
-    return f"{markdown(head, rows)}\n\n{numbers('angle [rad], in the engine', missed, 2)}"
+def table(every: Sequence[History], content: dict[str, Any]) -> str:
+    def middle(values: Sequence[float]) -> str:
+        spread = f" ({min(values):.0f} .. {max(values):.0f})" if len(values) > 1 else ""
+        return f"{np.median(values):.0f}{spread}" if values else "-"
+
+    found, rows = content["reached"], []
+    for name in dict.fromkeys(one.method for one in every):
+        one, mine = found[name], [h for h in every if h.method == name]
+        returns = " ".join(f"{x:.1f}" for x in sorted(one["returns"]))
+        rows.append((name, returns, middle([h.samples[-1] for h in mine]),
+                     f"{one['reached']} of {len(mine)}", middle(one["samples"]),
+                     middle(one["seconds"])))  # fmt: skip
+    head = ("method", "returns at the end", "samples", f"reach {LEVEL:.0%} of PPO's",
+            "after samples", "after seconds")  # fmt: skip
+    parts = [markdown(head, rows)]
+    if "deployed" in content:
+        rows = [(name, *(f"{1e3 * x:.0f}" for x in values))
+                for name, values in content["deployed"]["missed_rad"].items()]  # fmt: skip
+        head = ("angle missed [mrad] at a target of", "-0.5", "-0.25", "0", "0.25", "0.5 rad")
+        parts.append(markdown(head, rows))
+    return "\n\n".join(parts)
 
 
-def figure(every: Sequence[Training]) -> Figure:
+def figure(every: Sequence[History]) -> Figure:
     """Return against samples and against processor time, a line a seed."""
     fig = Figure(figsize=(7.2, 3.2), layout="constrained")
     left, right = fig.subplots(1, 2, sharey=True)
-    for name, colour in zip(METHODS, ("C0", "C1")):
-        left.plot([], [], colour, label=name)
-        for one in every:
-            if one.method == name:
-                left.semilogx(np.maximum(one.samples, 100), one.returns, colour, lw=1)
-                right.plot(one.seconds, one.returns, colour, lw=1)
+    names = list(dict.fromkeys(one.method for one in every))
+    for one in every:
+        colour = f"C{names.index(one.method)}"
+        label = one.method if one is next(h for h in every if h.method == one.method) else None
+        left.semilogx(np.maximum(one.samples, 100), one.returns, colour, lw=1, label=label)
+        right.plot(one.seconds, one.returns, colour, lw=1)
     left.set(xlabel="samples", ylabel="mean return of ten episodes")
     right.set(xlabel="processor time [s]")
     left.legend(frameon=False)

@@ -53,5 +53,5 @@ def test_learn_dynamics_smoke(tmp_path):
     module.main(module.Config(out=tmp_path, smoke=True))
     numbers = json.loads((tmp_path / "summary.json").read_text())
     assert set(numbers["held out"]) == {"mu = 0.5", "constant, fitted", "network"}
-    assert set(numbers["surrogate"]) == {"linear", "network"}
+    assert len(numbers["surrogate"]) == 6
     assert (tmp_path / "learn_dynamics.png").exists()
