@@ -211,13 +211,18 @@ def test_a_hardness_stands_for_a_modulus(tmp_path, monkeypatch, capsys):
     with pytest.warns(UserWarning, match=r"shore_a = 30 is taken for E = 1\.14 MPa, the estimate"):
         file = RigFile.from_tree(tree)
     assert file.materials["rubber"].build(tmp_path).E.item() == from_shore_a(30)
-    assert file.override(materials={"rubber": {"E": 1e6}}).assemble().parameter("materials.rubber.E") == 1e6
+    assert (
+        file.override(materials={"rubber": {"E": 1e6}}).assemble().parameter("materials.rubber.E")
+        == 1e6
+    )
     for wrong, sentence in ((90, "hardness must be from 20 to 80"), ("a", r"a number \[Shore A\]")):
         tree["materials"]["rubber"]["shore_a"] = wrong
         with pytest.raises(ValueError, match=rf"materials\.rubber: shore_a: .*{sentence}"):
             RigFile.from_tree(tree)
     assert main(["init", "skin", "--material", "Dragon Skin 30"]) == 0
-    assert RigFile.from_toml("skin.toml").build().rig.parameter("materials.rubber.E") == from_shore_a(30)
+    assert RigFile.from_toml("skin.toml").build().rig.parameter(
+        "materials.rubber.E"
+    ) == from_shore_a(30)
     assert main(["init", "other", "--material", "Dragon"]) == 2
     assert "did you mean `Dragon Skin 30`?" in capsys.readouterr().err
 

@@ -15,8 +15,8 @@ write into one folder: --part 2/8 makes every eighth shard from the second on, a
 by two at a time."""
 
 SLURM = """\
-Writes a job array that makes a dataset in parts to the standard output, for `sbatch`, and its cost to
-the screen. Where some of it is made already, the array has the parts that are not."""
+Writes a job array that makes a dataset in parts to the standard output, for `sbatch`, and its cost
+to the screen. Where some of it is made already, the array has the parts that are not."""
 
 EXPORT = """\
 Writes a finished dataset, without its failed trajectories, in the form of another project:

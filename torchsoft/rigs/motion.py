@@ -263,8 +263,8 @@ def read_column(
     if (back := np.flatnonzero(np.diff(times) <= 0)).size:
         i = back[0]
         raise ValueError(
-            f"{path}, row {table.rows[i + 1]}, column `{time}`: {times[i + 1]:g} s follows {times[i]:g} "
-            "s; times must increase"
+            f"{path}, row {table.rows[i + 1]}, column `{time}`: {times[i + 1]:g} s follows "
+            f"{times[i]:g} s; times must increase"
         )
     return times.tolist(), values.tolist()
 
