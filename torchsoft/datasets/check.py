@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from torchsoft.datasets.config import Config
@@ -25,7 +26,7 @@ from torchsoft.datasets.schema import not_finite, variables
 from torchsoft.datasets.simulation import points, task
 from torchsoft.datasets.subject import SPLITS
 from torchsoft.files import PARTIAL
-from torchsoft.plot.figures import save
+from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line
 
 MOTIONS = ("x_C", "y_Br", "F_y")
@@ -188,6 +189,7 @@ def summary(url: str, data: xr.Dataset) -> str:
     )
 
 
+@rc_context(STYLE)
 def figure(data: xr.Dataset, config: Config) -> Figure:
     """Each parameter over the next by split, failures crossed; trajectories of each kind of motion
     and split; some sound motions."""

@@ -210,7 +210,8 @@ class RubberTable(PartTable):
         if "E" in data:
             raise ValueError("E and shore_a each say how stiff it is; give one of them")
         with at_field("shore_a"):
-            hardness: Any = NumberOr("Shore A").check(data["shore_a"])
+            hardness = NumberOr("Shore A").check(data["shore_a"])
+            assert isinstance(hardness, float)
             E = from_shore_a(hardness)
         warnings.warn(
             f"shore_a = {hardness:g} is taken for E = {1e-6 * E:.3g} MPa, the estimate of Gent "
