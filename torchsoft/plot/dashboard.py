@@ -272,8 +272,9 @@ def dashboard(
     normal force. `only` names some of the panels: "scene", contacts, coordinates such as "disc.x",
     "friction", and so on.
 
-    `look` "page" or "column" is camera-ready: that wide, without a title. Raises `ValueError` for
-    another one, and for a panel that is not there.
+    `look` "page" or "column" is camera-ready: that wide, without a title; a column has the scene,
+    two contacts and the friction by default. Raises `ValueError` for another one, and for a panel
+    that is not there.
     """
     if time is None:
         total = sum(
@@ -286,6 +287,9 @@ def dashboard(
         for key in list(run.setup.contacts)[::-1]
     }
     drawn = contacts | panels(run)
+    few = [*list(contacts)[:2], *(name for name in drawn if name == "friction")]
+    if look == "column" and not only:
+        only = ("scene", *few)
     wanted = chosen(only, ("scene", *drawn))
     pictured = "scene" in wanted
     wanted = [name for name in wanted if name != "scene"]
