@@ -10,6 +10,7 @@ import torch
 
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.pads import Pad
+from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
 
@@ -48,6 +49,12 @@ class Surface(NamedTuple):
     def faces(self, other: "Surface") -> bool:
         """Whether two surfaces look at each other."""
         return bool(self.normal @ other.normal < FACING)
+
+
+def at(coordinate: str) -> tuple[str, int]:
+    """Body and number of a coordinate such as "disc.x"."""
+    body, _, axis = coordinate.partition(".")
+    return body, COORDINATES.index(axis)
 
 
 def turned(v: Array, angle: float) -> Array:
