@@ -712,8 +712,8 @@ def test_numbers_that_the_dtype_cannot_hold_are_refused(partial):
     )
     with pytest.raises(
         ValueError,
-        match=r"`materials.rubber.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take a "
-        r"wider `dtype`",
+        match=r"`materials.rubber.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take "
+        r"a wider `dtype`",
     ):
         reading(partial, ["materials.rubber.E"], dtype=torch.float16)[0]
     with pytest.raises(IndexError):

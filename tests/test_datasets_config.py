@@ -88,13 +88,13 @@ def test_numbers_that_are_whole_are_numbers():
         ),
         (
             ("kinds", 0, "fixed", "motion.x_d", "values"),
-            [0.0, "held"],
+            ["held", 0.0],
             'kinds.0.fixed: impossible: motion.x_d.values: "held" stands for the effort that holds',
         ),
         (
             ("kinds", 0, "fixed", "pads.L.elements_x"),
             60,
-            "kinds.0.parameters in their middle: it changes the contact points of pads.L",
+            "kinds.0.fixed: it changes the contact points of pads.L",
         ),
         (("workers",), 3, "workers is not known here"),
         (("parameters", "materials.rubber.E"), {"low": 9e5, "high": 8e5}, "rubber.E: low = 9"),

@@ -333,7 +333,7 @@ class Drawn(NamedTuple):
         if self._impossible(in_ratio(self.file, parameters, middle)) is not None:
             if (why := self._impossible({})) is not None:
                 raise ValueError(f"{f'{self.where}fixed' if self.where else 'rig'}: {why}")
-            for name, where in single:
+            for name, where in sorted(single, key=lambda one: parameters[one[0]].ratio_to is None):
                 check({name: where}, alone=True)
             check({})
         for name, where in single:
