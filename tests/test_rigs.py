@@ -123,14 +123,15 @@ def test_what_is_held_is_the_papers_grasping_force():
     file = changed(
         coarse(ready_rig("paper")), motion__F_ff__values=(0.0, "held"), materials__rubber__E=0.6e6,
         bodies__disc__start__x=60.3e-3, bodies__bracket__start__x=60.3e-3,
+        motion__x_d={"kind": "hold"},
     )  # fmt: skip
     ready = file.build()
     force, _ = ready.rig.reference["F_ff"](torch.tensor(1.0, dtype=torch.float64))
     assert float(force) == pytest.approx(-holding_force(model, press(model, 48.6e-3)), rel=1e-9)
     state = ready.rig.unpack(ready.y0)
-    depth = float(ready.rig.penetration("U", state).max())
+    depth = float(ready.rig.penetration("U", state).max().detach())
     assert -1e-15 < depth <= 0.0
-    top = float(model.unpack(rest(model)).pose["bracket"][1])
+    top = float(model.unpack(rest(model).detach()).pose["bracket"][1])
     assert float(state.pose["bracket"][1]) == pytest.approx(top, abs=50e-6)  # points 2 mm apart
     aside = changed(file, bodies__bracket__start__x=1.0)
     with pytest.raises(ValueError, match=r'bracket\.start\.y: "touch", but no pad bonded to it'):

@@ -30,7 +30,7 @@ from torchsoft.physics.validity import sound
 from torchsoft.quantity import Gravity, Quantity, Time
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.fields import Group, at_field
-from torchsoft.rigs.geometry import Scene, at
+from torchsoft.rigs.geometry import AWAY, Scene, above, at, upon
 from torchsoft.rigs.motion import HELD, MotionContext, MotionTable, flattened
 from torchsoft.rigs.parts import (
     REST,
@@ -57,15 +57,6 @@ TAKEN = frozenset(dir(nn.ModuleDict()))
 
 ROWS = 1_000_000
 """Outputs of one run at the most."""
-
-UPWARDS = 0.1
-"""Least upward part of the normal of a pad that something may rest on."""
-
-AWAY = 100.0
-"""Height [m] of a body whose pads are to come down until they touch."""
-
-CLEAR, DESCENTS = 1e-16, 50
-"""Gap [m] of what just touches, above rounding, and the steps down to it."""
 
 STIFF = 100.0
 """How many times as stiff as a point of the pad a contact may be for statics to be sure of
@@ -532,13 +523,13 @@ class RigFile(Group):
                 value = AWAY if given == TOUCH else given or 0.0
                 pose[name][COORDINATES.index(axis)] = value
         self._follow(pose, 0.0, ("driven",))
-        for name, axes in self._wanted().items():
+        for name, axes in (wanted := self._wanted()).items():
             if 1 in axes:
                 pose[name][1] = above(Scene(rig, pose), name)
         try:
-            pose = self._rested(rig, pose, self._wanted())
+            pose = self._rested(rig, pose, wanted)
         except NoEquilibrium as error:
-            name, (axis, *_) = next(iter(self._wanted().items()))
+            name, (axis, *_) = next(iter(wanted.items()))
             raise ValueError(
                 too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}"
             ) from None
@@ -609,49 +600,3 @@ def too_stiff(file: RigFile, rig: Rig) -> str:
                 "less, the pad gives way long before the contact does"
             )
     return ""
-
-
-def above(scene: Scene, body: str) -> float:
-    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there
-    is none."""
-    below, *beside = (
-        scene.reach(body, np.array(way)) for way in ([0.0, -1.0], [-1.0, 0.0], [1.0, 0.0])
-    )
-    x, heights = float(scene.pose[body][0]), []
-    for key, contact in scene.rig.contacts.items():
-        at, pad = scene.points(key), scene.pad(key)
-        on = contact.body == body and scene.surface(key).normal[1] > UPWARDS
-        if not on or not at[:, 0].min() < x < at[:, 0].max():
-            continue
-        under = at[(at[:, 0] > x - beside[0]) & (at[:, 0] < x + beside[1])]
-        if not len(under):
-            raise ValueError(
-                f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of "
-                f"`{contact.pad}`, which are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; "
-                f"make it larger, or give pads.{contact.pad} more elements or points"
-            )
-        heights.append(float(under[:, 1].max()) + below)
-    if not heights:
-        raise ValueError(
-            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x '
-            f"= {x:g} m; "
-            "place it over one, or say at which height it starts"
-        )
-    return max(heights)
-
-
-def upon(scene: Scene, body: str) -> float:
-    """The height [m] at which the pads of a body, come down from above, just touch. Raises
-    `ValueError` where they touch nothing."""
-    rig, pose = scene.rig, {name: x.copy() for name, x in scene.pose.items()}
-    own = [key for key, one in rig.contacts.items() if rig.pads[one.pad].base == body]
-    gap = np.inf
-    for _ in range(DESCENTS if own else 0):
-        gap = -max(Scene(rig, pose).pressed(key) for key in own)
-        pose[body][1] -= gap
-    if not abs(gap) < 1e-9:
-        raise ValueError(
-            f'bodies.{body}.start.y: "{TOUCH}", but no pad bonded to it comes down upon a body '
-            "that it has a contact with; place it over one, or say at which height it starts"
-        )
-    return float(pose[body][1]) + CLEAR
