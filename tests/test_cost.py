@@ -14,13 +14,10 @@ from torchsoft.cli import main
 from torchsoft.cost import Cost, Costly, agree, duration, rig_row, rig_step
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost
-from torchsoft.datasets.rig_files import embedded
 from torchsoft.physics.mesh import unit_compliance
 from torchsoft.rigs.run import condensing_time
 from torchsoft.rigs.written import template, to_toml
 
-CONFIGS = Path(__file__).parent.parent / "data_gen" / "configs"
-SMOKE = embedded(tomllib.loads((CONFIGS / "smoke.toml").read_text()), CONFIGS)
 CHEAP, LONG, LARGE = Cost(1e4, 60.0, 0.1), Cost(1e9, 2e5, 0.1), Cost(1e4, 60.0, 1e6)
 
 

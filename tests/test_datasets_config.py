@@ -17,8 +17,7 @@ from torchsoft.datasets.simulation import points, task
 from torchsoft.tables import InvalidTable
 
 PATH = Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml"
-CONFIGS = Path(__file__).parent.parent / "data_gen" / "configs"
-SMOKE = embedded(tomllib.loads((CONFIGS / "smoke.toml").read_text()), CONFIGS)
+SMOKE = embedded(tomllib.loads(PATH.read_text()), PATH.parent)
 LAW, LIGHT = "laws.steel_on_rubber", {"low": 49.6e-3, "high": 49.8e-3}
 
 
@@ -143,11 +142,19 @@ def test_a_logarithmic_range_does_not_go_beyond_its_ends(high):
     assert r.low <= r.at(0.0) <= r.at(1e-16) <= r.at(1.0) <= r.high
 
 
-def test_the_command_refuses_in_one_line(tmp_path, capsys):
-    path = tmp_path / "set.toml"
-    text = (CONFIGS / "smoke.toml").read_text().replace("../../rigs", str(CONFIGS / "../../rigs"))
-    path.write_text(text.replace("trajectories = 8", "trajectories = 1000000"))
-    assert main([str(path), "--out", str(tmp_path / "set"), "--workers", "0"]) == 2
+@pytest.mark.parametrize(
+    ("file", "out", "message"),
+    [
+        ("million.toml", "set", "or say --yes to begin"),
+        ("none.toml", "set", "No such file"),
+        (str(PATH), "nowhere://set", "Protocol not known: nowhere"),
+    ],
+)
+def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, file, out, message):
+    monkeypatch.chdir(tmp_path)
+    text = PATH.read_text().replace("../../rigs", str(PATH.parents[2] / "rigs"))
+    Path("million.toml").write_text(text.replace("trajectories = 8", "trajectories = 1000000"))
+    assert main([file, "--out", out, "--workers", "0"]) == 2
     said = capsys.readouterr().err
     assert message in said
     assert said.count("\n") == 1
