@@ -160,6 +160,10 @@ class Kind(Table):
     motion, and the `parameters` that are drawn besides those of all kinds, or otherwise."""
 
     name: str = Field(min_length=1, max_length=100)
+    """in the array `kind`"""
     weight: float = Field(default=1.0, ge=1e-6, le=1e6)
+    """by which it is drawn"""
     fixed: dict[str, Any] = Field(default_factory=dict)
+    """values in it, or whole tables such as a motion, by the names of the rig file's tables"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
+    """distributions of its own, besides those of all kinds or in their place"""

@@ -486,10 +486,8 @@ class RigFile(Group):
         (follows, *more), (fed, *others) = (
             sorted(roles.get(role, ())) or [""] for role in ("setpoint", "feed_forward")
         )
-        start = None
-        if pose is not None and follows and not more:
-            body, axis = at(follows)
-            start = float(pose[body][axis])
+        body, axis = at(follows) if follows and not more else ("", 0)
+        start = float(pose[body][axis]) if pose is not None and body else None
         effort = partial(held, fed) if held and fed and not others else None
         asked = MotionContext(
             name, self.unit(name), start, effort, self.outputs.duration, self.folder
@@ -555,7 +553,7 @@ class RigFile(Group):
         if not wanted:
             return dict(pose)
         places = {name: torch.from_numpy(x) for name, x in pose.items()}
-        still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+        still = torch.zeros(len(rig.signals), 2).double()
         found = resting(rig, places, wanted, signals=still, actuators=())
         return {name: x.numpy() for name, x in found.items()}
 
