@@ -24,7 +24,7 @@ from test_datasets_rigs import contents, same_commit, sound
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from torchsoft import SoftGrasp, simulate
+from torchsoft import Rig, simulate
 from torchsoft.datasets import simulation
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
@@ -39,30 +39,35 @@ from torchsoft.solve.progress import SimulationFailed
 ROOT = Path(__file__).parent.parent
 CONFIGS = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
 
-TOML = """
+TOML = f"""
 title = "Test"
+rig = {json.dumps(str(ROOT / "rigs" / "paper.toml"))}
 seed = 3
-trajectories = {trajectories}
-trajectories_per_shard = {shard}
+trajectories = {{trajectories}}
+trajectories_per_shard = {{shard}}
 duration = 0.9
 sample_interval = 0.01
 step = 0.002
 samples_per_chunk = 40
-grasp_depth = {{ low = 1.3e-3, high = 1.5e-3 }}
 [fixed]
-"pad.elements_x" = 60
-"pad.elements_y" = 2
-"contact.v_s" = 0.05
+"pads.L.elements_x" = 60
+"pads.L.elements_y" = 2
+"pads.U.elements_x" = 60
+"pads.U.elements_y" = 2
+"laws.steel_on_rubber.friction.v_s" = 0.05
+"motion.F_ff.values.1" = "held"
 [parameters]
-"pad.E" = {{ low = 7e5, high = 8e5, scale = "log" }}
-"contact.mu_s" = {{ low = 0.7, high = 0.9 }}
+"materials.rubber.E" = {{{{ low = 7e5, high = 8e5, scale = "log" }}}}
+"laws.steel_on_rubber.friction.mu_s" = {{{{ low = 0.7, high = 0.9 }}}}
+"motion.y_d.values.1" = {{{{ low = 48.6e-3, high = 48.8e-3 }}}}
 [[kinds]]
-kind = "slow_roll"
-travel = {{ low = 1e-3, high = 2e-3 }}
+name = "slow_roll"
+fixed."motion.x_d" = {{{{ kind = "strokes", since = 0.5, stroke_time = 0.4, travel = 1e-3 }}}}
+parameters."motion.x_d.travel" = {{{{ low = 1e-3, high = 2e-3, either_sign = true }}}}
 [[kinds]]
-kind = "multi_sine"
-amplitude_x = {{ low = 2e-4, high = 4e-4 }}
-amplitude_y = {{ low = 1e-5, high = 3e-5 }}
+name = "shake"
+fixed."motion.x_d" = {{{{ kind = "chirp", since = 0.5, amplitude = 1.0, first = 2.0, last = 5.0 }}}}
+parameters."motion.x_d.amplitude" = {{{{ low = 2e-4, high = 4e-4 }}}}
 """
 
 
@@ -124,7 +129,9 @@ def read_everywhere(url: str, folder: Path) -> None:
     """The check, xarray and torch see behind `url` what they see in `folder`."""
     assert [x for x in check(url) if "commit" not in x] == []
     assert open_dataset(url).load().identical(open_dataset(str(folder)).load())
-    here, there = (Trajectories(place, ["x_C", "pad.E"], window=7) for place in (url, str(folder)))
+    here, there = (
+        Trajectories(place, ["x_C", "materials.rubber.E"], window=7) for place in (url, str(folder))
+    )
     assert len(here) == len(there) == 5 * 13
     torch.testing.assert_close(here[20], there[20], rtol=0, atol=0)
 
@@ -171,7 +178,10 @@ def test_xarray_opens_it_with_units(made):
 
 @pytest.mark.parametrize(
     ("fixed", "points", "stores"),
-    [('"pad.fidelity" = "inertial"', 61, 9), ('"contact.points" = 2', 120, 7)],
+    [
+        ('"pads.L.inertial" = true\n"pads.U.inertial" = true', 61, 9),
+        ('"pads.L.points" = 2\n"pads.U.points" = 2', 120, 7),
+    ],
 )
 def test_other_pads_and_contacts_are_kept_whole(tmp_path, fixed, points, stores):
     """The kinetic energy of inertial pads is in the balance; series of nodes are then those of all
@@ -300,7 +310,10 @@ def open_ledger(folder: Path) -> None:
         (set_value("x_C", (0, 3), np.inf), "trajectory 0: not finite: x_C"),
         (set_value("stored_energy", (1, 7, 2), 1.0), "trajectory 1: energy_residual is not"),
         (set_value("contact_L", (0, 60), 0), "acts where contact_L is 0"),
-        (set_value("pad.E", (2,), 7.5e5), r"trajectory 2: pad\.E is 750000.0"),
+        (
+            set_value("materials.rubber.E", (2,), 7.5e5),
+            r"trajectory 2: materials\.rubber\.E is 750000.0",
+        ),
         (set_value("failed", (3,), 1), "failed without a reason"),
     ],
 )
@@ -321,7 +334,7 @@ def test_wrong_content_is_found(made, tmp_path, change, message):
             edit("theta/c/0/0", flipped),
             r"theta/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
         ),
-        (edit("grasp_force/c/2", flipped), "grasp_force/c/2 is damaged"),
+        (edit("motion.y_d.values.1/c/2", flipped), "motion.y_d.values.1/c/2 is damaged"),
         (remove("omega/c/1/0"), "omega/c/1/0 is missing"),
         (swap("omega/c/0/0", "omega/c/1/0"), "omega/c/0/0 is damaged"),
         (write("finished/1.sha256", b""), r"finished/1\.sha256 is damaged"),
@@ -351,7 +364,7 @@ def test_damage_is_found(made, tmp_path, damage, message):
     with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished") as refused:
         open_dataset(str(folder)).load()
     assert "\n" not in str(refused.value)
-    names = ["theta", "F_ff", "grasp_force", "omega"]
+    names = ["theta", "F_ff", "motion.y_d.values.1", "omega"]
     if (
         "time" not in message and "/c/1" not in message
     ):  # what is damaged may be of an array that it does not read
@@ -374,7 +387,7 @@ def test_damage_to_what_readers_do_not_open_is_found_by_the_check(made, tmp_path
 def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made, tmp_path):
     """By the checksums of the arrays, without this package's reader."""
     folder = copy(made[0], tmp_path / "set")
-    for name in ("theta/c/0/0", "grasp_force/c/1"):
+    for name in ("theta/c/0/0", "motion.y_d.values.1/c/1"):
         edit(name, flipped)(folder)
         with pytest.raises(ValueError, match="checksum"):
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
@@ -458,7 +471,7 @@ def test_check_draws_its_picture(made, tmp_path, capsys):
 
 
 def test_a_failed_simulation_is_recorded(tmp_path, monkeypatch):
-    def failing(model: SoftGrasp, t: Tensor, **options: Any) -> None:
+    def failing(model: Rig, t: Tensor, **options: Any) -> None:
         failure = SimulationFailed("the disc was lost at t = 0.1 s", 0.1)
         failure.trajectory = simulate(model, t[:11], **options)
         raise failure
@@ -471,7 +484,7 @@ def test_a_failed_simulation_is_recorded(tmp_path, monkeypatch):
     assert str(data.reason.values[0]) == "the disc was lost at t = 0.1 s"
     assert data.failure_time.values.tolist() == [0.1]
     assert np.isnan(data.x_C).all()
-    assert data["pad.E"].values[0] > 0
+    assert data["materials.rubber.E"].values[0] > 0
     assert sound(tmp_path / "set")
 
 
@@ -589,7 +602,7 @@ def partial(made, tmp_path_factory):
     is not finished."""
     folder = copy(made[0], tmp_path_factory.mktemp("partial") / "set")
     set_value("failed", (2,), 1)(folder)
-    set_value("grasp_force", (0,), np.inf)(folder)
+    set_value("motion.y_d.values.1", (0,), np.inf)(folder)
     vouch(folder)
     remove("finished/2.sha256")(folder)
     return str(folder)
@@ -602,7 +615,7 @@ def reading(url: str, *what: Any, **how: Any) -> Trajectories:
 
 def test_windows_hold_what_the_store_holds(partial):
     data, stored = (
-        reading(partial, ["x_C", "pad.E"], window=5, stride=40),
+        reading(partial, ["x_C", "materials.rubber.E"], window=5, stride=40),
         xr.open_zarr(partial),
     )
     assert data.trajectories.tolist() == [0, 1, 3]  # 2 failed, 4 is unfinished
@@ -610,7 +623,7 @@ def test_windows_hold_what_the_store_holds(partial):
     item = data[4]  # the second window of trajectory 1
     assert (int(item["trajectory"]), int(item["start"])) == (1, 40)
     np.testing.assert_array_equal(item["x_C"], stored["x_C"][1, 40:45])
-    assert item["pad.E"] == float(stored["pad.E"][1])
+    assert item["materials.rubber.E"] == float(stored["materials.rubber.E"][1])
     assert int(data[-1]["start"]) == 80
 
 
@@ -623,9 +636,9 @@ def test_splits_are_those_of_the_design(partial, made):
 
 def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial):
     fsspec.filesystem("memory").put(partial, "/copy/set", recursive=True)
-    plain = reading(partial, ["x_C", "pad.E"], window=30, dtype=torch.float32)
+    plain = reading(partial, ["x_C", "materials.rubber.E"], window=30, dtype=torch.float32)
     for url in (partial, "memory://copy/set"):
-        data = reading(url, ["x_C", "pad.E"], window=30, dtype=torch.float32)
+        data = reading(url, ["x_C", "materials.rubber.E"], window=30, dtype=torch.float32)
         data[0]  # opened before the fork
         assert len(pickle.dumps(data)) < 2000
         batches = list(
@@ -641,7 +654,7 @@ def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial):
 
 def test_windows_in_memory_streamed_and_read_one_by_one_are_the_same(partial):
     """With each sweep in another order, and with workers that share the shards out."""
-    names, how = ["x_C", "pad.E"], {"window": 5, "stride": 3, "dtype": torch.float32}
+    names, how = ["x_C", "materials.rubber.E"], {"window": 5, "stride": 3, "dtype": torch.float32}
     held, read = reading(partial, names, **how), reading(partial, names, **how, memory=0.0)
     assert (held.fits, read.fits) == (True, False)
     assert held.size == 3 * 4 * (91 + 1)
@@ -666,7 +679,7 @@ def test_windows_in_memory_streamed_and_read_one_by_one_are_the_same(partial):
 
 def test_windows_come_fast_from_memory(partial):
     """Shuffled, two thousand a second and more on one core."""
-    windows = reading(partial, ["x_C", "F_y", "pad.E"], window=20, stride=1)
+    windows = reading(partial, ["x_C", "F_y", "materials.rubber.E"], window=20, stride=1)
     began, count = time.process_time(), 0
     while time.process_time() - began < 0.5:
         for batch in DataLoader(windows, batch_size=64, shuffle=True):
@@ -694,12 +707,14 @@ def test_a_reading_that_is_none_is_refused(partial, names, how, message):
 
 def test_numbers_that_the_dtype_cannot_hold_are_refused(partial):
     """And those that are not finite in the store are given as they are."""
-    assert torch.isinf(reading(partial, ["grasp_force"], dtype=torch.float16)[0]["grasp_force"])
+    assert torch.isinf(
+        reading(partial, ["motion.y_d.values.1"], dtype=torch.float16)[0]["motion.y_d.values.1"]
+    )
     with pytest.raises(
         ValueError,
-        match=r"`pad.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take a wider "
-        r"`dtype`",
+        match=r"`materials.rubber.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take "
+        r"a wider `dtype`",
     ):
-        reading(partial, ["pad.E"], dtype=torch.float16)[0]
+        reading(partial, ["materials.rubber.E"], dtype=torch.float16)[0]
     with pytest.raises(IndexError):
-        reading(partial, ["pad.E"])[1000]
+        reading(partial, ["materials.rubber.E"])[1000]

@@ -17,9 +17,10 @@ from conftest import nested
 from PIL import Image
 from test_rig_parts import STONE
 
-from torchsoft import Parameters, SoftGrasp, press, simulate
+from torchsoft import Parameters, SoftGrasp, press, rest, simulate
 from torchsoft.cli import main
 from torchsoft.materials.presets import from_shore_a
+from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
@@ -99,24 +100,58 @@ def test_the_papers_rig_is_soft_grasp():
     """The same start to rounding, and from the same start the same bits."""
     model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
     manipulation = grasp_and_roll(model, grasp_force=80.0)
-    top = float(model.unpack(manipulation.y0).pose["bracket"][1])
     file = coarse(ready_rig("paper"))
+    assert torch.allclose(file.build().y0, manipulation.y0, rtol=0, atol=1e-11)
+    top = float(model.unpack(manipulation.y0).pose["bracket"][1])
     file = changed(file, bodies__bracket__start__y=top, motion__F_ff__values=(0.0, -80.0))
     ready = file.build()
-    assert torch.allclose(ready.y0, manipulation.y0, rtol=0, atol=1e-11)
     t = torch.linspace(0, 0.6, 61, dtype=torch.float64)
     with torch.no_grad():
         assert torch.equal(ready.rig(0.1, manipulation.y0), model(0.1, manipulation.y0))
     runs = [simulate(rig, t, y0=manipulation.y0) for rig in (model, ready.rig)]
     assert torch.equal(runs[0].y, runs[1].y)
-    for own, other in (
-        ("x_C", "x_C"),
-        ("theta", "theta_C"),
-        ("F_x", "F_x"),
-        ("F_y", "F_y"),
-        ("bracket_moment", "M_U"),
-    ):
-        assert torch.equal(runs[0][own], runs[1][other])
+    for name in ("x_C", "theta", "F_x", "F_y", "bracket_moment"):
+        assert torch.equal(runs[0][name], runs[1][name])
+
+
+def test_what_is_held_is_the_papers_grasping_force():
+    """Fed forward, it is that of the friction-free grasp, and the bracket comes down to touch the
+    disc wherever this is; both by statics."""
+    model = SoftGrasp(Parameters().override({
+        "pad.elements_x": 60, "pad.elements_y": 2, "scenario.x_C0": 60.3e-3, "pad.E": 0.6e6,
+    }))  # fmt: skip
+    file = changed(
+        coarse(ready_rig("paper")), motion__F_ff__values=(0.0, "held"), materials__rubber__E=0.6e6,
+        bodies__disc__start__x=60.3e-3, bodies__bracket__start__x=60.3e-3,
+        motion__x_d={"kind": "hold"},
+    )  # fmt: skip
+    ready = file.build()
+    force, _ = ready.rig.reference["F_ff"](torch.tensor(1.0, dtype=torch.float64))
+    assert float(force) == pytest.approx(-holding_force(model, press(model, 48.6e-3)), rel=1e-9)
+    state = ready.rig.unpack(ready.y0)
+    depth = float(ready.rig.penetration("U", state).max().detach())
+    assert -1e-15 < depth <= 0.0
+    top = float(model.unpack(rest(model).detach()).pose["bracket"][1])
+    assert float(state.pose["bracket"][1]) == pytest.approx(top, abs=50e-6)  # points 2 mm apart
+    aside = changed(file, bodies__bracket__start__x=1.0)
+    with pytest.raises(ValueError, match=r'bracket\.start\.y: "touch", but no pad bonded to it'):
+        aside.build()
+
+
+def test_strokes_go_there_and_back_until_there_is_no_time_for_more():
+    stroke = {"kind": "strokes", "since": 0.5, "stroke_time": 0.2, "travel": -1e-3, "until": 1.2}
+    file = changed(coarse(ready_rig("paper")), motion__x_d=stroke)
+    follow = file.build().rig.reference["x_d"]
+    t = torch.tensor([0.0, 0.5, 0.6, 0.7, 0.9, 1.1, 1.3], dtype=torch.float64)
+    wanted = torch.tensor([0.0, 0.0, -0.5e-3, -1e-3, 0.0, -1e-3, -1e-3], dtype=torch.float64)
+    assert torch.allclose(follow(t)[0] - 60e-3, wanted, rtol=0, atol=1e-12)
+
+
+def test_channels_have_the_names_that_a_file_gives_them():
+    with pytest.raises(ValueError, match=r"channels.theta_X: the rig has no such channel"):
+        changed(coarse(ready_rig("paper")), channels__theta_X="angle").assemble()
+    with pytest.raises(ValueError, match="channels: two would have the same name"):
+        changed(coarse(ready_rig("paper")), channels__theta_C="x_C").assemble()
 
 
 def test_a_drop_is_not_missed():

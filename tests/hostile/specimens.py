@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -21,8 +22,9 @@ EXAMPLE = ROOT / "examples" / "identify"
 
 SMALL = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
 
-DATASET = """
+DATASET = f"""
 title = "Small"
+rig = {json.dumps(str(ROOT / "rigs" / "paper.toml"))}
 seed = 5
 trajectories = 3
 trajectories_per_shard = 2
@@ -30,19 +32,21 @@ duration = 0.5
 sample_interval = 0.025
 step = 0.005
 samples_per_chunk = 16
-settle = 0.0
-grasp_depth = { low = 1.3e-3, high = 1.5e-3 }
 [fixed]
-"pad.elements_x" = 40
-"pad.elements_y" = 1
-"contact.v_s" = 0.05
-"scenario.grasp_time" = 0.1
+"pads.L.elements_x" = 40
+"pads.L.elements_y" = 1
+"pads.U.elements_x" = 40
+"pads.U.elements_y" = 1
+"laws.steel_on_rubber.friction.v_s" = 0.05
+"motion.y_d.times.1" = 0.1
+"motion.F_ff" = {{ kind = "profile", times = [0.0, 0.1], values = [0.0, "held"] }}
 [parameters]
-"pad.E" = { low = 7e5, high = 8e5, scale = "log" }
+"materials.rubber.E" = {{ low = 7e5, high = 8e5, scale = "log" }}
+"motion.y_d.values.1" = {{ low = 48.6e-3, high = 48.8e-3 }}
 [[kinds]]
-kind = "multi_sine"
-amplitude_x = { low = 2e-4, high = 4e-4 }
-amplitude_y = { low = 1e-5, high = 3e-5 }
+name = "shake"
+fixed."motion.x_d" = {{ kind = "chirp", since = 0.1, amplitude = 1e-3, first = 2.0, last = 5.0 }}
+parameters."motion.x_d.amplitude" = {{ low = 2e-4, high = 4e-4 }}
 """
 
 IDENTIFICATION = """

@@ -20,6 +20,7 @@ from torchsoft import Parameters, SoftGrasp, rest, simulate
 from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost as dataset_cost
+from torchsoft.datasets.rig_files import embedded
 from torchsoft.datasets.simulation import points, task
 from torchsoft.excitation import Excitation, begin
 from torchsoft.sysid import measured
@@ -101,10 +102,11 @@ def excitations() -> list[dict[str, Any]]:
 
 def datasets() -> list[dict[str, Any]]:
     files = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
-    trees = [tomllib.loads(path.read_text()) for path in files]
+    trees = [embedded(tomllib.loads(path.read_text()), path.parent) for path in files]
     for tree in trees:
-        tree["fixed"] = tree.get("fixed", {}) | COARSE | {"pad.height": 4.6e-3}
-        tree["kinds"].append({"kind": "jerk", "depth": {"low": 2e-4, "high": 4e-4}})
+        blocks = (name for name, pad in tree["rig"]["pads"].items() if "elements_x" in pad)
+        coarse = {f"pads.{name}.elements_x": 20 for name in blocks}
+        tree["fixed"] = tree.get("fixed", {}) | coarse
     return trees
 
 
@@ -126,8 +128,8 @@ def excite_briefly(e: Excitation) -> None:
 
 
 def design_briefly(config: Config) -> None:
-    """The cost, the first tasks of the design, and one of their references; a costly set needs the
-    user's word."""
+    """The cost, the first tasks of the design, and the begin of one; a costly set needs the user's
+    word."""
     expected = dataset_cost(config, 2)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
     try:
@@ -138,8 +140,9 @@ def design_briefly(config: Config) -> None:
     for i, u in enumerate(points(few)):
         one = task(few, i, u)
         assert np.isfinite([x for x in one.labels.values() if not isinstance(x, str)]).all()
-    if one.parameters.pad.memory <= SMALL:
-        excite_briefly(one.excitation)
+    if max(pad.mesh.memory for pad in few.subject.template.pads.values()) <= SMALL:
+        rig, y0 = few.subject.begin(one)
+        finite(y0, simulate(rig, BRIEFLY, y0=y0, step=2e-3).y)
 
 
 class Kind(NamedTuple):

@@ -208,7 +208,7 @@ COMMANDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     (IDENTIFY, "data.csv deep.toml", "nested too deeply"),
     (GENERATE, "million.toml --out o", "--yes"),
     (GENERATE, "huge.toml --out o", "elements_x"),
-    (GENERATE, "text.toml --out o", "fixed.pad.height"),
+    (GENERATE, "text.toml --out o", "fixed.pads.L.height"),
     (GENERATE, "long.toml --out o", "duration"),
     (GENERATE, "bad.toml --out o", "not a TOML file"),
     (GENERATE, "none.toml --out o", "none.toml"),
@@ -223,6 +223,7 @@ def folder(tmp_path, monkeypatch):
     """Recordings, configurations, and some that are wrong."""
     rig = tomllib.loads(IDENTIFICATION)
     data = tomllib.loads(sorted((ROOT / "data_gen" / "configs").glob("*.toml"))[2].read_text())
+    data["rig"] = str(ROOT / "rigs" / "paper.toml")
     table = cells()
     trees = {
         "rig.toml": rig,
@@ -230,8 +231,8 @@ def folder(tmp_path, monkeypatch):
         "µ.toml": rig | {"µ": 1},
         "set.toml": data,
         "million.toml": data | {"trajectories": 1_000_000},
-        "huge.toml": data | {"fixed": {"pad.elements_x": 40_000}},
-        "text.toml": data | {"fixed": {"pad.height": "abc"}},
+        "huge.toml": data | {"fixed": {"pads.L.elements_x": 40_000}},
+        "text.toml": data | {"fixed": {"pads.L.height": "abc"}},
         "long.toml": data | {"duration": 1e308},
     }
     files = {name: document(tree).encode() for name, tree in trees.items()} | {

@@ -2,12 +2,11 @@
 
 import json
 from collections.abc import Iterable
-from typing import Any
 
 import xarray as xr
 
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.distributions import Choice, Normal
+from torchsoft.datasets.distributions import Choice, Distribution, Normal
 from torchsoft.datasets.files import CARD, Manifest, read_bytes, store_errors, write_bytes
 from torchsoft.datasets.reader import Vouched
 from torchsoft.datasets.schema import variables
@@ -81,24 +80,23 @@ def counts(data: xr.Dataset) -> str:
 def rig(config: Config) -> str:
     """The parts of the rig, and what touches."""
     it = config.subject.template
-    of = "That of the paper" if config.rig is None else f"`{config.rig.get('title', 'rig file')}`"
     touching = (f"{one.body} on {one.pad}" for one in it.contacts.values())
     groups = {"bodies": it.bodies, "pads": it.pads, "contacts": touching, "actuators": it.actuators}
     said = (f"{name} {', '.join(some)}" for name, some in groups.items())
-    return f"{of}: {'; '.join(said)}."
+    return f"`{config.rig.get('title', 'rig file')}`: {'; '.join(said)}."
 
 
 def drawn(config: Config) -> Iterable[tuple[str, ...]]:
     """What is drawn: numbers of the rig, and of its motions."""
-    for name, one in config.subject.ranges.items():
-        unit = "1" if getattr(one, "ratio_to", None) else variables(config)[name].unit
+    for name, one in config.parameters.items():
+        unit = "1" if one.ratio_to else variables(config)[name].unit
         yield f"`{name}`", distribution(one), unit
     for kind in config.kinds:
-        said = (f"{name} {distribution(one)}" for name, one in kind.ranges.items())
-        yield f"motion `{kind.kind}`, weight {kind.weight:g}", "; ".join(said), "SI"
+        said = (f"`{name}` {distribution(one)}" for name, one in kind.parameters.items())
+        yield f"kind `{kind.name}`, weight {kind.weight:g}", "; ".join(said), "SI"
 
 
-def distribution(one: Any) -> str:
+def distribution(one: Distribution) -> str:
     """A distribution in words."""
     span = f"{one.low:g} to {one.high:g}"
     if isinstance(one, Choice):
@@ -107,8 +105,8 @@ def distribution(one: Any) -> str:
         said = f"normal, mean {one.mean:g}, standard deviation {one.sd:g}, {span}"
     else:
         said = span + (", logarithmic" if one.scale == "log" else "")
-    base = getattr(one, "ratio_to", None)
-    return said + (f", times `{base}`" if base else "")
+        said += ", of either sign" if one.either_sign else ""
+    return said + (f", times `{one.ratio_to}`" if one.ratio_to else "")
 
 
 def arrays(config: Config) -> Iterable[tuple[str, ...]]:

@@ -29,9 +29,6 @@ from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line
 
-MOTIONS = ("x_C", "y_Br", "F_y")
-"""Channels that the picture shows over time."""
-
 MOST = 3
 """Trajectories that it shows, of every kind of motion."""
 
@@ -193,7 +190,7 @@ def summary(url: str, data: xr.Dataset) -> str:
 def figure(data: xr.Dataset, config: Config) -> Figure:
     """Each parameter over the next by split, failures crossed; trajectories of each kind of motion
     and split; some sound motions."""
-    ranged = config.subject.ranges
+    ranged = config.parameters
     by = [name for name in ("kind", "split") if name in data]
     names, series = list(ranged), moving(data, config)
     count = len(names) + 1 + len(series)
@@ -207,9 +204,7 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     for ax, x, y in zip(panels, names, [*names[1:], names[0]]):
         for name, some in table.groupby("split"):
             ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4, label=name)
-        label, other = (
-            f"{name} [{data[name].units}]".replace("_over_", " over\n") for name in (x, y)
-        )
+        label, other = (f"{name} [{data[name].units}]" for name in (x, y))
         ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
     fig.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
     for ax in panels[count:]:
@@ -230,10 +225,8 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
 
 
 def moving(data: xr.Dataset, config: Config) -> list[str]:
-    """Names of the series, three at the most, that the picture shows: of a rig file the liveliest,
-    each over its own largest value."""
-    if config.rig is None:
-        return list(MOTIONS)
+    """Names of the series, three at the most, that the picture shows: the liveliest, each over its
+    own largest value."""
     names = list(config.subject.signals)
     values = data[names].isel(trajectory=np.flatnonzero(data.failed == 0)[:MOST])
     spread = {name: float(one.std() / max(float(abs(one).max()), 1e-300))

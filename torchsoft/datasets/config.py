@@ -7,9 +7,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from torchsoft.datasets.distributions import Distribution, Lengths
-from torchsoft.datasets.paper import Kind, PaperGrasp
-from torchsoft.datasets.rig_files import RigOfFile, embedded, outputs_of
+from torchsoft.datasets.distributions import Distribution, Kind
+from torchsoft.datasets.rig_files import embedded, outputs_of
 from torchsoft.datasets.subject import Subject
 from torchsoft.tables import LISTED, SEED, Table, from_toml
 
@@ -17,9 +16,8 @@ STEP = 0.02
 """Largest step [s] of the stepper: twice the pads' own time, and the energy balance is off by
 percents."""
 
-OF_THE_PAPER = ("settle", "feed_forward", "grasp_depth", "kinds")
-OF_A_FILE = ("rig", "files", "channels", "nodal")
-"""Fields that the other subject has not."""
+OUTDATED = ("grasp_depth", "settle", "feed_forward")
+"""Fields of configurations that knew the paper's rig only."""
 
 
 class Fractions(Table):
@@ -38,12 +36,11 @@ class Fractions(Table):
 
 
 class Config(Table):
-    """One dataset, of the paper's rig or of that of a `rig` file. `ValueError` names the field that
-    is wrong.
+    """One dataset, of the rig of a file. `ValueError` names the field that is wrong.
 
     Everything but `title`, `description` and `license` decides the data; `trajectories_per_shard`
-    and `samples_per_chunk` decide only where they lie. Parameters are known by the names of
-    `Parameters`, those of a rig file by the names of its tables.
+    and `samples_per_chunk` decide only where they lie. Parameters are known by the names of the
+    rig file's tables.
     """
 
     title: str
@@ -70,26 +67,19 @@ class Config(Table):
     """relative tolerance of the stepper [1]; 1e-4 by default, or what the rig file says"""
     step: float | None = Field(None, ge=1e-6, le=STEP)
     """equal steps no longer than this [s] instead"""
-    settle: float = Field(0.125, ge=0, le=1e4)
-    """time between the end of the grasp and the start of the motion [s]"""
-    feed_forward: Literal["pressed", "found"] = "pressed"
-    """grasping force of the frictionless statics, or found by simulating the grasp until the
-    bracket holds its height"""
     node_precision: Literal["float32", "float64"] = "float32"
     """of everything that is kept per node; the rest is float64"""
     ledger_tolerance: float = Field(0.02, ge=1e-12, le=1.0)
     """largest energy residual over the energy injected [1] that the check accepts"""
-    grasp_depth: Lengths = Lengths(low=1.0e-3, high=1.6e-3)
-    """compression of both pads together [m]"""
     splits: Fractions = Fractions(train=0.7, validation=0.15)
     """fractions of the trajectories; the rest is for testing"""
     fixed: dict[str, Any] = Field(default_factory=dict)
-    """parameters that differ from their defaults, or from the rig file, in every trajectory"""
+    """parameters that differ from the rig file in every trajectory"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
     """distributions of the parameters that differ between trajectories, by name"""
     kinds: Annotated[tuple[Kind, ...], LISTED] = Field((), max_length=100)
-    """motions of the paper's rig; those of a rig file are its own, whose numbers may be drawn"""
-    rig: dict[str, Any] | None = None
+    """kinds of trajectories, such as those of one motion or another; one kind by default"""
+    rig: dict[str, Any]
     """the tables of the rig file; its name, from the folder of the configuration, in a TOML file"""
     files: dict[str, str] = Field(default_factory=dict)
     """contents of the files that the rig file names, in base 64"""
@@ -101,7 +91,15 @@ class Config(Table):
     @model_validator(mode="before")
     @classmethod
     def _times_are_those_of_the_rig(cls, data: Any) -> Any:
-        if not isinstance(data, Mapping) or not isinstance(data.get("rig"), Mapping):
+        if not isinstance(data, Mapping):
+            return data
+        if "rig" not in data and (old := [name for name in OUTDATED if name in data]):
+            raise ValueError(
+                f"{old[0]} is of torchsoft 0.2.0 and before, which makes, checks and exports such "
+                "datasets; now every configuration names a rig file, for the paper's rig "
+                'rig = "rigs/paper.toml", and `fixed`, `parameters` and `kinds` speak of its tables'
+            )
+        if not isinstance(data.get("rig"), Mapping):
             return data
         return outputs_of(data["rig"]) | dict(data)
 
@@ -121,25 +119,13 @@ class Config(Table):
             raise ValueError(
                 f"step = {self.step} s exceeds sample_interval = {self.sample_interval} s"
             )
-        foreign = OF_A_FILE if self.rig is None else OF_THE_PAPER
-        if given := [name for name in foreign if name in self.model_fields_set]:
-            raise ValueError(
-                f"{given[0]} is of the paper's rig; with `rig` say it in the rig file, or in "
-                "`fixed` and `parameters` by the names of its tables"
-                if self.rig is not None
-                else f'{given[0]} is of a rig file, and there is none: say rig = "FILE.toml"'
-            )
-        self._made().check()
+        Subject(self).check()
         return self
 
     @model_serializer(mode="wrap")
     def _own_fields(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        foreign = OF_A_FILE if self.rig is None else OF_THE_PAPER
-        left_out = (*foreign, *(() if self.license else ("license",)))
-        return {name: x for name, x in handler(self).items() if name not in left_out}
-
-    def _made(self) -> Subject:
-        return PaperGrasp(self) if self.rig is None else RigOfFile(self)
+        unsaid = [name for name in ("license", "kinds") if not getattr(self, name)]
+        return {name: x for name, x in handler(self).items() if name not in unsaid}
 
     @property
     def subject(self) -> Subject:
@@ -148,7 +134,7 @@ class Config(Table):
         if key not in _subjects:
             while len(_subjects) >= SUBJECTS:
                 _subjects.pop(next(iter(_subjects)), None)
-            _subjects[key] = self._made()
+            _subjects[key] = Subject(self)
         return _subjects[key]
 
     @property

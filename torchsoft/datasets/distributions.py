@@ -3,7 +3,7 @@ of the design."""
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     Discriminator,
@@ -15,10 +15,7 @@ from pydantic import (
 )
 from scipy.special import ndtr, ndtri
 
-from torchsoft.excitation import Frequency, Time
 from torchsoft.tables import LISTED, Table
-
-T = TypeVar("T", bound=float)
 
 WIDTH = 4.0
 """Standard deviations from the mean at which a normal distribution is cut by default."""
@@ -27,12 +24,26 @@ SURE = 1e-12
 """Standard deviation over the width of the interval below which quantiles are rounding."""
 
 
-class Range(Table, Generic[T]):
-    """From `low` to `high`, uniformly in the value or in its logarithm."""
+class Related(Table):
+    """A number that is drawn; with `ratio_to` the parameter is so many times the one of that
+    name."""
 
-    low: T
-    high: T
+    ratio_to: str | None = None
+
+    @model_serializer(mode="wrap")
+    def _only_what_is_said(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        unsaid = {"ratio_to": None, "either_sign": False}
+        return {key: x for key, x in handler(self).items() if unsaid.get(key, ...) != x}
+
+
+class Uniform(Related):
+    """From `low` to `high`, uniformly in the value or in its logarithm; with `either_sign` as
+    often below zero as above."""
+
+    low: float
+    high: float
     scale: Literal["linear", "log"] = "linear"
+    either_sign: bool = False
 
     @model_validator(mode="after")
     def _is_ordered(self) -> Self:
@@ -44,6 +55,9 @@ class Range(Table, Generic[T]):
 
     def at(self, u: float) -> float:
         """The value at u in [0, 1]."""
+        if self.either_sign:
+            half = self.model_copy(update={"either_sign": False})
+            return half.at(2 * u - 1) if u >= 0.5 else -half.at(1 - 2 * u)
         low, high = self.low, self.high
         if self.scale == "log":
             value = math.exp(math.log(low) + u * (math.log(high) - math.log(low)))
@@ -51,35 +65,9 @@ class Range(Table, Generic[T]):
         return low + u * (high - low)
 
     def ends(self, where: str) -> dict[str, float]:
-        """Both ends by what messages call them."""
-        return {f"{where}.low": self.low, f"{where}.high": self.high}
-
-
-class Lengths(Range[Annotated[float, Field(ge=1e-9, le=10.0)]]):
-    """A range of lengths [m]."""
-
-
-class Times(Range[Time]):
-    """A range of times [s]."""
-
-
-class Frequencies(Range[Frequency]):
-    """A range of frequencies [Hz]."""
-
-
-class Related(Table):
-    """A number that is drawn; with `ratio_to` the parameter is so many times the one of that
-    name."""
-
-    ratio_to: str | None = None
-
-    @model_serializer(mode="wrap")
-    def _only_what_is_said(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: x for key, x in handler(self).items() if key != "ratio_to" or x is not None}
-
-
-class Uniform(Range[float], Related):
-    """From `low` to `high`, uniformly in the value or in its logarithm."""
+        """The ends by what messages call them."""
+        ends = {f"{where}.low": self.low, f"{where}.high": self.high}
+        return ends | {f"-{name}": -x for name, x in ends.items() if self.either_sign}
 
 
 class Normal(Related):
@@ -165,3 +153,17 @@ Distribution = Annotated[
     | Annotated[Choice, Tag("choice")],
     Discriminator(distribution),
 ]
+
+
+class Kind(Table):
+    """A kind of trajectory, drawn in proportion to `weight`: what is `fixed` in it, such as a whole
+    motion, and the `parameters` that are drawn besides those of all kinds, or otherwise."""
+
+    name: str = Field(min_length=1, max_length=100)
+    """in the array `kind`"""
+    weight: float = Field(default=1.0, ge=1e-6, le=1e6)
+    """by which it is drawn"""
+    fixed: dict[str, Any] = Field(default_factory=dict)
+    """values in it, or whole tables such as a motion, by the names of the rig file's tables"""
+    parameters: dict[str, Distribution] = Field(default_factory=dict)
+    """distributions of its own, besides those of all kinds or in their place"""

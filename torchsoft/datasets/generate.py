@@ -100,7 +100,7 @@ def usual(config: Config) -> tuple[float, float, float]:
     """Least and longest time [s], here one, and steps of a trajectory by experience, rather too
     many."""
     subject = config.subject
-    seconds, step = config.duration + subject.prelude, subject.steps.get("step")
+    seconds, step = config.duration, subject.steps.get("step")
     if step is not None:
         steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
     else:  # an output between two steps takes half the time of a step

@@ -32,6 +32,9 @@ RUN = {
 SPLIT = {"split": Label("1", "train, validation or test", "str")}
 """Numbers and texts of every trajectory of any rig."""
 
+KIND = {"kind": Label("1", "kind of trajectory", "str")}
+"""Where there are several."""
+
 
 @dataclass(frozen=True)
 class Variable:
@@ -75,20 +78,20 @@ def nodal(subject: "Subject") -> dict[str, Variable]:
     config, rig, out = subject.config, subject.template, dict[str, Variable]()
     series = {"trajectory": config.trajectories, "time": config.samples}
     precision = config.node_precision
-    for pad, surface in subject.surfaces.items():
+    for pad, touching in subject.surfaces.items():
         point = "contact point" if rig.pads[pad].points else "surface node"
-        per = f"each {point} of the {surface} pad"
-        where = series | {f"{surface}_point": len(rig.pads[pad].point_nodes)}
-        for contact, name in subject.touching(pad).items():
+        per = f"each {point} of the {pad} pad"
+        where = series | {f"{pad}_point": len(rig.pads[pad].point_nodes)}
+        for name in touching:
             out[f"normal_force_{name}"] = Variable(where, "N", f"normal force at {per}", precision)
             out[f"friction_force_{name}"] = Variable(
                 where, "N", f"friction force at {per}", precision
             )
-            body = rig.contacts[contact].body
+            body = rig.contacts[name].body
             meaning = f"1 where the {body} penetrates {per}, else 0"
             out[f"contact_{name}"] = Variable(where, "1", meaning, "uint8")
         meaning = f"displacement of {per}"
-        out[f"displacement_{surface}"] = Variable(where | {"axis": 2}, "m", meaning, precision)
+        out[f"displacement_{pad}"] = Variable(where | {"axis": 2}, "m", meaning, precision)
     return out
 
 
@@ -110,7 +113,7 @@ def arrays(subject: "Subject") -> dict[str, Variable]:
         series, "J", "positive part of what the sources supplied since t = 0"
     )
     more["energy_residual"] = Variable(series, "J", "stored - supplied + dissipated since t = 0")
-    labels = (subject.labels, RUN, subject.words, SPLIT)
+    labels = (subject.labels, RUN, KIND if config.kinds else {}, SPLIT)
     rows = [
         more,
         *({name: Variable(single, *one) for name, one in some.items()} for some in labels),

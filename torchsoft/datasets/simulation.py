@@ -50,8 +50,8 @@ def simulate_task(config: Config, task: Task) -> Row:
     )
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
-        rig, y0, motion, found = subject.begin(task)
-        run = simulate(rig, t, y0=y0, reference=motion, **subject.steps)
+        rig, y0 = subject.begin(task)
+        run = simulate(rig, t, y0=y0, **subject.steps)
     except SimulationFailed as failure:
         done = (
             {name: getattr(failure.trajectory.stats, name) for name in COUNTS}
@@ -61,7 +61,7 @@ def simulate_task(config: Config, task: Task) -> Row:
         return out | done | {"reason": failure.reason, "failure_time": failure.time}
     except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
         return out | {"reason": f"{type(failure).__name__}: {failure}"}
-    row = out | series(subject, rig, run) | found | {"failed": 0}
+    row = out | series(subject, rig, run) | {"failed": 0}
     bad = not_finite(config, row)
     return out | {"reason": f"not finite: {', '.join(bad)}"} if bad else row
 
@@ -70,13 +70,13 @@ def simulate_task(config: Config, task: Task) -> Row:
 def series(subject: Subject, rig: Rig, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
     out: Row = {name: run[name].numpy() for name in subject.signals}
-    for pad, surface in subject.surfaces.items() if subject.config.nodal else ():
-        for contact, name in subject.touching(pad).items():
-            out[f"normal_force_{name}"] = run.force[contact][..., 0].numpy()
-            out[f"friction_force_{name}"] = run.force[contact][..., 1].numpy()
-            depth = rig.penetration(contact, run.state)
+    for pad, touching in subject.surfaces.items() if subject.config.nodal else ():
+        for name in touching:
+            out[f"normal_force_{name}"] = run.force[name][..., 0].numpy()
+            out[f"friction_force_{name}"] = run.force[name][..., 1].numpy()
+            depth = rig.penetration(name, run.state)
             out[f"contact_{name}"] = (depth > 0).numpy().astype(np.uint8)
-        out[f"displacement_{surface}"] = (rig.pads[pad].spread @ run.displacement[pad]).numpy()
+        out[f"displacement_{pad}"] = (rig.pads[pad].spread @ run.displacement[pad]).numpy()
     for kind, (_, parts) in energies(subject).items():
         known = run.energy if kind == "stored" else getattr(run, kind)
         out[f"{kind}_energy"] = np.stack([known[part].numpy() for part in parts], -1)

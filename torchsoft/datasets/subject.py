@@ -1,8 +1,14 @@
-"""The subject of a dataset: the rig, the numbers that are drawn, and the run of one trajectory."""
+"""The subject of a dataset: the rig of a file, the numbers that are drawn, and one trajectory."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
+import base64
+import itertools
+import re
+import shutil
+import weakref
+from collections.abc import Iterable, Mapping
 from functools import cached_property
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -10,9 +16,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.datasets.distributions import Distribution, Kind
+from torchsoft.datasets.rig_files import (
+    channel_meanings,
+    differs,
+    hint,
+    number_or_word,
+    own_points,
+    place,
+)
 from torchsoft.datasets.schema import Label, Variable, arrays
-from torchsoft.physics.motion import Reference
+from torchsoft.physics.parts import PD, Actuator
 from torchsoft.physics.rig import Rig
+from torchsoft.quantity import quantity
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.places import replaced
+from torchsoft.solve.trajectory import channels, units
+from torchsoft.tables import line, shown
 
 if TYPE_CHECKING:
     from torchsoft.datasets.config import Config
@@ -29,107 +49,343 @@ POSITION, NODAL_FORCE = 10, 8
 """Decimals that starting poses and displacements [m] and nodal forces [N] are rounded to: linear
 solvers differ in the last bits with the alignment of memory, and a run may amplify that."""
 
+MIDDLE = 0.5
+"""Where other numbers are while the ends of one are tried."""
+
 Row = dict[str, Any]
 
 
 class Task(NamedTuple):
-    """One trajectory: its number, what its run needs, and what is known before it is simulated."""
+    """One trajectory: its number, the number of its kind, the values of the rig file's numbers by
+    name, and what is known before it is simulated."""
 
     index: int
-    given: Any
+    kind: int
+    values: dict[str, float]
     labels: Row
 
 
-class Begun(NamedTuple):
-    """A rig about to run: its state y0 (size,) at the start, the reference that it follows, and
-    what is known of the trajectory besides."""
-
-    rig: Rig
-    y0: Tensor
-    reference: Reference
-    labels: Row
-
-
-class Subject(ABC):
-    """What a configuration makes trajectories of.
-
-    `template` has the parts and meshes of every trajectory's rig, `signals` are the channels that
-    are kept, `words` texts of every trajectory; `prelude` is the time [s] that is simulated before
-    a trajectory can begin.
-    """
-
-    signals: Mapping[str, Label]
-    template: Rig
-    words: Mapping[str, Label] = {}
-    prelude: float = 0.0
+class Subject:
+    """What a configuration makes trajectories of: runs of the rig of a file. Parameters are any of
+    its numbers, by the names of its tables; what moves are its own motions, or those that a kind
+    fixes, whose numbers are among them."""
 
     def __init__(self, config: "Config") -> None:
         self.config = config
 
-    @abstractmethod
-    def check(self) -> None:
-        """Raises `ValueError` with the field's name for a configuration that cannot be carried
-        out."""
+    @cached_property
+    def _folder(self) -> Path:
+        """The files that the rig file names, as long as this object is there."""
+        if not self.config.files:
+            return Path()
+        folder = Path(mkdtemp(prefix="torchsoft-rig-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        for name, data in self.config.files.items():
+            try:
+                (folder / Path(name).name).write_bytes(base64.b64decode(data, validate=True))
+            except ValueError:
+                raise ValueError(f"files.{line(name, 80)} is not base 64") from None
+        return folder
 
-    @property
-    @abstractmethod
-    def labels(self) -> dict[str, Label]:
-        """Numbers of every trajectory, besides those of any run."""
+    @cached_property
+    def file(self) -> RigFile:
+        """The rig file with the times of the dataset and what is fixed. Raises `ValueError`."""
+        config = self.config
+        try:
+            file = RigFile.from_tree(config.rig, self._folder).override(
+                outputs={
+                    "duration": config.duration, "interval": config.sample_interval,
+                    "snapshots": (),
+                }
+            )  # fmt: skip
+        except ValueError as error:
+            raise ValueError(f"rig: {error}") from None
+        return with_fixed(file, config.fixed, "fixed")
 
-    @property
-    def ranges(self) -> dict[str, Any]:
-        """Distributions of the numbers that are drawn for every trajectory, by their arrays."""
-        return {name.replace("/", "_over_"): r for name, r in self.config.parameters.items()}
+    @cached_property
+    def kinds(self) -> list[tuple[RigFile, dict[str, Distribution]]]:
+        """Of every kind the rig file with what is fixed in it, and all that is drawn."""
+        config = self.config
+        return [
+            (
+                with_fixed(self.file, kind.fixed, f"kinds.{i}.fixed"),
+                config.parameters | kind.parameters,
+            )
+            for i, kind in enumerate(config.kinds or (Kind(name="any"),))
+        ]
 
-    @property
-    @abstractmethod
-    def constants(self) -> dict[str, Any]:
-        """Numbers and words that all trajectories share, by name."""
+    @cached_property
+    def template(self) -> Rig:
+        """The parts and meshes of every trajectory's rig."""
+        try:
+            return self.file.assemble()
+        except ValueError as error:
+            raise ValueError(f"rig: {error}") from None
 
-    @property
-    @abstractmethod
-    def drawn(self) -> int:
-        """Dimensions of the design."""
-
-    @abstractmethod
-    def task(self, index: int, u: list[float]) -> Task:
-        """Trajectory `index` at the point u of the design."""
-
-    @abstractmethod
-    def begin(self, task: Task) -> Begun:
-        """The rig of a trajectory, ready to run. Raises what its statics do."""
-
-    @property
-    @abstractmethod
-    def steps(self) -> dict[str, Any]:
-        """How `simulate` is to choose its steps."""
-
-    @property
-    def surfaces(self) -> dict[str, str]:
-        """Pads that something may touch, and their names in the dataset."""
-        touched = {contact.pad for contact in self.template.contacts.values()}
-        return {name: name for name in self.template.pads if name in touched}
-
-    def touching(self, pad: str) -> dict[str, str]:
-        """Contacts of a pad, and their names in the dataset."""
+    @cached_property
+    def there(self) -> dict[str, Label]:
+        """Every channel of the rig."""
         rig = self.template
-        return {name: name for name, one in rig.contacts.items() if one.pad == pad}
+        nothing = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+        state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), nothing)
+        moments = {name: torch.zeros((), dtype=torch.float64) for name in rig.pads}
+        with torch.no_grad():
+            known = channels(rig, state, nothing, moments)
+        of = units(rig)
+        meanings = {rig.renamed.get(key, key): said for key, said in channel_meanings(rig)}
+        return {key: Label(of[key], meanings[key]) for key in known}
+
+    @property
+    def signals(self) -> dict[str, Label]:
+        """Channels that are kept."""
+        kept = self.config.channels
+        return self.there if kept is None else {name: self.there[name] for name in kept}
+
+    @cached_property
+    def surfaces(self) -> dict[str, list[str]]:
+        """Pads that something may touch, and their contacts."""
+        out: dict[str, list[str]] = {}
+        for name, one in self.template.contacts.items():
+            out.setdefault(one.pad, []).append(name)
+        return {name: out[name] for name in self.template.pads if name in out}
 
     @cached_property
     def variables(self) -> dict[str, Variable]:
         """Every array of the dataset by its name."""
         return arrays(self)
 
-    @abstractmethod
     def columns(self) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64], str, str]]:
-        """Places of the contact points, and what else belongs to the rig of all trajectories:
-        dimensions, values, unit and meaning."""
+        """Places of the contact points: dimensions, values, unit and meaning."""
+        out = {}
+        for pad in self.surfaces if self.config.nodal else ():
+            at, surface = own_points(self.template, pad), f"{pad}_point"
+            along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1)))
+            out[surface] = (
+                (surface,), along, "m",
+                f"way along the surface of the {pad} pad from its first contact point, undeformed",
+            )  # fmt: skip
+            out[f"{pad}_places"] = (
+                (surface, "axis"), at, "m",
+                f"places of the contact points in the {pad} pad's own frame, undeformed",
+            )  # fmt: skip
+        return out
+
+    @property
+    def labels(self) -> dict[str, Label]:
+        """Numbers of every trajectory, besides those of any run."""
+        return {name: self._label(name) for name in self.config.parameters}
+
+    def _label(self, name: str) -> Label:
+        keys, _, field = place(self.file, name)
+        declared = quantity(hint(field)) or number_or_word(field)
+        unit = declared.unit if declared else "1"
+        if re.search(r",| or ", unit):  # it depends on what the number is of
+            unit = self._unit_of(name, keys) or unit
+        said = f": {field.description}" if isinstance(keys[-1], str) and field.description else ""
+        return Label(unit, f"parameter {name} of the rig file{said}")
+
+    def _unit_of(self, name: str, keys: tuple[Any, ...]) -> str | None:
+        """Unit of a number whose field takes several: of a motion, or of a gain."""
+        group, part, *way = keys
+        if group == "motion":
+            return self.file.unit(part)
+        if group == "controllers" and way[:1] == ["gain"]:
+            one, (row, column) = self.file.controllers[part], way[1:]
+            n = len(one.measures)
+            pushed = one.pushes[row]
+            loop = Actuator(one.measures[column % n], pushed, PD(1.0, 1.0), setpoint=part)
+            return loop.gain_unit(column >= n)
+        known = self.template.quantity(name) if name in self.template.aliases else None
+        return known and known.unit
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Numbers and words that all trajectories share, by name."""
+        rig = self.template
+        names = {own: name for name, own in rig.aliases.items()}
+        parameters: dict[str, Any] = rig.description()["parameters"]
+        values = {names.get(own, own): x for own, x in parameters.items()}
+        return {name: x for name, x in values.items() if name not in self.config.parameters}
+
+    @property
+    def drawn(self) -> int:
+        """Dimensions of the design."""
+        most = max(len(parameters) for _, parameters in self.kinds)
+        return max(1, most + (1 if self.config.kinds else 0))
+
+    @property
+    def steps(self) -> dict[str, Any]:
+        """How `simulate` is to choose its steps."""
+        given = {"step": self.config.step, "rtol": self.config.rtol}
+        stated = {name: value for name, value in given.items() if value is not None}
+        solver = self.file.solver.model_dump(exclude_unset=True, exclude_none=True)
+        own = {name: x for name, x in solver.items() if name != "tolerance"}
+        return {"tolerance": self.file.solver.tolerance} | (stated or own or {"rtol": RTOL})
+
+    def task(self, index: int, u: list[float]) -> Task:
+        """Trajectory `index` at the point u of the design: the common numbers, the kind, and its
+        own numbers."""
+        config, kind = self.config, 0
+        if config.kinds:
+            edges = np.cumsum([one.weight for one in config.kinds])
+            which = u.pop(len(config.parameters)) * edges[-1]
+            kind = min(int(np.searchsorted(edges, which, side="right")), len(edges) - 1)
+        file, parameters = self.kinds[kind]
+        drawn = {name: one.at(x) for (name, one), x in zip(parameters.items(), u)}
+        values = in_ratio(file, parameters, drawn)
+        labels: Row = {name: values[name] for name in config.parameters}
+        labels |= {"kind": config.kinds[kind].name} if config.kinds else {}
+        return Task(index, kind, values, labels | {"split": split(config, index)})
+
+    def begin(self, task: Task) -> tuple[Rig, Tensor]:
+        """The rig of a trajectory, ready to run, and its state (size,) at the start. Raises what
+        its statics do."""
+        rig, y0, _ = replaced(self.kinds[task.kind][0], task.values).build()
+        return rig, rounded(rig, y0)
+
+    def check(self) -> None:
+        """Raises `ValueError` with the field's name for a configuration that cannot be carried
+        out."""
+        config = self.config
+        if not (config.parameters or config.kinds) and config.trajectories > 1:
+            raise ValueError(
+                "parameters is missing: nothing would differ between trajectories of the rig file"
+            )
+        for name in config.channels or ():
+            if name not in self.there:
+                raise ValueError(
+                    f"channels: `{line(name, 80)}` is no channel of the rig; there are "
+                    f"{', '.join(self.there)}"
+                )
+        if config.channels is not None and len({*config.channels}) < len(config.channels):
+            raise ValueError("channels: every name once")
+        if len({one.name for one in config.kinds}) < len(config.kinds):
+            raise ValueError("kinds: every name once")
+        Drawn(self, self.file, config.parameters, config.fixed, "").check(config.parameters)
+        for i, (kind, (file, parameters)) in enumerate(zip(config.kinds, self.kinds)):
+            drawn = Drawn(self, file, parameters, config.fixed | kind.fixed, f"kinds.{i}.")
+            drawn.check([*kind.parameters, *(kind.fixed.keys() & config.parameters)])
+        for name in self.variables:
+            if "/" in name:
+                raise ValueError(f"`{line(name, 80)}` cannot be the name of an array; it has a `/`")
 
 
-def stated_steps(config: "Config") -> dict[str, Any]:
-    """How `simulate` is to choose its steps, as far as the configuration says it."""
-    given = {"step": config.step, "rtol": config.rtol}
-    return {name: value for name, value in given.items() if value is not None}
+class Drawn(NamedTuple):
+    """What is drawn for a trajectory of some kind: parameters of a rig file, besides those that are
+    fixed; fields within the table `where`."""
+
+    subject: Subject
+    file: RigFile
+    parameters: Mapping[str, Distribution]
+    fixed: Mapping[str, Any]
+    where: str
+
+    def check(self, names: Iterable[str]) -> None:
+        """Raises `ValueError` for parameters that are no numbers, or impossible together."""
+        for name in names:
+            self._check_number(name)
+        self._check_ends({*names})
+
+    def _check_number(self, name: str) -> None:
+        """Raises `ValueError` for a name that is no number, and for a ratio to none."""
+        where, parameters = f"{self.where}parameters.{line(name, 80)}", self.parameters
+        if name in self.fixed:
+            raise ValueError(f"{where} is in `fixed` as well; leave one of them out")
+        try:
+            _, value, field = place(self.file, name)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        if isinstance(value, int):
+            raise ValueError(f"{where} must be the same in every trajectory; set it in `fixed`")
+        word = isinstance(value, str) and number_or_word(field)
+        if not (value is None or isinstance(value, float) or word):
+            raise ValueError(f"{where} is no number, but {shown(value)}")
+        if (base := parameters[name].ratio_to) is None:
+            return
+        if base in parameters and parameters[base].ratio_to is None and base != name:
+            return
+        if base in parameters:
+            raise ValueError(f"{where}.ratio_to: {line(base, 80)} is a ratio itself")
+        try:
+            of = place(self.file, base).value
+        except ValueError as error:
+            raise ValueError(f"{where}.ratio_to: {error}") from None
+        if not isinstance(of, float):
+            raise ValueError(f"{where}.ratio_to: {line(base, 80)} is no number, but {shown(of)}")
+
+    def _check_ends(self, names: set[str]) -> None:
+        """Raises `ValueError` where ends of distributions with these names are impossible, each
+        alone and those of one part or ratio together, the others in their middle."""
+        parameters, within = self.parameters, f"{self.where}parameters"
+        middle = {name: one.at(MIDDLE) for name, one in parameters.items()}
+        ends = {name: one.ends(f"{within}.{name}") for name, one in parameters.items()}
+        single = [(name, where) for name in parameters if name in names for where in ends[name]]
+
+        def check(tried: Mapping[str, str], alone: bool = False) -> None:
+            drawn = {name: ends[name][where] for name, where in tried.items()}
+            values = in_ratio(self.file, parameters, middle | drawn)
+            own = {name: values[name] for name in tried} if alone else values
+            moves = {place(self.file, name).keys[0] for name in tried} == {"motion"}
+            if (why := self._impossible(own, moves)) is not None:
+                said = ", ".join(f"{tried[name]} = {x:g}" for name, x in drawn.items())
+                raise ValueError(f"{said or f'{within} in their middle'}: {why}")
+
+        if self._impossible(in_ratio(self.file, parameters, middle)) is not None:
+            if (why := self._impossible({})) is not None:
+                raise ValueError(f"{f'{self.where}fixed' if self.where else 'rig'}: {why}")
+            for name, where in sorted(single, key=lambda one: parameters[one[0]].ratio_to is None):
+                check({name: where}, alone=True)
+            check({})
+        for name, where in single:
+            check({name: where})
+        tables = {name: place(self.file, name).keys[:2] for name in parameters}
+        for one, other in itertools.combinations(parameters, 2):
+            related = {parameters[one].ratio_to, parameters[other].ratio_to} & {one, other}
+            parts = tables[one] == tables[other] and tables[one][0] != "motion"
+            if {one, other} & names and (related or parts):
+                for a, b in itertools.product(extremes(ends[one]), extremes(ends[other])):
+                    check({one: a, other: b})
+
+    def _impossible(self, values: Mapping[str, float], moves: bool = False) -> str | None:
+        """Why the rig file cannot have these values, or what they change that all trajectories
+        share; `moves` says that it is motions only."""
+        template = self.subject.template
+        try:
+            file = replaced(self.file, values)
+            rig = template if moves else file.assemble()
+            file.reference({name: np.zeros(3) for name in rig.bodies}, lambda *_: 0.0)
+        except ValueError as error:
+            return f"impossible: {error}"
+        change = differs(template, rig)
+        return change and f"it changes {change}, which all trajectories share; set it in `fixed`"
+
+
+def with_fixed(file: RigFile, fixed: Mapping[str, Any], where: str) -> RigFile:
+    """The rig file with what is fixed. Raises `ValueError`."""
+    for name, value in fixed.items():
+        try:
+            place(file, name)
+            file = replaced(file, {name: value})
+        except ValueError as error:
+            raise ValueError(f"{where}.{line(name, 80)}: {error}") from None
+    return file
+
+
+def in_ratio(
+    file: RigFile, parameters: Mapping[str, Distribution], drawn: Mapping[str, float]
+) -> dict[str, float]:
+    """Parameters by name, of what is drawn for each: the number, or its ratio to another."""
+    out = dict(drawn)
+    for name, one in parameters.items():
+        if (base := one.ratio_to) is not None:
+            of = drawn[base] if base in drawn else place(file, base).value
+            out[name] = drawn[name] * of
+    return out
+
+
+def extremes(ends: Mapping[str, float]) -> tuple[str, str]:
+    """The least and the largest of some numbers, by what messages call them."""
+    return min(ends, key=lambda where: ends[where]), max(ends, key=lambda where: ends[where])
 
 
 def split(config: "Config", index: int) -> str:

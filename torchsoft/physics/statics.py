@@ -209,11 +209,6 @@ def resting(
         if len(axes)
     }
     followed = soft.follow(0.0) if signals is None else signals
-    off = {
-        f"control_{name}"
-        for name in soft.actuators
-        if actuators is not None and name not in actuators
-    }
     with torch.no_grad():
         masses = {name: torch.stack(soft.bodies[name].masses) for name in sought}
         # an angle counts by the way of a point at the radius of gyration, so that all are lengths
@@ -241,9 +236,7 @@ def resting(
         still = {name: torch.zeros(*batch, 3, dtype=q.dtype) for name in soft.bodies}
         state = State({}, unstretched(soft, batch), poses(q), {}, still)
         state = state._replace(pads={name: carried(soft, name, state) for name in soft.pads})
-        graph = soft.evaluate(0.0, state, followed.expand(*batch, -1, -1), settled=True)
-        ports = {name: port for name, port in graph.ports.items() if name not in off}
-        net = soft.loads(graph, net_efforts(ports, soft.junctions))
+        net = net_loads(soft, state, followed.expand(*batch, -1, -1), actuators)
         return torch.cat([net[name][..., axes] for name, axes in sought.items()], -1) / scale
 
     path: list[tuple[float, Tensor]] = []
@@ -272,6 +265,17 @@ def resting(
         f"nothing is at rest: after {len(path)} steps {float(F.abs().max()):.2g} N still push "
         f"{names[worst]}; is there a pad to carry it?"
     )
+
+
+def net_loads(
+    rig: Rig, state: State, signals: Tensor, actuators: Container[str] | None = None
+) -> dict[str, Tensor]:
+    """Forces and moments left on the bodies (..., 3) [N, N, N.m] in a state without rates;
+    `actuators` names those that push, by default all."""
+    graph = rig.evaluate(0.0, state, signals, settled=True)
+    off = {f"control_{k}" for k in rig.actuators if actuators is not None and k not in actuators}
+    ports = {name: port for name, port in graph.ports.items() if name not in off}
+    return rig.loads(graph, net_efforts(ports, rig.junctions))
 
 
 def stalled(path: Sequence[tuple[float, Tensor]], stride: float) -> bool:

@@ -14,8 +14,8 @@ from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, massless, standing
-from torchsoft.rigs.course import Estimate, at, signals
-from torchsoft.rigs.geometry import Scene, tied
+from torchsoft.rigs.course import Estimate, signals
+from torchsoft.rigs.geometry import Scene, at, tied
 from torchsoft.rigs.motion import ProfileTable
 from torchsoft.solve.kernel.arrays import PASSED
 from torchsoft.solve.ledger import COMPRESSED

@@ -2,7 +2,8 @@
 reference, its state at the start, and the times of its outputs."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -11,20 +12,29 @@ import torch
 from pydantic import Field, PrivateAttr, model_validator
 from torch import Tensor, nn
 
+from torchsoft.display import suggestion
 from torchsoft.physics.material import Series
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import BuiltRig, NoEquilibrium, resting, standing
+from torchsoft.physics.statics import (
+    BuiltRig,
+    NoEquilibrium,
+    massless,
+    net_loads,
+    resting,
+    standing,
+)
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import Gravity, Quantity, Time
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.fields import Group, at_field
-from torchsoft.rigs.geometry import Scene
-from torchsoft.rigs.motion import MotionContext, MotionTable, flattened
+from torchsoft.rigs.geometry import AWAY, Scene, above, at, upon
+from torchsoft.rigs.motion import HELD, MotionContext, MotionTable, flattened
 from torchsoft.rigs.parts import (
     REST,
+    TOUCH,
     AnyPad,
     BodyTable,
     ContactTable,
@@ -32,6 +42,7 @@ from torchsoft.rigs.parts import (
     MaterialTable,
     TaxelsTable,
 )
+from torchsoft.solve.trajectory import units
 from torchsoft.tables import LISTED, from_toml, line
 from torchsoft.threads import single_threaded
 
@@ -46,9 +57,6 @@ TAKEN = frozenset(dir(nn.ModuleDict()))
 
 ROWS = 1_000_000
 """Outputs of one run at the most."""
-
-UPWARDS = 0.1
-"""Least upward part of the normal of a pad that something may rest on."""
 
 STIFF = 100.0
 """How many times as stiff as a point of the pad a contact may be for statics to be sure of
@@ -162,6 +170,7 @@ class RigFile(Group):
     actuators: dict[str, ActuatorTable] = Field(default_factory=dict)
     controllers: dict[str, ControllerTable] = Field(default_factory=dict)
     motion: dict[str, MotionTable] = Field(default_factory=dict)
+    channels: dict[str, str] = Field(default_factory=dict)
     outputs: OutputsTable
     solver: SolverTable = SolverTable()
     _folder: Path = PrivateAttr(default_factory=Path)
@@ -402,6 +411,16 @@ class RigFile(Group):
             symbols={name: one.symbol or name for name, one in self.bodies.items()},
             taxels=made("taxels", lambda one: one.build(folder)),
         )
+        known = units(rig)
+        for name in self.channels:
+            if name not in known:
+                raise ValueError(
+                    f"channels.{line(name, 80)}: the rig has no such channel; "
+                    f"{suggestion(name, known)}"
+                )
+        rig.renamed = dict(self.channels)
+        if len(units(rig)) < len(known):
+            raise ValueError("channels: two would have the same name; call one otherwise")
         named = {self._own_name(rig, *name.split(".")): name for name, _ in rig.named_parameters()}
         rig.aliases = {alias: name for alias, name in named.items() if alias != name}
         return rig
@@ -434,16 +453,9 @@ class RigFile(Group):
         name: for motions that cannot be, recorded ones that cannot be read, bodies that find no
         rest, and bodies too deep in a pad for it to settle.
         """
-        known = {
-            name: self._signal(name, None)
-            for name, who in self.followers().items()
-            if who[0][0] == "driven"
-        }
-        rig, zero = self.assemble(), torch.zeros((), dtype=torch.float64)
-        pose = self._starts(rig, {name: float(one(zero)[0]) for name, one in known.items()})
-        rig.reference = Reference(
-            **{name: known.get(name) or self._signal(name, pose) for name in self.motion}
-        )
+        rig = self.assemble()
+        pose = self._starts(rig)
+        rig.reference = self.reference(pose, lambda *asked: self._held(rig, pose, *asked))
         try:
             y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
         except NoEquilibrium as error:
@@ -456,52 +468,111 @@ class RigFile(Group):
             y0[rig.layout.slices["velocity", name]] = torch.tensor(rates, dtype=torch.float64)
         return BuiltRig(rig, y0, self.outputs.times())
 
-    def _signal(self, name: str, pose: Mapping[str, Array] | None) -> Piecewise:
-        """One motion, with bodies that start at `pose` (3,)."""
-        setpoints = {
-            coordinate for role, coordinate in self.followers()[name] if role == "setpoint"
-        }
-        start = None
-        if pose is not None and len(setpoints) == 1:
-            body, _, axis = setpoints.pop().partition(".")
-            start = float(pose[body][COORDINATES.index(axis)])
-        asked = MotionContext(name, self.unit(name), start, self.outputs.duration, self.folder)
+    def reference(
+        self, pose: Mapping[str, Array], held: Callable[[str, float], float]
+    ) -> Reference:
+        """All motions, with bodies that start at `pose` (3,); `held` is the effort that holds a
+        coordinate at a time [s]. Raises `ValueError` naming the field."""
+        return Reference(**{name: self._signal(name, pose, held) for name in self.motion})
+
+    def _signal(
+        self, name: str, pose: Mapping[str, Array] | None = None,
+        held: Callable[[str, float], float] | None = None,
+    ) -> Piecewise:  # fmt: skip
+        """One motion."""
+        roles: dict[str, set[str]] = {}
+        for role, coordinate in self.followers()[name]:
+            roles.setdefault(role, set()).add(coordinate)
+        (follows, *more), (fed, *others) = (
+            sorted(roles.get(role, ())) or [""] for role in ("setpoint", "feed_forward")
+        )
+        body, axis = at(follows) if follows and not more else ("", 0)
+        start = float(pose[body][axis]) if pose is not None and body else None
+        effort = partial(held, fed) if held and fed and not others else None
+        asked = MotionContext(
+            name, self.unit(name), start, effort, self.outputs.duration, self.folder
+        )
         try:
             return self.motion[name].build(asked)
         except ValueError as error:
             prefix = "" if str(error).startswith("motion.") else f"motion.{name}: "
             raise ValueError(f"{prefix}{error}") from None
 
-    def _starts(self, rig: Rig, driven: Mapping[str, float]) -> dict[str, Array]:
-        """Poses (3,) [m, m, rad] by body at the start, solved for where bodies rest; `driven` are
-        the driven ones'."""
+    def _follow(
+        self, pose: dict[str, Array], time: float, roles: Collection[str],
+        start: Mapping[str, Array] | None = None,
+    ) -> set[tuple[str, int]]:  # fmt: skip
+        """Puts the coordinates that follow motions in these roles where they are to be at a time
+        [s], and says which ones these are."""
+        moved = set[tuple[str, int]]()
+        for name, who in self.followers().items():
+            for body, axis in (at(coordinate) for role, coordinate in who if role in roles):
+                value, _ = self._signal(name, start)(torch.tensor(time, dtype=torch.float64))
+                pose[body][axis] = float(value)
+                moved.add((body, axis))
+        return moved
+
+    def _starts(self, rig: Rig) -> dict[str, Array]:
+        """Poses (3,) [m, m, rad] by body at the start, solved for where bodies rest or touch."""
         pose = {name: np.zeros(3) for name in self.bodies}
-        wanted: dict[str, list[int]] = {}
         for name, axis, kind in self.coordinates():
-            free = getattr(self.bodies[name].start, axis)
-            place = (
-                free if kind == "free" else driven[f"{name}.{axis}"] if kind == "driven" else kind
-            )
-            if place == REST:
-                wanted.setdefault(name, []).append(COORDINATES.index(axis))
-            else:
-                pose[name][COORDINATES.index(axis)] = place or 0.0
-        if not wanted:
-            return pose
-        for name, axes in wanted.items():
+            given = getattr(self.bodies[name].start, axis) if kind == "free" else kind
+            if given == TOUCH or not isinstance(given, str):
+                value = AWAY if given == TOUCH else given or 0.0
+                pose[name][COORDINATES.index(axis)] = value
+        self._follow(pose, 0.0, ("driven",))
+        for name, axes in (wanted := self._wanted()).items():
             if 1 in axes:
                 pose[name][1] = above(Scene(rig, pose), name)
-        places = {name: torch.from_numpy(at) for name, at in pose.items()}
         try:
-            found = resting(
-                rig, places, wanted, signals=torch.zeros(len(rig.signals), 2).double(), actuators=()
-            )
+            pose = self._rested(rig, pose, wanted)
         except NoEquilibrium as error:
             name, (axis, *_) = next(iter(wanted.items()))
             raise ValueError(
                 too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}"
             ) from None
-        return {name: at.numpy() for name, at in found.items()}
+        for name, body in self.bodies.items():
+            if body.y == "free" and body.start.y == TOUCH:
+                pose[name][1] = upon(Scene(rig, pose), name)
+        return pose
+
+    def _wanted(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
+        """Coordinates that are where their body rests, by body, but for some."""
+        out: dict[str, list[int]] = {}
+        for name, axis, kind in self.coordinates():
+            i = COORDINATES.index(axis)
+            rests = kind == "free" and getattr(self.bodies[name].start, axis) == REST
+            if rests and (name, i) not in but:
+                out.setdefault(name, []).append(i)
+        return out
+
+    def _rested(
+        self, rig: Rig, pose: Mapping[str, Array], wanted: Mapping[str, list[int]]
+    ) -> dict[str, Array]:
+        """Poses with these coordinates in balance, no actuator pushing. Raises `NoEquilibrium`."""
+        if not wanted:
+            return dict(pose)
+        places = {name: torch.from_numpy(x) for name, x in pose.items()}
+        still = torch.zeros(len(rig.signals), 2).double()
+        found = resting(rig, places, wanted, signals=still, actuators=())
+        return {name: x.numpy() for name, x in found.items()}
+
+    def _held(self, rig: Rig, start: Mapping[str, Array], coordinate: str, time: float) -> float:
+        """The effort [N, N.m] on a coordinate that holds it with bodies where set-points are at a
+        time [s], or where they rest or start, without friction. Raises `ValueError`."""
+        pose = {name: x.copy() for name, x in start.items()}
+        known = self._follow(pose, time, ("driven", "setpoint"), start)
+        soft, (body, axis) = massless(rig), at(coordinate)
+        still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+        try:
+            pose = self._rested(soft, pose, self._wanted(known))
+            y = standing(soft, {name: torch.from_numpy(x) for name, x in pose.items()})
+        except NoEquilibrium as error:
+            raise ValueError(
+                f'"{HELD}" asks for balance where set-points are at t = {time:g} s, and there is '
+                f"none: {error}"
+            ) from None
+        return -float(net_loads(soft, soft.unpack(y, still), still, ())[body][axis])
 
 
 def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any]:
@@ -527,32 +598,3 @@ def too_stiff(file: RigFile, rig: Rig) -> str:
                 "less, the pad gives way long before the contact does"
             )
     return ""
-
-
-def above(scene: Scene, body: str) -> float:
-    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there
-    is none."""
-    below, *beside = (
-        scene.reach(body, np.array(way)) for way in ([0.0, -1.0], [-1.0, 0.0], [1.0, 0.0])
-    )
-    x, heights = float(scene.pose[body][0]), []
-    for key, contact in scene.rig.contacts.items():
-        at, pad = scene.points(key), scene.pad(key)
-        on = contact.body == body and scene.surface(key).normal[1] > UPWARDS
-        if not on or not at[:, 0].min() < x < at[:, 0].max():
-            continue
-        under = at[(at[:, 0] > x - beside[0]) & (at[:, 0] < x + beside[1])]
-        if not len(under):
-            raise ValueError(
-                f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of "
-                f"`{contact.pad}`, which are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; "
-                f"make it larger, or give pads.{contact.pad} more elements or points"
-            )
-        heights.append(float(under[:, 1].max()) + below)
-    if not heights:
-        raise ValueError(
-            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x '
-            f"= {x:g} m; "
-            "place it over one, or say at which height it starts"
-        )
-    return max(heights)

@@ -16,9 +16,9 @@ from torchsoft.physics.motion import Sampled
 from torchsoft.physics.pads import Pad
 from torchsoft.rigs.balance import at_moments
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.course import Estimate, at, signals
+from torchsoft.rigs.course import Estimate, signals
 from torchsoft.rigs.fields import Refused
-from torchsoft.rigs.geometry import Scene, collision, nodes, tied
+from torchsoft.rigs.geometry import Scene, at, collision, nodes, tied
 from torchsoft.rigs.motion import CsvTable
 from torchsoft.solve.ledger import COMPRESSED
 from torchsoft.threads import single_threaded

@@ -18,7 +18,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig, NoEquilibrium, resting
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.geometry import Scene, turned
+from torchsoft.rigs.geometry import Scene, at, turned
 
 ALONG = 0.7
 """Least part of a surface's normal along an axis by which two pads hold a body along this axis."""
@@ -172,9 +172,3 @@ class Estimate:
 def signals(rig: Rig, time: float) -> dict[str, float]:
     """The values of all motions at a time [s]."""
     return dict(zip(rig.signals, rig.follow(time).detach()[:, 0].tolist()))
-
-
-def at(coordinate: str) -> tuple[str, int]:
-    """Body and number of a coordinate such as "disc.x"."""
-    body, _, axis = coordinate.partition(".")
-    return body, COORDINATES.index(axis)

@@ -2,6 +2,7 @@
 functions of time."""
 
 import csv
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
@@ -21,10 +22,16 @@ from torchsoft.tables import LISTED, line, shown
 START = "start"
 """The word for where the coordinate that follows a motion is when the run begins."""
 
+HELD = "held"
+"""The word for the effort, fed forward, that holds a coordinate in place."""
+
+STROKES = 10_000
+"""Strokes of one motion at the most."""
+
 PERIODS = 1e5
 """Periods of a wave in one run at the most."""
 
-Value = Annotated[float | str, NumberOr("m, rad, N or N.m", START)]
+Value = Annotated[float | str, NumberOr("m, rad, N or N.m", START, HELD)]
 
 Times = Annotated[tuple[Time, ...], LISTED, Field(min_length=1, max_length=100_000)]
 Values = Annotated[tuple[Value, ...], LISTED, Field(min_length=1, max_length=100_000)]
@@ -33,19 +40,30 @@ Frequency = Annotated[float, Quantity("Hz", 1e-6, 1e5)]
 
 
 class MotionContext(NamedTuple):
-    """Context of a motion: its name, its unit, where the coordinate that follows it starts (None:
-    no coordinate that is free does), the end of the run [s], and the folder of the rig's file."""
+    """Context of a motion: its name, its unit, where the coordinate that follows it starts
+    (None: no coordinate that is free does), the effort at a time [s] that holds the coordinate
+    that it is fed forward to (None: there is no such one), the end of the run [s], and the folder
+    of the rig's file."""
 
     name: str
     unit: str
     start: float | None
+    held: Callable[[float], float] | None
     end: float
     folder: Path
 
-    def value(self, field: str, value: float | str) -> float:
-        """A number, or the start. Raises `ValueError`."""
+    def value(self, field: str, value: float | str, time: float = 0.0) -> float:
+        """A number, the start, or the effort that holds at a time [s]. Raises `ValueError`."""
         if not isinstance(value, str):
             return value
+        if value == HELD:
+            if self.held is None:
+                raise ValueError(
+                    f'motion.{self.name}.{field}: "{HELD}" stands for the effort that holds the '
+                    "one coordinate that it is fed forward to, and there is none such here; give a "
+                    "number"
+                )
+            return self.held(time)
         if self.start is None:
             raise ValueError(
                 f'motion.{self.name}.{field}: "{START}" stands for where the one free coordinate '
@@ -85,7 +103,13 @@ class Knots(Motion):
 
     times: Times = Field(description="increasing; constant before the first and after the last [s]")
     values: Values = Field(
-        description=f'one per time; "{START}": where the coordinate that follows starts'
+        description=f'one per time; "{START}": where the coordinate that follows starts; "{HELD}", '
+        "of a feed-forward: the effort that holds its coordinate where set-points are then, pads "
+        "in balance without friction"
+    )
+    offset: Value = Field(
+        default=0.0,
+        description=f'added to all values; "{START}": where the coordinate that follows starts',
     )
 
     @model_validator(mode="after")
@@ -102,7 +126,9 @@ class Knots(Motion):
 
     def knots(self, asked: MotionContext) -> tuple[list[float], list[float]]:
         """Times and values."""
-        return list(self.times), [asked.value("values", value) for value in self.values]
+        offset = asked.value("offset", self.offset)
+        known = zip(self.values, self.times)
+        return list(self.times), [offset + asked.value("values", *one) for one in known]
 
 
 class ProfileTable(Knots):
@@ -112,6 +138,36 @@ class ProfileTable(Knots):
 
     def build(self, asked: MotionContext) -> Piecewise:
         return Profile(*self.knots(asked))
+
+
+class StrokesTable(Motion):
+    """There and back, from `since` to `until`, along polynomials of 7th order, at rest at each
+    end."""
+
+    kind: Literal["strokes"] = "strokes"
+    travel: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(
+        description="how far, to the side of its sign"
+    )
+    stroke_time: Time = Field(description="each way", gt=0)
+    offset: Value = Field(
+        default=START, description=f'the near end; "{START}": where the coordinate starts'
+    )
+    since: Time = Field(default=0.0, description="when the first stroke begins")
+    until: Time | None = Field(
+        default=None, description="when the last one has ended; the end of the run if not given"
+    )
+
+    def build(self, asked: MotionContext) -> Piecewise:
+        until = asked.end if self.until is None else self.until
+        count = int((until - self.since) / self.stroke_time + 1e-9)
+        if not 1 <= count <= STROKES:
+            raise ValueError(
+                f"motion.{asked.name}.stroke_time = {self.stroke_time:g} s makes {count} strokes "
+                f"from {self.since:g} to {until:g} s, but a motion has 1 to {STROKES}; take another"
+            )
+        near = asked.value("offset", self.offset)
+        times = [self.since + i * self.stroke_time for i in range(count + 1)]
+        return Profile(times, [near + i % 2 * self.travel for i in range(count + 1)])
 
 
 class SplineTable(Knots):
@@ -279,7 +335,7 @@ def names(path: Path) -> list[str]:
 
 
 MotionTable = Annotated[
-    HoldTable | ProfileTable | SplineTable | SinesTable | ChirpTable | CsvTable,
+    HoldTable | ProfileTable | StrokesTable | SplineTable | SinesTable | ChirpTable | CsvTable,
     Field(discriminator="kind"),
 ]
 

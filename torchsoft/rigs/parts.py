@@ -66,15 +66,18 @@ else:
 REST = "rest"
 """The word for a coordinate that is to start where the body rests."""
 
+TOUCH = "touch"
+"""The word for the height at which a body's pads just touch what is under them."""
+
 
 class StartTable(Group):
     """Where a body is when the run begins, and how it moves; for coordinates that are free."""
 
     x: Place | None = Field(default=None, description="centre of mass, to the right")
-    y: Annotated[float | str | None, NumberOr("m", REST, optional=True)] = Field(
+    y: Annotated[float | str | None, NumberOr("m", REST, TOUCH, optional=True)] = Field(
         default=None,
         description='centre of mass, upwards; "rest": where it lies under its weight, the loops '
-        "off",
+        'off; "touch": where the pads bonded to it, undeformed, come down upon what they touch',
     )
     theta: Annotated[float | str | None, NumberOr("rad", REST, optional=True)] = Field(
         default=None, description='anticlockwise, 0 if not given; "rest" as for y'

@@ -68,10 +68,12 @@ FILES = ("file", "network")
 
 
 def files_renamed(tree: Any, name: Callable[[str], str]) -> Any:
-    """The tables of a rig file with other names of the files that they name."""
+    """Tables of a rig file, by their names too, with other names of the files that they name."""
     if isinstance(tree, dict):
         return {
-            key: name(x) if key in FILES and isinstance(x, str) else files_renamed(x, name)
+            key: name(x)
+            if key.rpartition(".")[2] in FILES and isinstance(x, str)
+            else files_renamed(x, name)
             for key, x in tree.items()
         }
     return [files_renamed(x, name) for x in tree] if isinstance(tree, list) else tree

@@ -21,7 +21,9 @@ def to_toml(file: RigFile) -> str:
     lines = [*heading(type(file)), "", *scalars(file, [], seen)]
     for name, field in type(file).model_fields.items():
         value = getattr(file, name)
-        if isinstance(value, Mapping):
+        if name == "channels" and value:
+            lines += ["", "[channels]", *(toml_row(f'"{key}"', own) for key, own in value.items())]
+        elif isinstance(value, Mapping):
             for key, table in value.items():
                 lines += ["", *(heading(type(table)) if type(table) not in seen else ())]
                 lines += section(table, f"{name}.{key}", kinds(field), seen)

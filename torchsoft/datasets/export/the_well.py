@@ -22,7 +22,7 @@ FLOAT = np.float32
 
 def write(source: Source, out: Path) -> str:
     """A folder a pad with its splits. Raises `ValueError` for a dataset without contact points."""
-    if not (surfaces := list(source.config.subject.surfaces.values())) or not source.config.nodal:
+    if not (surfaces := list(source.config.subject.surfaces)) or not source.config.nodal:
         raise ValueError(
             "The Well is for fields, and this dataset has none (nodal = false); export it to "
             "lerobot or mcap"
