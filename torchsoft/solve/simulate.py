@@ -124,6 +124,8 @@ def prepare(
         None if x is None else tensor(name, x)
         for name, x in (("y0", y0), ("knots", knots), ("dy0", dy0))
     )
+    if y0 is not None:
+        check_array("y0", y0)
     _check_wanted(gradient, wrt, dy0, rigid, touch)
     ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
