@@ -43,6 +43,10 @@ FORCE = 0.5
 CLOCK, SLOWER = 1e-4, 1e-4
 """Variation of the time at which set-points are given [s], and of the rate of their clock [1]."""
 
+NEAR, WIDEST = 5.0, 5.0
+"""Amounts by which a known number may be off to first order before a new fit looks for it farther
+away, and how many times as far at the most."""
+
 SMALLER_RAMP = 0.1
 """Factor by which the depth epsilon of the touch-down ramp is made smaller."""
 
@@ -115,8 +119,12 @@ class Variation(Assumption):
     fault: tuple[str, Any] | None = None
 
     def of(self, amount: float) -> "Variation":
-        """The variation by another amount, where it can be had."""
+        """The variation by another amount, where it can be had; a known number may be off by more
+        then."""
         by = self.by
+        if self.parameter and not self.extension:
+            wider = min(max(abs(amount / self.amount) / NEAR, 1.0), WIDEST)
+            return replace(self, amount=wider * self.amount, step=wider * self.step)
         if by is None:
             return self
         return replace(self, amount=amount, vary=lambda recording: by(recording, amount))
@@ -188,7 +196,8 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         if isinstance(first.start, AtRest) and "start.disc.x" not in unknown:
             out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0",
                 f"it began {1e6 * PLACE:g} um further right",
-                                  1e6 * PLACE, "um", vary=placed))  # fmt: skip
+                                  1e6 * PLACE, "um", vary=placed,
+                                  by=lambda r, amount: placed(r, 1e-6 * amount)))  # fmt: skip
         if isinstance(rig.contacts["L"].law.friction, SmoothSlip):
             out.append(Variation("Coulomb friction", "law",
             "slip is smooth (contact.friction = \"smooth\")",
@@ -200,7 +209,7 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
             otherwise, by = f"it began {1e6 * PLACE:g} um further right", partial(moved, body=name)
             out.append(
                 Variation(f"start of {name}.x", "known", stated, otherwise, 1e6 * PLACE, "um",
-                          vary=by)
+                          vary=by, by=lambda r, amount, name=name: moved(r, name, 1e-6 * amount))
             )  # fmt: skip
     for name, value in first.parameters.items():
         if (
@@ -266,20 +275,20 @@ def scaled(recording: Recording, names: Collection[str], factor: float) -> Recor
     )
 
 
-def placed(recording: Recording) -> Recording | None:
-    """The disc a little further right."""
+def placed(recording: Recording, by: float = PLACE) -> Recording | None:
+    """The disc a little further right [m]."""
     start, rig = recording.start, recording.rig
     if not isinstance(start, AtRest) or not isinstance(rig, SoftGrasp):
         return None
-    return replace(recording, start=start._replace(x=start.place(rig) + PLACE))
+    return replace(recording, start=start._replace(x=start.place(rig) + by))
 
 
-def moved(recording: Recording, body: str) -> Recording:
-    """A body that stands a little further right."""
+def moved(recording: Recording, body: str, by: float = PLACE) -> Recording:
+    """A body that stands a little further right [m]."""
     start = recording.start
     assert isinstance(start, Standing)
     (x, *others), velocity = start.bodies[body]
-    bodies = {**start.bodies, body: ((x + PLACE, *others), velocity)}
+    bodies = {**start.bodies, body: ((x + by, *others), velocity)}
     return replace(recording, start=start._replace(bodies=bodies))
 
 

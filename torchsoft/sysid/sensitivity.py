@@ -259,7 +259,7 @@ def new_fits(
             other = refit(problem, end, tried, loss, notify, joint)
             if other is not None and as_stated is not None:
                 found = judge.fit(tried, other, as_stated, checks[one.name])
-                checks[one.name] = replace(found, amount=one.amount)
+                checks[one.name] = replace(found, amount=one.amount, step=one.step)
             bar.update()
             yield one
             if judge.nearly(checks[one.name]):
