@@ -376,7 +376,7 @@ class Settled(NamedTuple):
     `at` where these could not be had; and whether the fit is `at_rest`: with steps chosen anew no
     coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
     whether the fit has converged). `rough` names the coordinates that would move although steps do
-    not matter: samples are not smooth in them. `steps` are those of `at` where steps chosen anew
+    not matter, the farthest first: samples are not smooth in them. `steps` are those of `at` where steps chosen anew
     have no run."""
 
     x: Array
@@ -444,8 +444,9 @@ def settle(
         anew = np.abs(shift(J, fresh.r - at.r)) / sd
         shifts, rough = np.abs(bias[free]) / sd, tuple[str, ...]()
         if not at_rest and tightenings and max(anew.max(), shifts.max()) <= SETTLED:
-            far = np.abs(newton_step(problem, x, end, free)) > SETTLED * sd
-            rough = tuple(np.array(problem.coordinates.labels)[free][far].tolist())
+            moves = np.abs(newton_step(problem, x, end, free)) / sd
+            order = np.argsort(-moves)[: int(np.sum(moves > SETTLED))]
+            rough = tuple(np.array(problem.coordinates.labels)[free][order].tolist())
         elif left and not (at_rest and shifts.max() <= STEP_BIAS):
             left, rounds, rtol = left - 1, ROUNDS, FINER * rtol
             if along(finer, steps):

@@ -161,10 +161,12 @@ class Joint(NamedTuple):
 
 
 def joint_fit(
-    problem: Problem, end: End, suspects: Sequence[Variation], loss: Loss, notify: Notify
-) -> Joint | None:
-    """The fit with every suspect unknown that is a number or a fault of a sensor, from where the
-    first fit began; None where there is none.
+    problem: Problem, end: End, suspects: Sequence[Variation], enough: float, loss: Loss,
+    notify: Notify,
+) -> Joint | None:  # fmt: skip
+    """The fit with every suspect unknown that is a number or a fault of a sensor; None where there
+    is none. It begins where the first fit ended and, if a sum of squares above `enough` is left,
+    where that began, too.
 
     A fit that lacks something may end far from the truth, where tests to first order rank suspects
     wrongly. The joint fit ends near it, and there they rank them rightly. Where it does not explain
@@ -183,11 +185,16 @@ def joint_fit(
         Stage(f"joint by rtol = {rtol:g}", end.which, labels, rtol, ALL, ROUGH)
         for rtol in (LOOSE, end.rtol)
     ]
-    try:
-        fit = run_plan(other, end.runner.of(other.recordings), plan, c.start,
-                       loss=loss, notify=notify).fit  # fmt: skip
-    except Unreachable:
+    at, fits = dict(zip(problem.coordinates.labels, end.x)), list[Fit]()
+    runner = end.runner.of(other.recordings)
+    for x in (np.array([at.get(one, own) for one, own in zip(c.labels, c.start)]), c.start):
+        with suppress(Unreachable):
+            fits.append(run_plan(other, runner, plan, x, loss=loss, notify=notify).fit)
+            if float(fits[-1].at.r @ fits[-1].at.r) <= enough:
+                break
+    if not fits:
         return None
+    fit = min(fits, key=lambda fit: fit.chi2)
     J, columns = fit.at.J, [c.labels.index(one.label) for one in tried]
     Q, _ = np.linalg.qr(J[:, np.isin(c.labels, problem.coordinates.labels) & free])
 

@@ -239,10 +239,10 @@ def new_fits(
 
         if end.far:
             bar.set_description("new fit with all suspects unknown at once")
-            joint = joint_fit(problem, end, candidates, loss, notify)
+            joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
         if joint is not None:
             gains |= {name: part * judge.square for name, part in joint.parts.items()}
-            if not judge.nearly_all(joint.left):  # none of them alone does
+            if joint.left > judge.little:  # none of them alone does
                 gains |= dict.fromkeys(joint.parts, 0.0)
                 joint = None
         bar.set_description("new fit with all assumptions")
@@ -325,6 +325,9 @@ class Judge:
         self.places = [part.rows for part in self.parts]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
+        misfit = self.square - self.dof
+        self.little = self.square - NEARLY * misfit if misfit > 0.0 else 0.0
+        """Sum of squares that is next to nothing above the noise."""
 
     def explained(self, checks: Iterable[AssumptionTest]) -> bool:
         """Whether the data favour something with which residuals are no larger than the noise."""
@@ -333,11 +336,7 @@ class Judge:
 
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""
-        return self.explained([one]) or (one.refitted and self.nearly_all(one.left))
-
-    def nearly_all(self, left: float) -> bool:
-        """Whether a sum of squares leaves next to nothing above the noise."""
-        return self.square - left > NEARLY * (self.square - self.dof) > 0.0
+        return self.explained([one]) or (one.refitted and one.left < self.little)
 
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
