@@ -23,11 +23,11 @@ from tqdm import tqdm
 
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
-from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
+from torchsoft.sysid.fit import Loss, Notify, fisher, shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, extended
-from torchsoft.sysid.refits import End, Refit, difference, joint_fit, refit
+from torchsoft.sysid.refits import End, Joint, Refit, difference, joint_fit, refit
 from torchsoft.sysid.residual_tests import LEVEL, parts
 from torchsoft.tables import Number, plain
 
@@ -228,8 +228,7 @@ def new_fits(
     checks: dict[str, AssumptionTest], progress: bool,
 ) -> Iterator[Variation]:  # fmt: skip
     """Repeats the fit with one suspect after the other, whose `checks` it replaces. Once one
-    explains the misfit, or `NEARLY` all of it, those that are worth much less to first order are
-    left out."""
+    explains the misfit, or `NEARLY` all of it, those that are worth much less are left out."""
     gains, joint = {one.name: checks[one.name].gain for one in candidates}, None
     count = len(candidates)
     with quiet(), tqdm(total=count + 1, unit="fit", disable=not progress) as bar:
@@ -239,18 +238,13 @@ def new_fits(
 
         if end.far:
             bar.set_description("new fit with all suspects unknown at once")
-            joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
-        if joint is not None:
-            gains |= {name: part * judge.square for name, part in joint.parts.items()}
-            if joint.left > judge.little:  # none of them alone does
-                gains |= dict.fromkeys(joint.parts, 0.0)
-                joint = None
+            gains, joint = ranked(problem, end, candidates, gains, loss, judge, notify)
+        blind = end.far and joint is None  # gains to first order say little
+        order = sorted(candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name]))
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, None, loss, notify)
         bar.update()
         enough = 0.0
-        blind = end.far and joint is None  # gains to first order say little
-        order = sorted(candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name]))
         for number, one in enumerate(order if as_stated is not None else (), 1):
             if gains[one.name] < enough:
                 return
@@ -266,6 +260,21 @@ def new_fits(
                 enough = max(enough, RIVAL * gains[one.name])
 
 
+def ranked(
+    problem: Problem, end: End, candidates: Sequence[Variation], gains: dict[str, float],
+    loss: Loss, judge: "Judge", notify: Notify,
+) -> tuple[dict[str, float], Joint | None]:  # fmt: skip
+    """Gains of suspects by a joint fit of all of them, and that fit; those to first order, without
+    a joint fit, where there is none. Where it leaves much, no number of it explains the data
+    alone, and gains nothing."""
+    joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
+    if joint is None:
+        return gains, None
+    if joint.left > judge.little:
+        return gains | dict.fromkeys(joint.parts, 0.0), None
+    return gains | {name: part * judge.square for name, part in joint.parts.items()}, joint
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     """No warnings: of pads that creep longer than a run begins before its samples, for one."""
@@ -276,8 +285,9 @@ def quiet() -> Iterator[None]:
 
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
     """Suspects with which a fit is repeated, those that would explain most first: `MOST` of them,
-    and every law."""
-    known = [one for one in suspects if one.name in checks and not checks[one.name].unchecked]
+    and every law, with which there may be a run elsewhere though none where the fit ended."""
+    tested = [one for one in suspects if one.name in checks]
+    known = [one for one in tested if one.kind == "law" or not checks[one.name].unchecked]
     known.sort(key=lambda one: -checks[one.name].gain)
     return [one for k, one in enumerate(known) if k < MOST or one.kind in ("law", "numerical")]
 
