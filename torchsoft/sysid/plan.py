@@ -372,11 +372,11 @@ class Settled(NamedTuple):
     """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with
     the last Jacobian; how far the steps have moved every coordinate (n,), None where that could not
     be checked; the fits on other steps since, with their tolerances and when on the clock [s] they
-    ended; the residuals by a tenth of the tolerance, those of
-    `at` where these could not be had; and whether the fit is `at_rest`: with steps chosen anew no
-    coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
-    whether the fit has converged). `rough` names the coordinates that would move although steps do
-    not matter, the farthest first: samples are not smooth in them. `steps` are those of `at` where steps chosen anew
+    ended; the residuals by a tenth of the tolerance, those of `at` where these could not be had;
+    and whether the fit is `at_rest`: with steps chosen anew no coordinate would move by more than
+    `SETTLED` standard deviations (where steps are only checked: whether the fit has converged).
+    `rough` names the coordinates that would move although steps do not matter, the farthest first:
+    samples are not smooth in them. `steps` are those of `at` where steps chosen anew
     have no run."""
 
     x: Array
