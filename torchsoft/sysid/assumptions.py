@@ -204,7 +204,7 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
                                   "it were Coulomb's", vary=coulomb))  # fmt: skip
     pushed = {one.pushes for one in rig.actuators.values()}
     for name, axes in rig.layout.free.items() if isinstance(first.start, Standing) else ():
-        if 0 in axes and f"{name}.x" not in pushed:
+        if 0 in axes and f"{name}.x" not in pushed and f"start.{name}.x" not in unknown:
             stated = f"{name} begins where the rig file says"
             otherwise, by = f"it began {1e6 * PLACE:g} um further right", partial(moved, body=name)
             out.append(

@@ -6,7 +6,7 @@ Every error is a `ValueError` in a sentence that names the file, the row and the
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,24 +14,20 @@ import numpy as np
 import xarray as xr
 
 from torchsoft import csvfile
-from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS
+from torchsoft.channels import UNITS
 from torchsoft.display import enumerated, nearest, suggestion
 from torchsoft.solve.mcap import read_log
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
 
-COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)
-"""Names that a column of a recording of the paper's rig may have."""
-
 
 class Vocabulary(NamedTuple):
-    """Columns of the recordings of a rig: `units` by column, the names of signals, those of them
-    that a recording must have, and what `headings` of other names stand for."""
+    """Columns of the recordings of a rig: `units` by column, the names of signals, and what
+    `headings` of other names stand for."""
 
     units: Mapping[str, str]
     signals: tuple[str, ...]
-    needed: tuple[str, ...] = ()
     headings: Mapping[str, str] = {}
 
     def renamed(self, headings: Mapping[str, str]) -> "Vocabulary":
@@ -55,11 +51,6 @@ class Vocabulary(NamedTuple):
         """Signals and their rates."""
         return tuple(name for name in self.units if name not in ("t", *self.measured))
 
-
-PAPER = Vocabulary(
-    {name: CHANNELS[name].unit for name in COLUMNS}, (*SETPOINTS, "F_ff"), (*SETPOINTS, "F_ff")
-)
-"""Of the paper's rig."""
 
 ROWS = 10
 """A table with set-points has at least as many rows."""
@@ -96,12 +87,10 @@ class Columns:
 
 @dataclass(frozen=True)
 class Tables:
-    """The tables of one recording, each with times of its own; a column stands in one of them.
-    `constants` are columns that were stated in the place of missing ones."""
+    """The tables of one recording, each with times of its own; a column stands in one of them."""
 
     tables: tuple[Columns, ...]
-    constants: tuple[str, ...] = ()
-    known: Vocabulary = PAPER
+    known: Vocabulary
 
     def __contains__(self, column: str) -> bool:
         return any(column in table.values for table in self.tables)
@@ -132,17 +121,14 @@ class Tables:
 
     def near(self, time: float) -> str:
         """Names the file with the set-points, and the first row at or after a time [s]."""
-        table = next((self.of(name) for name in self.known.needed), self.tables[0])
+        asked = (self.of(name) for name in self.known.signals if name in self)
+        table = next(asked, self.tables[0])
         return f"{table.path}, {table.near(time)}"
 
 
-def read_tables(
-    paths: Sequence[Path], ignore: Collection[str], constants: Mapping[str, float],
-    known: Vocabulary = PAPER,
-) -> Tables:  # fmt: skip
-    """The tables of one recording; a column that none has is a constant, where one is stated.
-    Raises `ValueError` for a column that is there twice, or is needed and missing, and for samples
-    at times without set-points."""
+def read_tables(paths: Sequence[Path], ignore: Collection[str], known: Vocabulary) -> Tables:
+    """The tables of one recording. Raises `ValueError` for a column that is there twice, and for
+    samples at times without set-points."""
     tables = [read_table(path, ignore, known) for path in paths]
     names = ", ".join(str(path) for path in paths)
     for i, table in enumerate(tables):
@@ -154,27 +140,11 @@ def read_tables(
                 )
     there = {name for table in tables for name in table.values}
     for name in known.signals:
-        if name not in there and name not in constants and name in known.needed:
-            if name in FEED_FORWARD:
-                raise ValueError(
-                    f"{names} has no column `{name}`, and nothing says which force was fed forward "
-                    "to the bracket: give the column, or state a constant [N], missing = {"
-                    f"{name} = 0.0}} where there was none"
-                )
-            raise ValueError(
-                f"{names} has no column `{name}`; it needs t, x_d, y_d and at least one of "
-                f"{enumerated(known.measured)}"
-            )
         if f"{name}_dot" in there and not any(
             {name, f"{name}_dot"} <= table.values.keys() for table in tables
         ):
             raise ValueError(f"{names}: the columns `{name}` and `{name}_dot` must be in one file")
-    most = max(range(len(tables)), key=lambda i: len({*known.signals} & tables[i].values.keys()))
-    stated = {name: value for name, value in constants.items() if name not in there}
-    table = tables[most]
-    filled = {name: np.full(len(table.rows), value) for name, value in stated.items()}
-    tables[most] = check_table(replace(table, values=table.values | filled), known)
-    made = Tables(tuple(tables), tuple(stated), known)
+    made = Tables(tuple(tables), known)
     check_times(made)
     return made
 
@@ -196,7 +166,7 @@ def check_times(tables: Tables) -> None:
                     )
 
 
-def read_table(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
+def read_table(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
     """A CSV, NetCDF or MCAP file, by its suffix, without the columns `ignore`."""
     if path.suffix in (".nc", ".h5", ".mcap"):
         return read_trajectory(path, ignore, known)
@@ -217,7 +187,7 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
     )
 
 
-def read_csv(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
+def read_csv(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
     """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is
     row 1) and the column."""
     renamed = {of: heading for heading, of in known.headings.items()}
@@ -227,7 +197,7 @@ def read_csv(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER
     return check_table(Columns(path, values, table.rows, ignored=table.ignored), known)
 
 
-def read_trajectory(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
+def read_trajectory(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
     """The table in a file of `Trajectory.save` or `to_mcap`; rows are called samples, counted from
     0. Raises `ValueError`."""
     data = read_log(path) if path.suffix == ".mcap" else load(path)
@@ -263,7 +233,7 @@ def read_channels(data: xr.Dataset, path: Path, known: Vocabulary) -> dict[str, 
     return {name: np.array(one.values, float) for name, one in values.items()}
 
 
-def check_table(table: Columns, known: Vocabulary = PAPER) -> Columns:
+def check_table(table: Columns, known: Vocabulary) -> Columns:
     """The table, where its times and set-points can be used. Raises `ValueError` naming row and
     column."""
     path, values = table.path, table.values

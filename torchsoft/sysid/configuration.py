@@ -1,14 +1,12 @@
 """What a TOML file states of an identification: what is known, what is unknown, and how good the
 sensors are."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from torchsoft.paper.rig import NAMES
-from torchsoft.physics.material import INSTANT
 from torchsoft.plan.knots import Bounds
 from torchsoft.sysid.criterion import Optimality
 from torchsoft.sysid.design import RTOL
@@ -16,10 +14,6 @@ from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.initial_state import LEAD, SETTLE
 from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import LISTED, SEED, Table, from_toml
-
-VOCABULARY = {own: name for name, own in NAMES.items()}
-"""The rig's own names of parameters, by which they are understood too, with those of
-`Parameters`."""
 
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 File = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -39,13 +33,14 @@ def told_apart(sd: float, value: float = 1.0) -> float:
 
 
 class Rest(Table):
-    """A recording that begins at rest, `lead` [s] after its bodies were put where they stand. In
-    the paper's rig the disc stands on the lower pad at `scenario.x_C0`, known to `position_sd` [m],
-    and the bracket clear of it; in another one they stand where the rig file has them start."""
+    """A recording that begins at rest, `lead` [s] after its bodies were put where the rig file has
+    them start; `position_sd` has by coordinate how well that is known [m or rad]."""
 
     kind: Literal["rest"] = "rest"
     lead: float = Field(default=SETTLE, ge=0, le=10)
-    position_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
+    position_sd: dict[Name, Annotated[float, AfterValidator(told_apart), Field(ge=0, le=0.1)]] = (
+        Field(default_factory=dict)
+    )
 
 
 class Known(Table):
@@ -72,62 +67,6 @@ class Moving(Table):
 Beginning = Annotated[Rest | Moving, Field(discriminator="kind")]
 
 
-class Missing(Table):
-    """Constants [m, N] in the place of columns that a recording does not have."""
-
-    x_d: float | None = Field(default=None, ge=-100, le=100)
-    y_d: float | None = Field(default=None, ge=-100, le=100)
-    F_ff: float | None = Field(default=None, ge=-1e9, le=1e9)
-
-    def over(self, other: "Missing") -> dict[str, float]:
-        """Those of this table, and of the other where this has none."""
-        return other.model_dump(exclude_none=True) | self.model_dump(exclude_none=True)
-
-
-class KelvinVoigtPads(Table):
-    """Pads of one retardation time, `pad.tau`."""
-
-    kind: Literal["kelvin_voigt"] = "kelvin_voigt"
-
-
-class StandardLinearPads(Table):
-    """Pads that are stiffer at first: `E_instant` [Pa] above `pad.E`, which is the relaxed
-    modulus."""
-
-    kind: Literal["standard_linear_solid"] = "standard_linear_solid"
-    E_instant: float = Field(ge=1.0, le=1e13)
-    tau_instant: float = Field(default=INSTANT, ge=1e-9, le=1e6)
-
-
-Times = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], LISTED]
-
-
-class GeneralisedKelvinPads(Table):
-    """Pads that creep in several times `tau` [s], each by a fraction `J` of the relaxed compliance
-    1 / `pad.E`."""
-
-    kind: Literal["generalised_kelvin"] = "generalised_kelvin"
-    J: Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], LISTED]
-    tau: Times
-    tau_instant: float = Field(default=INSTANT, ge=1e-9, le=1e6)
-
-
-class PronyPads(Table):
-    """Pads with a relaxation series: `moduli` [Pa] on top of `pad.E`, the relaxed one, that fade in
-    the times `tau` [s]."""
-
-    kind: Literal["prony"] = "prony"
-    moduli: Annotated[tuple[Annotated[float, Field(ge=1e-6, le=1e13)], ...], LISTED]
-    tau: Times
-    tau_instant: float = Field(default=INSTANT, ge=1e-9, le=1e6)
-
-
-Pads = Annotated[
-    KelvinVoigtPads | StandardLinearPads | GeneralisedKelvinPads | PronyPads,
-    Field(discriminator="kind"),
-]
-
-
 class Entry(Table):
     """One more recording, called `name` or like its file: its columns stand in `file`, or in
     several `files` next to the configuration, each with times of its own. Without a file it has
@@ -138,7 +77,6 @@ class Entry(Table):
     files: Annotated[tuple[File, ...], LISTED] = ()
     settings: dict[str, Any] = Field(default_factory=dict)
     start: Beginning | None = None
-    missing: Missing = Missing()
 
     @model_validator(mode="after")
     def _is_named(self) -> "Entry":
@@ -156,11 +94,10 @@ class Entry(Table):
 
 
 class Law(Table):
-    """A competing law: `settings` that differ, such as `contact.friction`, another material of the
-    `pads`, `unknowns` that it has besides or with other bounds, and those that it is `without`."""
+    """A competing law: `settings` that differ, such as the `friction` of a law or a material,
+    `unknowns` that it has besides or with other bounds, and those that it is `without`."""
 
     settings: dict[str, Any] = Field(default_factory=dict)
-    pads: Pads | None = None
     unknowns: dict[str, Unknown] = Field(default_factory=dict)
     without: Annotated[tuple[str, ...], LISTED] = ()
 
@@ -191,26 +128,30 @@ class DesignTable(Table):
     seed: int = Field(default=0, ge=0, le=SEED)
 
 
+REPLACED = {
+    "pads": "what a pad is made of is the material of the rig file: say [settings.materials.NAME]",
+    "missing": "a signal without a column is the motion of the rig file: say [settings.motion.NAME]",
+}
+"""Tables of old files, and what says it now."""
+
+
 class Config(Table):
     """An identification as a TOML file states it.
 
-    `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors`
-    are tables by the dotted names of parameters and by channels. With a `rig` file the names are
-    those of its tables, and `settings` replaces fields of it. `columns` has channels and signals by
-    headings of another name, `heldout` names recordings that are predicted and not fitted, `ignore`
-    columns that are left out, and `acknowledged` findings that are no mistakes. `missing` and
-    `start` hold for all recordings that say nothing else.
-    `compare` has competing laws by name.
+    `rig` is the rig file, whose fields have the names of its tables: `settings` replaces known
+    ones, `unknowns` are tables by the dotted names of parameters, `sensors` by channels. `columns`
+    has channels and signals by headings of another name, `heldout` names recordings that are
+    predicted and not fitted, `ignore` columns that are left out, and `acknowledged` findings that
+    are no mistakes. `start` holds for all recordings that say nothing else. `compare` has competing
+    laws by name.
     """
 
+    rig: File
     unknowns: dict[str, Unknown]
     sensors: dict[str, Sensor]
-    rig: File | None = None
     columns: dict[Name, Name] = Field(default_factory=dict)
     settings: dict[str, Any] = Field(default_factory=dict)
-    pads: Pads = KelvinVoigtPads()
     start: Beginning = Rest()
-    missing: Missing = Missing()
     fit: Settings = Field(default_factory=lambda: Settings.model_validate({}))
     recordings: Annotated[tuple[Entry, ...], LISTED] = ()
     compare: dict[Name, Law] = Field(default_factory=dict)
@@ -220,23 +161,23 @@ class Config(Table):
     ignore: Annotated[tuple[str, ...], LISTED] = ()
     acknowledged: Annotated[tuple[str, ...], LISTED] = ()
 
-    def understood(self, name: str) -> str:
-        """A parameter's name among `Parameters`, where the paper's rig has it by its own."""
-        return VOCABULARY.get(name, name) if self.rig is None else name
-
-    @model_validator(mode="after")
-    def _the_rig_says_what_it_is_made_of(self) -> "Config":
-        if self.rig is None:
-            return self
-        for field in ("pads", "missing"):
-            if field in self.model_fields_set:
-                raise ValueError(f"{field} are of the paper's rig; say it in the rig file")
-        for name, law in self.compare.items():
-            if law.pads is not None:
-                raise ValueError(
-                    f"compare.{name}.pads are of the paper's rig; say it by compare.{name}.settings"
-                )
-        return self
+    @model_validator(mode="before")
+    @classmethod
+    def _a_rig_file_says_what_is_recorded(cls, tree: Any) -> Any:
+        if not isinstance(tree, dict):
+            return tree
+        if "rig" not in tree:
+            raise ValueError(
+                'rig is missing: say rig = "FILE.toml", the rig file whose names [settings] and '
+                "[unknowns] have; rigs/paper.toml is the rig of the paper"
+            )
+        compared = tree.get("compare")
+        laws = compared.values() if isinstance(compared, dict) else ()
+        for one in (tree, *(one for one in laws if isinstance(one, dict))):
+            for field, now in REPLACED.items():
+                if field in one:
+                    raise ValueError(f"{field} is not known: {now}")
+        return tree
 
     @model_validator(mode="after")
     def _laws_have_likelihoods(self) -> "Config":
@@ -244,22 +185,19 @@ class Config(Table):
             raise ValueError(
                 f"compare needs likelihoods: fit.loss must be 'linear', not '{self.fit.loss}'"
             )
-        known = {self.understood(name) for name in self.unknowns}
         for law, one in self.compare.items():
-            if strange := [name for name in one.without if self.understood(name) not in known]:
+            if strange := [name for name in one.without if name not in self.unknowns]:
                 raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         return self
 
     @model_validator(mode="after")
     def _recordings_state_what_is_known(self) -> "Config":
-        unknown = {self.understood(name): name for name in self.unknowns}
         for i, entry in enumerate(self.recordings):
-            stated = [self.understood(name) for name, _ in flattened(entry.settings)]
-            if strange := [name for name in stated if name in unknown]:
+            if strange := [x for x, _ in flattened(entry.settings) if x in self.unknowns]:
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "
-                    f'and say by unknowns."{unknown[strange[0]]}".nominal where the search starts'
+                    f'and say by unknowns."{strange[0]}".nominal where the search starts'
                 )
         return self
 
@@ -270,22 +208,6 @@ def read_config(path: str | Path) -> Config:
     return from_toml(path, Config.model_validate)
 
 
-def in_one_vocabulary(
-    unknowns: Mapping[str, Unknown], understood: Callable[[str], str]
-) -> dict[str, Unknown]:
-    """Unknowns by the names that are `understood`. Raises `ValueError` for one that is there by
-    two."""
-    out: dict[str, Unknown] = {}
-    for name, one in unknowns.items():
-        if understood(name) in out:
-            raise ValueError(f"unknowns.{name} is there twice: it is {understood(name)} too")
-        ratio = one.ratio_to
-        out[understood(name)] = (
-            one.model_copy(update={"ratio_to": understood(ratio)}) if ratio is not None else one
-        )
-    return out
-
-
 def flattened(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
     """Values by their dotted names."""
     for key, value in settings.items():
@@ -293,17 +215,3 @@ def flattened(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[s
             yield from flattened(value, f"{within}{key}.")
         else:
             yield within + key, value
-
-
-def groups(*settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by group and name, the later ones first."""
-    tree: dict[str, Any] = {}
-    for given in settings:
-        for name, value in flattened(given):
-            group, _, field = VOCABULARY.get(name, name).partition(".")
-            if not field:
-                tree[group] = value
-            else:
-                old = tree.get(group)
-                tree[group] = (old if isinstance(old, dict) else {}) | {field: value}
-    return tree

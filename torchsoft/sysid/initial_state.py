@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.display import suggestion
 from torchsoft.excitation import start
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.pads import Pad
@@ -121,12 +122,14 @@ class Standing(NamedTuple):
     """Bodies are at known places, `lead` [s] before the first sample, and pads have settled around
     them.
 
-    `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s]. The
-    displacements of the pads are those at the nominal parameters, whatever the others are.
+    `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s], `position_sd`
+    how well coordinates such as "disc.x" are known [m, rad]: these are coordinates of the start.
+    The displacements of the pads are those at the nominal parameters, whatever the others are.
     """
 
     bodies: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
     lead: float = SETTLE
+    position_sd: Mapping[str, float] = {}
 
     @classmethod
     def of(cls, rig: Rig, y0: Tensor, lead: float = SETTLE) -> "Standing":
@@ -141,17 +144,47 @@ class Standing(NamedTuple):
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
         if self.lead > 0:
             warn_of_memory(rig, self.lead)
-        return ()
+        known = free_coordinates(rig)[: len(free_coordinates(rig)) // 2]
+        for name in self.position_sd:
+            if name not in known:
+                raise ValueError(
+                    f"`position_sd` of the start speaks of `{name}`; "
+                    f"{suggestion(name, known, 'there are')}"
+                )
+        return tuple(
+            StartCoordinate(f"{PREFIX}{name}", self.place(name), sd)
+            for name, sd in self.position_sd.items()
+            if sd > 0
+        )
+
+    def place(self, coordinate: str) -> float:
+        """Where the body of a coordinate stands [m or rad]."""
+        body, axis = coordinate.split(".")
+        return self.bodies[body][0][COORDINATES.index(axis)]
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
-        pose, velocity = (
-            {name: torch.tensor(one[k], dtype=torch.float64) for name, one in self.bodies.items()}
-            for k in range(2)
+        own, moving = (
+            deepcopy(rig).requires_grad_(False),
+            [k for k, sd in self.position_sd.items() if sd > 0],
         )
+
+        def state(values: Mapping[str, Tensor]) -> Tensor:
+            pose = {k: torch.tensor(q, dtype=torch.float64) for k, (q, _) in self.bodies.items()}
+            for name in moving:
+                body, axis = name.split(".")
+                place = torch.tensor(self.place(name), dtype=torch.float64)
+                by = values.get(f"{PREFIX}{name}", place) - place
+                pose[body] = pose[body] + by * torch.eye(3).double()[COORDINATES.index(axis)]
+            found = own.unpack(standing(own, pose))
+            rates = {
+                k: torch.tensor(self.bodies[k][1], dtype=torch.float64) for k in found.velocity
+            }
+            return own.pack(found._replace(velocity=rates))
+
+        if moving:
+            return HeldPads(rig, rig, state)
         with torch.no_grad():
-            state = rig.unpack(standing(rig, pose))
-            moving = {name: velocity[name] for name in state.velocity}
-            y0 = rig.pack(state._replace(velocity=moving))
+            y0 = state({})
         return HeldPads(rig, rig, lambda values: y0)
 
 

@@ -43,10 +43,6 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
     Returns the configuration of their identification, whose search begins away from the truth, and
     the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot do.
     """
-    if stated.rig is None:
-        raise ValueError(
-            f'{config}: a rehearsal simulates the rig of a file: say rig = "FILE.toml"'
-        )
     file, plan = RigFile.from_toml(config.parent / stated.rig), stated.rehearsal
     entries = stated.recordings or (Entry(name="rehearsal"),)
     paths, random = [], np.random.default_rng(plan.seed)

@@ -87,8 +87,6 @@ def choose(
     The rig is as its file has it. Raises `ValueError` for what does not fit together, or where no
     candidate can be made.
     """
-    if stated.rig is None:
-        raise ValueError(f'{config}: a design is of the rig of a file: say rig = "FILE.toml"')
     plan = stated.design
     with at_field("settings"):
         file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)

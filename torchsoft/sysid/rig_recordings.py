@@ -1,30 +1,51 @@
 """Recordings of the rig that a rig file describes.
 
 Columns are the rig's own channels and signals, by the names that a run of the file writes. A signal
-without a column is the file's own motion, counted from the same zero of time.
+without a column is the file's own motion, counted from the same zero of time. What a recording at
+rest begins with is held against where the file has bodies and motions start.
 """
 
 from collections.abc import Mapping
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchsoft.channels import UNITS
-from torchsoft.physics.motion import Reference, Sampled
+from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.state import State
+from torchsoft.physics.statics import net_loads
 from torchsoft.rigs.build import RigFile
 from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import channels, measurable, units
 from torchsoft.sysid.columns import Tables, Vocabulary
 from torchsoft.sysid.configuration import Beginning, Moving
 from torchsoft.sysid.first_samples import estimate_initial_state
-from torchsoft.sysid.initial_state import Standing, Start
-from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.initial_state import BOUNDS, Standing, Start
+from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.setpoints import channel
 from torchsoft.sysid.unknowns import Sensor, by_channel
+
+FARTHEST = 10.0
+"""How many times as far from the origin as anything of the rig a place may be."""
+
+LARGEST = {"rad": 100.0, "m/s": 10.0, "rad/s": 1e3, "N": 1e4, "N.m": 1e3}
+"""Largest plausible values of other columns, by unit."""
 
 APART = {"m": 1e-3, "rad": 0.05}
 """How far [m, rad] the first sample of a coordinate may be from the file's start, besides what its
-sensor does."""
+sensor does: a body may roll into a dent while it settles."""
+
+ASIDE = {"m": 3e-4, "rad": 0.05}
+"""How far [m, rad] the first set-point may be from the file's: a body that is pushed must not press
+already."""
+
+BEGINNING, CREEP = 10e-3, 20e-3
+"""For so long [s] nothing may move faster than this [m/s] besides what the file does: a body put
+down on a pad still settles."""
+
+WAY_OUT = 'or say start = {kind = "moving"} for a recording that begins in motion or in mid-grasp'
 
 SLACK = 0.05
 """Time [s] by which a recording may begin after the file's own motions, or end after them."""
@@ -40,7 +61,7 @@ def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
     return Vocabulary(columns, signals).renamed(headings)
 
 
-def followed(tables: Tables, rig: Rig | None = None) -> Reference:
+def followed(tables: Tables, rig: Rig) -> Reference:
     """The signals that tables have, with the rates of their columns, if there are any; the others
     are those of the rig."""
     columns, signals = tables.columns, {}
@@ -49,7 +70,7 @@ def followed(tables: Tables, rig: Rig | None = None) -> Reference:
             rate = columns.get(f"{name}_dot")
             times, values = (torch.tensor(column) for column in columns[name])
             signals[name] = Sampled(times, values, None if rate is None else torch.tensor(rate[1]))
-        elif rig is not None:
+        else:
             signals[name] = rig.reference[name]
     return Reference(**signals)
 
@@ -95,19 +116,38 @@ def rig_recording(
     """The recording that tables hold, of the rig of a file. Raises `ValueError` naming row and
     column, or the file's field."""
     rig, y0, _ = file.build()
-    sensors = by_channel([rig], sensors)
+    sensors, own = by_channel([rig], sensors), rig.reference
     check_clock(file, rig, tables, start)
+    check_plausible(rig, rig.unpack(y0), tables)
     rig.reference = followed(tables, rig)
-    made = recorded(name, rig, tables, sensors, start, Standing.of(rig, y0, start.lead))
     if isinstance(start, Moving):
-        return made
-    if start.position_sd:
-        raise ValueError(
-            "start.position_sd is of the paper's rig; where the places of bodies are not known, "
-            'say start = {kind = "moving"}'
-        )
-    check_start(made, y0, tables, sensors)
+        return recorded(name, rig, tables, sensors, start, Standing.of(rig, y0))
+    at_rest = Standing.of(rig, y0, start.lead)._replace(position_sd=start.position_sd)
+    made = recorded(name, rig, tables, sensors, start, at_rest)
+    made.start_coordinates  # refuses other names
+    check_start(made, y0, own, tables, sensors)
     return made
+
+
+def check_plausible(rig: Rig, state: State, tables: Tables) -> None:
+    """Raises `ValueError` naming row and column for values that no such rig can have."""
+    reach = [float(pad.positions.norm(dim=-1).max()) for pad in rig.pads.values()]
+    reach += [float(pose[:2].norm()) for pose in state.pose.values()]
+    reach += [body.shape.size() for body in rig.bodies.values() if body.shape is not None]
+    for name in rig.signals:
+        signal = rig.reference[name]
+        if tables.known.units.get(name) == "m" and isinstance(signal, Piecewise):
+            reach.append(float(signal.values.detach().abs().max()))
+    for name, (_, column) in tables.columns.items():
+        unit, table = tables.known.units[name], tables.of(name)
+        most = LARGEST.get(unit, FARTHEST * max(reach))
+        for i in np.flatnonzero(np.abs(column) > most)[:1].tolist():
+            raise ValueError(
+                f"{table.at(i)}, column `{name}`: {column[i]:.4g} {unit} is not plausible, it "
+                f"should be between {-most:.3g} and {most:.3g} {unit}"
+                + (f", {FARTHEST:g} times as far as the rig reaches" if unit == "m" else "")
+                + "; is the unit in the heading right?"
+            )
 
 
 def check_clock(file: RigFile, rig: Rig, tables: Tables, start: Beginning) -> None:
@@ -132,24 +172,66 @@ def check_clock(file: RigFile, rig: Rig, tables: Tables, start: Beginning) -> No
 
 
 def check_start(
-    made: Recording, y0: torch.Tensor, tables: Tables, sensors: Mapping[str, Sensor]
+    made: Recording, y0: Tensor, own: Reference, tables: Tables, sensors: Mapping[str, Sensor]
 ) -> None:
-    """Raises `ValueError` naming row and column for a coordinate that does not begin where the rig
-    file says."""
-    rig = made.rig
+    """Raises `ValueError` naming row and column for a recording that does not begin at rest, with
+    coordinates and set-points where the rig file says; `own` are the file's motions."""
+    rig, start, first = made.rig, made.start, tables.begin
+    assert isinstance(start, Standing)
     with torch.no_grad():
-        signals = rig.follow(made.times[0])
+        signals = rig.follow(first)
         here = channels(rig, rig.unpack(y0, signals), signals)
-    for channel, (t, y) in made.samples.items():
-        unit, sensor = made.units[channel], sensors.get(channel)
-        if channel not in here or unit not in APART:
+        asked = own(torch.tensor(first, dtype=torch.float64), rig.signals)[..., 0]
+    places = {name: [float(value)] for name, value in here.items() if name in made.samples}
+    places |= {name: [float(value)] for name, value in zip(rig.signals, asked)}
+    for coordinate, setpoint in (pair for one in rig.actuators.values() for pair in one.follows):
+        places[setpoint].append(float(here[channel(rig, coordinate)]))
+    unsure = {channel(rig, name): BOUNDS * sd for name, sd in start.position_sd.items()}
+    speed, rush = pace(made, rig.unpack(y0, signals), own, first)
+    sizes = [body.shape.size() for body in rig.bodies.values() if body.shape is not None]
+    for name, (t, column) in tables.columns.items():
+        unit, rows = tables.known.units[name], np.flatnonzero(np.isfinite(column))
+        late = name in tables.known.measured and rows.size and t[rows[0]] > first + BEGINNING
+        if not rows.size or late or not unit.startswith(("m", "rad")):
             continue
-        slack = APART[unit] + (8 * sensor.sd + sensor.bias if sensor else 0.0)
-        if abs(y[0] - float(here[channel])) > slack:
-            table = tables.of(channel)
-            row = int(np.searchsorted(table.values["t"], t[0]))
+        sensor, t, y, table = sensors.get(name), t[rows], column[rows], tables.of(name)
+        noise, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
+        size = 1 / min(sizes) if unit.startswith("rad") else 1.0
+        near = (APART if name in made.samples else ASIDE).get(unit, np.inf) + noise + bias
+        near += unsure.get(name, max(unsure.values(), default=0.0) if name in rig.signals else 0.0)
+        if all(abs(y[0] - place) > near for place in places.get(name, ())) and name in places:
+            place = places[name][0]
             raise ValueError(
-                f"{table.at(row)}, column `{channel}`: it begins at {y[0]:.5g} {unit}, but the "
-                f"rig file at {float(here[channel]):.5g} {unit}; say so there, or say start = "
-                '{kind = "moving"} for a recording that begins elsewhere'
+                f"{table.at(rows[0])}, column `{name}`: it begins at {y[0]:.5g} {unit}, but the "
+                f"rig file at {place:.5g} {unit}; "
+                + ("is its sign opposite?" if abs(y[0] + place) <= near else "say so there, ")
+                + (WAY_OUT if abs(y[0] + place) > near else "")
             )
+        early = (t <= first + BEGINNING) | (np.arange(len(t)) < 2)
+        gone = y if unit.endswith("/s") else y - y[0]
+        passed = np.ones(len(t)) if unit.endswith("/s") else t - t[0]
+        allowed = size * (speed + rush * (t - first + start.lead)) * passed + noise
+        allowed += bias if unit.endswith("/s") else 0.0
+        for i in np.flatnonzero(early & (np.abs(gone) > allowed))[:1].tolist():
+            raise ValueError(
+                f"{table.at(int(rows[i]))}, column `{name}` moves already: a recording must begin "
+                f"at rest, its bodies where the rig file has them start, {WAY_OUT}"
+            )
+
+
+def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[float, float]:
+    """How fast [m/s] anything may move at the first sample by the rig file, its start in `state`
+    and its motions; and how much faster it gets [m/s2], from the start on."""
+    rig, lead = made.rig, made.start.lead
+    around = torch.linspace(first - lead, first + BEGINNING, 51, dtype=torch.float64)
+    with torch.no_grad():
+        rates = [float(own(around, (name,))[..., 1].abs().max()) for name in rig.signals
+                 if made.units[name] in ("m", "rad")]  # fmt: skip
+        loads = net_loads(rig, state, rig.follow(first))
+        deep = {name: float(rig.penetration(name, state).max()) for name in rig.contacts}
+    speeds = [float(v.abs().max()) for v in state.velocity.values()]
+    pushed = {one.pushes.split(".")[0] for one in rig.actuators.values()}
+    pushed |= {contact.body for name, contact in rig.contacts.items() if deep[name] > 0}
+    rushes = [float(loads[name][:2].norm() / body.mass) for name, body in rig.bodies.items()
+              if lead == 0 or name not in pushed]  # fmt: skip
+    return CREEP + 2 * max(rates, default=0.0) + max(speeds), max(rushes, default=0.0)
