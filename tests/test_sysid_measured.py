@@ -6,6 +6,7 @@ import re
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,37 +15,35 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
-from conftest import paper_settings
 
-from torchsoft import Parameters, simulate
-from torchsoft.channels import CHANNELS
+from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.channels import CHANNELS, UNITS
 from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.paper.rig import NAMES
 from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
+from torchsoft.rigs.build import RigFile
 from torchsoft.solve.trajectory import save
-from torchsoft.sysid import MEASURED, Recording, Sensor, record
-from torchsoft.sysid.columns import COLUMNS, UNITS, read_table, read_tables
-from torchsoft.sysid.initial_state import AtRest, MovingStart
-from torchsoft.sysid.measured import (
-    STATED,
-    cost,
-    known_parameters,
-    load,
-    recording,
-    stem,
-)
+from torchsoft.sysid import MEASURED, Sensor, record
+from torchsoft.sysid.columns import read_table
+from torchsoft.sysid.initial_state import MovingStart, StartCoordinate
+from torchsoft.sysid.measured import STATED, cost, load, stem
+from torchsoft.sysid.rig_recordings import vocabulary
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
-CONFIG = """
+RIG = EXAMPLE.parents[1] / "rigs" / "paper.toml"
+CONFIG = f"""
+rig = "{RIG.as_posix()}"
 [settings]
-contact.v_s = 0.05
-control.senses = "bracket"
-scenario.x_C0 = 60.3e-3
+laws.steel_on_rubber.friction.v_s = 0.05
+actuators.x.measures = "bracket.x"
+bodies.disc.start.x = 60.3e-3
+bodies.bracket.start.x = 60.3e-3
 
-[unknowns."contact.K_n"]
+[unknowns."laws.steel_on_rubber.K_n"]
 nominal = 1e5
-[unknowns."pad.E"]
+[unknowns."materials.rubber.E"]
 nominal = 0.7e6
 
 [sensors]
@@ -57,6 +56,32 @@ rtol = 1e-3
 """
 
 SIGNALS = ("x_d", "y_d", "F_ff")
+LAW = "laws.steel_on_rubber"
+SOLID = (
+    'materials.rubber = {kind = "standard_linear_solid", E = 0.75e6, E_instant = 2e6, nu = 0.45, '
+    "tau = 10e-3, depth = 44e-3}\n"
+)
+COULOMB = f"""[compare.coulomb.settings]
+{LAW}.friction = {{kind = "coulomb", mu_s = 0.8, mu_k = 0.7}}
+"""
+FILED = (
+    (r"^contact\.", f"{LAW}."),
+    (r"^pad\.", "materials.rubber."),
+    (r"^control\.", "actuators."),
+    (r"^disc\.|^bracket\.", r"bodies.\g<0>"),
+)
+"""What names of the paper's rig are in its file."""
+
+PAPER = vocabulary(RigFile.from_toml(RIG).assemble(), {})
+
+
+def series(kind: str, strengths: str) -> str:
+    """The setting of a material of several retardation times."""
+    return (
+        f'materials.rubber = {{kind = "{kind}", E = 0.75e6, nu = 0.45, {strengths}, tau = [2e-3, '
+        "0.01], depth = 44e-3}\n"
+    )
+
 
 Table = list[list[str]]
 Change = Callable[[Table], object]
@@ -67,10 +92,6 @@ def example():
     """Cells of the first 0.3 s of the example, with its heading."""
     with (EXAMPLE / "rolling.csv").open(newline="") as file:
         return list(csv.reader(file))[:62]
-
-
-def read_recording(path: Path, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
-    return recording(read_tables([path], (), {}), name, p, sensors)
 
 
 def write(path: Path, table: Table) -> Path:
@@ -132,13 +153,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "another column": (put(1, X_C, "Ventil"),
         r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
-    "no feed-forward": (
-        drop(F_FF),
-        r"data\.csv has no column `F_ff`, and nothing says which force was fed forward.* missing = "
-        r"\{F_ff = 0\.0\} where",
-    ),
     "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
-    "no set-point": (drop(Y_D), r"data\.csv has no column `y_d`"),
     "no sensor": (put(1, X_C, "y_C [mm]"),
         r"rig\.toml: sensors: no recording has samples of `x_C`"),
     "semicolons": (
@@ -165,39 +180,55 @@ BAD: dict[str, tuple[Change, str]] = {
     "few rows": (lambda table: table.__delitem__(slice(8, None)),
         r"has 7 rows of numbers, but needs at least 10"),
     "mm under m": (put(1, X_C, "x_C [m]"),
-        r"row 2, column `x_C`: 60.54 m is not plausible, .* between -0.12 and 0.24 m"),
+        r"row 2, column `x_C`: 60.54 m is not plausible, .* between -1.2 and 1.2 m, 10 times as f"
+        r"ar as the rig reaches; is the unit in the heading right\?"),
+    "a force in mN": (scale(F_Y, 1e3), r"row \d+, column `F_y`: .* between -1e\+04 and 1e\+04 N"),
     "another start": (scale(X_C, 1.0, 5.0),
-        r"row 2, column `x_C`: it begins at 0.065\d* m, but scenario.x_C0 is 0.0603 m"),
+        r"row 2, column `x_C`: it begins at 0.065\d* m, but the rig file at 0.0603 m; say so"),
     "another sign": (scale(X_C, -1.0),
-        r"it begins at -0.0605\d* m, but scenario.x_C0 is 0.0603 m; is its sign opposite\?"),
+        r"it begins at -0.0605\d* m, but the rig file at 0.0603 m; is its sign opposite\?"),
     "turned already": (scale(THETA, 1.0, 500.0),
-        r"row 2, column `theta`: it begins at 0.48\d* rad, but the start is 0 rad"),
+        r"row 2, column `theta`: it begins at 0.48\d* rad, but the rig file at 0 rad"),
     "another ground": (scale(Y_BR, 1.0, 3.0),
-        r"row 2, column `y_Br`: it begins at .*, but the set-point y_d is 0.0501 m"),
+        r"row 2, column `y_Br`: it begins at .*, but the rig file at 0.0501"),
     "moving": (
         lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i,
         cells in enumerate(table[1:])],
         r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = "
         r"\{kind = \"moving\"\}",
     ),
+    "turning": (
+        lambda table: [cells.__setitem__(THETA, f"{15.0 * i}") for i,
+        cells in enumerate(table[1:])],
+        r"row 3, column `theta` moves already",
+    ),
+    "asked to move": (
+        lambda table: [cells.__setitem__(X_D, f"{60.3 + 0.3 * i}") for i,
+        cells in enumerate(table[1:])],
+        r"row 3, column `x_d` moves already",
+    ),
     "in the grasp": (
         lambda table: [scale(k, 1.0, -0.6)(table) for k in (Y_D, Y_BR)],
-        r"row 2, column `y_d`: the bracket must begin clear",
-    ),
-    "no grasp": (
-        lambda table: [scale(k, 0.0, 50.2)(table) for k in (Y_D, Y_BR)],
-        r"row 2, column `y_d`: the bracket never comes lower",
+        r"row 2, column `y_d`: it begins at 0.0495 m, but the rig file at 0.0501",
     ),
     "one sample": (
         lambda table: [cells.__setitem__(X_C, "") for cells in table[2:]],
         r"column `x_C` has 1 samples, but needs at least two",
     ),
-    "crushed": (scale(Y_D, 6.0, -250.5),
-        r"rig\.toml, settings of `data`: the disc does not fit: scenario.y_Br_grasp"),
 }  # fmt: skip
 
 
 BAD_CONFIG = {
+    "no rig": (CONFIG.replace("rig =", "title ="),
+        r'rig\.toml: rig is missing: say rig = "FILE.toml".*; rigs/paper.toml is'),
+    "the paper's settings": (CONFIG.replace("actuators.x.measures", "control.senses"),
+        r"rig\.toml, recording `data`: settings.*control is not known here.*controllers"),
+    "the paper's pads": (CONFIG + '[pads]\nkind = "kelvin_voigt"\n',
+        r"pads is not known: .* material of the rig file: say \[settings\.materials\.NAME\]"),
+    "a law's pads": (CONFIG + '[compare.solid.pads]\nkind = "kelvin_voigt"\n',
+        r"pads is not known: .* say \[settings\.materials\.NAME\]"),
+    "a constant": (CONFIG + "[missing]\nF_ff = 0.0\n",
+        r"missing is not known: .* follows the rig file: say \[settings\.motion\.NAME\]"),
     "not TOML": (CONFIG + "[[", r"rig\.toml is not a TOML file"),
     "unknown table": (CONFIG + "[sensor]\n", r"rig\.toml: sensor is not known here"),
     "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"),
@@ -206,18 +237,17 @@ BAD_CONFIG = {
         r"sensors\.F_y\.noise should be .* 1e-15, not 0\.0"),
     "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"),
         r"rig\.toml: sensors: `F_z` is not a channel"),
-    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"),
-        r"rig\.toml: unknowns: `contact.K` cannot be identified"),
-    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"),
-        r"settings of `data`: contact\.vs is not known here"),
-    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1],
-        r"of `data`: disc should be a table, not 3"),
-    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"),
-        r"touch .* at 46.92 mm \(twice pad.height"),
-    "a disc that fits nowhere": (
-        CONFIG.replace('unknowns."pad.E"]\nnominal = 0.7e6', 'unknowns."disc.radius"]'),
-        r"unknowns\.disc\.radius\.low = 0\.001937 is impossible: the disc does not fit",
-    ),
+    "unknown parameter": (CONFIG.replace("rubber.K_n", "rubber.K"),
+        r"rig\.toml: unknowns: `laws.steel_on_rubber.K` cannot be identified"),
+    "the paper's unknown": (CONFIG.replace("laws.steel_on_rubber.K_n", "contact.K_n"),
+        r"rig\.toml: unknowns: `contact.K_n` cannot be identified.*laws\.steel_on_rubber\.K_n"),
+    "unknown setting": (CONFIG.replace("friction.v_s", "friction.vs"),
+        r"recording `data`: settings.*vs is not known here"),
+    "not a table": (
+        re.sub(r"bodies\..*\n", "", CONFIG).replace("actuators", "bodies = 3\nactuators"),
+        r"`data`: settings.*bodies should be a table, not 3"),
+    "other pads": (CONFIG.replace("bodies.disc", "pads.L.height = 3e-3\nbodies.disc", 1),
+        r"column `y_d`: it begins at 0.0501\d* m, but the rig file at 0.0485"),
     "nothing to fit": ('heldout = ["data"]\n' + CONFIG, r"heldout: it names every recording"),
     "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n",
     r"sensors\.theta\.delay should be less than"),
@@ -226,35 +256,39 @@ BAD_CONFIG = {
     "another kind of start": (CONFIG + '[start]\nkind = "flying"\n',
         r"start\.kind should be one of 'rest', 'moving', not 'fl"),
     "a start that is hardly uncertain": (
-        CONFIG + '[start]\nkind = "rest"\nposition_sd = 1e-300\n',
-        r"start\.position_sd: should be 0, or at least 1e-12, but is 1e-300",
+        CONFIG + '[start]\nkind = "rest"\nposition_sd = {"disc.x" = 1e-300}\n',
+        r"start\.position_sd\.disc\.x: should be 0, or at least 1e-12, but is 1e-300",
     ),
-    "a parameter by both names": (
-        CONFIG.replace('"pad.E"]\nnominal = 0.7e6',
-        '"contact.friction.mu_s"]\n[unknowns."contact.mu_s"]'),
-        r"unknowns\.contact\.mu_s is there twice: it is contact\.mu_s too",
+    "a start of nothing": (
+        CONFIG + '[start]\nkind = "rest"\nposition_sd = {"disk.x" = 1e-3}\n',
+        r"`position_sd` of the start speaks of `disk.x`; did you mean `disc.x`",
+    ),
+    "a start by a number": (
+        CONFIG + '[start]\nkind = "rest"\nposition_sd = 1e-3\n',
+        r"start\.position_sd should be a table, not 0\.001",
     ),
     "soft at first": (
-        CONFIG + '[pads]\nkind = "standard_linear_solid"\nE_instant = 1e5\n',
-        r"rig\.toml, recording `data`: pads\.E_instant = 100000 must be above pad\.E = 750000",
+        CONFIG.replace("bodies.disc", SOLID.replace("2e6", "1e5") + "bodies.disc", 1),
+        r"rig\.toml, recording `data`: settings.*materials\.rubber.*E_instant",
     ),
     "more than all": (
-        CONFIG + '[pads]\nkind = "generalised_kelvin"\nJ = [0.8, 0.5]\ntau = [1, 2]\n',
-        r"pads: the fractions J sum to 1\.3, above one",
+        CONFIG.replace("bodies.disc", series("generalised_kelvin", "J = [0.8, 0.5]")
+        + "bodies.disc", 1),
+        r"materials\.rubber.*the fractions J sum to 1\.3, above one",
     ),
     "laws without likelihood": (
-        CONFIG + 'loss = "huber"\n[compare.coulomb.settings]\ncontact.friction = "coulomb"\n',
+        CONFIG + 'loss = "huber"\n' + COULOMB,
         r"compare needs likelihoods: fit\.loss must be 'linear', not 'huber'",
     ),
     "without what is not there": (
-        CONFIG + '[compare.coulomb]\nwithout = ["contact.mu_s"]\n',
-        r"compare\.coulomb\.without: `contact\.mu_s` is not an unknown",
+        CONFIG + '[compare.coulomb]\nwithout = ["laws.steel_on_rubber.R_t"]\n',
+        r"compare\.coulomb\.without: `laws\.steel_on_rubber\.R_t` is not an unknown",
     ),
     "a law's own mistake": (
-        CONFIG + '[compare.coulomb.unknowns."contact.eta"]\nlow = -1.0\nscale = "linear"\nhigh = '
-                 '1.0\n',
-        r"rig\.toml, compare\.coulomb: unknowns\.contact\.eta\.low = -1 is beyond what "
-        r"contact\.eta may be",
+        CONFIG + f'[compare.coulomb.unknowns."{LAW}.friction.eta"]\nlow = -1.0\nscale = "linear"\n'
+                 'high = 1.0\n',
+        r"rig\.toml, compare\.coulomb: unknowns\.laws\.steel_on_rubber\.friction\.eta\.low = -1 is "
+        r"beyond what laws\.steel_on_rubber\.friction\.eta may be",
     ),
     "a law of the same name": (
         CONFIG + '[compare."as stated"]\n',
@@ -272,9 +306,9 @@ BAD_CONFIG = {
     ),
     "nameless": (CONFIG + "[[recordings]]\n", r"recordings\.0: a recording needs a `file`"),
     "a setting that is unknown": (
-        CONFIG + '[[recordings]]\nname = "data"\nsettings.pad.E = 2e6\n',
-        r"recordings\.0\.settings: pad\.E is unknown, .* leave it out there, and say by "
-        r"unknowns\.\"pad\.E\"\.nominal where",
+        CONFIG + '[[recordings]]\nname = "data"\nsettings.materials.rubber.E = 2e6\n',
+        r"recordings\.0\.settings: materials\.rubber\.E is unknown, .* leave it out there, and say "
+        r"by unknowns\.\"materials\.rubber\.E\"\.nominal where",
     ),
     "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n',
         r"names of their own, but are called data, data"),
@@ -305,7 +339,7 @@ def test_empty_cells_are_missing_samples(case):
     assert made.tables["data"].near(0.2) == f"{data}, row 43 (t = 0.2 s)"
 
 
-@pytest.mark.parametrize("name", sorted(set(COLUMNS) - {"t"}))
+@pytest.mark.parametrize("name", sorted({*SIGNALS, *MEASURED}))
 def test_every_unit_is_understood(tmp_path, name):
     dimension = CHANNELS[name].unit
     for unit, factor in UNITS[dimension].items():
@@ -321,7 +355,7 @@ def test_every_unit_is_understood(tmp_path, name):
             [*cells, f"{name} [{unit}]" if i == 0 else repr(0.03 / factor)]
             for i, cells in enumerate(table)
         ]
-        read = read_table(write(tmp_path / "units.csv", table))
+        read = read_table(write(tmp_path / "units.csv", table), (), PAPER)
         np.testing.assert_allclose(read.values[name], 0.03, rtol=1e-14)
         np.testing.assert_allclose(read.values["t"], 5e-3 * np.arange(10), rtol=1e-14)
 
@@ -343,11 +377,10 @@ def test_a_recording_survives_the_way_through_csv(made, tmp_path):
     script, one = made
     script.UNITS["rad/s"] = ("deg/s", 180 / np.pi)
     script.write(one, tmp_path / "short.csv", digits=17)
-    sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
-    back = read_recording(tmp_path / "short.csv", "short", paper_settings(one), sensors)
+    (tmp_path / "fit.toml").write_text(CONFIG)
+    (back,) = load([tmp_path / "short.csv"], tmp_path / "fit.toml").problem.recordings
     assert back.name == one.name
-    assert paper_settings(back) == paper_settings(one)
-    assert list(back.samples) == list(one.samples) == list(MEASURED)
+    assert set(back.samples) == set(one.samples) == set(MEASURED)
     for channel, (t, y) in one.samples.items():
         np.testing.assert_allclose(back.samples[channel][0], t, rtol=0, atol=1e-12)
         np.testing.assert_allclose(back.samples[channel][1], y, rtol=1e-13)
@@ -363,17 +396,20 @@ def test_the_examples_files_are_what_its_script_makes(made):
     case = load([EXAMPLE / "rolling.csv"], EXAMPLE / "rolling.toml")
     assert case.problem.names == ("rolling", "checking")
     assert {k: s.noise for k, s in case.problem.sensors.items()} == script.SENSORS
-    known_by_file, truth = (
-        paper_settings(case.problem.recordings[0]).table(),
-        script.NOMINAL.override(script.TRUTH).table(),
-    )
-    own = {"scenario.y_Br_grasp", "scenario.travel", "scenario.x_C0", "control.senses"}
-    for name, row in truth.items():  # the configuration tells the truth, but for what is unknown
-        if name not in case.problem.unknowns and name not in own:
-            assert known_by_file[name]["value"] == row["value"], name
-    text = (EXAMPLE / "README.md").read_text()
-    for name in case.problem.unknowns:
-        assert re.search(rf"`{re.escape(name)}` +\| +{truth[name]['value']:g} ", text), name
+    rig, truth = case.problem.recordings[0].rig, script.NOMINAL.override(script.TRUTH)
+    own = SoftGrasp(truth)
+    text, found = (EXAMPLE / "README.md").read_text(), set()
+    for name, of in NAMES.items():  # the file tells the truth, but for what is unknown
+        filed = reduce(lambda x, pair: re.sub(*pair, x), FILED, of)
+        value = own.parameter(name).item()
+        if filed in case.problem.unknowns:
+            assert re.search(rf"`{re.escape(filed)}` +\| +{value:g} ", text), filed
+            found.add(filed)
+        else:
+            assert rig.parameter(filed).item() == value, name
+    assert found == set(case.problem.unknowns)
+    for name, pad in own.pads.items():
+        assert torch.equal(pad.positions, rig.pads[name].positions)
     for file in EXAMPLE.glob("*.csv"):
         assert file.stat().st_size < 150e3
 
@@ -390,32 +426,20 @@ def run():
 
 def test_a_trajectory_file_is_a_recording(run, tmp_path):
     run.save(tmp_path / "run.nc")
-    tables = read_tables([tmp_path / "run.nc"], (), {})
-    settings = {
-        "scenario": {"x_C0": 60.3e-3},
-        "control.senses": "bracket",
-        "contact": {"v_s": 0.05},
-    }
-    sensors = {"x_C": Sensor(noise=1e-5)}
-    one = read_recording(
-        tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", tables, settings), sensors
-    )
-    assert list(one.samples) == list(MEASURED)
+    (tmp_path / "fit.toml").write_text(CONFIG)
+    (one,) = load([tmp_path / "run.nc"], tmp_path / "fit.toml").problem.recordings
+    assert set(one.samples) >= set(MEASURED)
     for channel in MEASURED:
         np.testing.assert_array_equal(one.samples[channel][1], run[channel].detach())
     desired = run.together("x_d", "x_d_dot", "y_d", "y_d_dot", "F_ff")
     with torch.no_grad():
         got = one.rig.reference(run.t, SIGNALS).flatten(1)[:, :5]
     np.testing.assert_allclose(got, desired, atol=1e-12)
-    assert paper_settings(one).scenario.y_Br_grasp == pytest.approx(float(desired[:, 2].min()))
     older = tmp_path / "older.nc"  # without the rate of y_d
     save(run.to_xarray().drop_vars("y_d_dot"), older)
-    table = read_table(older)
-    assert "y_d_dot" not in table.values
+    (again,) = load([older], tmp_path / "fit.toml").problem.recordings
     with torch.no_grad():
-        got = read_recording(older, "older", paper_settings(one), sensors).rig.reference(
-            run.t, SIGNALS
-        )[:, 1, 1]
+        got = again.rig.reference(run.t, SIGNALS)[:, 1, 1]
     np.testing.assert_allclose(got, desired[:, 3], atol=2e-4)
 
 
@@ -450,7 +474,7 @@ def test_a_mistake_in_a_trajectory_file_is_named(run, tmp_path, change, message)
     else:
         save(change(run.to_xarray().copy(deep=True)), path)
     with pytest.raises(ValueError, match=rf"bad\.nc ?{message}"):
-        read_table(path)
+        read_table(path, (), PAPER)
 
 
 def test_samples_much_denser_than_the_motion_are_not_all_simulated(
@@ -482,15 +506,16 @@ def test_a_long_identification_is_priced(loaded):
 
 def test_recordings_have_settings_of_their_own(case, tmp_path):
     more = (
-        '[[recordings]]\nname = "data"\nsettings.disc.mass = 0.5\n'
+        '[[recordings]]\nname = "data"\nsettings.bodies.disc.mass = 0.5\n'
         '[[recordings]]\nfile = "second.csv"\nname = "b"\n'
     )
     data, config = case(config=CONFIG + more)
     (tmp_path / "second.csv").write_text(Path(data).read_text())
     first, second = load([data], config).problem.recordings
-    assert (first.name, paper_settings(first).disc.mass) == ("data", 0.5)
-    assert (second.name, paper_settings(second).disc.mass) == ("b", Parameters().disc.mass)
-    assert paper_settings(first).contact.v_s == paper_settings(second).contact.v_s == 0.05
+    mass, v_s = "bodies.disc.mass", f"{LAW}.friction.v_s"
+    assert (first.name, first.parameters[mass]) == ("data", 0.5)
+    assert (second.name, second.parameters[mass]) == ("b", Parameters().disc.mass)
+    assert first.parameters[v_s] == second.parameters[v_s] == 0.05
 
 
 def test_a_name_is_the_same_where_the_system_knows_ascii_only():
@@ -522,38 +547,13 @@ def test_a_laboratorys_headings_stand_for_ours(loaded):
         loaded(change, 'columns."Disc x" = "x_D"\n' + CONFIG)
 
 
-def test_a_constant_stands_for_a_column_that_is_missing(loaded, tmp_path):
-    own = '[[recordings]]\nname = "data"\nmissing.F_ff = -2.5\n'
-    for text, force in (("[missing]\nF_ff = 0.0\n", 0.0), ("[missing]\nF_ff = 0.0\n" + own, -2.5)):
-        made = loaded(drop(F_FF), CONFIG + text)
-        (one,) = made.problem.recordings
+def test_a_motion_of_the_file_stands_for_a_column_that_is_missing(loaded):
+    own = '[[recordings]]\nname = "data"\nsettings.motion.F_ff.values = [-2.5, -2.5]\n'
+    none = CONFIG.replace("bodies.disc", "motion.F_ff.values = [0.0, 0.0]\nbodies.disc", 1)
+    for text, force in ((none, 0.0), (none + own, -2.5)):
+        (one,) = loaded(drop(F_FF), text).problem.recordings
         at = one.rig.reference(torch.tensor([0.0, 0.1], dtype=torch.float64), ("F_ff",))
         np.testing.assert_array_equal(at[:, 0].detach(), [[force, 0.0]] * 2)
-        assert made.tables["data"].constants == ("F_ff",)
-    for text, where in (
-        ("[missing]\nF_ff = 7.0\n", "missing"),
-        (own, "recordings: missing of `data`"),
-    ):
-        with pytest.raises(
-            ValueError,
-            match=rf"rig\.toml, {where}: F_ff is not missing, .* say ignore = \['F_ff'\]$",
-        ):
-            loaded(config=CONFIG + text)
-    made = loaded(config=f"ignore = ['F_ff']\n{CONFIG}[missing]\nF_ff = 7.0\n")
-    assert made.tables["data"].constants == ("F_ff",)
-
-
-def test_a_constant_may_stand_for_the_column_of_one_of_the_recordings(
-    case,
-):
-    more = '[missing]\nF_ff = 7.0\n[[recordings]]\nfile = "second.csv"\n'
-    data, config = case(config=CONFIG + more)
-    Path(data).with_name("second.csv").write_text(Path(data).read_text())
-    made = load([case(drop(F_FF), CONFIG + more)[0]], config)
-    assert {name: one.constants for name, one in made.tables.items()} == {
-        "data": ("F_ff",),
-        "second": (),
-    }
 
 
 def parts(table: Table, *columns: list[int]) -> list[Table]:
@@ -607,29 +607,25 @@ def test_a_file_may_state_everything_that_a_problem_can_have(
     loaded,
 ):
     text = CONFIG.replace(
-        '[unknowns."contact.K_n"]\nnominal = 1e5',
-        '[unknowns."contact.K_n"]\nnominal = 1e5\nper = "recording"\nprior = {median = 1e5, sd = '
-        '0.3, kind = "log-normal"}\n[unknowns."contact.friction.mu_k"]\nratio_to = '
-        '"contact.friction.mu_s"\nnominal = 0.9\nhigh = 1.0',
+        f'[unknowns."{LAW}.K_n"]\nnominal = 1e5',
+        f'[unknowns."{LAW}.K_n"]\nnominal = 1e5\nper = "recording"\nprior = {{median = 1e5, sd = '
+        f'0.3, kind = "log-normal"}}\n[unknowns."{LAW}.friction.mu_k"]\nratio_to = '
+        f'"{LAW}.friction.mu_s"\nnominal = 0.9\nhigh = 1.0',
     ).replace(
         "F_y.noise = 0.1",
         'F_y = {noise = 0.1, gain = 0.02, drift = 0.1, inertia = 0.4, per = "recording", colour = '
         '"ar"}\n'
         "F_x = {noise = 0.1, misalignment = 0.01, low = -50.0, high = 50.0}",
     )
-    text = text.replace(
-        "contact.v_s = 0.05", "contact.friction.v_s = 0.05\ngravity = 9.8\ncontrol.y.Kp = 1.1e5"
-    )
-    made = loaded(config=text + '[start]\nkind = "rest"\nposition_sd = 1e-4\n').problem
-    settings = paper_settings(made.recordings[0])
-    assert (settings.contact.v_s, settings.scenario.gravity, settings.control.K_98) == (
-        0.05,
-        9.8,
-        1.1e5,
-    )
-    assert made.recordings[0].start == AtRest(position_sd=1e-4)
+    text = text.replace("[settings]", "[settings]\ngravity = 9.8\nactuators.y.Kp = 1.1e5")
+    made = loaded(config=text + '[start]\nkind = "rest"\nposition_sd = {"disc.x" = 1e-4}\n').problem
+    (one,) = made.recordings
+    stated = {"gravity": 9.8, "actuators.y.Kp": 1.1e5, f"{LAW}.friction.v_s": 0.05}
+    assert {name: one.parameters[name] for name in stated} == stated
+    assert one.start_coordinates == (StartCoordinate("start.disc.x", 60.3e-3, 1e-4),)
     labels = (
-        "contact.K_n in data", "contact.mu_k / contact.mu_s", "pad.E", "start.disc.x in data",
+        f"{LAW}.K_n in data", f"{LAW}.friction.mu_k / {LAW}.friction.mu_s", "materials.rubber.E",
+        "start.disc.x in data",
         "gain of F_y in data", "drift of F_y in data", "inertia of F_y in data",
         "misalignment of F_x",
     )  # fmt: skip
@@ -671,18 +667,19 @@ def test_a_recording_may_begin_anywhere_if_that_is_said(loaded):
 
 def test_competing_laws_have_the_same_data(loaded):
     text = CONFIG + (
-        '[unknowns."contact.eta"]\n[compare.coulomb]\nsettings.contact.friction = '
-        '"coulomb"\nwithout = ["contact.eta"]\n[compare.solid]\npads = {kind = '
-        '"standard_linear_solid", E_instant = 2e6}\nunknowns."pad.E_instant" = {ratio_to = '
-        '"pad.E", low = 1.01, high = 20.0}\n'
+        f'[unknowns."{LAW}.friction.eta"]\n{COULOMB}[compare.coulomb]\nwithout = '
+        f'["{LAW}.friction.eta"]\n[compare.solid]\nsettings.{SOLID}'
+        'unknowns."materials.rubber.E_instant" = {ratio_to = "materials.rubber.E", low = 1.01, '
+        "high = 20.0}\n"
     )
     made = loaded(config=text)
     assert list(made.laws) == [STATED, "coulomb", "solid"]
     assert made.laws[STATED] is made.problem
+    both = [f"{LAW}.K_n", "materials.rubber.E"]
     assert {name: list(law.unknowns) for name, law in made.laws.items()} == {
-        STATED: ["contact.K_n", "pad.E", "contact.eta"],
-        "coulomb": ["contact.K_n", "pad.E"],
-        "solid": ["contact.K_n", "pad.E", "contact.eta", "pad.E_instant"],
+        STATED: [*both, f"{LAW}.friction.eta"],
+        "coulomb": both,
+        "solid": [*both, f"{LAW}.friction.eta", "materials.rubber.E_instant"],
     }
     rigs = {name: law.recordings[0].rig for name, law in made.laws.items()}
     assert isinstance(rigs["coulomb"].contacts["L"].law.friction, Coulomb)
@@ -690,19 +687,19 @@ def test_competing_laws_have_the_same_data(loaded):
 
 
 @pytest.mark.parametrize(
-    ("pads", "symbol", "bound"),
+    ("kind", "strengths", "first", "bound"),
     [
-        ('kind = "prony"\nmoduli = [2e5, 1e5]', "E", ""),
-        ('kind = "generalised_kelvin"\nJ = [0.3, 0.2]', "J", "\nhigh = 0.7"),
+        ("prony", "moduli = [2e5, 1e5]", "moduli_1", ""),
+        ("generalised_kelvin", "J = [0.3, 0.2]", "J_1", "\nhigh = 0.7"),
     ],
 )
-def test_pads_may_be_of_any_series(loaded, pads, symbol, bound):
-    """Of the relaxed modulus `pad.E`; their coefficients may be unknown."""
+def test_pads_may_be_of_any_series(loaded, kind, strengths, first, bound):
+    """Of the relaxed modulus; their coefficients may be unknown."""
     config = CONFIG.replace(
-        '[unknowns."contact.K_n"]\nnominal = 1e5', f'[unknowns."pad.{symbol}_1"]{bound}'
-    )
-    problem = loaded(config=f"{config}[pads]\n{pads}\ntau = [2e-3, 0.01]\n").problem
-    assert set(problem.unknowns) == {f"pad.{symbol}_1", "pad.E"}
+        f'[unknowns."{LAW}.K_n"]\nnominal = 1e5', f'[unknowns."materials.rubber.{first}"]{bound}'
+    ).replace("bodies.disc", series(kind, strengths) + "bodies.disc", 1)
+    problem = loaded(config=config).problem
+    assert set(problem.unknowns) == {f"materials.rubber.{first}", "materials.rubber.E"}
     one = problem.recordings[0]
     assert one.rig.pads["L"].material.branches == 3
-    assert one.rig.pads["L"].material.E.item() == one.parameters["pad.E"]
+    assert one.rig.pads["L"].material.E.item() == one.parameters["materials.rubber.E"]

@@ -129,8 +129,8 @@ class DesignTable(Table):
 
 
 REPLACED = {
-    "pads": "what a pad is made of is the material of the rig file: say [settings.materials.NAME]",
-    "missing": "a signal without a column is the motion of the rig file: say [settings.motion.NAME]",
+    "pads": "a pad is made of a material of the rig file: say [settings.materials.NAME]",
+    "missing": "a signal without a column follows the rig file: say [settings.motion.NAME]",
 }
 """Tables of old files, and what says it now."""
 

@@ -22,9 +22,9 @@ from torchsoft.solve.trajectory import channels, measurable, units
 from torchsoft.sysid.columns import Tables, Vocabulary
 from torchsoft.sysid.configuration import Beginning, Moving
 from torchsoft.sysid.first_samples import estimate_initial_state
-from torchsoft.sysid.initial_state import BOUNDS, Standing, Start
-from torchsoft.sysid.recording import Array, Recording
-from torchsoft.sysid.setpoints import channel
+from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing, Start
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.setpoints import channel as channel_of
 from torchsoft.sysid.unknowns import Sensor, by_channel
 
 FARTHEST = 10.0
@@ -124,7 +124,6 @@ def rig_recording(
         return recorded(name, rig, tables, sensors, start, Standing.of(rig, y0))
     at_rest = Standing.of(rig, y0, start.lead)._replace(position_sd=start.position_sd)
     made = recorded(name, rig, tables, sensors, start, at_rest)
-    made.start_coordinates  # refuses other names
     check_start(made, y0, own, tables, sensors)
     return made
 
@@ -181,38 +180,41 @@ def check_start(
     with torch.no_grad():
         signals = rig.follow(first)
         here = channels(rig, rig.unpack(y0, signals), signals)
-        asked = own(torch.tensor(first, dtype=torch.float64), rig.signals)[..., 0]
+        asked = own(torch.tensor(first, dtype=torch.float64), rig.signals)[:, 0]
     places = {name: [float(value)] for name, value in here.items() if name in made.samples}
     places |= {name: [float(value)] for name, value in zip(rig.signals, asked)}
     for coordinate, setpoint in (pair for one in rig.actuators.values() for pair in one.follows):
-        places[setpoint].append(float(here[channel(rig, coordinate)]))
-    unsure = {channel(rig, name): BOUNDS * sd for name, sd in start.position_sd.items()}
+        places[setpoint].append(float(here[channel_of(rig, coordinate)]))
+    unsure = {
+        channel_of(rig, one.name.removeprefix(PREFIX)): BOUNDS * one.sd
+        for one in made.start_coordinates
+    }
+    unsure |= dict.fromkeys(rig.signals, max(unsure.values(), default=0.0))
     speed, rush = pace(made, rig.unpack(y0, signals), own, first)
-    sizes = [body.shape.size() for body in rig.bodies.values() if body.shape is not None]
+    smallest = min(body.shape.size() for body in rig.bodies.values() if body.shape is not None)
     for name, (t, column) in tables.columns.items():
         unit, rows = tables.known.units[name], np.flatnonzero(np.isfinite(column))
-        late = name in tables.known.measured and rows.size and t[rows[0]] > first + BEGINNING
-        if not rows.size or late or not unit.startswith(("m", "rad")):
+        late = name in made.samples and made.samples[name][0][0] > first + BEGINNING
+        if not len(rows) or late or not unit.startswith(("m", "rad")):
             continue
-        sensor, t, y, table = sensors.get(name), t[rows], column[rows], tables.of(name)
+        t, y, table, sensor = t[rows], column[rows], tables.of(name), sensors.get(name)
         noise, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
-        size = 1 / min(sizes) if unit.startswith("rad") else 1.0
-        near = (APART if name in made.samples else ASIDE).get(unit, np.inf) + noise + bias
-        near += unsure.get(name, max(unsure.values(), default=0.0) if name in rig.signals else 0.0)
-        if all(abs(y[0] - place) > near for place in places.get(name, ())) and name in places:
-            place = places[name][0]
-            raise ValueError(
-                f"{table.at(rows[0])}, column `{name}`: it begins at {y[0]:.5g} {unit}, but the "
-                f"rig file at {place:.5g} {unit}; "
-                + ("is its sign opposite?" if abs(y[0] + place) <= near else "say so there, ")
-                + (WAY_OUT if abs(y[0] + place) > near else "")
-            )
+        near = (ASIDE if name in rig.signals else APART).get(unit, np.inf)
+        near += noise + bias + unsure.get(name, 0.0)
+        for place in places.get(name, ())[:1]:
+            if min(abs(y[0] - one) for one in places[name]) > near:
+                opposite = abs(y[0] + place) <= near
+                raise ValueError(
+                    f"{table.at(int(rows[0]))}, column `{name}`: it begins at {y[0]:.5g} {unit}, "
+                    f"but the rig file at {place:.5g} {unit}; "
+                    + ("is its sign opposite?" if opposite else f"say so there, {WAY_OUT}")
+                )
         early = (t <= first + BEGINNING) | (np.arange(len(t)) < 2)
-        gone = y if unit.endswith("/s") else y - y[0]
-        passed = np.ones(len(t)) if unit.endswith("/s") else t - t[0]
-        allowed = size * (speed + rush * (t - first + start.lead)) * passed + noise
-        allowed += bias if unit.endswith("/s") else 0.0
-        for i in np.flatnonzero(early & (np.abs(gone) > allowed))[:1].tolist():
+        fastest = (speed + rush * (t - first + start.lead)) / (smallest if "rad" in unit else 1.0)
+        moving = np.abs(y - y[0]) > fastest * (t - t[0]) + noise
+        if unit.endswith("/s"):
+            moving = np.abs(y) > fastest + noise + bias
+        for i in np.flatnonzero(early & moving)[:1].tolist():
             raise ValueError(
                 f"{table.at(int(rows[i]))}, column `{name}` moves already: a recording must begin "
                 f"at rest, its bodies where the rig file has them start, {WAY_OUT}"
@@ -220,18 +222,19 @@ def check_start(
 
 
 def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[float, float]:
-    """How fast [m/s] anything may move at the first sample by the rig file, its start in `state`
-    and its motions; and how much faster it gets [m/s2], from the start on."""
+    """How fast [m/s] anything may move at the first sample by the rig file, with its start in
+    `state` and its motions; and how much faster a body that nothing holds gets from the start on
+    [m/s2]."""
     rig, lead = made.rig, made.start.lead
     around = torch.linspace(first - lead, first + BEGINNING, 51, dtype=torch.float64)
     with torch.no_grad():
-        rates = [float(own(around, (name,))[..., 1].abs().max()) for name in rig.signals
+        rates = [own(around, (name,))[..., 1].abs().max().item() for name in rig.signals
                  if made.units[name] in ("m", "rad")]  # fmt: skip
         loads = net_loads(rig, state, rig.follow(first))
-        deep = {name: float(rig.penetration(name, state).max()) for name in rig.contacts}
-    speeds = [float(v.abs().max()) for v in state.velocity.values()]
-    pushed = {one.pushes.split(".")[0] for one in rig.actuators.values()}
-    pushed |= {contact.body for name, contact in rig.contacts.items() if deep[name] > 0}
-    rushes = [float(loads[name][:2].norm() / body.mass) for name, body in rig.bodies.items()
-              if lead == 0 or name not in pushed]  # fmt: skip
-    return CREEP + 2 * max(rates, default=0.0) + max(speeds), max(rushes, default=0.0)
+        held = {contact.body for name, contact in rig.contacts.items()
+                if rig.penetration(name, state).max() > 0}  # fmt: skip
+    held |= {one.pushes.split(".")[0] for one in rig.actuators.values()}
+    speeds = [rate.abs().max().item() for rate in state.velocity.values()]
+    rushes = [(loads[name][:2].norm() / body.mass).item() for name, body in rig.bodies.items()
+              if lead == 0 or name not in held]  # fmt: skip
+    return CREEP + 2 * max(rates, default=0.0) + max(speeds, default=0.0), max(rushes, default=0.0)
