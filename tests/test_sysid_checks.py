@@ -267,7 +267,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
         for one in assumptions(problem.recordings, set(TRUTH))
         if one.name in ("disc.mass", "pad.nu", "contact.eta", "mesh")
     ]
-    found = joint_fit(problem, end, suspects, "linear", lambda chi2: None)
+    found = joint_fit(problem, end, suspects, 1.1 * len(at.r), "linear", lambda chi2: None)
     assert found.left < 1.1 * len(at.r)
     assert found.parts.keys() == {"disc.mass", "pad.nu", "contact.eta"}
     assert max(found.parts, key=lambda name: found.parts[name]) == "disc.mass"
@@ -276,24 +276,32 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
 
 
 @pytest.mark.parametrize(
-    ("left", "cause", "tried"),
-    [(10.0, "b", ["b"]), (10.0, "nothing", ["b", "a", "law"]), (500.0, "law", ["law"])],
+    ("joint_left", "lefts", "tried"),
+    [
+        (10.0, {"b": 50.0}, ["b"]),
+        (10.0, {}, ["b", "a", "law"]),
+        (500.0, {"law": 50.0}, ["law"]),
+        (500.0, {"law": 150.0}, ["law"]),
+        (500.0, {"law": 200.0}, ["law", "a", "b"]),
+    ],
 )
-def test_a_joint_fit_decides_what_is_tried(left, cause, tried, monkeypatch):
-    """Where it explains the data, numbers by their part; where not, no number before a law."""
+def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, monkeypatch):
+    """Where it explains the data, numbers by their part; where not, no number before a law, and
+    none at all after a law that leaves much less than all numbers together."""
     taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
-        nearly_all=lambda left: left < 100,
-        nearly=lambda one: one.gain > 900,
+        little=100.0,
+        misfit=lambda left: left - 10.0,
+        nearly=lambda one: one.left < 100.0,
         fit=lambda one, again, stated, linear: replace(
-            linear, gain=950.0 if one.name == cause else 1.0
+            linear, left=lefts.get(one.name, 999.0), refitted=True
         ),
     )
-    joint = Joint({}, left, {"a": 0.25, "b": 0.9})
+    joint = Joint({}, joint_left, {"a": 0.25, "b": 0.9})
     monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)
     monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
     end: Any = SimpleNamespace(far=True)

@@ -23,11 +23,11 @@ from tqdm import tqdm
 
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
-from torchsoft.sysid.fit import Loss, Notify, fisher, shift, standard_deviations
+from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, extended
-from torchsoft.sysid.refits import End, Joint, Refit, difference, joint_fit, refit
+from torchsoft.sysid.refits import End, Refit, difference, joint_fit, refit
 from torchsoft.sysid.residual_tests import LEVEL, parts
 from torchsoft.tables import Number, plain
 
@@ -227,9 +227,13 @@ def new_fits(
     problem: Problem, end: End, candidates: Sequence[Variation], loss: Loss, judge: "Judge",
     checks: dict[str, AssumptionTest], progress: bool,
 ) -> Iterator[Variation]:  # fmt: skip
-    """Repeats the fit with one suspect after the other, whose `checks` it replaces. Once one
-    explains the misfit, or `NEARLY` all of it, those that are worth much less are left out."""
-    gains, joint = {one.name: checks[one.name].gain for one in candidates}, None
+    """Repeats the fit with one suspect after the other, whose `checks` it replaces.
+
+    Once one explains the misfit, or `NEARLY` all of it, those that are worth much less are left
+    out; and numbers are, once a law leaves less than `RIVAL` of the misfit that all numbers
+    together leave.
+    """
+    gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     count = len(candidates)
     with quiet(), tqdm(total=count + 1, unit="fit", disable=not progress) as bar:
 
@@ -238,8 +242,14 @@ def new_fits(
 
         if end.far:
             bar.set_description("new fit with all suspects unknown at once")
-            gains, joint = ranked(problem, end, candidates, gains, loss, judge, notify)
-        blind = end.far and joint is None  # gains to first order say little
+            joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
+        explains = joint is not None and joint.left <= judge.little
+        bounded = dict[str, float]()
+        if joint is not None:  # where it leaves much, no number of it explains the data alone
+            gains |= {name: explains * judge.square * part for name, part in joint.parts.items()}
+            if not explains:
+                bounded = dict.fromkeys(joint.parts, RIVAL * judge.misfit(joint.left))
+        blind = end.far and not explains  # gains to first order say little
         order = sorted(candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name]))
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, None, loss, notify)
@@ -248,31 +258,19 @@ def new_fits(
         for number, one in enumerate(order if as_stated is not None else (), 1):
             if gains[one.name] < enough:
                 return
+            if one.name in bounded and least < bounded[one.name]:
+                continue
             bar.set_description(plain(f"new fit with another {one.name} ({number} of {count})"))
             tried = one.of(checks[one.name].favoured)
-            other = refit(problem, end, tried, loss, notify, joint)
+            other = refit(problem, end, tried, loss, notify, joint if explains else None)
             if other is not None and as_stated is not None:
                 found = judge.fit(tried, other, as_stated, checks[one.name])
                 checks[one.name] = replace(found, amount=one.amount, step=one.step)
+                least = min(least, judge.misfit(found.left)) if found.refitted else least
             bar.update()
             yield one
             if judge.nearly(checks[one.name]):
                 enough = max(enough, RIVAL * gains[one.name])
-
-
-def ranked(
-    problem: Problem, end: End, candidates: Sequence[Variation], gains: dict[str, float],
-    loss: Loss, judge: "Judge", notify: Notify,
-) -> tuple[dict[str, float], Joint | None]:  # fmt: skip
-    """Gains of suspects by a joint fit of all of them, and that fit; those to first order, without
-    a joint fit, where there is none. Where it leaves much, no number of it explains the data
-    alone, and gains nothing."""
-    joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
-    if joint is None:
-        return gains, None
-    if joint.left > judge.little:
-        return gains | dict.fromkeys(joint.parts, 0.0), None
-    return gains | {name: part * judge.square for name, part in joint.parts.items()}, joint
 
 
 @contextmanager
@@ -335,9 +333,13 @@ class Judge:
         self.places = [part.rows for part in self.parts]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
-        misfit = self.square - self.dof
+        misfit = self.misfit(self.square)
         self.little = self.square - NEARLY * misfit if misfit > 0.0 else 0.0
         """Sum of squares that is next to nothing above the noise."""
+
+    def misfit(self, left: float) -> float:
+        """Part of a sum of squares that is above the noise."""
+        return left - self.dof
 
     def explained(self, checks: Iterable[AssumptionTest]) -> bool:
         """Whether the data favour something with which residuals are no larger than the noise."""
