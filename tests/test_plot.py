@@ -238,11 +238,17 @@ def test_figure_draws_something(rig, name, request):
     [
         ({"look": "pgae"}, "`look` must be one of screen, page, column.* did you mean `page`"),
         ({"only": ["disc.yy"]}, "there is no panel `disc.yy`; did you mean `disc.y`"),
+        ({"time": 40.0}, "there is nothing at 40 s: the run goes from 0 to 0.2 s"),
     ],
 )
 def test_a_dashboard_that_there_is_not_is_refused(done, how, message):
     with pytest.raises(ValueError, match=message):
         dashboard(done[1], **how)
+
+
+def test_text_of_a_saved_page_is_text_in_a_font_that_journals_take(done, tmp_path):
+    dashboard(done[1], look="page").savefig(tmp_path / "page.pdf")
+    assert b"Type3" not in (tmp_path / "page.pdf").read_bytes()
 
 
 def assert_legends_stand_above_the_curves(figure: Figure) -> None:

@@ -313,6 +313,29 @@ def test_a_recorded_motion_that_cannot_be_is_named(tmp_path, text, sentence):
     assert re.search(sentence, first.message), first.message
 
 
+@pytest.mark.parametrize(
+    ("text", "where", "sentence"),
+    [
+        ("t [s],x_d [m]\n0,0\n1000,1e-3\n2000,0\n", "motion.x_d.file", r"lasts 2000 s.*millisec"),
+        ("t [s],x_d [m]\n0,0\n1,12\n2,0\n", "motion.x_d", r"goes 12 m, .* is it in millimetres"),
+    ],
+)
+def test_units_that_cannot_be_meant_are_asked_about(tmp_path, text, where, sentence):
+    (tmp_path / "x.csv").write_text(text, encoding="utf-8")
+    csv = {"kind": "csv", "file": "x.csv", "column": "x_d"}
+    file = changed(coarse(template("t")), motion__x_d=csv)
+    file._folder = tmp_path
+    (found,) = (one for one in check(file) if one.where == where)
+    assert found.severity == "warning"
+    assert re.search(sentence, found.message), found.message
+
+
+def test_a_body_too_heavy_to_rest_is_named_with_its_weight():
+    (found,) = check(changed(coarse(template("t")), bodies__disc__mass=400.0))
+    assert found.where == "bodies.disc.start.y"
+    assert "no rest under its weight of 3.92e+03 N is found" in found.message
+
+
 def test_what_two_pads_grip_is_taken_along():
     """The estimate before a run: fingertips go around a box that they hold, and the box with them;
     the run agrees."""

@@ -247,6 +247,10 @@ def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
     return out | {"energy": lambda axes: energies(axes, run)}
 
 
+FLATTEST = 0.8
+"""Height of a panel, over its usual one, down to which panels become flatter to fit on a page."""
+
+
 def ripples(run: Trajectory) -> bool:
     """Whether points touch and part often enough for forces to show it."""
     late = run.t >= run.t[0] + 0.05 * (run.t[-1] - run.t[0])
@@ -262,6 +266,11 @@ def chosen(only: Sequence[str], known: Iterable[str]) -> list[str]:
         if name not in names:
             raise ValueError(f"there is no panel `{name}`; {suggestion(name, names, 'there are')}")
     return list(only) or names
+
+
+def named(run: Trajectory) -> list[str]:
+    """Names of the panels that a dashboard of the run has."""
+    return ["scene", *(f"contact {key}" for key in list(run.setup.contacts)[::-1]), *panels(run)]
 
 
 def dashboard(
@@ -290,7 +299,7 @@ def dashboard(
     few = [*list(contacts)[:2], *(name for name in drawn if name == "friction")]
     if look == "column" and not only:
         only = ("scene", *few)
-    wanted = chosen(only, ("scene", *drawn))
+    wanted = chosen(only, named(run))
     pictured = "scene" in wanted
     wanted = [name for name in wanted if name != "scene"]
     with looking(look) as size:
@@ -308,6 +317,8 @@ def dashboard(
         top = max(1, beside) if pictured else 0
         rows = -(-(len(wanted) - beside) // columns)
         heading = (title or "Run") if size.titled else ""
+        room = (size.height - tall - 0.06 * size.font) / max(rows, 1)
+        each = room if FLATTEST * each <= room < each else each
         figure = new_figure(heading, width * columns, tall + rows * each + 0.06 * size.font)
         heights = [*[tall / max(top, 1)] * top, *[each] * rows]
         # Rows under the scene are as if it had no colour bar, but a column has one left edge.

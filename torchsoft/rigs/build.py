@@ -518,26 +518,28 @@ class RigFile(Group):
         for name, axis, kind in self.coordinates():
             given = getattr(self.bodies[name].start, axis) if kind == "free" else kind
             if given == TOUCH or not isinstance(given, str):
-                value = AWAY if given == TOUCH else given or 0.0
-                pose[name][COORDINATES.index(axis)] = value
+                pose[name][COORDINATES.index(axis)] = AWAY if given == TOUCH else given or 0.0
         self._follow(pose, 0.0, ("driven",))
-        for name, axes in (wanted := self._wanted()).items():
+        for name, axes in (wanted := self.rests()).items():
             if 1 in axes:
                 pose[name][1] = above(Scene(rig, pose), name)
         try:
             pose = self._rested(rig, pose, wanted)
         except NoEquilibrium as error:
             name, (axis, *_) = next(iter(wanted.items()))
+            weight = self.bodies[name].weighted * rig.bodies[name].mass.item() * rig.gravity.item()
             raise ValueError(
-                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}"
+                too_stiff(self, rig)
+                or f"bodies.{name}.start.{COORDINATES[axis]}: no rest under "
+                f"its weight of {weight:.3g} N is found; {error}"
             ) from None
         for name, body in self.bodies.items():
             if body.y == "free" and body.start.y == TOUCH:
                 pose[name][1] = upon(Scene(rig, pose), name)
         return pose
 
-    def _wanted(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
-        """Coordinates that are where their body rests, by body, but for some."""
+    def rests(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
+        """Numbers of the coordinates that begin where their body rests, by body, but for some."""
         out: dict[str, list[int]] = {}
         for name, axis, kind in self.coordinates():
             i = COORDINATES.index(axis)
@@ -565,7 +567,7 @@ class RigFile(Group):
         soft, (body, axis) = massless(rig), at(coordinate)
         still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
         try:
-            pose = self._rested(soft, pose, self._wanted(known))
+            pose = self._rested(soft, pose, self.rests(known))
             y = standing(soft, {name: torch.from_numpy(x) for name, x in pose.items()})
         except NoEquilibrium as error:
             raise ValueError(
@@ -585,8 +587,7 @@ def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any
 
 
 def too_stiff(file: RigFile, rig: Rig) -> str:
-    """The law of a contact so much stiffer than its pad that its force is rounding of its depth;
-    empty if there is none."""
+    """Sentence on a contact too much stiffer than its pad to be solved; empty if there is none."""
     for name, contact in rig.contacts.items():
         give = float(rig.pads[contact.pad].compliance().diagonal().max())
         ratio = float((rig.weight(name) * contact.law.K_n).max()) * give

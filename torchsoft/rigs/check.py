@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Callable, Iterator
 
 import networkx as nx
+import numpy as np
 import torch
 
 from torchsoft.diagnostic import SEVERITIES, Diagnostic
@@ -28,6 +29,10 @@ JUMP = {"m": 1e-4, "rad": 1e-2}
 
 TOUCH = 1e-6
 """Depth [m] up to which things that touch do not overlap."""
+
+LONGER, FARTHER, TURNED = 100.0, 10.0, 20 * np.pi
+"""How often a recorded motion is longer than the run, how often a set-point goes farther than the
+rig is large, and how far it turns [rad], from where units are in doubt."""
 
 OUTPUTS_PER_PERIOD = 4
 """Outputs that a period of a motion needs at the least."""
@@ -84,6 +89,12 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
                     f"{e.file.outputs.duration:g} s: nothing says what is wanted then; shorten "
                     f"outputs.duration to {last:g}, or record longer",
                 )  # fmt: skip
+            if last > LONGER * e.file.outputs.duration:
+                yield Diagnostic(
+                    "warning", f"motion.{name}.file",
+                    f"{motion.file} lasts {last:g} s, and the run shows "
+                    f"{e.file.outputs.duration:g} s of it: are its times in milliseconds?",
+                )  # fmt: skip
             if first > 0:
                 sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
                 yield Diagnostic("warning", f"motion.{name}.file", sentence)
@@ -93,6 +104,23 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
                 f"outputs every {interval:g} s do not show motion.{name}, which goes up to "
                 f"{fastest:g} Hz; take {1 / (OUTPUTS_PER_PERIOD * fastest):.2g} s or less",
             )  # fmt: skip
+
+
+def travels(e: Estimate) -> Iterator[Diagnostic]:
+    """Motions that go much farther than the rig is large, or turn it round and round."""
+    scene, every = Scene(e.rig, e.start), [signals(e.rig, time) for time in e.knots()]
+    shapes = [scene.outline(name) for name, body in e.rig.bodies.items() if body.shape is not None]
+    places = np.concatenate([*(nodes(pad, scene.pose) for pad in e.rig.pads.values()), *shapes])
+    size = float(np.ptp(places, axis=0).max())
+    limits = {
+        "m": (FARTHER * size, "m", f"the whole rig is {size:.2g} m large", "millimetres"),
+        "rad": (TURNED, "rad", f"that is more than {TURNED / (2 * np.pi):g} turns", "degrees"),
+    }
+    for name in e.file.motion:
+        most, unit, beside, other = limits.get(e.file.unit(name), (np.inf, "", "", ""))
+        if (far := float(np.ptp([values[name] for values in every]))) > most:
+            sentence = f"it goes {far:.3g} {unit}, and {beside}: is it in {other}?"
+            yield Diagnostic("warning", f"motion.{name}", sentence)
 
 
 def jumps(e: Estimate) -> Iterator[Diagnostic]:
@@ -243,6 +271,6 @@ def bears(pad: Pad) -> float:
 
 
 CHECKS: tuple[Callable[[Estimate], Iterator[Diagnostic]], ...] = (
-    ties, recordings, jumps, carried, overlaps, corners, overloads,
+    ties, recordings, travels, jumps, carried, overlaps, corners, overloads,
 )  # fmt: skip
 """Another check is one more of these."""

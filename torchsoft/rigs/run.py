@@ -94,7 +94,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             name: {
                 "largest_normal_force_N": float(force[..., 0].sum(-1).max()),
                 "normal_force_at_end_N": float(force[-1, :, 0].sum()),
-                "largest_friction_N": float(force[..., 1].sum(-1).abs().max()),
+                "largest_net_friction_N": float(force[..., 1].sum(-1).abs().max()),
                 "most_points_touching": int((force[..., 0] > 0).sum(-1).max()),
             }
             for name, force in run.force.items()

@@ -171,7 +171,14 @@ class Trajectory(Shown):
         return float(self.energy_residual.detach().abs().max() / scale)
 
     def at(self, time: float) -> int:
-        """Index of the sample nearest to `time` [s]."""
+        """Index of the sample nearest to `time` [s]. Raises `ValueError` half a sample and more outside
+        of the run."""
+        first, last = float(self.t[0]), float(self.t[-1])
+        beyond = 0.5 * (last - first) / max(len(self.t) - 1, 1)
+        if not first - beyond <= time <= last + beyond:
+            raise ValueError(
+                f"there is nothing at {time:g} s: the run goes from {first:g} to {last:g} s"
+            )
         return int((self.t - time).abs().argmin())
 
     @cached_property

@@ -7,8 +7,9 @@ differentiable in both.
 """
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -21,7 +22,7 @@ from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, settled, standing
+from torchsoft.physics.statics import NoEquilibrium, resting, settled, standing
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.tangent import directions
 
@@ -118,22 +119,30 @@ class AtRest(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """Bodies are at known places, `lead` [s] before the first sample, and pads have settled around
-    them.
+    """Bodies stand at known places, `lead` [s] before the first sample, and pads have settled
+    around them.
 
-    `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s]. The
-    displacements of the pads are those at the nominal parameters, whatever the others are.
+    `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s]; `rests` by body
+    the numbers of the coordinates that are in balance instead, no actuator pushing. Rest and pads
+    are those of the present parameters, not of the nominal ones.
     """
 
     bodies: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
     lead: float = SETTLE
+    rests: Mapping[str, Sequence[int]] = MappingProxyType({})
 
     @classmethod
-    def of(cls, rig: Rig, y0: Tensor, lead: float = SETTLE) -> "Standing":
+    def of(
+        cls, rig: Rig, y0: Tensor, lead: float = SETTLE,
+        rests: Mapping[str, Sequence[int]] = MappingProxyType({}),
+    ) -> "Standing":  # fmt: skip
         """The places of the state y0 (size,)."""
         state = rig.unpack(y0.detach())
         pairs = zip(state.pose.items(), state.velocity.values())
-        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead)
+        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead, rests)
+
+    def __repr__(self) -> str:
+        return f"Standing({dict(self.bodies)}, {self.lead}, {dict(self.rests)})"
 
     def __str__(self) -> str:
         return f"{self.lead:g} s early, bodies at known places, pads settled around them"
@@ -144,15 +153,25 @@ class Standing(NamedTuple):
         return ()
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
-        pose, velocity = (
+        at = min(float(t[0]) for t, _ in samples.values()) - self.lead
+        given, velocity = (
             {name: torch.tensor(one[k], dtype=torch.float64) for name, one in self.bodies.items()}
             for k in range(2)
         )
-        with torch.no_grad():
-            state = rig.unpack(standing(rig, pose))
-            moving = {name: velocity[name] for name in state.velocity}
-            y0 = rig.pack(state._replace(velocity=moving))
-        return HeldPads(rig, rig, lambda values: y0)
+        still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+
+        def state(values: Mapping[str, Tensor]) -> Tensor:
+            pose = given
+            try:
+                if self.rests:
+                    pose = resting(rig, given, self.rests, signals=still, actuators=())
+                found = rig.unpack(standing(rig, pose))
+            except NoEquilibrium as error:
+                raise SimulationFailed(f"the run cannot begin there: {error}", at) from None
+            moving = {name: velocity[name] for name in found.velocity}
+            return rig.pack(found._replace(velocity=moving))
+
+        return state
 
 
 class Known(NamedTuple):

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from torchsoft import csvfile
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.sysid.configuration import Beginning, Config, Entry, Rest
@@ -24,15 +23,16 @@ FINER = 0.1
 
 
 def planned(
-    stated: Config, built: BuiltRig[Any], name: str, rtol: float, start: Beginning | None = None,
+    stated: Config, file: RigFile, name: str, rtol: float, start: Beginning | None = None,
     **how: Any,
 ) -> Recording:  # fmt: skip
-    """A recording of a rig as a configuration has it planned, from the run that `rtol` makes; `how`
-    is what else `record` takes. Raises `ValueError`, and `SimulationFailed`."""
-    plan, start = stated.rehearsal, start or stated.start
+    """A recording of a file's rig as a configuration has it planned, from the run that `rtol`
+    makes; `how` is what else `record` takes. Raises `ValueError`, and `SimulationFailed`."""
+    plan, start, built = stated.rehearsal, start or stated.start, file.build()
     if plan.duration is not None:
         built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
-    at_rest = Standing.of(built.rig, built.y0, start.lead if isinstance(start, Rest) else 0.0)
+    lead = start.lead if isinstance(start, Rest) else 0.0
+    at_rest = Standing.of(built.rig, built.y0, lead, file.rests())
     return record(name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **how)
 
 
@@ -54,12 +54,12 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
         name = entry.name or Path(entry.paths[0]).stem
         with at_field("settings"):
             mine = file.override(**stated.settings).override(**entry.settings)
-        built = mine.build()
-        known, rig = vocabulary(built.rig, stated.columns), built.rig
+        known = vocabulary(mine.build().rig, stated.columns)
         try:
-            made = planned(stated, built, name, FINER * stated.fit.rtol, entry.start, seed=random)
+            made = planned(stated, mine, name, FINER * stated.fit.rtol, entry.start, seed=random)
         except ValueError as error:
             raise ValueError(f"{config}: {error}") from None
+        rig = made.rig
         followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
         columns = {"t": made.times} | dict(zip(rig.signals, followed))
         columns |= {channel: y for channel, (_, y) in made.samples.items()}

@@ -98,7 +98,8 @@ def rig_recording(
     sensors = by_channel([rig], sensors)
     check_clock(file, rig, tables, start)
     rig.reference = followed(tables, rig)
-    made = recorded(name, rig, tables, sensors, start, Standing.of(rig, y0, start.lead))
+    at_rest = Standing.of(rig, y0, start.lead, file.rests())
+    made = recorded(name, rig, tables, sensors, start, at_rest)
     if isinstance(start, Moving):
         return made
     if start.position_sd:

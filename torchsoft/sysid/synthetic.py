@@ -55,10 +55,12 @@ def record(
     made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)
     begun, early = made.begin(), int(begins.lead > 0)
     if isinstance(truth, Rig):
-        begun, truth = begun._replace(rig=deepcopy(truth)), AS_STATED
-        if isinstance(begun.y0, HeldPads):
-            begun.y0.rig = begun.rig
-        begun.rig.reference = rig.reference
+        own, truth = deepcopy(truth), AS_STATED
+        own.reference = rig.reference
+        y0 = begins.begin(own, made.samples)
+        if isinstance(begun.y0, HeldPads):  # displacements at the nominal parameters
+            y0, begun.y0.rig = begun.y0, own
+        begun = begun._replace(rig=own, y0=y0)
     grid = Grid(torch.from_numpy(np.append([at[0] - begins.lead] * early, at)), early)
     exact, rng = predict(begun, truth, grid, (), rtol).signals, np.random.default_rng(seed)
     samples = {}
