@@ -144,7 +144,7 @@ def legend_above(axes: Axes) -> None:
         if box.width <= room.width:
             break
     low, high = axes.get_ylim()
-    axes.set_ylim(low, low + (high - low) / (1.0 - min(0.6, box.height / room.height)))
+    axes.set_ylim(low, low + (high - low) / (1.0 - min(0.7, 1.1 * box.height / room.height)))
 
 
 def letter(i: int) -> str:

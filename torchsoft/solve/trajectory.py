@@ -171,8 +171,8 @@ class Trajectory(Shown):
         return float(self.energy_residual.detach().abs().max() / scale)
 
     def at(self, time: float) -> int:
-        """Index of the sample nearest to `time` [s]. Raises `ValueError` half a sample and more outside
-        of the run."""
+        """Index of the sample nearest to `time` [s]. Raises `ValueError` more than half a sample
+        outside of the run."""
         first, last = float(self.t[0]), float(self.t[-1])
         beyond = 0.5 * (last - first) / max(len(self.t) - 1, 1)
         if not first - beyond <= time <= last + beyond:
