@@ -95,7 +95,7 @@ def test_numbers_that_are_whole_are_numbers():
             60,
             "kinds.0.fixed: it changes the contact points of pads.L",
         ),
-        (("workers",), 3, "workers is not known here"),
+        (("workers",), 3, "`workers` is not known here"),
         (("parameters", "materials.rubber.E"), {"low": 9e5, "high": 8e5}, "rubber.E: low = 9"),
         (("parameters", "materials.rubber.E", "low"), -1.0, "logarithmic range needs low > 0"),
         (("duration",), 0.4, "kinds.1.fixed: impossible: motion.x_d.stroke_time = 0.3 s makes 0"),

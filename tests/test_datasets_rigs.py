@@ -301,7 +301,7 @@ def tree(folder: Path) -> Any:
         (("channels",), ["x_disk"],
          "channels: `x_disk` is no channel of the rig; there are x_disc"),
         (("channels",), ["x_disc", "x_disc"], "channels: every name once"),
-        (("grasp_depth",), {"low": 1e-3, "high": 1e-3}, "grasp_depth is not known here"),
+        (("grasp_depth",), {"low": 1e-3, "high": 1e-3}, "`grasp_depth` is not known here"),
         (("parameters",), {}, "parameters is missing: nothing would differ"),
         (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
         (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),

@@ -236,8 +236,8 @@ def test_a_file_holds_the_same_parameters(changes, tmp_path_factory):
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("[pad]\nYoung = 1e6", "pad.Young"),
-        ("E = 1e6", "E is not known here"),
+        ("[pad]\nYoung = 1e6", "pad: `Young` is not known here"),
+        ("E = 1e6", "`E` is not known here"),
         ("[pad]\nnu = 0.5", "pad.nu"),
         ("[scenario]\ntravel = 0.1", "scenario.travel"),
         ("[pad]\nE = soft", "line 2"),

@@ -220,6 +220,8 @@ BAD: list[tuple[Callable[[Record, dict[str, list[Term]]], object], str]] = [
     (lambda one, terms: assemble([one, Record(one.t[:10], {k: x[:10] for k,
     x in one.series.items()})], terms, RECIPE),
      "the shortest record is 10 samples"),
+    (lambda one, terms: assemble([one], terms, replace(RECIPE, width=3 * one.step)),
+     r"a sample every .* ms is too seldom for the weak form's test functions"),
     (lambda one, terms: assemble([one, Record(2 * one.t, one.series)], terms, RECIPE),
     "one time step"),
     (lambda one, terms: assemble([Record(one.t, {k: v for k,

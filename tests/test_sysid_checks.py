@@ -33,7 +33,7 @@ from torchsoft.sysid.assumptions import (
     scaled,
     unramped,
 )
-from torchsoft.sysid.identification import notices_on
+from torchsoft.sysid.identification import held_by, notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import AMOUNTS, End, Joint, difference, ended, joint_fit, refit, varied
@@ -463,6 +463,17 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
 def test_no_bound_is_to_be_widened_for_what_is_not_identifiable():
     for seen in (False, True):
         one: Any = SimpleNamespace(identifiable=seen, at_bound=True, relative_sd=2.0, label="a",
-                                   last=1.0, step_bias_sd=0.0)  # fmt: skip
-        said = notices_on([one], True, 1e-5, False)
+                                   name="a", last=1.0, step_bias_sd=0.0)  # fmt: skip
+        said = notices_on([one], {}, True, 1e-5, False)
         assert any("widen" in text for text in said) == seen
+
+
+def test_a_known_number_that_holds_an_unknown_one_is_named():
+    """mu_s ends at the mu_k that is taken for known."""
+    problem = Problem([recorded()], SENSORS, {"contact.mu_s": Unknown()})
+    held = held_by(problem)
+    assert held == {"contact.mu_s": ("contact.mu_k", BASE.contact.mu_k)}
+    one: Any = SimpleNamespace(identifiable=True, at_bound=True, label="contact.mu_s", name="contact.mu_s",
+                               last=1.0001 * BASE.contact.mu_k, step_bias_sd=0.0)  # fmt: skip
+    (said,) = notices_on([one], held, True, 1e-5, False)
+    assert "contact.mu_k = " in said and "which is known, holds it there; is that right?" in said

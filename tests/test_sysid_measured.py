@@ -199,9 +199,10 @@ BAD: dict[str, tuple[Change, str]] = {
 
 BAD_CONFIG = {
     "not TOML": (CONFIG + "[[", r"rig\.toml is not a TOML file"),
-    "unknown table": (CONFIG + "[sensor]\n", r"rig\.toml: sensor is not known here"),
+    "unknown table": (CONFIG + "[sensor]\n",
+        r"rig\.toml: `sensor` is not known here; did you mean `sensors`"),
     "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"),
-        r"y_Br\.noise is missing; sensors\.y_Br\.sigma is not known"),
+        r"sensors\.y_Br: `sigma` is not known here"),
     "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"),
         r"sensors\.F_y\.noise should be .* 1e-15, not 0\.0"),
     "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"),
@@ -209,7 +210,7 @@ BAD_CONFIG = {
     "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"),
         r"rig\.toml: unknowns: `contact.K` cannot be identified"),
     "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"),
-        r"settings of `data`: contact\.vs is not known here"),
+        r"settings of `data`: contact: `vs` is not known here; did you mean `v_s`"),
     "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1],
         r"of `data`: disc should be a table, not 3"),
     "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"),

@@ -98,6 +98,7 @@ def make(options: argparse.Namespace) -> int:
 
     from torchsoft.cost import agree
     from torchsoft.datasets import generate
+    from torchsoft.datasets.check import failures
     from torchsoft.datasets.config import Config
     from torchsoft.datasets.files import listed
     from torchsoft.threads import cores
@@ -135,6 +136,8 @@ def make(options: argparse.Namespace) -> int:
         f"{made} trajectories in {options.out}; of those made now "
         + (f"{bad} failed, each with its reason" if bad else "none failed")
     )
+    if bad:
+        say(failures(options.out)[1])
     if left:
         say(f"of the whole set {len(left)} of {config.shards} shards are left: {listed(left)}")
     return 0

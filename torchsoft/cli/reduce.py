@@ -6,6 +6,9 @@ from typing import Any
 
 from torchsoft.cli.results import add_command, add_out, say, try_folder
 
+LARGEST = 2.0
+"""Rolling radius over the farthest point of the body that rolls."""
+
 REDUCE = """\
 Which sparse equations do saved runs of a rig obey?
 
@@ -59,6 +62,12 @@ def reduce(options: argparse.Namespace) -> int:
     ]
     try_folder(options.out, options.force)
     radius = options.radius or rolling_radius(records[:1])
+    size = Trajectory.load(fitted[0]).setup.bodies[options.disc].size
+    if not radius < LARGEST * size:
+        raise ValueError(
+            f"a rolling radius of {radius:g} m is not that of `{options.disc}`, which reaches "
+            f"{size:.3g} m from its centre; give it in metres by --radius"
+        )
     recipe = Recipe(threshold=options.threshold, width=0.004, window=0.3)
     model = fit(assemble(records[:-1], mechanics(radius), recipe), recipe, loop(records[:-1]))
     predicted = score(model, records[-1])

@@ -1,6 +1,7 @@
 """Re-read a dataset, list what is wrong with it, and draw what it covers."""
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ from torchsoft.datasets.subject import SPLITS
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line
+
+MANY = 0.5
+"""Share of trajectories that failed from which a set is called wrong."""
 
 MOST = 3
 """Trajectories that it shows, of every kind of motion."""
@@ -74,6 +78,22 @@ def findings(url: str) -> Iterator[str]:
     design = points(config)
     for shard in sorted(store.finished):
         yield from check_shard(data, config, shard, design)
+    share, sentence = failures(url)
+    if share > MANY:
+        yield sentence
+
+
+def failures(url: str) -> tuple[float, str]:
+    """Share of the finished trajectories that failed, and a sentence with the commonest reason."""
+    store = Vouched(url, unfinished=True)
+    config, data = Config.model_validate(Manifest.read(url).config), store.data(chunks=None)
+    rows = [i for shard in sorted(store.finished) for i in config.rows(shard)]
+    failed = data.failed.values[rows].astype(bool)
+    if not failed.any():
+        return 0.0, "none failed"
+    reason, _ = Counter(data.reason.values[rows][failed].tolist()).most_common(1)[0]
+    said = f"{failed.sum()} of {len(rows)} trajectories failed, most often: {line(reason, 200)}"
+    return float(failed.mean()), said
 
 
 def check_files(url: str, manifest: Manifest) -> Iterator[str]:

@@ -16,6 +16,9 @@ SPARE, LEAST = 3.0, 600.0
 BASE = 1.5
 """Memory of a process [GiB] besides its shard."""
 
+BEGINNING = 5
+"""Time [s] that a process takes to begin with its first shard."""
+
 SCRIPT = """\
 #!/bin/bash
 #SBATCH --job-name={name}
@@ -50,7 +53,8 @@ def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
     minutes = math.ceil(max(SPARE * price.seconds, LEAST) / 60)
     told = (
         f"each of {len(left)} tasks: {price.sentence}; all of them: "
-        f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk"
+        f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk; "
+        f"besides, every task takes {BEGINNING:g} s to start and {BASE:g} GiB for its process"
     )
     script = SCRIPT.format(
         name=f"torchsoft-{path.stem}".replace(" ", "-"), parts=parts,

@@ -87,13 +87,19 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             "disturbances": disturbances or {},
         }  # fmt: skip
         self.dynamics = Dynamics(built, **self._how)
-        left = float(built.t[-1]) - begin if duration is None else number("duration", duration)
+        rest = float(built.t[-1]) - begin
+        if rest <= 0:
+            raise ValueError(
+                f"`begin` = {begin:g} s is not before the end of the rig's own motion, "
+                f"{float(built.t[-1]):g} s"
+            )
+        left = rest if duration is None else number("duration", duration)
         self.limit = int(left / interval + 1e-9) if math.isfinite(left) else 0
         if self.limit < 1 or (duration is not None and abs(self.limit * interval - left) > 1e-9):
-            rest = "" if duration is not None else ", the rest of the run after `begin`"
+            why = "" if duration is not None else ", the rest of the run after `begin`"
             raise ValueError(
                 f"`duration` must be a multiple of `interval` = {interval:g} s, but is {left:g} s"
-                f"{rest}"
+                f"{why}"
             )
         free = self.dynamics.coordinates
         self.bounds = checked("bounds", bounds or {}, free, "free are")

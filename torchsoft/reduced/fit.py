@@ -56,6 +56,10 @@ class Recipe:
     seed: int = 0
 
 
+SAMPLED = 4
+"""Samples in half of a test function of the weak form at the least."""
+
+
 @dataclass(frozen=True, repr=False)
 class Regression:
     """Rows of one equation: columns (rows, terms) and rate (rows,), each of unit root mean square,
@@ -399,6 +403,12 @@ def _weak(
     length."""
     pysindy = needed("pysindy", "reduced")
     length = min(round(recipe.window / step) + 1, *(len(one) for one in columns))
+    if recipe.width < SAMPLED * step:
+        raise ValueError(
+            f"a sample every {1e3 * step:g} ms is too seldom for the weak form's test functions, "
+            f"{1e3 * recipe.width:g} ms to each side; sample every "
+            f"{1e3 * recipe.width / SAMPLED:g} ms or faster, or take a larger `width`"
+        )
     if 2 * recipe.width > 0.9 * (length - 1) * step:
         raise ValueError(
             f"too little data: the shortest record is {length} samples, {(length - 1) * step:g} s, "

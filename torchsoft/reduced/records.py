@@ -77,6 +77,8 @@ def record(
         measured = measured or own
     times = np.asarray(source["time"] if t is None else t, dtype=float)
     keep = times >= (times[0] if begin is None else begin)
+    if not keep.any():
+        raise ValueError(f"`begin` = {begin:g} s is after the last sample, at {times[-1]:g} s")
     if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
         raise ValueError("`t` must hold at least three equally spaced times")
     series = {}

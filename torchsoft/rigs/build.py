@@ -528,10 +528,9 @@ class RigFile(Group):
         except NoEquilibrium as error:
             name, (axis, *_) = next(iter(wanted.items()))
             weight = self.bodies[name].weighted * rig.bodies[name].mass.item() * rig.gravity.item()
+            why = f"no rest under its weight of {weight:.3g} N is found; {error}"
             raise ValueError(
-                too_stiff(self, rig)
-                or f"bodies.{name}.start.{COORDINATES[axis]}: no rest under "
-                f"its weight of {weight:.3g} N is found; {error}"
+                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {why}"
             ) from None
         for name, body in self.bodies.items():
             if body.y == "free" and body.start.y == TOUCH:

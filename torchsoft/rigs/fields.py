@@ -2,7 +2,7 @@
 own keys."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import lru_cache, reduce
@@ -20,7 +20,6 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from torchsoft.display import suggestion
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import metadata, quantity
 from torchsoft.tables import LISTED, Table, shown
@@ -76,18 +75,7 @@ class NumberOr:
 
 
 class Group(Table):
-    """A table of a rig file; a key that it has not is refused with the one that may be meant."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _known(cls, data: Any) -> Any:
-        if isinstance(data, Mapping):
-            for key in data:
-                if key not in cls.model_fields:
-                    raise ValueError(
-                        f"`{key}` is not known here; {suggestion(key, cls.model_fields)}"
-                    )
-        return data
+    """A table of a rig file."""
 
     @model_validator(mode="after")
     def _has_its_kind(self) -> Self:

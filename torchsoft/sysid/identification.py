@@ -4,7 +4,7 @@
 import platform
 import sys
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -193,7 +193,9 @@ def conclude(
             predicted = nrmse(problem, held.r, list(how.heldout))
             notices += guesses(problem, x, how.heldout)
     sd = np.sqrt(np.diag(C_free))
-    notices += notices_on(found, end.at_rest or bool(end.rough), rtol, end.bias is None)
+    notices += notices_on(
+        found, held_by(problem), end.at_rest or bool(end.rough), rtol, end.bias is None
+    )
     notices += rough_notices(c, end.rough)
     notices += assumption_notices(checked) if checked is not None else []
     notices += residual_notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
@@ -298,7 +300,26 @@ def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
     return out
 
 
-def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) -> list[str]:
+NEXT_TO = 1e-2
+"""Relative distance of an estimate at a bound from the known number that is the bound."""
+
+
+def held_by(problem: Problem) -> dict[str, tuple[str, float]]:
+    """Known numbers that unknown ones may not pass, such as mu_k of mu_s: name and value by the
+    name of the unknown."""
+    out, unknown = dict[str, tuple[str, float]](), problem.coordinates.names
+    for recording in problem.recordings:
+        for pair in recording.rig.ordered.items():
+            for mine, other in (pair, pair[::-1]):
+                if mine in unknown and other not in unknown:
+                    out[mine] = other, recording.parameters[other]
+    return out
+
+
+def notices_on(
+    found: list[Any], held: Mapping[str, tuple[str, float]], converged: bool, rtol: float,
+    unchecked: bool,
+) -> list[str]:  # fmt: skip
     """Sentences on what a reader must know before using the numbers."""
     out = []
     for e in found:
@@ -312,9 +333,11 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
                 f"{e.label} is not identifiable from these data: {change} would not show in them"
             )
         if e.at_bound and e.identifiable:
-            out.append(
-                f"{e.label} ended at a bound ({e.last:.4g}): widen the bound or question the model"
-            )
+            other, value = held.get(e.name, ("", np.nan))
+            remedy = "widen the bound or question the model"
+            if np.isclose(e.last, value, rtol=NEXT_TO):
+                remedy = f"{other} = {value:.4g}, which is known, holds it there; is that right?"
+            out.append(f"{e.label} ended at a bound ({e.last:.4g}): {remedy}")
     worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
     if unchecked:
         out.append(

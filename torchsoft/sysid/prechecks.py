@@ -203,7 +203,8 @@ def findings(
 ) -> list[Diagnostic]:
     """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the
     names of unknown parameters. A recording with an error is not held against the run."""
-    every = [*setpoint_findings(recording, sensors), *rounded(recording, sensors)]
+    every = [*setpoint_findings(recording, sensors), *noisy(recording, sensors)]
+    every += rounded(recording, sensors)
     every += another_body(recording, sensors, expected)
     for more in (
         against_run(recording, sensors, expected),
@@ -216,6 +217,23 @@ def findings(
 
 COARSE = 1.2
 """Steps of a sensor over its noise from which they widen the noise by 6 % and more."""
+
+
+ENOUGH, WIDTH = 10, 0.5
+"""Samples of a channel whose range, over their noise, is not smaller than that by chance."""
+
+
+def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
+    """Noise that is stated so large that samples could not be as near to each other as they are."""
+    for name, sensor in sensors.items():
+        y = recording.samples[name][1] if name in recording.samples else np.zeros(0)
+        if len(y) >= ENOUGH and 0 < np.ptp(y) < WIDTH * sensor.noise:
+            unit = recording.units[name]
+            text = (
+                f"the noise of {name} is stated as {sensor.noise:.3g} {unit}, but all of its "
+                f"samples are within {np.ptp(y):.3g} {unit}: is it in the right unit?"
+            )
+            yield found(f"noise of {name}", recording, text, grave=True)
 
 
 def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
