@@ -476,4 +476,4 @@ def test_a_known_number_that_holds_an_unknown_one_is_named():
     one: Any = SimpleNamespace(identifiable=True, at_bound=True, label="mu_s", name="contact.mu_s",
                                last=1.0001 * BASE.contact.mu_k, step_bias_sd=0.0)  # fmt: skip
     (said,) = notices_on([one], held, True, 1e-5, False)
-    assert "contact.mu_k = 0.5, which is known, holds it there; is that right?" in said
+    assert "contact.mu_k = 0.7, which is known, holds it there; is that right?" in said
