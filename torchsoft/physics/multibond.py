@@ -16,11 +16,10 @@ from torch import Tensor
 
 
 class Junction(NamedTuple):
-    """A 1-junction: `nodes` flow vectors of `width` components, the field that stores or sets its
-    flow, and the paper's name."""
+    """A 1-junction: how many flow vectors it has, the field that stores or sets its flow, and the
+    paper's name."""
 
     nodes: int
-    width: int
     element: str
     label: str
 

@@ -17,7 +17,7 @@ from scipy import linalg, sparse
 from torch import Tensor
 
 from torchsoft.physics.contact import Friction
-from torchsoft.physics.mesh import banded
+from torchsoft.physics.mesh import banded, dofs_of, unit_loads
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -213,9 +213,7 @@ class Compiled:
             } | {rows["base"][-1]}
             mine = [i for i, c in enumerate(self._bodies.coordinate) if c // 3 * 3 in involved]
             columns[number, mine] = np.arange(len(mine))
-        points = np.cumsum(
-            [0, *(len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values())]
-        )
+        points = np.cumsum([0, *rig.point_counts.values()])
         point_start = points[np.searchsorted(contact_pads, np.arange(len(rig.pads) + 1))]
         C, dC, reach = np.zeros(C_start[-1]), np.zeros(C_start[-1]), []
         for i, pad in enumerate(rig.pads.values()):
@@ -240,7 +238,7 @@ class Compiled:
         total = dofs[-1]
         X, area, D = np.zeros(total), np.zeros(total), np.zeros((total, 2))
         moving = {i: pad for i, pad in enumerate(self.rig.pads.values()) if pad.inertial}
-        both = {i: [pad.stiffness(modulus) for modulus in range(2)] for i, pad in moving.items()}
+        both = {i: [pad.stiffness(1, 0), pad.stiffness(0, 1)] for i, pad in moving.items()}
         patterns = {
             i: sparse.csr_array(abs(K_lambda) + abs(K_mu)) for i, (K_lambda, K_mu) in both.items()
         }
@@ -257,8 +255,8 @@ class Compiled:
         for i, pad in moving.items():
             here = slice(dofs[i], dofs[i + 1])
             X[here], area[here] = pad.positions.numpy().ravel(), np.repeat(pad.mesh.nodal_areas, 2)
-            own = 2 * pad.surface.numpy()[:, None] + np.arange(2)
-            surface[2 * node_start[i] : 2 * node_start[i + 1]] = own.ravel()
+            own = dofs_of(pad.surface.numpy())
+            surface[2 * node_start[i] : 2 * node_start[i + 1]] = own
             stiffness, pattern = both[i], patterns[i]
             row = np.repeat(np.arange(here.stop - here.start), np.diff(pattern.indptr))
             at = dofs[i] + row, np.arange(len(row)) - pattern.indptr[row]
@@ -303,8 +301,7 @@ class Compiled:
         rig, rows, starts, point_start, sizes, limits = self.rig, [], [], [0], [], []
         X, weight, node, N = [], [], [], []
         for name, contact in rig.contacts.items():
-            pad, shape = rig.pads[contact.pad], rig.bodies[contact.body].shape
-            assert shape is not None
+            pad, shape = rig.pads[contact.pad], rig.shape_of(name)
             key = id(contact.law), id(shape)
             if key not in self._known:
                 check_shape(contact.body, shape)
@@ -394,14 +391,13 @@ class Compiled:
             lame_lambda, lame_mu, tau, density = p[
                 inertia.material_at[i] : inertia.material_at[i] + 4
             ]
-            K = lame_lambda * pad.stiffness(0) + lame_mu * pad.stiffness(1)
+            K = pad.stiffness(lame_lambda, lame_mu)
             M = density * inertia.area[here]
             A = banded((K * (tau + a)).tocsr())
             A[0] += M / a
             factor = linalg.cholesky_banded(A, lower=True)
             surface = inertia.surface[2 * pads.node_start[i] : 2 * pads.node_start[i + 1]]
-            loads = np.zeros((len(M), len(surface)))
-            loads[surface, np.arange(len(surface))] = 1.0
+            loads = unit_loads(len(M), surface)
             P = linalg.cho_solve_banded((factor, True), loads)[surface]
             pads.C[pads.C_start[i] : pads.C_start[i + 1]] = P.ravel()
             uniform = M[:, None] * np.tile(np.eye(2), (len(M) // 2, 1)) / a
