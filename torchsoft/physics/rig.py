@@ -272,6 +272,11 @@ class Rig(Shown, nn.Module):
             ]
         return tuple(dict.fromkeys(name for name in names if name is not None))
 
+    @property
+    def fixed_values(self) -> list[Tensor]:
+        """Values of the fixed coordinates, in the order of all coordinates."""
+        return [value for body in self.bodies.values() for value in body.fixed.values()]
+
     def follow(self, t: Tensor | float, reference: Reference | None = None) -> Tensor:
         """The signals at t (...) [s]: values and rates (..., signals, 2)."""
         followed = self.reference if reference is None else reference
