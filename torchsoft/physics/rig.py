@@ -275,7 +275,8 @@ class Rig(Shown, nn.Module):
     @property
     def fixed_values(self) -> list[Tensor]:
         """Values of the fixed coordinates, in the order of all coordinates."""
-        return [value for body in self.bodies.values() for value in body.fixed.values()]
+        every = [(body.fixed, axis) for body in self.bodies.values() for axis in COORDINATES]
+        return [fixed[axis] for fixed, axis in every if axis in fixed]
 
     def follow(self, t: Tensor | float, reference: Reference | None = None) -> Tensor:
         """The signals at t (...) [s]: values and rates (..., signals, 2)."""
