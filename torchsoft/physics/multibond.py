@@ -16,11 +16,10 @@ from torch import Tensor
 
 
 class Junction(NamedTuple):
-    """A 1-junction: `nodes` flow vectors of `width` components, the field that stores or sets its
-    flow, and the paper's name."""
+    """A 1-junction: how many flow vectors it has, the field that stores or sets its flow, and the
+    paper's name."""
 
     nodes: int
-    width: int
     element: str
     label: str
 
@@ -76,10 +75,6 @@ class Port:
     elements: tuple[str, ...]
     source: bool = False
     senses: tuple[str, ...] = ()
-
-    def power(self, flows: Mapping[str, Tensor]) -> Tensor:
-        """e . f [W], shape (...): into the element, or out of it for a source."""
-        return (self.effort * self.transformer.flow(flows)).sum((-2, -1))
 
 
 def net_efforts(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> dict[str, Tensor]:

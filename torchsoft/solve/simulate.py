@@ -314,7 +314,7 @@ def gather(
     rig, names, t = stepper.rig, stepper.integrals, task.t[:count]
     y, felt = (part[:count] for part in rows)
     integrals = dict(zip(names.names, torch.from_numpy(out.integrals[:count]).unbind(-1)))
-    sizes = [2 * len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values()]
+    sizes = [2 * count for count in rig.point_counts.values()]
     with torch.set_grad_enabled(y.requires_grad), independent():
         *forces, wrenches, loads = felt.split(
             [*sizes, 3 * len(rig.pads), 3 * len(rig.bodies) + 3], -1

@@ -287,10 +287,9 @@ def channels(
     out: dict[str, Tensor] = {}
     for name in rig.bodies:
         symbol, pose, velocity = rig.symbols[name], state.pose[name], state.velocity[name]
-        for i, key in enumerate((f"x_{symbol}", f"y_{symbol}", f"theta_{symbol}")):
-            out[key] = pose[..., i]
-        for i, key in enumerate((f"v_x_{symbol}", f"v_y_{symbol}", f"omega_{symbol}")):
-            out[key] = velocity[..., i]
+        keys = [f"{axis}_{symbol}" for axis in COORDINATES]
+        out |= zip(keys, pose.unbind(-1))
+        out |= zip(map(rate_channel, keys), velocity.unbind(-1))
         if rig.bodies[name].freedom["theta"] == "free":
             out[f"L_{symbol}"] = rig.bodies[name].inertia * velocity[..., 2]
     for i, name in enumerate(rig.signals):
