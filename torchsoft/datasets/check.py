@@ -1,4 +1,4 @@
-"""Re-read a dataset, list what is wrong with it, and draw what it covers."""
+"""Validation of a dataset: read it again, list its defects, and draw its coverage."""
 
 import sys
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line
 
 MOST = 3
-"""Trajectories that it shows, of every kind of motion."""
+"""Most trajectories of each kind in the picture."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -44,7 +44,7 @@ def check(url: str) -> Iterator[str]:
 
 
 def findings(url: str) -> Iterator[str]:
-    """Every finding; raises what keeps it from going on."""
+    """Every finding, as a sentence. Raises the error that ends the check."""
     manifest = Manifest.read(url)
     try:
         config = Config.model_validate(manifest.config)
@@ -77,8 +77,7 @@ def findings(url: str) -> Iterator[str]:
 
 
 def check_files(url: str, manifest: Manifest) -> Iterator[str]:
-    """Files laid out at the start that are missing or damaged, and files that do not belong
-    there."""
+    """Files that are missing, damaged or foreign to the dataset."""
     layout, there = manifest.layout, keys(url)
     for key in manifest.digests:
         try:
@@ -93,7 +92,7 @@ def check_files(url: str, manifest: Manifest) -> Iterator[str]:
 
 
 def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
-    """Arrays, their shapes, dimensions and units."""
+    """Arrays that are missing, or whose dimensions, unit or shard size differ from the schema."""
     for name, variable in variables(config).items():
         if name not in data:
             yield f"{name}: missing"
@@ -115,7 +114,7 @@ def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
 def check_shard(
     data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]
 ) -> Iterator[str]:
-    """Everything about the trajectories of one finished shard."""
+    """Findings on the trajectories of one finished shard."""
     schema, columns, here = variables(config), dict[str, Any](), config.rows(shard)
     for name in schema:
         try:
@@ -131,7 +130,8 @@ def check_shard(
 
 
 def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]) -> Iterator[str]:
-    """What the design says of it; that it is finite, or failed for a reason; energy and contact."""
+    """Findings on one trajectory: labels unlike the design, numbers that are not finite, a failure
+    without a reason, and physics."""
     for name, value in labels.items():
         if one[name] != value:
             yield f"{name} is {one[name]}, but the design has {value}"
@@ -150,7 +150,7 @@ def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]
 
 
 def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
-    """The energy balance, and contact where there is force."""
+    """Findings on the energy balance, and on contact forces without contact."""
     stored, dissipated, supplied = (
         one[f"{x}_energy"].sum(-1) for x in ("stored", "dissipated", "supplied")
     )
@@ -188,8 +188,8 @@ def summary(url: str, data: xr.Dataset) -> str:
 
 @rc_context(STYLE)
 def figure(data: xr.Dataset, config: Config) -> Figure:
-    """Each parameter over the next by split, failures crossed; trajectories of each kind of motion
-    and split; some sound motions."""
+    """Coverage of a dataset: scatter plots of neighbouring parameters by split, with failures
+    crossed; counts by kind and split; time series of some sound trajectories."""
     ranged = config.parameters
     by = [name for name in ("kind", "split") if name in data]
     names, series = list(ranged), moving(data, config)

@@ -1,5 +1,5 @@
-"""Trajectory number `index`: parameters and motion by the configuration alone, then the run, or why
-there is none."""
+"""One trajectory: its parameters and motion from the configuration and its index alone, and its run
+or the reason of its failure."""
 
 import numpy as np
 import torch
