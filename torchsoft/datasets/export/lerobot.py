@@ -1,8 +1,8 @@
 """LeRobot's dataset v3, with a trajectory as an episode and a sample as a frame.
 
-Setpoints are the action, or efforts of the actuators where no setpoint is kept; other channels are
-the state, and forces at the contact points observations of their own. Drawn parameters are columns
-of the episodes.
+Set-points are the action, or efforts of the actuators where no set-point is kept. Other channels
+are the state, and forces at the contact points observations of their own. Drawn parameters are
+columns of the episodes.
 """
 
 from collections.abc import Iterator

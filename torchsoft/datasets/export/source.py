@@ -33,7 +33,7 @@ class Source(NamedTuple):
 
     @property
     def motions(self) -> list[str]:
-        """Channels that are setpoints of the rig, or their rates."""
+        """Channels that are set-points of the rig, or their rates."""
         of = self.config.subject.template.signals
         return [name for name in self.channels if name.removesuffix("_dot") in of]
 
