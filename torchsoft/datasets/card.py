@@ -71,11 +71,15 @@ windows = Trajectories("FOLDER", ["{example}"], split="train", window=20)  # for
 def counts(data: xr.Dataset) -> str:
     """Number of trajectories in all and in each split, number of failures, and their reasons."""
     failed = data.failed.values.astype(bool)
-    said = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
-    out = f"{len(failed)} ({said}; {int(failed.sum())} failed, their series are NaN"
+    out = f"{len(failed)} ({by_split(data)}; {int(failed.sum())} failed, their series are NaN"
     reasons = sorted({line(x, 100) for x in data.reason.values[failed]})
     more = ["..."] if len(reasons) > REASONS else []
     return "; ".join([out, *reasons[:REASONS], *more]) + ")"
+
+
+def by_split(data: xr.Dataset) -> str:
+    """Number of trajectories in each split."""
+    return ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
 
 
 def rig(config: Config) -> str:

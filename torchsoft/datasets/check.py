@@ -1,6 +1,5 @@
 """Validation of a dataset: read it again, list its defects, and draw its coverage."""
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import xarray as xr
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from torchsoft.datasets.card import by_split
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import (
     CARD,
@@ -23,8 +23,7 @@ from torchsoft.datasets.files import (
 )
 from torchsoft.datasets.reader import Vouched, open_dataset
 from torchsoft.datasets.schema import not_finite, variables
-from torchsoft.datasets.simulation import points, task
-from torchsoft.datasets.subject import SPLITS
+from torchsoft.datasets.simulation import points
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line
@@ -125,7 +124,8 @@ def check_shard(
                 return  # nothing vouches for the others either
     for row, index in enumerate(here if len(columns) == len(schema) else []):
         one = {name: values[row] for name, values in columns.items()}
-        for finding in check_trajectory(config, one, task(config, index, design[index]).labels):
+        labels = config.subject.task(index, design[index]).labels
+        for finding in check_trajectory(config, one, labels):
             yield f"trajectory {index}: {finding}"
 
 
@@ -178,10 +178,9 @@ def summary(url: str, data: xr.Dataset) -> str:
     """Sizes and counts."""
     fs, root = filesystem(url)
     stored = [info["size"] for info in fs.find(root, detail=True).values()]
-    counts = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
     return (
-        f"{data.sizes['trajectory']} trajectories ({counts}; {int(data.failed.sum())} failed) of "
-        f"{data.sizes['time']} samples, {data.nbytes / 1e6:.1f} MB of arrays in "
+        f"{data.sizes['trajectory']} trajectories ({by_split(data)}; {int(data.failed.sum())} "
+        f"failed) of {data.sizes['time']} samples, {data.nbytes / 1e6:.1f} MB of arrays in "
         f"{sum(stored) / 1e6:.1f} MB and {len(stored)} files"
     )
 
@@ -255,14 +254,3 @@ def report(url: str, picture: Path | None = None) -> int:
             print(found[-1])
     print(f"{len(found)} finding{'s' * (len(found) > 1)}" if found else "sound")
     return len(found)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The command `torchsoft dataset check`."""
-    from torchsoft.cli import main as command
-
-    return command(["dataset", "check", *(sys.argv[1:] if arguments is None else arguments)])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

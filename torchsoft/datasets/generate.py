@@ -21,7 +21,7 @@ from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, read_bytes
 from torchsoft.datasets.schema import variables
-from torchsoft.datasets.simulation import points, simulate_task, task
+from torchsoft.datasets.simulation import points, simulate_task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.processes import local_processes
 
@@ -117,7 +117,7 @@ def measured(config: Config) -> tuple[float, float, float]:
     with threads.single_threaded():
         for i in (0, *range(TRIED)):
             began = time.thread_time()
-            row = simulate_task(config, task(config, i, design[i]))
+            row = simulate_task(config, config.subject.task(i, design[i]))
             steps += row["steps"] if times else 0
             times.append(time.thread_time() - began)
     mean, error = statistics.mean(times[1:]), SURE * statistics.stdev(times[1:]) / TRIED**0.5
@@ -151,7 +151,7 @@ def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
         if store.finished(shard):  # by another process, since it was submitted
             return len(config.rows(shard)), 0
         for i, u in zip(config.rows(shard), design, strict=True):
-            rows.append(simulate_task(config, task(config, i, u)))
+            rows.append(simulate_task(config, config.subject.task(i, u)))
             simulated()
         store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
@@ -219,14 +219,3 @@ def dask_cluster(address: str) -> Iterator[Executor]:
         raise StoreError("--scheduler needs Dask: pip install 'torchsoft[scale]'") from None
     with Client(address) as client:
         yield client.get_executor(retries=3, pure=False)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The command `torchsoft dataset make`."""
-    from torchsoft.cli import main as command
-
-    return command(["dataset", "make", *(sys.argv[1:] if arguments is None else arguments)])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -223,16 +223,16 @@ class Subject:
         own = {name: x for name, x in solver.items() if name != "tolerance"}
         return {"tolerance": self.file.solver.tolerance} | (stated or own or {"rtol": RTOL})
 
-    def task(self, index: int, u: list[float]) -> Task:
-        """Trajectory `index` at the point u of the design, whose entries are the common parameters,
-        the kind, and the parameters of the kind."""
-        config, kind = self.config, 0
+    def task(self, index: int, u: NDArray[np.floating]) -> Task:
+        """Trajectory `index` at the point u (dimensions,) of the design, whose entries are the
+        common parameters, the kind, and the parameters of the kind."""
+        config, kind, at = self.config, 0, u.tolist()
         if config.kinds:
             edges = np.cumsum([one.weight for one in config.kinds])
-            which = u.pop(len(config.parameters)) * edges[-1]
+            which = at.pop(len(config.parameters)) * edges[-1]
             kind = min(int(np.searchsorted(edges, which, side="right")), len(edges) - 1)
         file, parameters = self.kinds[kind]
-        drawn = {name: one.at(x) for (name, one), x in zip(parameters.items(), u)}
+        drawn = {name: one.at(x) for (name, one), x in zip(parameters.items(), at)}
         values = in_ratio(file, parameters, drawn)
         labels: Row = {name: values[name] for name in config.parameters}
         labels |= {"kind": config.kinds[kind].name} if config.kinds else {}
