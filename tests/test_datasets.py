@@ -25,13 +25,15 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from torchsoft import Rig, simulate
+from torchsoft.cli import main
 from torchsoft.datasets import simulation
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import Manifest, StoreError, digest, record, record_key, write_bytes
-from torchsoft.datasets.generate import Serial, generate, local_processes, main
+from torchsoft.datasets.generate import Serial, generate, local_processes
 from torchsoft.datasets.reader import Trajectories, open_dataset
-from torchsoft.datasets.simulation import Task, points, simulate_task, split, task
+from torchsoft.datasets.simulation import points, simulate_task
+from torchsoft.datasets.subject import Task, split
 from torchsoft.datasets.writer import Store, create, laid_out, open_or_create
 from torchsoft.files import replacing
 from torchsoft.solve.progress import SimulationFailed
@@ -417,7 +419,7 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
     """Unless it is marked as failed; a simulation whose results are not finite has failed."""
     config = made[1]
     store, design = open_or_create(str(tmp_path / "set"), config), points(config)
-    row = simulate_task(config, task(config, 4, design[4]))
+    row = simulate_task(config, config.subject.task(4, design[4]))
     angle = row["theta"].copy()
     angle[3] = np.nan
     with pytest.raises(
@@ -427,7 +429,7 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
     assert store.unfinished() == [0, 1, 2]
     series = simulation.series
     monkeypatch.setattr(simulation, "series", lambda *given: series(*given) | {"theta": angle})
-    row = simulate_task(config, task(config, 4, design[4]))
+    row = simulate_task(config, config.subject.task(4, design[4]))
     assert (row["failed"], row["reason"]) == (1, "not finite: theta")
     assert np.isnan(row["theta"]).all()
 
@@ -463,9 +465,8 @@ def test_whoever_lays_a_folder_out_later_changes_nothing(made, tmp_path):
 
 
 def test_check_draws_its_picture(made, tmp_path, capsys):
-    from torchsoft.datasets.check import main as check_main
-
-    check_main([str(made[0]), "--picture", str(tmp_path / "coverage.png")])
+    picture = str(tmp_path / "coverage.png")
+    assert main(["dataset", "check", str(made[0]), "--picture", picture]) == 0
     assert "5 trajectories" in capsys.readouterr().out
     assert (tmp_path / "coverage.png").stat().st_size > 10_000
 
@@ -532,7 +533,8 @@ def test_a_file_size_limit_is_said_and_costs_nothing(made, tmp_path, capfd):
     """The operating system's own refusal, in the middle of a shard; without the limit the same
     command finishes."""
     largest = max(len(data) for name, data in contents(made[0]).items() if "/c/" in name)
-    command = [str(write_config(tmp_path)), "--out", str(tmp_path / "set"), "--workers", "0"]
+    config, out = str(write_config(tmp_path)), str(tmp_path / "set")
+    command = ["dataset", "make", config, "--out", out, "--workers", "0"]
     open_or_create(str(tmp_path / "set"), made[1])
 
     def limited() -> int:
@@ -563,7 +565,8 @@ def test_a_killed_run_ends_in_the_same_bytes(made, tmp_path, monkeypatch):
         pid = fork(lambda: generate(made[1], str(out), Serial(), progress=False))
     assert ended(pid) == -signal.SIGKILL
     assert Store(str(out), made[1]).unfinished() == [1, 2]
-    assert main([str(write_config(tmp_path)), "--out", str(out), "--workers", "1"]) == 0
+    make = ["dataset", "make", str(write_config(tmp_path))]
+    assert main([*make, "--out", str(out), "--workers", "1"]) == 0
     assert contents(out) == contents(made[0])
 
 

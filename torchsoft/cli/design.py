@@ -1,4 +1,4 @@
-"""Design of motions for an identification."""
+"""The command `design`: motions for an identification."""
 
 import argparse
 from pathlib import Path
@@ -17,7 +17,7 @@ there are already."""
 
 
 def add_commands(commands: Any) -> None:
-    """The command that designs motions."""
+    """Add the command `design`."""
     one = add_command(
         commands, "design", design, "find a motion that identifies parameters", DESIGN
     )
@@ -31,7 +31,7 @@ def add_commands(commands: Any) -> None:
 
 
 def design(options: argparse.Namespace) -> int:
-    """Choose a motion, and write it."""
+    """Choose a motion and write it."""
     configs = [file for file in options.files if file.suffix == ".toml"]
     data = [file for file in options.files if file.suffix != ".toml"]
     if len(configs) != 1:

@@ -1,4 +1,4 @@
-"""Identification from files."""
+"""The commands `identify`, `explain` and `rehearse`."""
 
 import argparse
 from dataclasses import replace
@@ -36,7 +36,7 @@ intervals. The CSV files it writes are templates of those to record."""
 
 
 def add_commands(commands: Any) -> None:
-    """The commands that identify, that explain a misfit, and that rehearse."""
+    """Add the commands `identify`, `explain` and `rehearse`."""
     for name, help, description in (
         ("identify", "find parameters in recordings", IDENTIFY),
         ("explain", "find what is wrong where a model does not explain recordings", EXPLAIN),
@@ -46,7 +46,7 @@ def add_commands(commands: Any) -> None:
 
 
 def add_arguments(one: argparse.ArgumentParser) -> None:
-    """Arguments of either."""
+    """Add the arguments of any of these commands."""
     metavar, said = "DATA.csv ... CONFIG.toml", "data files and a configuration"
     if one.prog.endswith("rehearse"):
         metavar, said = "CONFIG.toml", "the configuration"
@@ -145,7 +145,7 @@ def identify(options: argparse.Namespace) -> int:
 
 
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
-    """Fits the competing laws, and says which one made the data."""
+    """Fit the competing laws and write the comparison; returns its table and verdict."""
     from torchsoft.sysid.compare import compare
     from torchsoft.sysid.runs import forget
 

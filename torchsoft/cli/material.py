@@ -1,4 +1,4 @@
-"""Materials from tests and from the literature."""
+"""The command `material`: fits to tests, and presets from the literature."""
 
 import argparse
 from pathlib import Path
@@ -23,7 +23,7 @@ Rubbers from the literature, every coefficient marked `published`, with where, o
 
 
 def add_commands(commands: Any) -> None:
-    """The commands on materials."""
+    """Add the command `material`."""
     material = commands.add_parser(
         "material", help="fit a material to a test, or list some", description="Materials of pads."
     )

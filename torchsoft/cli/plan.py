@@ -1,4 +1,4 @@
-"""Plans: a goal of a rig file reached by gradient."""
+"""The command `plan`: a motion that reaches a goal."""
 
 import argparse
 from pathlib import Path
@@ -19,7 +19,7 @@ and run.png; the exit status is 1 where a target or limit is not kept."""
 
 
 def add_commands(commands: Any) -> None:
-    """The command that plans motions."""
+    """Add the command `plan`."""
     one = add_command(commands, "plan", plan, "find a motion that reaches a goal", PLAN)
     one.add_argument("rig", type=Path, metavar="RIG.toml")
     one.add_argument("goal", type=Path, metavar="GOAL.toml")
@@ -30,7 +30,7 @@ def add_commands(commands: Any) -> None:
 
 
 def plan(options: argparse.Namespace) -> int:
-    """Plan, and write the motion."""
+    """Plan and write the motion."""
     from torchsoft.files import write_json
     from torchsoft.plot import figures
     from torchsoft.plot.dashboard import dashboard

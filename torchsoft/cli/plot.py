@@ -1,4 +1,4 @@
-"""Pictures of a run that was saved, and the version."""
+"""The commands `plot` and `version`."""
 
 import argparse
 import platform
@@ -16,7 +16,7 @@ as wide as a page or a column, with --only for some of its panels."""
 
 
 def add_commands(commands: Any) -> None:
-    """The commands `plot` and `version`."""
+    """Add the commands `plot` and `version`."""
     one = add_command(commands, "plot", plot, "draw a saved run", PLOT)
     one.add_argument("file", type=Path, metavar="FILE.nc", help="the run")
     one.add_argument("--html", action="store_true", help="write the interactive player")
@@ -73,7 +73,7 @@ def plot(options: argparse.Namespace) -> int:
 
 
 def versions(options: argparse.Namespace) -> int:
-    """Say which versions are at work."""
+    """Print the versions of torchsoft and its main dependencies."""
     names = ("torchsoft", "torch", "numpy", "numba")
     listed = ", ".join(f"{name} {version(name)}" for name in names)
     say(f"{listed}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")

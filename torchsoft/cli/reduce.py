@@ -1,4 +1,4 @@
-"""Reduced models: sparse equations from runs that were saved."""
+"""The command `reduce`: sparse equations from saved runs."""
 
 import argparse
 from pathlib import Path
@@ -20,7 +20,7 @@ and the error of the prediction; the exit status is 1 where that is no better th
 
 
 def add_commands(commands: Any) -> None:
-    """The command that finds reduced models."""
+    """Add the command `reduce`."""
     one = add_command(commands, "reduce", reduce, "find sparse equations of saved runs", REDUCE)
     one.add_argument("files", type=Path, nargs="+", metavar="RUN.nc", help="runs")
     one.add_argument("--held-out", type=Path, metavar="RUN.nc", help="run that is predicted")
@@ -34,7 +34,7 @@ def add_commands(commands: Any) -> None:
 
 
 def reduce(options: argparse.Namespace) -> int:
-    """Fit the runs, and predict the one held out."""
+    """Fit the runs and predict the held-out one."""
     from torchsoft.files import write_json
     from torchsoft.reduced import (
         Recipe,

@@ -1,4 +1,4 @@
-"""Results of a command: the folder that they are written to, and sentences on the terminal."""
+"""Shared parts of commands: arguments, the folder of results, and messages on the terminal."""
 
 import argparse
 import sys
@@ -14,7 +14,7 @@ from torchsoft.tables import line, plain
 def add_command(
     commands: Any, name: str, run: Callable[[argparse.Namespace], int], help: str, description: str
 ) -> argparse.ArgumentParser:
-    """A command that `run` carries out, its description as it is written."""
+    """Add a command that `run` carries out; the help shows its description verbatim."""
     one = commands.add_parser(
         name, help=help, description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -24,7 +24,7 @@ def add_command(
 
 
 def add_out(command: Any, **more: Any) -> None:
-    """The options on the folder."""
+    """Add the options on the folder of results."""
     command.add_argument("--out", type=Path, **more)
     command.add_argument(
         "--force", action="store_true", help="write to a folder that holds other files"
@@ -32,7 +32,7 @@ def add_out(command: Any, **more: Any) -> None:
 
 
 def add_progress(command: Any) -> None:
-    """The option on progress, which only a terminal is shown."""
+    """Add the option on progress, which is shown on terminals only."""
     command.add_argument(
         "--no-progress", dest="progress", action="store_false", default=sys.stderr.isatty(),
         help="show no progress; only a terminal is shown any",
@@ -40,19 +40,19 @@ def add_progress(command: Any) -> None:
 
 
 def say(*text: object, error: bool = False) -> None:
-    """Print text without characters that a terminal obeys."""
+    """Print text without control characters."""
     print(plain(" ".join(map(str, text))), file=sys.stderr if error else sys.stdout)
 
 
 def failed(reason: str) -> int:
-    """Say why a command failed; its exit status."""
+    """Print the reason of a failure; returns the exit status."""
     print(f"torchsoft: error: {line(reason, 2000)}", file=sys.stderr)
     return 2
 
 
 def try_folder(out: Path, force: bool) -> None:
-    """Make the folder, and try that files can be written to it. Raises `ValueError` where they
-    cannot, and for a folder of other files, unless by `force`."""
+    """Make the folder and test that files can be written to it. Raises `ValueError` where they
+    cannot, and for a folder with other files unless `force` is set."""
     try:
         claim(out, force)
         with TemporaryFile(dir=out):

@@ -1,4 +1,4 @@
-"""Commands on rig files: run, check, init."""
+"""The commands `run`, `check` and `init` on rig files."""
 
 import argparse
 import shlex
@@ -26,7 +26,7 @@ every number in a comment. A folder that is not there is made."""
 
 
 def add_commands(commands: Any) -> None:
-    """The commands on rig files."""
+    """Add the commands `run`, `check` and `init`."""
     one = add_command(commands, "run", run_rig, "simulate a rig file", RUN)
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
     add_out(one, help="folder for the results (out/RIG)")
@@ -46,7 +46,7 @@ def add_commands(commands: Any) -> None:
 
 
 def run_rig(options: argparse.Namespace) -> int:
-    """Check a rig file, simulate it, and write the results."""
+    """Check a rig file, simulate it and write the results."""
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
@@ -82,7 +82,7 @@ def run_rig(options: argparse.Namespace) -> int:
 
 
 def check_rig(options: argparse.Namespace) -> int:
-    """Print the faults of a rig file."""
+    """Print the findings on a rig file."""
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check

@@ -28,14 +28,14 @@ Mode = Literal["rgb_array", "human"]
 FRAMES_PER_SECOND = 10
 
 DRAWS = 10
-"""Draws of parameters that are tried for one episode."""
+"""Most draws of parameters for one episode."""
 
 SOLVER = {"rtol": 1e-3}
-"""How steps are chosen where a rig file leaves it open."""
+"""Default step control, where the rig file states none."""
 
 
 class RedrawnStart(UserWarning):
-    """An episode began with other parameters than those first drawn, which no start exists for."""
+    """The first draw of an episode's parameters had no initial state; others were drawn."""
 
 
 class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -130,7 +130,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return dict(ranges)
 
     def _checked_held(self, held: Sequence[str]) -> dict[str, list[slice]]:
-        """The recorded forces of the contacts of each body that is to be held."""
+        """Recorded forces of the contacts of each body in `held`."""
         rig, at, slices = self.dynamics.rig, 0, dict[str, list[slice]]()
         for contact in rig.contacts.values():
             size = 2 * len(rig.pads[contact.pad].point_nodes)
@@ -160,7 +160,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._seen(self.dynamics.observe(self.moment)), self._info(self.moment)
 
     def _drawn_target(self, options: Mapping[str, Any]) -> Tensor:
-        """The target of an episode, as far as it is not given."""
+        """Target of an episode: the given coordinates, and draws of the others."""
         checked("options", dict.fromkeys(options, (0.0, 1.0)), ["target"], "known is")
         goal, (low, high) = self.dynamics.goal, self.dynamics.targets.numpy().T
         target, axes = self.np_random.uniform(low, high), list(goal.target) if goal else []
@@ -178,7 +178,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return torch.tensor(peaks, dtype=torch.float64).reshape(-1, 2)
 
     def _drawn_start(self) -> Moment:
-        """The begin with parameters drawn anew."""
+        """The first moment, with newly drawn parameters."""
         why = ""
         for _ in range(DRAWS):
             values = {k: float(self.np_random.uniform(*x)) for k, x in self.parameters.items()}
@@ -202,8 +202,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Carry out an action over one control interval. Raises `ValueError` for one that is not
-        finite or outside of [-1, 1], and before `reset`."""
+        """Apply an action over one control interval. Raises `ValueError` for an action that is not
+        finite or out of [-1, 1], and before `reset`."""
         now, dynamics = self.moment, self.dynamics
         if now is None or self._over:
             raise ValueError("the episode is over, or has not begun; call `reset` first")
@@ -229,7 +229,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._seen(done.observation), reward, bool(ended), truncated, info
 
     def ended(self, now: Moment) -> str:
-        """Why an episode terminates at a moment, empty where it goes on."""
+        """Reason why an episode terminates at a moment, empty where it goes on."""
         for name, (low, high) in self.bounds.items():
             x = now.y[self.dynamics.coordinates[name]].item()
             if not low <= x <= high:
@@ -249,7 +249,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return {"time": self.dynamics.start + now.steps * self.dynamics.interval} | goal
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The picture (height, width, 3), or None where it is shown in a window."""
+        """The picture (height, width, 3), or None in the mode "human", which shows it in a
+        window."""
         from torchsoft.envs.view import View
 
         if self.moment is None or self.render_mode is None:

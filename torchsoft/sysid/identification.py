@@ -65,19 +65,19 @@ from torchsoft.sysid.unknowns import Coordinates
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
-"""Relative tolerance of the last stage: derivatives are then right to some percent, and estimates
-to a fraction of a standard deviation where sensors are as good as `RIG`."""
+"""Relative tolerance of the last stage, at which derivatives are right to some percent, and
+estimates to a fraction of a standard deviation with sensors as good as `RIG`."""
 
 PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
-"""Those whose versions a result names."""
+"""Packages whose versions a result records."""
 
 Assumed = Literal["checked", "explained", "trusted"]
 """Whether assumptions are tested to first order, tested and followed by new fits that look for a
-cause, or believed."""
+cause, or trusted."""
 
 
 class Settings(Table):
-    """How to fit: the arguments of `identify` by the same names."""
+    """Settings of a fit, which are arguments of `identify`."""
 
     rtol: float = Field(RTOL, ge=1e-8, le=1e-2)
     starts: int = Field(1, ge=1, le=2**20)
@@ -102,8 +102,7 @@ class Settings(Table):
 
 
 class How(NamedTuple):
-    """How an identification goes about it, beside its stages; `identify` says what the fields
-    mean."""
+    """Arguments of an identification besides its stages; `identify` documents the fields."""
 
     fitted: list[str]
     heldout: tuple[str, ...]
@@ -116,8 +115,7 @@ class How(NamedTuple):
 
     @property
     def tightenings(self) -> int:
-        """How often the tolerance may become tighter; a robust fit ends on the steps that it
-        has."""
+        """Most times that the tolerance may become tighter; a robust fit keeps its steps."""
         return self.settings.tightenings if self.loss == "linear" else 0
 
 
@@ -125,14 +123,14 @@ def conclude(
     coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How,
     findings: list[str], asked: float, began: float, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
-    """The result, from the fit of the last stage with the noise that was found; `findings` are
-    sentences on the recordings and the plan, `asked` is the tolerance of the whole plan, `began` is
-    on the clock [s]."""
+    """The result, from the fit of the last stage with its estimated noise. `findings` are sentences
+    on the recordings and the plan, `asked` is the tolerance of the whole plan, `began` is on the
+    clock [s]."""
     c = coloured.problem.coordinates
     free, stages = np.isin(c.labels, stage.free), list(stages)
 
     def at_rest() -> Settled:
-        """The fit of the noise that is known, gone on until steps do not matter."""
+        """Continue the fit with its noise until its steps do not matter."""
         start, by = clock.perf_counter(), stage.rtol
         with progress_bar("check of the steps", progress) as notify:
             end = settle(
@@ -248,7 +246,7 @@ def conclude(
 
 
 def noise_entries(coloured: Coloured, stage: Stage, began: float) -> list[dict[str, Any]]:
-    """The result's entries on the fits with the noise that was found."""
+    """The result's entries on the fits with estimated noise."""
     name, out = "with the noise that was found", []
     for one, at in coloured.fits:
         out.append(stage_entry(name, stage, stage.rtol, one, began, at))
@@ -260,9 +258,9 @@ def tested_assumptions(
     coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_],
     doubtful: bool, how: How, progress: bool,
 ) -> Checked:  # fmt: skip
-    """The checks at the end of a fit, on residuals with the colour that was declared and no other:
-    what was found unasked may be the very trace of a wrong assumption. Their columns then get all
-    the noise."""
+    """Tests of the assumptions at the end of a fit, on residuals whitened by declared colour only:
+    undeclared colour may be the trace of a wrong assumption. The columns in the result are whitened
+    by all of the noise."""
     problem, which = coloured.problem, stage.recordings
     declared = {
         channel: noise
@@ -284,8 +282,8 @@ def tested_assumptions(
 
 
 def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
-    """Sentences on recordings that were predicted with values of their own, which no recording that
-    was fitted tells."""
+    """Sentences on held-out recordings that were predicted with parameters of their own, which no
+    fitted recording determines."""
     out = []
     for k in (k for k, name in enumerate(problem.names) if name in heldout):
         mine = [
@@ -320,7 +318,7 @@ def notices_on(
     found: list[Any], held: Mapping[str, tuple[str, float]], converged: bool, rtol: float,
     unchecked: bool,
 ) -> list[str]:  # fmt: skip
-    """Sentences on what a reader must know before using the numbers."""
+    """Sentences on unidentifiable estimates, active bounds, tolerance and convergence."""
     out = []
     for e in found:
         if not e.identifiable:
@@ -356,7 +354,8 @@ def notices_on(
 
 
 def rough_notices(c: Coordinates, rough: Sequence[str]) -> list[str]:
-    """That samples are not smooth in some coordinates where a fit has ended, and the remedy."""
+    """A sentence on coordinates in which samples are not smooth at the end of the fit, with the
+    remedy."""
     if not rough:
         return []
     remedy = "judge the intervals by profile likelihoods (torchsoft.sysid.profile)"
@@ -478,8 +477,8 @@ def with_its_noise(
     method: Method,
     notify: Notify,
 ) -> Coloured:
-    """The fit of the last stage, gone on with whatever noise it leaves: by new Jacobians, then by
-    the last one."""
+    """The fit of the last stage, continued with the noise estimated from its residuals: with a new
+    Jacobian first, then with the last one."""
     free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
 
     def refit(one: Problem, last: Fit, number: int) -> Fit:

@@ -1,5 +1,5 @@
-"""Rehearsal of an experiment: its recordings are simulated, with the sensors' noise, before anyone
-builds it, and what would be identified from them shows what the experiment is good for."""
+"""Rehearsal of an experiment: simulated recordings with the sensors' noise, whose identification
+shows the information of the experiment before it is built."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,15 +19,15 @@ from torchsoft.sysid.synthetic import record
 from torchsoft.sysid.unknowns import Unknown
 
 FINER = 0.1
-"""Tolerance of the simulated experiment, in parts of the fit's."""
+"""Tolerance of the simulated experiment, over the fit's."""
 
 
 def planned(
     stated: Config, file: RigFile, name: str, rtol: float, start: Beginning | None = None,
     **how: Any,
 ) -> Recording:  # fmt: skip
-    """A recording of a file's rig as a configuration has it planned, from the run that `rtol`
-    makes; `how` is what else `record` takes. Raises `ValueError`, and `SimulationFailed`."""
+    """A planned recording of a file's rig by a configuration, from a run with the tolerance `rtol`;
+    `how` are further arguments of `record`. Raises `ValueError`, and `SimulationFailed`."""
     plan, start, built = stated.rehearsal, start or stated.start, file.build()
     if plan.duration is not None:
         built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
@@ -37,11 +37,11 @@ def planned(
 
 
 def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Path]]:
-    """Simulate the recordings of a configuration, of the rig as its file has it, and write them to
-    `out` as CSV files, the templates of those to record.
+    """Simulate the recordings of a configuration, with the parameters of its rig file, and write
+    them to `out` as CSV files, which are templates of those to record.
 
     Returns the configuration of their identification, whose search begins away from the truth, and
-    the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot do.
+    the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot follow.
     """
     if stated.rig is None:
         raise ValueError(
@@ -78,8 +78,8 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
 def away(
     unknowns: dict[str, Unknown], file: RigFile, factor: float
 ) -> Iterator[tuple[str, Unknown]]:
-    """The unknowns, those whose start is not stated off by a factor, up and down in turns. Numbers
-    that bound each other stay."""
+    """The unknowns, with unstated starts moved by a factor, up and down in turns. Parameters that
+    bound each other stay."""
     rig = file.assemble()
     bound = {name for pair in rig.ordered.items() for name in pair}
     for k, (name, one) in enumerate(unknowns.items()):
