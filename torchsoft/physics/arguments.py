@@ -81,6 +81,6 @@ def names(name: str, value: Any, known: tuple[str, ...]) -> None:
 
 
 def line(value: Any) -> str:
-    """A value in one short line."""
+    """Representation of a value in one short line."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."

@@ -62,7 +62,7 @@ class Rounded(Outlined):
         bulge = torch.where(cross >= 0, 1.0, -1.0).double()
         trim = (
             self.radius * bulge * cross / (1 + dot)
-        )  # r tan(|turn| / 2): what an arc takes of both of its sides
+        )  # r tan(|turn| / 2): length that an arc takes from both of its sides
         normal, start = torch.stack((t[:, 1], -t[:, 0]), -1), v + trim[:, None] * t
         centre = start - (bulge * self.radius)[:, None] * normal
         return Sides(
