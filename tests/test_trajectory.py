@@ -19,6 +19,7 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
+from torchsoft.physics.extensions import extend
 from torchsoft.physics.setup import von_mises
 from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.rigs.written import template
@@ -112,9 +113,14 @@ def test_channels_have_one_name_everywhere(done):
         run["x_c"]
 
 
-def test_points_stick_slip_and_part_as_the_graph_says():
-    """The same as the graph at the same states, in a fast stroke that slips."""
+@pytest.mark.parametrize("extended", [False, True])
+def test_points_stick_slip_and_part_as_the_graph_says(extended):
+    """The same as the graph at the same states, in a fast stroke that slips, also where a pad has
+    retardation times of its own."""
     model = coarse(contact__mu_s=0.05, contact__mu_k=0.04)
+    for name in ("pads.L.tau_ratio", "pad.slow(0.1 s)") if extended else ():
+        extend(model, [name])
+        torch.nn.init.constant_(model.parameter(name), 0.5)
     start = grasp_and_roll(model, grasp_force=80.0)
     t = torch.linspace(0, 3.0, 61, dtype=torch.float64)
     run = simulate(model, t, y0=start.y0)

@@ -27,7 +27,7 @@ class Junction(NamedTuple):
 class Block(NamedTuple):
     """One junction's modulus: matrix (..., bonds or 1, m, width), after an interpolation of the
     junction's nodes at the bonds, spread (bonds, nodes); None where bonds are nodes, or the
-    junction has only one."""
+    junction has a single node."""
 
     matrix: Tensor
     spread: Tensor | None = None

@@ -102,7 +102,7 @@ class Rig(Shown, nn.Module):
     actuators: Mapping[str, Actuator]
 
     def check_names(self) -> None:
-        """Raises what the class does for parts that do not fit together."""
+        """Raises the errors of the class for parts that do not fit together."""
         for name, pad in self.pads.items():
             if pad.base is not None and pad.base not in self.bodies:
                 raise ValueError(

@@ -26,7 +26,7 @@ def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], 
     The interior's displacement depends on the surface's only, for any E and depth; both are 1.
     """
     K, surface = mesh.stiffness(*lame_moduli(1.0, nu)).tocsc(), dofs_of(mesh.surface)
-    interior = np.setdiff1d(np.arange(K.shape[0]), surface)
+    interior = np.setdiff1d(np.arange(2 * len(mesh.free)), surface)
     return splu(K[interior][:, interior]), interior, K[interior][:, surface].toarray()
 
 

@@ -186,7 +186,7 @@ def resting(
     signals: Tensor | None = None, actuators: Container[str] | None = None,
     residual: float = RESIDUAL,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Poses (3,) [m, m, rad] by body of a rig at rest, looked for from `pose`: the coordinates
+    """Poses (3,) [m, m, rad] by body of a rig at rest, searched for from `pose`: the coordinates
     `free`, numbers by body (by default all that can move), are brought into balance, and all others
     stay as given.
 

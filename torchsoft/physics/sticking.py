@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torchsoft.physics.condensed import nodal
+from torchsoft.physics.condensed import free_rates, nodal
 from torchsoft.physics.contact import cross, interface_law, moving_frame, turned
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
@@ -58,6 +58,5 @@ def _rates(
         frame = moving_frame(rig.shape_of(key), x[..., 3:5], x[..., 5])
         F_N, F_T = force[key][..., which, :].split(1, -1)
         f = f + spread.mT @ (F_N * frame.n + F_T * frame.t)
-    fractions, times = pad.material.chain()
-    setting = (fractions / times)[:, None, None] * (f[..., None, :, :] - state.pads[name])
-    return nodal(pad.compliance(), setting.sum(-3))
+    free, P = free_rates(pad, state.pads[name], 0.0)
+    return free + nodal(P, f)

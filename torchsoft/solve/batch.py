@@ -82,7 +82,7 @@ class Batch(Shown):
         return f"Batch: {count} runs, {len(self.failures)} failed, {wall:.2g} s", rows
 
     def __getitem__(self, channel: str) -> Tensor:
-        """A channel (runs, T). Raises `KeyError` for one that a run has not."""
+        """A channel (runs, T). Raises `KeyError` for a channel that a run does not have."""
         return self._stacked(lambda run: run[channel])
 
     def together(self, *channels: str) -> Tensor:

@@ -126,7 +126,7 @@ def add_setup(setup: Setup, add: Add) -> None:
 
 
 def from_xarray(data: xr.Dataset, source: str = "the dataset") -> Trajectory:
-    """The run of `to_xarray`. Raises `ValueError` naming what is missing."""
+    """The run of `to_xarray`. Raises `ValueError` naming a missing array."""
     about = {}
     for name, value in data.attrs.items():
         try:

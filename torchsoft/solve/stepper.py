@@ -44,7 +44,7 @@ from torchsoft.solve.kernel.arrays import (
 )
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.progress import Integrals, Marching, Progress, Segment, SimulationFailed
+from torchsoft.solve.progress import Integrals, Progress, RunState, Segment, SimulationFailed
 from torchsoft.solve.system import Compiled
 from torchsoft.solve.tolerances import Followed, error_parts, part_name
 from torchsoft.threads import others_turn
@@ -135,7 +135,7 @@ class ImplicitStepper:
         return other
 
     def _call(
-        self, s: Any, now: "Marching", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
+        self, s: Any, now: "RunState", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
         *, taping: bool, given: bool = True, follow: Any = NO_SIGNALS, errors: Any = NO_ERRORS,
         k: Array = NONE, clock: Array = START, stops: Array = NONE, times: Array = NONE,
         row: int = 0, rung: float = 0.0,
@@ -210,7 +210,7 @@ class ImplicitStepper:
         step = room("Step", s, self.layout.size, integrals=len(names))
         y, integrals = y0.numpy().copy(), np.zeros(len(names))
         set_velocities(s, work, y)
-        state = Marching(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
+        state = RunState(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
         self._start(t[0], state)
         set_velocities(s, work, y)
         yield from (
@@ -219,7 +219,7 @@ class ImplicitStepper:
             else self._as_given(t, state)
         )
 
-    def _as_given(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
+    def _as_given(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take the steps of a plan."""
         todo = list(
             given_steps(t, self.knots)
@@ -276,7 +276,7 @@ class ImplicitStepper:
             elif status != CONVERGED:
                 raise self._failure(status, float(plan.starts[steps]), float(plan.h[steps]))
 
-    def _by_tolerance(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
+    def _by_tolerance(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
         times, out = t.numpy(), now.out
         followed = Followed(
@@ -317,7 +317,7 @@ class ImplicitStepper:
                 worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
                 raise self._failure(status, float(clock[0]), float(clock[1]), worst)
 
-    def _start(self, time: Tensor, now: "Marching") -> None:
+    def _start(self, time: Tensor, now: "RunState") -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
         `SimulationFailed`."""
         signals = self.compiled.signals(time[None], self.reference).numpy()
@@ -362,7 +362,7 @@ class ImplicitStepper:
         s, n = self.system(segment), len(segment.plan.out_step)
         work, names = room("Work", s, self.layout.size, columns=1), len(self.integrals.names)
         work.V[:], work.u_dot[:] = segment.V, segment.u_dot
-        again = Marching(
+        again = RunState(
             segment.y.copy(),
             work,
             room("Step", s, self.layout.size, integrals=names),
@@ -378,7 +378,7 @@ class ImplicitStepper:
         return tapes
 
     def _run(
-        self, plan: Plan, signals: Array, at_outputs: Array, now: "Marching", rows: slice,
+        self, plan: Plan, signals: Array, at_outputs: Array, now: "RunState", rows: slice,
         taping: bool,
     ) -> tuple[int, int, int, int, tuple[Any, Any] | None]:  # fmt: skip
         """One compiled call of given steps; with `taping` once more with longer tapes if more

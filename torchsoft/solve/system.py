@@ -46,7 +46,7 @@ from torchsoft.solve.kernel.table import Index, layout
 from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
 
 NOMINAL = 1e-3
-"""Stage length a h [s] with which slip laws of one's own are tried."""
+"""Stage length a h [s] at which slip laws of users are tried."""
 
 
 @contextmanager
@@ -369,7 +369,7 @@ def moduli(pad: Pad) -> Tensor:
 
 
 def filled(kind: Any, **fields: Any) -> Any:
-    """One of `PARTS` of its fields, as arrays of their types; empty ones have no rows."""
+    """One of `PARTS` from its fields, as arrays of their declared types."""
     parts = []
     for name, dtype, ndim, _ in layout(kind):
         value = np.ascontiguousarray(fields[name], dtype) if ndim else fields[name]
@@ -378,5 +378,5 @@ def filled(kind: Any, **fields: Any) -> Any:
 
 
 def _ragged(lists: list[list[int]]) -> tuple[Index, list[int]]:
-    """The ends of lists that are put one after the other, and all their numbers."""
+    """Ends of concatenated lists, and their numbers."""
     return np.cumsum([0, *map(len, lists)]), [number for one in lists for number in one]

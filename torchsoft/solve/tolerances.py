@@ -1,5 +1,5 @@
-"""Data of a rig for step-size control: which errors count together and by what unit, and the
-reference's pieces."""
+"""Data of a rig for step-size control: groups of errors with their units, and the reference's
+pieces."""
 
 import ctypes
 from collections.abc import Callable

@@ -226,9 +226,7 @@ def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Ind
 
     if unit not in LENGTHS:
         raise ValueError(f"`unit` must be one of {', '.join(LENGTHS)}, but is {unit!r}")
-    with check_file(path, LARGEST).open(
-        "rb"
-    ):  # what is not there, or not to be read, is an OSError
+    with check_file(path, LARGEST).open("rb"):  # a missing or unreadable file is an OSError
         pass
     try:
         with (
