@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, failed, say
+from torchsoft.cli.results import add_command, add_yes, failed, say
 
 MAKE = """\
 Simulates the dataset of CONFIG.toml, shard by shard, into a folder or what fsspec opens. Ctrl-C and
@@ -50,9 +50,7 @@ def add_commands(commands: Any) -> None:
     workers = "threads, or processes if more than a few"
     one.add_argument("--workers", type=count, default=os.cpu_count() or 1, help=workers)
     one.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
-    one.add_argument(
-        "--yes", action="store_true", help="begin even what takes hours, or much memory or disk"
-    )
+    add_yes(one)
     one = add_command(
         own, "slurm", slurm, "write the job array that makes a dataset in parts", SLURM
     )

@@ -31,7 +31,7 @@ def add_commands(commands: Any) -> None:
     help = "fit a material to a relaxation or creep test"
     one = add_command(commands, "fit", fit_material, help, MATERIAL_FIT)
     one.add_argument("file", type=Path, metavar="FILE.csv", help="the test")
-    add_out(one, default=Path("out/material"), help="folder for the results (%(default)s)")
+    add_out(one, "material")
     one.add_argument(
         "--test",
         choices=("relaxation", "creep"),

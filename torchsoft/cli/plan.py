@@ -25,7 +25,7 @@ def add_commands(commands: Any) -> None:
     one.add_argument("goal", type=Path, metavar="GOAL.toml")
     said = "draw what an identification of the rig leaves unknown"
     one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=said)
-    add_out(one, default=Path("out/plan"), help="folder for the results (%(default)s)")
+    add_out(one, "plan")
     add_progress(one)
 
 

@@ -30,7 +30,7 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--bracket", default="bracket", help="body of the other pad (%(default)s)")
     said = "least part of a rate that a term must account for (%(default)s)"
     one.add_argument("--threshold", type=float, default=0.05, help=said)
-    add_out(one, default=Path("out/reduced"), help="folder for the result (%(default)s)")
+    add_out(one, "reduced")
 
 
 def reduce(options: argparse.Namespace) -> int:

@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -23,12 +23,19 @@ def add_command(
     return one
 
 
-def add_out(command: Any, **more: Any) -> None:
-    """Add the options on the folder of results."""
-    command.add_argument("--out", type=Path, **more)
+def add_out(command: Any, folder: str, **more: Any) -> None:
+    """Add the options on the folder of results, which is out/`folder` by default."""
+    help = f"folder for the results (out/{folder})"
+    command.add_argument("--out", type=Path, help=help, **{"default": Path("out", folder)} | more)
     command.add_argument(
         "--force", action="store_true", help="write to a folder that holds other files"
     )
+
+
+def add_yes(command: Any) -> None:
+    """Add the option on costly work."""
+    said = "begin even what takes hours, or much memory or disk"
+    command.add_argument("--yes", action="store_true", help=said)
 
 
 def add_progress(command: Any) -> None:
@@ -48,6 +55,15 @@ def failed(reason: str) -> int:
     """Print the reason of a failure; returns the exit status."""
     print(f"torchsoft: error: {line(reason, 2000)}", file=sys.stderr)
     return 2
+
+
+def sorted_files(files: Sequence[Path]) -> tuple[Path, list[Path]]:
+    """The configuration among some files, and the others, which are data. Raises `ValueError`
+    unless there is one configuration."""
+    configs = [file for file in files if file.suffix == ".toml"]
+    if len(configs) != 1:
+        raise ValueError(f"one CONFIG.toml is needed, but {len(configs)} were given")
+    return configs[0], [file for file in files if file.suffix != ".toml"]
 
 
 def try_folder(out: Path, force: bool) -> None:

@@ -218,10 +218,8 @@ def laid_out(config: Config) -> dict[str, bytes]:
             name, data=values, chunks=values.shape, dimension_names=dimensions, compressors=SMALL,
             attributes={"units": unit, "long_name": meaning}, config={"write_empty_chunks": True},
         )  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # consolidated metadata is zarr-python's and xarray's own addition
+    # consolidated metadata is zarr-python's and xarray's own addition
+    with warnings.catch_warnings(action="ignore"):
         zarr.consolidate_metadata(group.store)
     return {key: data.to_bytes() for key, data in content.items()}
 

@@ -154,7 +154,7 @@ class Dynamics:
         goal, free = self.goal, self.coordinates
         wanted = dict(goal.target) if goal else {}
         body = goal.body if goal else ""
-        checked("goal.target", {f"{body}.{x}": (0.0, 1.0) for x in wanted}, free, "free are")
+        check_names("goal.target", [f"{body}.{x}" for x in wanted], free, "free are")
         if goal and wanted.keys() != goal.scale.keys():
             raise ValueError(
                 f"`goal.scale` must have the coordinates of `goal.target`, {', '.join(wanted)}, "
@@ -279,12 +279,18 @@ class Dynamics:
         return run(task, TAPE_BYTES, explained=False)
 
 
-def checked(field: str, ranges: Ranges, known: Iterable[str], listed: str) -> Ranges:
-    """The ranges as given. Raises `ValueError` for an unknown name, and for an invalid range."""
+def check_names(field: str, given: Iterable[str], known: Iterable[str], listed: str) -> None:
+    """Raises `ValueError` for an unknown name."""
     names = list(known)
-    for name, given in ranges.items():
+    for name in given:
         if name not in names:
             raise ValueError(f"`{field}` names `{name}`; {suggestion(name, names, listed)}")
+
+
+def checked(field: str, ranges: Ranges, known: Iterable[str], listed: str) -> Ranges:
+    """The ranges as given. Raises `ValueError` for an unknown name, and for an invalid range."""
+    check_names(field, ranges, known, listed)
+    for name, given in ranges.items():
         try:
             low, high = map(float, given)
         except (TypeError, ValueError):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, checked
+from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, check_names, checked
 from torchsoft.physics.arguments import number
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
@@ -136,8 +136,9 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             size = 2 * len(rig.pads[contact.pad].point_nodes)
             slices.setdefault(contact.body, []).append(slice(at, at + size, 2))
             at += size
-        names = dict.fromkeys([held] if isinstance(held, str) else held, (0.0, 1.0))
-        return {body: slices[body] for body in checked("held", names, slices, "there are")}
+        names = [held] if isinstance(held, str) else held
+        check_names("held", names, slices, "there are")
+        return {body: slices[body] for body in names}
 
     def _built(self, values: Mapping[str, float]) -> BuiltRig[Rig]:
         if isinstance(self._file, RigFile):
@@ -161,11 +162,12 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _drawn_target(self, options: Mapping[str, Any]) -> Tensor:
         """Target of an episode: the given coordinates, and draws of the others."""
-        checked("options", dict.fromkeys(options, (0.0, 1.0)), ["target"], "known is")
+        check_names("options", options, ["target"], "known is")
         goal, (low, high) = self.dynamics.goal, self.dynamics.targets.numpy().T
         target, axes = self.np_random.uniform(low, high), list(goal.target) if goal else []
         given = options.get("target") or {}
-        for name in checked("target", dict.fromkeys(given, (0.0, 1.0)), axes, "the goal has"):
+        check_names("target", given, axes, "the goal has")
+        for name in given:
             target[axes.index(name)] = number("target", given[name])
         if not np.isfinite(target).all():
             raise ValueError(f"`target` must be finite, but is {given}")

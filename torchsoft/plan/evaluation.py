@@ -108,8 +108,8 @@ class Evaluator:
         for impossible values."""
         self.looks += 1
         rows = torch.from_numpy(np.tile(z, (self.draws, 1))).requires_grad_(gradient)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the run that is kept is made again, and warns
+        # the run that is kept is made again, and warns
+        with warnings.catch_warnings(action="ignore"):
             batch = simulate_batch(
                 self.rig, self.t, parameters=self.over | self.variables.parameters(rows),
                 reference=[self.variables.reference(row) for row in rows], y0=self.y0,

@@ -193,7 +193,7 @@ def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
         names = [name for name in energies if name.startswith(prefix)]
         return MM * sum((energies.pop(name) for name in names), zero).detach().numpy()
 
-    groups = [
+    return [
         ("stored in pads", taken(stored, "strain_"), "#2171b5"),
         ("in contact springs", taken(stored, "normal_springs") + taken(stored, "tangential"),
          "#9ecae1"),
@@ -202,7 +202,6 @@ def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
         ("by slip", taken(lost, "slip"), "#fdae6b"),
         ("by dashpots", taken(lost, ""), "#7f2704"),
     ]  # fmt: skip
-    return groups
 
 
 def energies(axes: Axes, run: Trajectory) -> None:

@@ -346,14 +346,14 @@ def largest_stress(shown: Sequence[Instant]) -> float:
     return max((float(one.max()) for at in shown for one in at.stress.values()), default=0.0)
 
 
-def keys(setup: Setup, shown: Sequence[Instant], forces: bool = True) -> list[Artist]:
+def keys(setup: Setup, shown: Sequence[Instant]) -> list[Artist]:
     """Handles of a legend: the contact states that occur, and forces."""
     there = {int(x) for at in shown for one in at.state.values() for x in np.unique(one)}
     out: list[Artist] = [
         Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=f"point {word}")
         for state, (word, marker, colour) in STATES.items() if state in there
     ]  # fmt: skip
-    if forces and setup.contacts:
+    if setup.contacts:
         out += [
             Line2D([], [], color=NORMAL, lw=1.4, label="normal force"),
             Line2D([], [], color=FRICTION, lw=1.4, label=f"friction ({outwards(setup, shown[0])})"),

@@ -154,6 +154,11 @@ class Rollout(Shown):
         )
 
 
+def indices(places: Sequence[tuple[int, int]]) -> tuple[Tensor, ...] | None:
+    """Places (row, column) of a matrix, as `index_put` takes them; None if there are none."""
+    return tuple(torch.tensor(one, dtype=torch.long) for one in zip(*places)) or None
+
+
 class ReducedModel(Shown, nn.Module):
     """y' = S y + C phi(y, u). `forward(t, y)` follows torchdiffeq, y (..., states); inputs come
     from `signal(t)`.
@@ -203,18 +208,12 @@ class ReducedModel(Shown, nn.Module):
         self.signal: nn.Module | None = None
         self._table = tabulate(self.terms, (*self.states, *self.inputs))
         entries = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
-        self._entries = (
-            tuple(torch.tensor(index, dtype=torch.long) for index in zip(*entries))
-            if entries
-            else None
-        )
+        self._entries = indices(entries)
         law = [
             (self.inputs.index(name), [*self.states, *self.outer].index(other))
             for name, gains in self.feedback.items() for other in gains
         ]  # fmt: skip
-        self._law = (
-            tuple(torch.tensor(index, dtype=torch.long) for index in zip(*law)) if law else None
-        )
+        self._law = indices(law)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         rows = [tuple(line.split(" = ", 1)) for line in self.text()]

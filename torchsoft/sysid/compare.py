@@ -337,7 +337,7 @@ def refitted(
             x[i] = one.to_x(float(np.clip(known[one.label], one.low, one.high)))
     if (x == law.x).all():
         return None
-    free = tuple(label for label, one in zip(c.labels, law.free) if one)
+    free = tuple(one.label for one in c.within(law.free))
     try:
         stage = Stage("again", tuple(which), free, law.rtol, tolerance=CLOSE)
         fit = run_plan(law.problem, runner, [stage], x).fit

@@ -105,18 +105,13 @@ def next_recording(
         [*problem.recordings, *candidates], problem.sensors, problem.unknowns, problem.noise
     )
     known = dict(zip(problem.coordinates.labels, x))
-    c, x = (
-        both.coordinates,
-        np.array(
-            [known.get(a.label, s) for a, s in zip(both.coordinates.all, both.coordinates.start)]
-        ),
-    )
+    c = both.coordinates
+    x = c.begun(known)
     names, T = chosen(both, x, names)
     runner, priors = Runner(both.recordings, workers), len(c.priors)
     have = both.residuals(runner, x, problem.names, rtol, c.free)
     if have.lost:
-        reasons = "; ".join(f"`{name}`: {lost.reason}" for name, lost in have.lost.items())
-        raise ValueError(f"`x` does not reproduce what was recorded: {reasons}")
+        raise ValueError(f"`x` does not reproduce what was recorded: {have.reasons}")
 
     def covariance(J: Array, those: Sequence[str]) -> Array:
         """Of the coordinates that matter to some recordings; zero for the others."""

@@ -177,7 +177,7 @@ def conclude(
         else covariance(J, at.r, how.loss, len(c.priors), exact)
     )
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
-    labels = [label for label, one in zip(c.labels, free) if one]
+    labels = [one.label for one in c.within(free)]
     found = estimates(problem, x, free, C, shift)
     predicted, notices = {}, list(findings)
     if how.heldout:

@@ -80,8 +80,7 @@ class Whitened(NamedTuple):
 def sampler() -> Any:
     """nutpie. Raises `ImportError` with the remedy where it is missing."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # arviz announces its next edition
+        with warnings.catch_warnings(action="ignore"):  # arviz announces its next edition
             importlib.import_module("nutpie.compiled_pyfunc")
             return importlib.import_module("nutpie")
     except ImportError as missing:
@@ -136,8 +135,7 @@ def nuts(
         ["x"],
         make_initial_point_fn=start,
     )
-    with single_threaded(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with single_threaded(), warnings.catch_warnings(action="ignore"):
         trace = package.sample(
             model, chains=chains, cores=min(chains, o.workers), draws=draws, tune=tune,
             target_accept=accept, seed=seed, progress_bar=progress,

@@ -129,11 +129,9 @@ class Planner:
             if which:
                 at = p.residuals(self._others, x, which, self.rtol, p.coordinates.free)
                 if at.lost:
-                    reasons = "; ".join(
-                        f"`{name}`: {lost.reason}" for name, lost in at.lost.items()
-                    )
                     raise ValueError(
-                        f"a draw of the parameters does not reproduce what was recorded: {reasons}"
+                        f"a draw of the parameters does not reproduce what was recorded: "
+                        f"{at.reasons}"
                     )
                 J = at.J[: len(at.J) - len(p.coordinates.priors)]
             self._known[x.tobytes()] = np.linalg.qr(J)[1]

@@ -158,7 +158,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
         x = o.place(z[k])
         at = o.residuals(x)
         if at.lost:
-            return -np.inf, next(iter(at.lost.values())).reason
+            return -np.inf, at.reason
         return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
 
     with single_threaded(), tqdm(desc="Laplace", total=draws, disable=not progress) as bar:

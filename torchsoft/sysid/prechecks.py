@@ -181,8 +181,7 @@ def precheck(
     which = problem.names if which is None else which
     unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
     jobs = problem.jobs(x, which, LOOSE, None)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of motions that a mistake makes violent
+    with warnings.catch_warnings(action="ignore"):  # of motions that a mistake makes violent
         runs = runner.run(jobs)
     for job, got in zip(jobs, runs):
         recording, expected = problem.recordings[job.recording], {}

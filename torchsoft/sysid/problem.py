@@ -42,6 +42,16 @@ class Residuals(NamedTuple):
     J: Array
     lost: dict[str, FailedRun]
 
+    @property
+    def reason(self) -> str:
+        """Reason of the first failed run, empty if there is none."""
+        return next((one.reason for one in self.lost.values()), "")
+
+    @property
+    def reasons(self) -> str:
+        """Every failed run with its reason."""
+        return "; ".join(f"`{name}`: {one.reason}" for name, one in self.lost.items())
+
 
 def with_extensions(
     recordings: Sequence[Recording], unknowns: dict[str, Unknown]
@@ -81,8 +91,8 @@ def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> Non
 
 def check_value(recording: Recording, name: str, value: float) -> None:
     """Raises `ValueError` for a parameter value that makes the rig impossible."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a steep friction law, which a search may pass through
+    # of a steep friction law, through which a search may pass
+    with warnings.catch_warnings(action="ignore"):
         if isinstance(recording.rig, SoftGrasp) and name in NAMES:
             recording.rig.settings.override({name: value})
         else:
@@ -202,10 +212,6 @@ class Problem:
             for channel, (t, _) in recording.samples.items()
             if channel in self.sensors
         )
-
-    @property
-    def data_seconds(self) -> float:
-        return sum(recording.duration for recording in self.recordings)
 
     def values(self, x: Array, k: int) -> dict[str, float]:
         """Values of the unknowns of the rig and of the start in recording k."""

@@ -78,9 +78,7 @@ class Optimum:
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the free coordinates."""
-        return tuple(
-            label for label, free in zip(self.problem.coordinates.labels, self.free) if free
-        )
+        return tuple(one.label for one in self.problem.coordinates.within(self.free))
 
     @property
     def J(self) -> Array:
@@ -111,7 +109,7 @@ class Optimum:
 
     def values(self, z: Array) -> Array:
         """Free coordinates z (..., free coordinates) in physical units."""
-        mine = [c for c, free in zip(self.problem.coordinates.all, self.free) if free]
+        mine = self.problem.coordinates.within(self.free)
         return np.stack(
             [np.vectorize(c.to_value, [float])(z[..., i]) for i, c in enumerate(mine)], -1
         )
@@ -306,7 +304,7 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
             x, at = fit.x, fit.at
             x[i] = aim
     if at.lost:
-        return None, next(iter(at.lost.values())).reason
+        return None, at.reason
     return Point(x, (float(at.r @ at.r) - o.square) / o.variance, at), ""
 
 

@@ -133,7 +133,7 @@ def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None
              for r in other.recordings if r.name in end.steps}  # fmt: skip
     got = other.residuals(runner, end.x, end.which, steps)
     if got.lost:
-        return None, f"a run failed: {next(iter(got.lost.values())).reason}"
+        return None, f"a run failed: {got.reason}"
     return got.r - end.base.r, ""
 
 
@@ -176,14 +176,14 @@ def joint_fit(
     if not tried:
         return None
     c, free = other.coordinates, freed(problem, other, end)
-    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
+    labels = tuple(one.label for one in c.within(free))
     plan = [
         Stage(f"joint by rtol = {rtol:g}", end.which, labels, rtol, ALL, ROUGH)
         for rtol in (LOOSE, end.rtol)
     ]
     at, fits = dict(zip(problem.coordinates.labels, end.x)), list[Fit]()
     runner = end.runner.of(other.recordings)
-    for x in (np.array([at.get(one, own) for one, own in zip(c.labels, c.start)]), c.start):
+    for x in (c.begun(at), c.start):
         with suppress(Unreachable):
             fits.append(run_plan(other, runner, plan, x, loss=loss, notify=notify).fit)
             if float(fits[-1].at.r @ fits[-1].at.r) <= enough:
@@ -242,11 +242,11 @@ def refit(
     c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
     if joint is not None:
         at |= {label: joint.at[label] for label in c.labels if label in joint.at}
-    x = np.array([at.get(label, own) for label, own in zip(c.labels, c.start)])
+    x = c.begun(at)
     free = freed(problem, other, end)
-    stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
+    stuck = [one for one in c.within(free & c.at_bound(x)) if one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
+    labels = tuple(one.label for one in c.within(free))
     runner = end.runner.of(other.recordings)
 
     def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:

@@ -106,8 +106,7 @@ def rebuildable(rig: Rig) -> bool:
         return False
     settings = rig.settings
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a steep friction law
+        with warnings.catch_warnings(action="ignore"):  # of a steep friction law
             Parameters.model_validate(settings.model_dump())
     except ValueError:
         return False
@@ -447,8 +446,8 @@ def load_answer(path: str | Path) -> IdentificationResult:
             f"{path} is damaged: its content is not what was saved; restore it from a copy, or "
             "identify again"
         )
-    with refusing(content, str(path)), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a steep friction law, which was fitted nevertheless
+    # of a steep friction law, which was fitted nevertheless
+    with refusing(content, str(path)), warnings.catch_warnings(action="ignore"):
         return adapter().validate_json(json.dumps(content))
 
 

@@ -10,7 +10,6 @@ determine it.
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
@@ -192,7 +191,8 @@ def check_assumptions(
     judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
     untried = [one.name for one in taken if one.vary is not None]
     try:
-        with quiet():
+        # such as of pads that creep longer than the lead of a run
+        with warnings.catch_warnings(action="ignore"):
             first = columns_of(problem, end, taken)
         judge.columns = {one.name: d for one, d in first if d.any()}
         checks |= {one.name: judge.column(one, d) for one, d in first if d.any()}
@@ -237,7 +237,8 @@ def new_fits(
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     count = len(candidates)
-    with quiet(), tqdm(total=count + 1, unit="fit", disable=not progress) as bar:
+    bar = tqdm(total=count + 1, unit="fit", disable=not progress)
+    with warnings.catch_warnings(action="ignore"), bar:
 
         def notify(chi2: float) -> None:
             bar.set_postfix_str(f"chi2 = {chi2:.4g}")
@@ -273,14 +274,6 @@ def new_fits(
             yield one
             if judge.nearly(checks[one.name]):
                 enough = max(enough, RIVAL * gains[one.name])
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Suppress warnings, such as of pads that creep longer than the lead of a run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
@@ -327,9 +320,7 @@ class Judge:
         self.end, self.r, self.J = end, end.at.r, end.at.J[:, end.free]
         self.Q, _ = np.linalg.qr(self.J)
         self.sd = standard_deviations(self.J)
-        self.coordinates = [
-            one for one, is_free in zip(problem.coordinates.all, end.free) if is_free
-        ]
+        self.coordinates = problem.coordinates.within(end.free)
         self.labels = [one.label for one in self.coordinates]
         self.columns, self.ends = dict[str, Array](), dict[str, tuple[Array, Array]]()
         self.parts = parts(problem, self.r, end.which)

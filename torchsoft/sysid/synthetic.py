@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -29,8 +28,6 @@ RIG = {
 RTOL = 1e-6
 """Relative tolerance of the runs behind synthetic recordings, a tenth of a fit's."""
 
-AS_STATED: Mapping[str, float] = MappingProxyType({})
-
 
 def record(
     name: str, planned: BuiltRig[Any], truth: Mapping[str, float] | Rig,
@@ -55,7 +52,7 @@ def record(
     made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)
     begun, early = made.begin(), int(begins.lead > 0)
     if isinstance(truth, Rig):
-        own, truth = deepcopy(truth), AS_STATED
+        own, truth = deepcopy(truth), {}
         own.reference = rig.reference
         y0 = begins.begin(own, made.samples)
         if isinstance(begun.y0, HeldPads):  # displacements at the nominal parameters

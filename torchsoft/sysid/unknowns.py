@@ -392,6 +392,14 @@ class Coordinates:
             [c.to_x(c.high) for c in self.all]
         )
 
+    def begun(self, known: Mapping[str, float]) -> Array:
+        """Vector x (n,) with the `known` entries by label, and the nominal values elsewhere."""
+        return np.array([known.get(label, own) for label, own in zip(self.labels, self.start)])
+
+    def within(self, mask: NDArray[np.bool_]) -> list[Coordinate]:
+        """The coordinates of a mask (n,)."""
+        return [one for one, is_in in zip(self.all, mask) if is_in]
+
     def at_bound(self, x: Array) -> NDArray[np.bool_]:
         """Mask of coordinates (n,) within `AT_BOUND` of a bound."""
         low, high = self.bounds
