@@ -12,10 +12,8 @@ from torch import Tensor
 
 from torchsoft import Coulomb, Rig, Trajectory, simulate
 from torchsoft.physics.contact import cross, turned
-from torchsoft.physics.energy import stored
+from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.multibond import net_efforts
-from torchsoft.physics.rig import Evaluation
-from torchsoft.physics.state import State
 from torchsoft.solve.kernel.arrays import GAMMA
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.rates import Rates
@@ -56,41 +54,6 @@ def telling(start: Start) -> int:
         if all(on.any() and not on.all() for on in touching) and some.any() and not some.all():
             return seed
     raise AssertionError("no state touches, sticks and slips at every contact")
-
-
-def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
-    """Powers [W] that the R elements take out, each shaped like the batch and never negative."""
-    powers, dashpots, slip = {}, 0.0, 0.0
-    for name, pad in rig.pads.items():
-        port = graph.ports[f"pad_{name}"]
-        if pad.inertial:
-            u_dot = port.transformer.flow(graph.flows)
-            powers[f"pad_{name}"] = (
-                pad.retardation_time(name) * u_dot * pad.elastic_force(u_dot)
-            ).sum((-2, -1))
-        else:
-            fractions, times = pad.chain()
-            rate = (
-                (port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]
-            ).flatten(-2)
-            powers[f"pad_{name}"] = (
-                fractions * times * ((rate @ pad.compliance()) * rate).sum(-1)
-            ).sum(-1)
-    for interface in graph.interfaces.values():
-        dashpots, slip = (
-            dashpots + interface.out[..., 5].sum(-1),
-            slip + interface.out[..., 6].sum(-1),
-        )
-    return powers | {"contact_dashpots": torch.as_tensor(dashpots), "slip": torch.as_tensor(slip)}
-
-
-def supplied(graph: Evaluation) -> dict[str, Tensor]:
-    """Powers [W] that the sources put in, by their port, each shaped like the batch."""
-    return {
-        name: (port.effort * port.transformer.flow(graph.flows)).sum((-2, -1))
-        for name, port in graph.ports.items()
-        if port.source
-    }
 
 
 def assert_power_balanced(start: Start, seed: int, t: float = 0.01) -> None:

@@ -1,6 +1,8 @@
 """Energies of a rig: those stored in its C and I fields, element by element, at given states.
 
-Dissipated and supplied energies are integrated beside the state by the stepper, from the same laws.
+Dissipated and supplied energies are integrated beside the state by the stepper, from the same laws;
+`powers` reads them off the ports of the multibond graph, so that the balance at one instant can be
+checked without any stepper.
 """
 
 from collections.abc import Mapping
@@ -9,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rig import Rig
+from torchsoft.physics.rig import Evaluation, Rig
 from torchsoft.physics.state import State
 
 
@@ -72,3 +74,34 @@ def stores(rig: Rig) -> tuple[str, ...]:
         names += [name] * any(axis < 2 for axis in axes) + [f"{name}_spin"] * (2 in axes)
     names += [f"kinetic_{name}" for name, pad in rig.pads.items() if pad.inertial]
     return tuple(rig.renamed.get(name, name) for name in names)
+
+
+def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
+    """Powers [W] that the R elements take out, each shaped like the batch and never negative."""
+    powers, dashpots, slip = {}, 0.0, 0.0
+    for name, pad in rig.pads.items():
+        port = graph.ports[f"pad_{name}"]
+        if pad.inertial:
+            u_dot = port.transformer.flow(graph.flows)
+            powers[f"pad_{name}"] = (
+                pad.retardation_time(name) * u_dot * pad.elastic_force(u_dot)
+            ).sum((-2, -1))
+        else:
+            fractions, times = pad.chain()
+            rate = (
+                (port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]
+            ).flatten(-2)
+            powers[f"pad_{name}"] = (
+                fractions * times * ((rate @ pad.compliance()) * rate).sum(-1)
+            ).sum(-1)
+    for interface in graph.interfaces.values():
+        dashpots, slip = (
+            dashpots + interface.out[..., 5].sum(-1),
+            slip + interface.out[..., 6].sum(-1),
+        )
+    return powers | {"contact_dashpots": torch.as_tensor(dashpots), "slip": torch.as_tensor(slip)}
+
+
+def supplied(graph: Evaluation) -> dict[str, Tensor]:
+    """Powers [W] that the sources put in, by their port, each shaped like the batch."""
+    return {name: port.power(graph.flows) for name, port in graph.ports.items() if port.source}

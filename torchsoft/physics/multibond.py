@@ -76,6 +76,10 @@ class Port:
     source: bool = False
     senses: tuple[str, ...] = ()
 
+    def power(self, flows: Mapping[str, Tensor]) -> Tensor:
+        """e . f [W], shape (...): into the element, or out of it for a source."""
+        return (self.effort * self.transformer.flow(flows)).sum((-2, -1))
+
 
 def net_efforts(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> dict[str, Tensor]:
     """Net effort at every 1-junction, which its I field integrates: sum of +-T^T e over the
