@@ -1,7 +1,5 @@
 """A friction law written by the user, learned through the compiled stepper, and a surrogate."""
 
-import json
-
 import pytest
 import torch
 from conftest import f64
@@ -45,13 +43,3 @@ def test_a_residual_learns_the_coefficient():
     assert student.law.mu(f64(0.0)).item() == pytest.approx(
         0.5 - 0.4 * 0.2913, abs=0.03
     )  # from 0.5
-
-
-@pytest.mark.slow
-def test_learn_dynamics_smoke(tmp_path):
-    module = experiment("learn_dynamics")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    numbers = json.loads((tmp_path / "summary.json").read_text())
-    assert set(numbers["held out"]) == {"mu = 0.5", "constant, fitted", "network"}
-    assert len(numbers["surrogate"]) == 6
-    assert (tmp_path / "learn_dynamics.png").exists()
