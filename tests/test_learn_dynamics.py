@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from conftest import f64
+from conftest import f64, times
 from test_experiments import experiment
 
 
@@ -12,7 +12,7 @@ def test_the_learned_law_solves_its_own_equation():
     torch.manual_seed(0)
     law = module.MuNetwork(20.0)
     torch.nn.init.normal_(law.net[2].weight, std=0.1)
-    E, F_N = torch.linspace(0.0, 30.0, 31, dtype=torch.float64), f64(20.0).expand(31)
+    E, F_N = times(30.0, 31), f64(20.0).expand(31)
     v = law(E, F_N, f64(880.0))
     stuck = law.mu(f64(0.0)) * F_N  # [N], what sticking can carry
     residual = (E - law.mu(v) * F_N).clamp(min=0.0) - 900.0 * v

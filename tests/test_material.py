@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, RUBBER
+from conftest import COARSE, RUBBER, f64
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd import gradcheck
@@ -119,7 +119,7 @@ def test_one_relaxation_time_is_the_standard_linear_solid():
 @torch.no_grad()
 def test_creep_and_complex_modulus_have_their_limits(material):
     """From nothing to 1/E; the storage modulus from E on grows, and losses are positive."""
-    E, ends = material.E.item(), torch.tensor([0.0, 1e6], dtype=torch.float64)
+    E, ends = material.E.item(), f64(0.0, 1e6)
     assert (material.creep(ends) * E).tolist() == pytest.approx([0.0, 1.0], abs=1e-12)
     modulus = material.complex_modulus(torch.logspace(-4, 2, 25, dtype=torch.float64))
     assert modulus.real[0].item() == pytest.approx(E, rel=1e-3)

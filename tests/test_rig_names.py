@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from conftest import nested
+from conftest import nested, times
 from test_controllers import file as controlled
 from torch import nn
 
@@ -76,7 +75,7 @@ def test_a_gain_is_differentiated_and_set_by_its_name():
     name = "controllers.jaw.gain_2_4"
     rig, y0, _ = controlled().build()
     assert rig.parameter(name).item() == 400.0
-    t = torch.linspace(0.0, 0.3, 7, dtype=torch.float64)
+    t = times(0.3, 7)
     how: dict[str, Any] = {"knots": simulate(rig, t, y0=y0).knots}
     by = simulate(rig, t, y0=y0, gradient="forward", wrt=[name], rigid=True, **how)
     ends = []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, f64, times
 
 from torchsoft import Parameters, Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
@@ -469,8 +469,8 @@ def test_catalogue_begins_at_rest_and_can_be_written_down():
 
 def test_a_sampled_set_point_follows_the_profile_it_was_taken_from():
     profile = Profile([0.0, 0.3, 0.8], [0.0, 1e-2, -5e-3])
-    t = torch.linspace(0, 0.8, 161, dtype=torch.float64)
-    between = torch.linspace(0.0, 0.8, 777, dtype=torch.float64)
+    t = times(0.8, 161)
+    between = times(0.8, 777)
     value, rate = profile(t)
     want, want_rate = profile(between)
     for rates, near in ((rate.tolist(), 1e-7), (None, 1e-6)):
@@ -481,4 +481,4 @@ def test_a_sampled_set_point_follows_the_profile_it_was_taken_from():
         step = 1e-6
         slope = (sampled(between[1:-1] + step)[0] - sampled(between[1:-1] - step)[0]) / (2 * step)
         assert float((slope - got_rate[1:-1]).abs().max()) < 1e-6
-    assert float(sampled(torch.tensor([5.0], dtype=torch.float64))[0]) == pytest.approx(-5e-3)
+    assert float(sampled(f64(5.0))[0]) == pytest.approx(-5e-3)

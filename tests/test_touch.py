@@ -214,7 +214,7 @@ def test_taxels_of_a_rig_file_are_columns_of_its_recordings(tmp_path):
     skin = {"skin": {"pad": "left_tip", "width": 2e-3, "count": 3, "spread": 5e-4}}
     file = fingers(taxels=skin)
     rig, y0, _ = file.build()
-    t = torch.linspace(0, 0.4, 81, dtype=torch.float64)
+    t = times(0.4, 81)
     run = simulate(rig, t, y0=y0, rtol=1e-5)
     text = RIG.read_text(encoding="utf-8") + (
         '\n[taxels.skin]\npad = "left_tip"\nwidth = 2e-3\ncount = 3\nspread = 5e-4\n'
