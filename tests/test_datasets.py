@@ -165,17 +165,6 @@ def test_another_shard_size_makes_the_same_data(made, tmp_path):
     assert here.equals(there)
 
 
-def test_xarray_opens_it_with_units(made):
-    data = xr.open_zarr(made[0])
-    assert dict(data.normal_force_L.sizes) == {"trajectory": 5, "time": 91, "L_point": 61}
-    assert data.normal_force_L.attrs["units"] == "N"
-    assert data.displacement_U.dims == ("trajectory", "time", "U_point", "axis")
-    assert all("units" in data[name].attrs for name in data.data_vars)
-    rest, grasp = (float(data.normal_force_L.isel(trajectory=0, time=i).sum()) for i in (0, 50))
-    assert rest == pytest.approx(0.4065 * 9.81, rel=2e-3)  # [N], the disc's weight
-    assert 20 < grasp < 120
-
-
 @pytest.mark.parametrize(
     ("fixed", "points", "stores"),
     [

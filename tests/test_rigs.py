@@ -569,12 +569,3 @@ def test_a_failure_keeps_what_was_simulated(small, tmp_path, capsys):
         "the body was lost"
         in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
     )
-
-
-def test_check_and_run_name_what_cannot_be_read(tmp_path, capsys):
-    (tmp_path / "no.toml").write_text("[[", encoding="utf-8")
-    for command in ("check", "run"):
-        assert main([command, str(tmp_path / "none.toml")]) == 2
-        assert "none.toml: No such file or directory" in capsys.readouterr().err
-        assert main([command, str(tmp_path / "no.toml")]) == 2
-        assert "no.toml is not a TOML file" in capsys.readouterr().err
