@@ -10,7 +10,6 @@ import torch
 from conftest import COARSE, RUBBER, f64
 from scipy.optimize import brentq
 from torch import Tensor
-from torch.autograd import gradcheck
 
 from torchsoft import (
     Actuator,
@@ -92,18 +91,6 @@ def test_a_relaxation_series_is_its_chain_exactly(name):
     assert bool((J > 0).all())
     early = torch.tensor(sorted(tau), dtype=torch.float64)
     assert bool((late > early).all() and (late[:-1] < early[1:]).all())
-
-
-@pytest.mark.parametrize("name", ["one", "unsorted", "ten decades"])
-def test_the_conversion_is_differentiable(name):
-    """In logarithms of moduli and times, against differences."""
-    moduli, tau = (torch.tensor(x, dtype=torch.float64) for x in SERIES[name])
-
-    def logarithms(m: Tensor, t: Tensor) -> Tensor:
-        return torch.cat([x.log() for x in retarded(m.exp(), t.exp())])
-
-    m, t = (moduli / 7.5e5).log().requires_grad_(), tau.log().requires_grad_()
-    assert gradcheck(logarithms, (m, t), eps=1e-6, atol=1e-8, rtol=1e-6)
 
 
 @torch.no_grad()
