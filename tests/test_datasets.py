@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ trajectories = {{trajectories}}
 trajectories_per_shard = {{shard}}
 duration = 0.9
 sample_interval = 0.01
-step = 0.002
+step = 0.005
 samples_per_chunk = 40
 [fixed]
 "pads.L.elements_x" = 60
@@ -100,10 +101,8 @@ def copy(source: Path, target: Path) -> Path:
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path):
     config = Config.from_toml(path)
-    shares = [
-        sum(split(config, i) == name for i in range(1000)) / 1000
-        for name in ("train", "validation", "test")
-    ]
+    found = Counter(split(config, i) for i in range(1000))
+    shares = [found[name] / 1000 for name in ("train", "validation", "test")]
     np.testing.assert_allclose(shares, [0.7, 0.15, 0.15], atol=0.01)
 
 
@@ -165,17 +164,6 @@ def test_another_shard_size_makes_the_same_data(made, tmp_path):
     generate(config, str(tmp_path / "set"), Serial(), progress=False)
     here, there = (open_dataset(str(path)).load() for path in (tmp_path / "set", folder))
     assert here.equals(there)
-
-
-def test_xarray_opens_it_with_units(made):
-    data = xr.open_zarr(made[0])
-    assert dict(data.normal_force_L.sizes) == {"trajectory": 5, "time": 91, "L_point": 61}
-    assert data.normal_force_L.attrs["units"] == "N"
-    assert data.displacement_U.dims == ("trajectory", "time", "U_point", "axis")
-    assert all("units" in data[name].attrs for name in data.data_vars)
-    rest, grasp = (float(data.normal_force_L.isel(trajectory=0, time=i).sum()) for i in (0, 50))
-    assert rest == pytest.approx(0.4065 * 9.81, rel=2e-3)  # [N], the disc's weight
-    assert 20 < grasp < 120
 
 
 @pytest.mark.parametrize(

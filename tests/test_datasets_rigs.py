@@ -18,7 +18,7 @@ from torchsoft.datasets.check import check, figure
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.distributions import Choice, Normal
 from torchsoft.datasets.files import Manifest
-from torchsoft.datasets.generate import Serial, cost, generate, local_workers
+from torchsoft.datasets.generate import Serial, generate, local_workers
 from torchsoft.datasets.rig_files import embedded
 from torchsoft.physics.energy import stores
 from torchsoft.rigs import RigFile
@@ -244,12 +244,6 @@ def test_channels_are_chosen_and_points_left_out(tmp_path):
     assert [one.get_text() for one in drawn.legends[0].get_texts()]
     assert not any(ax.get_legend() for ax in drawn.axes)
     assert all(ax.axison and ax.has_data() for ax in drawn.axes)
-
-
-def test_its_price_is_of_the_right_order(made):
-    price = cost(made[1], 1)
-    assert 0.05 < price.seconds < 10.0
-    assert price.memory < 0.1
 
 
 def tree(folder: Path) -> Any:

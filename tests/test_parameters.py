@@ -125,11 +125,6 @@ def test_a_trajectory_that_just_stays_on_the_pad_is_accepted():
     assert Parameters().override({"scenario.travel": -54e-3}).scenario.travel == -54e-3
 
 
-def test_parameters_are_frozen():
-    with pytest.raises(InvalidTable, match="cannot be set"):
-        Parameters().pad.E = 1.0
-
-
 # the warning
 # ----------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from conftest import coarse
+from conftest import coarse, times
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -44,7 +44,7 @@ def manipulated(**changes: object) -> Done:
     """The first 0.2 s of the grasp on a coarse mesh, with a force that need not be looked for."""
     model = coarse(**changes)
     start = grasp_and_roll(model, grasp_force=80.0)
-    return model, simulate(model, torch.linspace(0, 0.2, 21, dtype=torch.float64), y0=start.y0)
+    return model, simulate(model, times(0.2, 21), y0=start.y0)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_the_stress_under_a_contact_carries_its_force(done):
     """In a held grasp s_yy, summed along the bonded layer, balances the nodal forces."""
     model = coarse(pad__elements_x=120, pad__elements_y=6)
     start = grasp_and_roll(model, grasp_force=80.0)
-    run = simulate(model, torch.linspace(0, 0.6, 4, dtype=torch.float64), y0=start.y0)
+    run = simulate(model, times(0.6, 4), y0=start.y0)
     pad = run.setup.pads["L"]
     stress = pad.stress(pad.strain(pad.displacement(run.displacement["L"][-1].numpy())))
     nodes = pad.mesh.nodes[pad.mesh.elements]
@@ -161,7 +161,7 @@ def held():
     pose = state.pose | {
         name: torch.tensor(place, dtype=torch.float64) for name, place in start.items()
     }
-    t = torch.linspace(0, 0.12, 13, dtype=torch.float64)
+    t = times(0.12, 13)
     return rig, simulate(rig, t, y0=rig.pack(state._replace(pose=pose)), step=1e-3)
 
 
