@@ -2,7 +2,7 @@
 
 import sys
 
-from torchsoft.datasets.check import main
+from torchsoft.cli import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(["dataset", "check", *sys.argv[1:]]))

@@ -2,7 +2,7 @@
 
 import sys
 
-from torchsoft.datasets.generate import main
+from torchsoft.cli import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(["dataset", "make", *sys.argv[1:]]))

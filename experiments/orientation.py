@@ -236,12 +236,10 @@ def outcome(case: Case, run: Trajectory, stopped: str, config: Config) -> Outcom
         angle.abs(),
         run["F_turn_lower"] if "F_turn_lower" in run.channels else torch.zeros_like(run.t),
     )
-    turn = case.signals["x_d"]
+    turn, end = case.signals["x_d"], float(run.t[-1])
     assert isinstance(turn, Piecewise)
-    rests = [
-        run.at(float(turn.times[0])),
-        len(run.t) - 1,
-    ]  # the turn has come to rest when the way begins
+    # the turn has come to rest when the way begins
+    rests = [run.at(min(float(turn.times[0]), end)), len(run.t) - 1]
     share = [
         f[later, :, 1].sum(-1).abs() / f[later, :, 0].sum(-1).clamp(min=1e-9)
         for f in run.force.values()
@@ -253,7 +251,7 @@ def outcome(case: Case, run: Trajectory, stopped: str, config: Config) -> Outcom
         *off, float(position[rests].max()),
         float(angle[rests].max()), float(torch.stack(share).max()),
         float(effort.detach()[later].abs().max()),
-        MM * float((opening - opening[run.at(GRIPPED)])[later].abs().max()),
+        MM * float((opening - opening[run.at(min(GRIPPED, end))])[later].abs().max()),
         "lost" if stopped else "within" if within else "beyond", stopped,
     )  # fmt: skip
 

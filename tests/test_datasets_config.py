@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from torchsoft.cli import main
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.distributions import Uniform
-from torchsoft.datasets.generate import main
 from torchsoft.datasets.rig_files import embedded
-from torchsoft.datasets.simulation import points, task
+from torchsoft.datasets.simulation import points
 from torchsoft.tables import InvalidTable
 
 PATH = Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml"
@@ -95,7 +95,7 @@ def test_numbers_that_are_whole_are_numbers():
             60,
             "kinds.0.fixed: it changes the contact points of pads.L",
         ),
-        (("workers",), 3, "workers is not known here"),
+        (("workers",), 3, "`workers` is not known here"),
         (("parameters", "materials.rubber.E"), {"low": 9e5, "high": 8e5}, "rubber.E: low = 9"),
         (("parameters", "materials.rubber.E", "low"), -1.0, "logarithmic range needs low > 0"),
         (("duration",), 0.4, "kinds.1.fixed: impossible: motion.x_d.stroke_time = 0.3 s makes 0"),
@@ -121,7 +121,7 @@ def test_kinds_are_drawn_by_weight_with_their_own_numbers():
     kinds, otherwise distributed."""
     light = {"name": "light", "weight": 3.0, "parameters": {"motion.y_d.values.1": LIGHT}}
     config = Config.model_validate(SMOKE | {"trajectories": 256, "kinds": [*SMOKE["kinds"], light]})
-    tasks = [task(config, i, u) for i, u in enumerate(points(config))]
+    tasks = [config.subject.task(i, u) for i, u in enumerate(points(config))]
     of = {
         kind.name: [one for one in tasks if one.labels["kind"] == kind.name]
         for kind in config.kinds
@@ -154,7 +154,7 @@ def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, file, ou
     monkeypatch.chdir(tmp_path)
     text = PATH.read_text().replace("../../rigs", str(PATH.parents[2] / "rigs"))
     Path("million.toml").write_text(text.replace("trajectories = 8", "trajectories = 1000000"))
-    assert main([file, "--out", out, "--workers", "0"]) == 2
+    assert main(["dataset", "make", file, "--out", out, "--workers", "0"]) == 2
     said = capsys.readouterr().err
     assert message in said
     assert said.count("\n") == 1
@@ -163,6 +163,6 @@ def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, file, ou
 
 def test_the_command_takes_no_nonsense_for_workers(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["set.toml", "--out", "set", "--workers", "-3"])
+        main(["dataset", "make", "set.toml", "--out", "set", "--workers", "-3"])
     assert end.value.code == 2
     assert "--workers: should be from 0 to 1000, not -3" in capsys.readouterr().err

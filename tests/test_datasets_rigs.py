@@ -18,7 +18,7 @@ from torchsoft.datasets.check import check, figure
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.distributions import Choice, Normal
 from torchsoft.datasets.files import Manifest
-from torchsoft.datasets.generate import Serial, cost, generate, local_workers
+from torchsoft.datasets.generate import Serial, generate, local_workers
 from torchsoft.datasets.rig_files import embedded
 from torchsoft.physics.energy import stores
 from torchsoft.rigs import RigFile
@@ -246,12 +246,6 @@ def test_channels_are_chosen_and_points_left_out(tmp_path):
     assert all(ax.axison and ax.has_data() for ax in drawn.axes)
 
 
-def test_its_price_is_of_the_right_order(made):
-    price = cost(made[1], 1)
-    assert 0.05 < price.seconds < 10.0
-    assert price.memory < 0.1
-
-
 def tree(folder: Path) -> Any:
     return embedded(tomllib.loads(written(folder).read_text()), folder)
 
@@ -301,7 +295,7 @@ def tree(folder: Path) -> Any:
         (("channels",), ["x_disk"],
          "channels: `x_disk` is no channel of the rig; there are x_disc"),
         (("channels",), ["x_disc", "x_disc"], "channels: every name once"),
-        (("grasp_depth",), {"low": 1e-3, "high": 1e-3}, "grasp_depth is not known here"),
+        (("grasp_depth",), {"low": 1e-3, "high": 1e-3}, "`grasp_depth` is not known here"),
         (("parameters",), {}, "parameters is missing: nothing would differ"),
         (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
         (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),

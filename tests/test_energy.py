@@ -3,7 +3,7 @@ rigs, without any stepper."""
 
 import pytest
 import torch
-from conftest import coarse, f64, random_state
+from conftest import coarse, f64, random_state, times
 
 from torchsoft import simulate
 from torchsoft.physics.energy import stored
@@ -42,7 +42,7 @@ def test_stored_energies_by_hand():
 def test_a_run_balances_its_energies_better_with_smaller_steps():
     """To 1e-3 of the energy injected at 2 ms over grasp and first stroke, and better at 0.5 ms."""
     manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
-    t = torch.linspace(0, 0.6, 61, dtype=torch.float64)
+    t = times(0.6, 61)
     residual = [
         simulate(manipulation.model, t, y0=manipulation.y0, step=h).energy_residual_rel
         for h in (2e-3, 1e-3, 5e-4)

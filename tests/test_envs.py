@@ -326,6 +326,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "rate": ({"interval": 1e-6}, "`interval` must be at least 0.0001 s"),
     "duration": ({"duration": 0.25}, "must be a multiple of `interval` = 0.1 s, but is 0.25 s"),
     "short": ({"begin": 2.25}, "but is 0.05 s, the rest of the run after `begin`"),
+    "late": ({"begin": 9.0, "duration": 0.5}, "9 s is not before the end of the rig's own motion"),
     "begin": ({"begin": -1.0}, "`begin` must be a time from 0 s on"),
     "both": ({"reward": lambda *_: 0.0}, "give either a `goal` or a `reward`"),
     "body": ({"goal": Goal("disk", {"x": 0.0}, {"x": 1.0})}, "`goal.target` names `disk.x`; did"),

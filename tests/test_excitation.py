@@ -1,7 +1,7 @@
 """Excitations: what cannot be carried out is refused by its field before anything is simulated."""
 
 import pytest
-import torch
+from conftest import f64
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Knots, begin
@@ -41,7 +41,7 @@ def test_knots_are_reached_from_the_grasp():
     knots, p = Knots(x=((0.1, 4e-3), (0.3, -2e-3)), y=((0.2, -1e-4),)), Parameters()
     excitation = Excitation(motion=knots, grasp_time=0.2, settle=0.1, duration=0.8, depth=1e-3)
     reference, since = begin(excitation, p).rig.reference, 0.3
-    t = torch.tensor([0.0, since, since + 0.1, since + 0.2, since + 0.3, 5.0], dtype=torch.float64)
+    t = f64(0.0, since, since + 0.1, since + 0.2, since + 0.3, 5.0)
     value, rate = reference(t, ["x_d", "y_d"]).unbind(-1)
     x, y = 60.3e-3, apart(p)
     assert value[:, 0].tolist() == pytest.approx([x, x, x + 4e-3, x + 1e-3, x - 2e-3, x - 2e-3])

@@ -7,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from statistics import median
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,10 +28,16 @@ def experiment(name: str) -> ModuleType:
     return module
 
 
+def smoke(name: str, out: Path) -> tuple[ModuleType, dict[str, Any]]:
+    """An experiment carried out at smoke size, and its summary."""
+    module = experiment(name)
+    run = module.main if hasattr(module, "main") else module.run
+    run(module.Config(out=out, smoke=True))
+    return module, json.loads((out / "summary.json").read_text())
+
+
 def test_grasp_and_roll_smoke(tmp_path):
-    module = experiment("grasp_and_roll")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    numbers = json.loads((tmp_path / "summary.json").read_text())
+    module, numbers = smoke("grasp_and_roll", tmp_path)
     assert numbers["y_C_grasp_mm"] == pytest.approx(23.20, abs=0.01)
     assert numbers["y_Br_hold_mm"]["max"] == pytest.approx(48.6, abs=0.002)
     assert (
@@ -114,9 +121,7 @@ def test_peers_smoke():
 def test_experiment_design_smoke(tmp_path):
     """Jerks of a light grasp see friction and dashpots better than strokes; together they see more
     than either alone."""
-    module = experiment("experiment_design")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    module, summary = smoke("experiment_design", tmp_path)
     single = {row["names"][0]: row["sd"] for row in summary["single"]}
     both = summary["together"][0]["sd"]
     assert single["jerks, light"]["contact.R_n"] < single["strokes"]["contact.R_n"]
@@ -128,9 +133,7 @@ def test_experiment_design_smoke(tmp_path):
 def test_identify_contact_smoke(tmp_path):
     """Without noise the truth, with noise the truth within what was predicted, by differences the
     same at more runs."""
-    module = experiment("identify_contact")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    _, summary = smoke("identify_contact", tmp_path)
     cases = {case["case"]: case for case in summary["cases"]}
     assert all(abs(p["relative_error"]) < 1e-3 for p in cases["noise-free"]["parameters"].values())
     for name, p in cases["noisy"]["parameters"].items():
@@ -147,9 +150,7 @@ def test_identify_contact_smoke(tmp_path):
 @pytest.mark.slow
 def test_identify_by_touch_smoke(tmp_path):
     """Taxels shrink every interval, shear shrinks it further, and the fits are within theirs."""
-    module = experiment("identify_by_touch")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    _, summary = smoke("identify_by_touch", tmp_path)
     without, _, normal, shear = summary["relative_sd"]["strokes"].values()
     for name, sd in without.items():
         assert sd > 1.5 * normal[name] > 2 * shear[name], name
@@ -163,9 +164,8 @@ def test_identify_by_touch_smoke(tmp_path):
 def test_interval_coverage_smoke(tmp_path):
     """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour
     is found where it is, and rig files are identified by their names."""
-    module = experiment("interval_coverage")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
+    module, summary = smoke("interval_coverage", tmp_path)
+    cases = summary["cases"]
     errors = {
         case: [abs(e) for one in row["parameters"].values() for e in one["errors"]]
         for case, row in cases.items()
@@ -184,10 +184,8 @@ def test_interval_coverage_smoke(tmp_path):
 @pytest.mark.slow
 def test_contact_points_smoke(tmp_path):
     """Two points an element take most of the nodes out of the force along the pad."""
-    module = experiment("contact_points")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
-    nodes, between = cases["1 mm, nodes"], cases["1 mm, 2"]
+    _, summary = smoke("contact_points", tmp_path)
+    nodes, between = (summary["cases"][name] for name in ("1 mm, nodes", "1 mm, 2"))
     name = "static ripple of the force along the pad [mN]"
     assert between[name] < 0.3 * nodes[name]
 
@@ -196,9 +194,7 @@ def test_contact_points_smoke(tmp_path):
 def test_orientation_smoke(tmp_path):
     """Loops turn and carry the disc within the tolerance; what they do not do is as rigid statics
     say, and is said."""
-    module = experiment("orientation")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    _, summary = smoke("orientation", tmp_path)
     alone, fed = summary["loops_alone"], summary["efforts_fed_forward"]["ellipse 1.3"]
     assert alone["disc"]["verdict"] == fed["verdict"] == "within"
     assert (
@@ -237,9 +233,7 @@ def test_orientation_rig_has_the_gains_of_its_design():
 @pytest.mark.slow
 def test_rolling_resistance_smoke(tmp_path):
     """Force and power give one resistance, near theory's, with a peak."""
-    module = experiment("rolling_resistance")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    _, summary = smoke("rolling_resistance", tmp_path)
     (one,) = summary["resistance"].values()
     assert one["power over force less one, largest"] < 0.02
     assert 0.97 < min(one["force over theory"]) < max(one["force over theory"]) < 1.06
@@ -261,9 +255,7 @@ def test_compliance_of_a_layer_has_both_limits():
 @pytest.mark.slow
 def test_startup_smoke(tmp_path):
     """Kernels of the wheel are as good as loaded; those that are missing are compiled."""
-    module = experiment("startup")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    found = json.loads((tmp_path / "summary.json").read_text())
+    _, found = smoke("startup", tmp_path)
     assert found["wheel_s"]["first run"] < 0.2 * found["fallback_s"]["first run"]
     assert found["processes_s"]["import torchsoft"] < found["processes_s"]["import torch"]
 
@@ -293,9 +285,61 @@ def test_a_policy_becomes_a_controller(tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_learn_policy_smoke(tmp_path):
-    module = experiment("learn_policy")
-    module.run(module.Config(out=tmp_path, smoke=True))
-    numbers = json.loads((tmp_path / "summary.json").read_text())
+    module, numbers = smoke("learn_policy", tmp_path)
     assert {one["method"] for one in numbers["trainings"]} == set(module.METHODS)
     assert all(x < 2 for part in numbers["deployed"]["missed_rad"].values() for x in part)
     assert torch.jit.load(tmp_path / "policy.pt")(f64(*[0.0] * 6)).shape == (3,)
+
+
+@pytest.mark.slow
+def test_learn_dynamics_smoke(tmp_path):
+    _, numbers = smoke("learn_dynamics", tmp_path)
+    assert set(numbers["held out"]) == {"mu = 0.5", "constant, fitted", "network"}
+    assert len(numbers["surrogate"]) == 6
+    assert (tmp_path / "learn_dynamics.png").exists()
+
+
+@pytest.mark.slow
+def test_gradient_accuracy_smoke(tmp_path):
+    """The windows are what they are called, and errors are 1e-6 where the judge is that good."""
+    _, numbers = smoke("gradient_accuracy", tmp_path)
+    assert set(numbers["windows"]) == {"stick", "slip", "make-break", "grasp", "full"}
+    slip, stick, grasp = (numbers["windows"][name] for name in ("slip", "stick", "grasp"))
+    assert slip["events"]["slip_onsets"] > 0
+    assert stick["events"]["slip_onsets"] + stick["events"]["touch"] == 0
+    assert grasp["events"]["touch"] > 3
+    for window in (slip, stick):
+        errors, unsure = window["relative_error"], window["judge_uncertainty"]
+        assert max(errors[name] for name in errors if unsure[name] <= 1e-6) <= 1e-6
+    assert (tmp_path / "table.md").read_text().count("|\n") == 7
+
+
+@pytest.mark.slow
+def test_reduced_model_smoke(tmp_path):
+    """What is found agrees with mechanics, and with the full model where it is used."""
+    module, numbers = smoke("reduced_model", tmp_path)
+    stick, slip = numbers["stick"], numbers["slip"]
+    assert stick["terms"] <= 10
+    assert stick["heldout_nrmse"] < 0.02
+    radius = stick["rolling_radius_mm"]
+    assert radius["found"] == pytest.approx(radius["expected"], rel=0.03)
+    found = {(row["equation"], row["term"]): row for row in stick["coefficients"]}
+    for term in ("x_Br - 2 x_C", "v_Br - 2 v_C"):
+        row = found["v_C", term]
+        assert abs(row["error"]) < 0.1
+        assert row["interval"][0] < row["value"] < row["interval"][1]
+    assert found["v_Br", "F_x"]["value"] == pytest.approx(1 / 0.4065, rel=0.05)
+    assert slip["heldout_nrmse"] < 0.1
+    fastest = min(slip["by_stroke"], key=lambda row: row["stroke_time_s"])
+    assert fastest["slipping"] > 0.5
+    assert fastest["nrmse_linear"] > 2 * fastest["nrmse"]  # it needs saturation
+    assert "| stick |" in module.table({"stick": stick, "slip": slip})
+
+
+@pytest.mark.slow
+def test_law_comparison_smoke(tmp_path):
+    """Named where contacts slip, and not where they roll."""
+    _, summary = smoke("law_comparison", tmp_path)
+    *near, far, other = summary["cases"]
+    assert [case["answer"] for case in (*near, far, other)] == ["right"] * 2 + ["cannot tell"] * 2
+    assert min(case["D"] for case in near) > 20 > 1 > max(far["D"], other["D"])

@@ -4,8 +4,7 @@ an identification."""
 from copy import deepcopy
 
 import pytest
-import torch
-from conftest import COARSE
+from conftest import COARSE, times
 
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.paper.equilibrium import rest
@@ -27,24 +26,20 @@ def test_what_a_rig_may_be_extended_by():
     )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def grasped():
-    """The grasp, run from rest, and its reference."""
+@pytest.mark.parametrize("slow", ["pad.slow(0.1 s)", "pad.slow(1 s)"])
+def test_neutral_extensions_change_nothing(slow):
+    """All of them at once; of slow branches a pad has one."""
     model = grasp_and_roll(deepcopy(MODEL)).model
-    t = torch.linspace(0, 0.3, 31, dtype=torch.float64)
-    return simulate(model, t, y0=rest(model)), model.reference
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_neutral_extension_changes_nothing(name, grasped):
-    model, (before, reference) = deepcopy(MODEL), grasped
-    extend(model, [name])
-    after = simulate(model, before.t, y0=rest(model), reference=reference, knots=before.knots)
+    before = simulate(model, times(0.3, 31), y0=rest(model))
+    names = [name for name in NAMES if name == slow or ".slow(" not in name]
+    extend(model, names)
+    after = simulate(model, before.t, y0=rest(model), knots=before.knots)
     for channel in ("x_C", "y_C", "theta", "F_x", "F_y"):
         moved = (after[channel] - before[channel]).abs().max()
         assert float(moved) <= 1e-8 * float(before[channel].abs().max() + 1e-3), channel
-    assert model.parameter(name).item() == extensions(MODEL)[name].neutral
-    assert name not in extensions(model)
+    for name in names:
+        assert model.parameter(name).item() == extensions(MODEL)[name].neutral
+    assert not extensions(model)
 
 
 def test_parts_that_are_shared_are_extended_once():
@@ -71,7 +66,7 @@ def test_names_are_those_of_a_rig_file():
 
 def test_an_extension_may_be_unknown():
     """With the bounds of its own search, or with those that are given."""
-    t = torch.linspace(0.0, 0.1, 11, dtype=torch.float64).numpy()
+    t = times(0.1, 11).numpy()
     recording = Recording("one", deepcopy(MODEL), {"F_y": (t, 0 * t)})
     unknowns = {
         "guides.bracket.x.friction": Unknown(),

@@ -1,10 +1,8 @@
 """A friction law written by the user, learned through the compiled stepper, and a surrogate."""
 
-import json
-
 import pytest
 import torch
-from conftest import f64
+from conftest import f64, times
 from test_experiments import experiment
 
 
@@ -14,7 +12,7 @@ def test_the_learned_law_solves_its_own_equation():
     torch.manual_seed(0)
     law = module.MuNetwork(20.0)
     torch.nn.init.normal_(law.net[2].weight, std=0.1)
-    E, F_N = torch.linspace(0.0, 30.0, 31, dtype=torch.float64), f64(20.0).expand(31)
+    E, F_N = times(30.0, 31), f64(20.0).expand(31)
     v = law(E, F_N, f64(880.0))
     stuck = law.mu(f64(0.0)) * F_N  # [N], what sticking can carry
     residual = (E - law.mu(v) * F_N).clamp(min=0.0) - 900.0 * v
@@ -45,13 +43,3 @@ def test_a_residual_learns_the_coefficient():
     assert student.law.mu(f64(0.0)).item() == pytest.approx(
         0.5 - 0.4 * 0.2913, abs=0.03
     )  # from 0.5
-
-
-@pytest.mark.slow
-def test_learn_dynamics_smoke(tmp_path):
-    module = experiment("learn_dynamics")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    numbers = json.loads((tmp_path / "summary.json").read_text())
-    assert set(numbers["held out"]) == {"mu = 0.5", "constant, fitted", "network"}
-    assert len(numbers["surrogate"]) == 6
-    assert (tmp_path / "learn_dynamics.png").exists()

@@ -4,7 +4,7 @@ go."""
 import numpy as np
 import pytest
 import torch
-from conftest import f64
+from conftest import f64, times
 from scipy.interpolate import CubicSpline
 from torch.autograd import gradcheck
 
@@ -19,7 +19,7 @@ def test_profile_is_the_papers_seventh_order_polynomial():
     """Ends where it should, at rest with zero acceleration and jerk; peak speed 4.375 mm/s for 20
     mm in 10 s."""
     profile = Profile([0.0, 10.0], [0.06, 0.04])
-    t = torch.linspace(0, 10, 1001, dtype=torch.float64)
+    t = times(10, 1001)
     value, rate = profile(t)
     assert float(value[0]) == 0.06
     assert float(value[-1]) == pytest.approx(0.04, abs=1e-15)
@@ -53,7 +53,7 @@ def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots):
         Sampled(TIMES[:knots], VALUES[:knots]),
         CubicSpline(TIMES[:knots], VALUES[:knots]),
     )
-    t = torch.linspace(0, TIMES[knots - 1], 301, dtype=torch.float64)
+    t = times(TIMES[knots - 1], 301)
     value, rate = signal(t)
     np.testing.assert_allclose(value, spline(t), rtol=0, atol=1e-15)
     np.testing.assert_allclose(rate, spline(t, 1), rtol=0, atol=1e-13)
@@ -70,7 +70,7 @@ def test_sampled_stays_the_spline_when_its_knots_are_changed():
     with torch.no_grad():
         signal.times.copy_(at)
         signal.values.copy_(values)
-    t = torch.linspace(0, 2.5, 101, dtype=torch.float64)
+    t = times(2.5, 101)
     np.testing.assert_allclose(
         signal(t)[1].detach(), CubicSpline(at, values)(t, 1), rtol=0, atol=1e-13
     )
@@ -83,7 +83,7 @@ def test_sampled_with_rates_is_hermites_cubic():
     """x^3 from its values and rates, exactly."""
     knots = f64(0.0, 0.5, 2.0)
     signal = Sampled(knots.tolist(), (knots**3).tolist(), (3 * knots**2).tolist())
-    t = torch.linspace(0, 2, 101, dtype=torch.float64)
+    t = times(2, 101)
     value, rate = signal(t)
     assert torch.allclose(value, t**3, rtol=0, atol=1e-14)
     assert torch.allclose(rate, 3 * t**2, rtol=0, atol=1e-14)
@@ -130,7 +130,7 @@ def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it():
 
 def test_reference_gives_named_signals_side_by_side():
     reference = Reference(x=Profile([0.0, 1.0], [0.0, 1.0]), y=Profile([0.0], [7.0]))
-    t = torch.linspace(0, 1, 5, dtype=torch.float64)
+    t = times(1, 5)
     got = reference(t, ("y", "x", "y"))
     assert got.shape == (5, 3, 2)
     assert torch.equal(got[:, 1], torch.stack(reference["x"](t), -1))

@@ -286,24 +286,17 @@ def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     assert "drws" in capsys.readouterr().err
 
 
-def test_draws_of_a_goal_begin_with_the_stated_numbers():
-    name = "materials.silicone.E"
-    goal = Goal.model_validate(GOAL | {"uncertain": {name: {"low": 4e5, "high": 6e5}}})
-    _, over, y0 = drawn(FILE, goal, 3, seed=0)
-    assert over[name].shape == (4,)
-    assert float(over[name][0]) == 5e5
-    assert bool(((over[name] > 4e5) & (over[name] < 6e5)).all())
-    assert y0.shape == (4, BUILT.rig.layout.size)
-    assert not torch.equal(y0[0], y0[1])
-
-
-def test_draws_of_an_identification_begin_with_its_estimates():
+def test_draws_begin_with_the_stated_numbers_and_those_of_an_identification_with_its_estimates():
     name, other = "materials.silicone.E", "laws.dry.K_n"
     goal = Goal.model_validate(GOAL | {"uncertain": {name: {"low": 4e5, "high": 6e5}}})
-    _, over, y0 = drawn(FILE, goal, 2, seed=0, known={other: [2e5, 1.9e5, 2.1e5]})
-    assert over[other].tolist() == [2e5, 1.9e5, 2.1e5]
-    assert float(over[name][0]) == 5e5
-    assert not torch.equal(y0[0], y0[1])
+    for known in ({}, {other: [2e5, 1.9e5, 2.1e5]}):
+        _, over, y0 = drawn(FILE, goal, 2, seed=0, known=known)
+        assert {key: over[key].tolist() for key in known} == known
+        assert over[name].shape == (3,)
+        assert float(over[name][0]) == 5e5
+        assert bool(((over[name] > 4e5) & (over[name] < 6e5)).all())
+        assert y0.shape == (3, BUILT.rig.layout.size)
+        assert not torch.equal(y0[0], y0[1])
     with pytest.raises(ValueError, match=f"uncertain.{name} is drawn by the identification"):
         drawn(FILE, goal, 1, seed=0, known={name: [5e5, 5e5]})
     with pytest.raises(ValueError, match=r"uncertain.*contact"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from browser import MISSING, browser
-from conftest import coarse
+from conftest import coarse, times
 from PIL import Image
 
 from torchsoft import simulate
@@ -29,7 +29,7 @@ return [r.x + q[0], r.y + q[1]]"""
 def run():
     model = coarse()
     start = grasp_and_roll(model, grasp_force=80.0)
-    return simulate(model, torch.linspace(0, 0.5, 51, dtype=torch.float64), y0=start.y0)
+    return simulate(model, times(0.5, 51), y0=start.y0)
 
 
 @pytest.fixture(scope="module")

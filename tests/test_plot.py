@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from conftest import coarse
+from conftest import coarse, times
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -44,7 +44,7 @@ def manipulated(**changes: object) -> Done:
     """The first 0.2 s of the grasp on a coarse mesh, with a force that need not be looked for."""
     model = coarse(**changes)
     start = grasp_and_roll(model, grasp_force=80.0)
-    return model, simulate(model, torch.linspace(0, 0.2, 21, dtype=torch.float64), y0=start.y0)
+    return model, simulate(model, times(0.2, 21), y0=start.y0)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,8 @@ def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(enclosed):
     lame_lambda, lame_mu = lame_moduli(1.0, model.settings.pad.nu)
     for which, pad in model.pads.items():
         u = run.displacement[which]
-        nodes = run.setup.pads[which].deformed(u.numpy())
+        own = run.setup.pads[which]
+        nodes = own.placed(own.mesh.nodes + own.displacement(u.numpy()))
         assert nodes.shape == (21, 61 * 3, 2)
         surface = nodes[:, pad.mesh.free[pad.mesh.surface]]
         np.testing.assert_allclose(surface, (pad.positions + u).numpy(), rtol=1e-9, atol=1e-15)
@@ -101,7 +102,7 @@ def test_the_stress_under_a_contact_carries_its_force(done):
     """In a held grasp s_yy, summed along the bonded layer, balances the nodal forces."""
     model = coarse(pad__elements_x=120, pad__elements_y=6)
     start = grasp_and_roll(model, grasp_force=80.0)
-    run = simulate(model, torch.linspace(0, 0.6, 4, dtype=torch.float64), y0=start.y0)
+    run = simulate(model, times(0.6, 4), y0=start.y0)
     pad = run.setup.pads["L"]
     stress = pad.stress(pad.strain(pad.displacement(run.displacement["L"][-1].numpy())))
     nodes = pad.mesh.nodes[pad.mesh.elements]
@@ -160,7 +161,7 @@ def held():
     pose = state.pose | {
         name: torch.tensor(place, dtype=torch.float64) for name, place in start.items()
     }
-    t = torch.linspace(0, 0.12, 13, dtype=torch.float64)
+    t = times(0.12, 13)
     return rig, simulate(rig, t, y0=rig.pack(state._replace(pose=pose)), step=1e-3)
 
 
@@ -238,11 +239,17 @@ def test_figure_draws_something(rig, name, request):
     [
         ({"look": "pgae"}, "`look` must be one of screen, page, column.* did you mean `page`"),
         ({"only": ["disc.yy"]}, "there is no panel `disc.yy`; did you mean `disc.y`"),
+        ({"time": 40.0}, "there is nothing at 40 s: the run goes from 0 to 0.2 s"),
     ],
 )
 def test_a_dashboard_that_there_is_not_is_refused(done, how, message):
     with pytest.raises(ValueError, match=message):
         dashboard(done[1], **how)
+
+
+def test_text_of_a_saved_page_is_text_in_a_font_that_journals_take(done, tmp_path):
+    dashboard(done[1], look="page").savefig(tmp_path / "page.pdf")
+    assert b"Type3" not in (tmp_path / "page.pdf").read_bytes()
 
 
 def assert_legends_stand_above_the_curves(figure: Figure) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import times
 from torch import Tensor
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, press, rest, simulate
@@ -51,7 +52,7 @@ def series(run: Trajectory) -> dict[str, Tensor]:
 def manipulation():
     """The 30 s with the gradient behind them, pads' initial displacements held."""
     made = grasp_and_roll(SoftGrasp(), grasp_force=REFERENCE["manipulation"]["grasp_force"])
-    t = torch.linspace(0, 30, 3001, dtype=torch.float64)
+    t = times(30, 3001)
     y0 = held_displacements(made.model, made.y0)
     return made.model, simulate(made.model, t, y0=y0, step=2e-3, gradient="discrete")
 
@@ -119,7 +120,7 @@ def test_light_shaking_is_the_reference():
         columns.append(
             torch.zeros_like(y0) if pulled is None else torch.autograd.grad(pulled, ones)[0]
         )
-    t = torch.linspace(0, 2, 401, dtype=torch.float64)
+    t = times(2, 401)
     run = simulate(
         model,
         t,

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from conftest import nested
 from test_controllers import file as controlled
 from torch import nn
 
-from torchsoft import Rig, simulate
+from torchsoft import Rig
 from torchsoft.rigs import RigFile
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
@@ -70,24 +69,6 @@ def test_every_number_that_a_rig_is_made_with_has_its_name(rig):
             assert after[name] == pytest.approx(1.01 * value or 1e-3, rel=1e-12)
             seen.add(name)
     assert len(seen) > 10
-
-
-def test_a_gain_is_differentiated_and_set_by_its_name():
-    name = "controllers.jaw.gain_2_4"
-    rig, y0, _ = controlled().build()
-    assert rig.parameter(name).item() == 400.0
-    t = torch.linspace(0.0, 0.3, 7, dtype=torch.float64)
-    how: dict[str, Any] = {"knots": simulate(rig, t, y0=y0).knots}
-    by = simulate(rig, t, y0=y0, gradient="forward", wrt=[name], rigid=True, **how)
-    ends = []
-    for gain in (400.04, 399.96):
-        other = controlled().override(**nested(name, gain)).build().rig
-        assert other.parameter(name).item() == gain
-        ends.append(simulate(other, t, y0=y0, **how).y[:, rig.layout.rigid])
-    slope = (ends[0] - ends[1]).numpy() / 0.08
-    found = by.sensitivities[..., 0].numpy()
-    assert np.abs(found).max() > 0
-    np.testing.assert_allclose(found, slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
 
 
 def test_gains_have_units_and_bounds():

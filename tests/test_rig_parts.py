@@ -15,7 +15,7 @@ import meshio
 import numpy as np
 import pytest
 import torch
-from conftest import nested
+from conftest import f64, nested
 from hostile.damage import document
 from torch import nn
 
@@ -111,7 +111,7 @@ def network() -> nn.Sequential:
     with torch.no_grad():
         for p in net.parameters():
             p.copy_(torch.randn(p.shape, generator=generator, dtype=torch.float64))
-        net[0].weight.mul_(torch.tensor([50.0, 1.0, 50.0, 1.0], dtype=torch.float64))
+        net[0].weight.mul_(f64(50.0, 1.0, 50.0, 1.0))
     return net
 
 
@@ -333,7 +333,7 @@ def test_a_network_from_a_file_is_the_module_in_python(folder):
     ready = file.build()
     run = running.carry_out(file).trajectory
     law = ready.rig.actuators["x"]
-    x = torch.tensor([1e-2, 0.1, 7.0, 5e-3, -0.2], dtype=torch.float64)
+    x = f64(1e-2, 0.1, 7.0, 5e-3, -0.2)
     net = network()
     with torch.no_grad():
         expected = 1e5 * 5e-3 + 400 * 0.3 + 7.0 + net(x[[0, 1, 3, 4]])[0]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import nested
+from conftest import f64, nested, times
 from PIL import Image
 from test_rig_parts import STONE
 
@@ -105,7 +105,7 @@ def test_the_papers_rig_is_soft_grasp():
     top = float(model.unpack(manipulation.y0).pose["bracket"][1])
     file = changed(file, bodies__bracket__start__y=top, motion__F_ff__values=(0.0, -80.0))
     ready = file.build()
-    t = torch.linspace(0, 0.6, 61, dtype=torch.float64)
+    t = times(0.6, 61)
     with torch.no_grad():
         assert torch.equal(ready.rig(0.1, manipulation.y0), model(0.1, manipulation.y0))
     runs = [simulate(rig, t, y0=manipulation.y0) for rig in (model, ready.rig)]
@@ -126,7 +126,7 @@ def test_what_is_held_is_the_papers_grasping_force():
         motion__x_d={"kind": "hold"},
     )  # fmt: skip
     ready = file.build()
-    force, _ = ready.rig.reference["F_ff"](torch.tensor(1.0, dtype=torch.float64))
+    force, _ = ready.rig.reference["F_ff"](f64(1.0)[0])
     assert float(force) == pytest.approx(-holding_force(model, press(model, 48.6e-3)), rel=1e-9)
     state = ready.rig.unpack(ready.y0)
     depth = float(ready.rig.penetration("U", state).max().detach())
@@ -142,8 +142,8 @@ def test_strokes_go_there_and_back_until_there_is_no_time_for_more():
     stroke = {"kind": "strokes", "since": 0.5, "stroke_time": 0.2, "travel": -1e-3, "until": 1.2}
     file = changed(coarse(ready_rig("paper")), motion__x_d=stroke)
     follow = file.build().rig.reference["x_d"]
-    t = torch.tensor([0.0, 0.5, 0.6, 0.7, 0.9, 1.1, 1.3], dtype=torch.float64)
-    wanted = torch.tensor([0.0, 0.0, -0.5e-3, -1e-3, 0.0, -1e-3, -1e-3], dtype=torch.float64)
+    t = f64(0.0, 0.5, 0.6, 0.7, 0.9, 1.1, 1.3)
+    wanted = f64(0.0, 0.0, -0.5e-3, -1e-3, 0.0, -1e-3, -1e-3)
     assert torch.allclose(follow(t)[0] - 60e-3, wanted, rtol=0, atol=1e-12)
 
 
@@ -313,6 +313,29 @@ def test_a_recorded_motion_that_cannot_be_is_named(tmp_path, text, sentence):
     assert re.search(sentence, first.message), first.message
 
 
+@pytest.mark.parametrize(
+    ("text", "where", "sentence"),
+    [
+        ("t [s],x_d [m]\n0,0\n1000,1e-3\n2000,0\n", "motion.x_d.file", r"lasts 2000 s.*millisec"),
+        ("t [s],x_d [m]\n0,0\n1,12\n2,0\n", "motion.x_d", r"goes 12 m, .* is it in millimetres"),
+    ],
+)
+def test_units_that_cannot_be_meant_are_asked_about(tmp_path, text, where, sentence):
+    (tmp_path / "x.csv").write_text(text, encoding="utf-8")
+    csv = {"kind": "csv", "file": "x.csv", "column": "x_d"}
+    file = changed(coarse(template("t")), motion__x_d=csv)
+    file._folder = tmp_path
+    (found,) = (one for one in check(file) if one.where == where)
+    assert found.severity == "warning"
+    assert re.search(sentence, found.message), found.message
+
+
+def test_a_body_too_heavy_to_rest_is_named_with_its_weight():
+    (found,) = check(changed(coarse(template("t")), bodies__disc__mass=400.0))
+    assert found.where == "bodies.disc.start.y"
+    assert "no rest under its weight of 3.92e+03 N is found" in found.message
+
+
 def test_what_two_pads_grip_is_taken_along():
     """The estimate before a run: fingertips go around a box that they hold, and the box with them;
     the run agrees."""
@@ -394,7 +417,7 @@ def test_a_body_rests_where_nothing_accelerates_it(inertial):
 def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate():
     file = coarse(ready_rig("drop"))
     rig = file.build().rig
-    pose = {"ellipse": torch.tensor([60.2e-3, 30e-3, 0.1], dtype=torch.float64)}
+    pose = {"ellipse": f64(60.2e-3, 30e-3, 0.1)}
     found = resting(rig, pose)["ellipse"]
     rate = rig(0.0, standing(rig, {"ellipse": found}))[rig.layout.rigid[3:]]
     assert float(rate.detach().abs().max()) < 1e-4
@@ -569,12 +592,3 @@ def test_a_failure_keeps_what_was_simulated(small, tmp_path, capsys):
         "the body was lost"
         in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
     )
-
-
-def test_check_and_run_name_what_cannot_be_read(tmp_path, capsys):
-    (tmp_path / "no.toml").write_text("[[", encoding="utf-8")
-    for command in ("check", "run"):
-        assert main([command, str(tmp_path / "none.toml")]) == 2
-        assert "none.toml: No such file or directory" in capsys.readouterr().err
-        assert main([command, str(tmp_path / "no.toml")]) == 2
-        assert "no.toml is not a TOML file" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from conftest import f64
+from conftest import f64, times
 from matplotlib.path import Path as Polygon
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline
@@ -327,7 +327,7 @@ def test_a_uniform_body_has_mass_and_inertia_of_its_shape():
 def test_support_outline_and_size_are_the_bodys(case):
     shape, boundary = case
     x = torch.from_numpy(boundary(np.arange(100_000) / 100_000))
-    angle = torch.linspace(0, 6.2, 40, dtype=torch.float64)
+    angle = times(6.2, 40)
     way = torch.stack((angle.cos(), angle.sin()), -1)
     assert float((shape.support(way) - (way @ x.mT).amax(-1)).abs().max()) < 1e-8
     assert shape.size() == pytest.approx(float(x.norm(dim=-1).max()), rel=1e-4)

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from conftest import f64
 from fem_oracle import dilatation, shear, world_stiffness
 from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, condense, solve
 from test_experiments import experiment
@@ -169,7 +170,7 @@ def weightless(E: float) -> Rig:
 @pytest.mark.parametrize("theta", [0.0, 0.3])
 def test_a_neutral_direction_stays_where_it_is(theta):
     """Its stiffness and load are rounding; the depth and its derivative are exact."""
-    rig, start = weightless(1e6), torch.tensor([20.3e-3, 14.8e-3, theta], dtype=torch.float64)
+    rig, start = weightless(1e6), f64(20.3e-3, 14.8e-3, theta)
     found = resting(rig, {"disc": start})["disc"]
     assert found[2].item() == pytest.approx(theta, abs=1e-12)
     alone = resting(rig, {"disc": start}, {"disc": (1,)})["disc"]

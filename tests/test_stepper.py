@@ -1,6 +1,4 @@
-"""The stepper: order, grids, how runs end, halved steps, driven bodies, and threads."""
-
-from concurrent.futures import ThreadPoolExecutor
+"""The stepper: order, grids, how runs end, halved steps, driven bodies."""
 
 import numpy as np
 import pytest
@@ -31,17 +29,6 @@ def test_second_order_on_a_smooth_motion(fidelity):
     errors = [float((place(h) - fine).norm()) for h in (2e-3, 1e-3, 5e-4)]
     orders = [float(np.log2(errors[i] / errors[i + 1])) for i in range(2)]
     assert min(orders) >= 1.8, (errors, orders)
-
-
-def test_same_run_twice_to_the_bit_and_in_two_threads_at_once():
-    """Nothing is shared between runs: two models, each simulated alone and beside the other."""
-    made = [grasp_and_roll(coarse(pad__E=E), grasp_force=75.0) for E in (0.75e6, 0.7e6)]
-    run = lambda m: simulate(m.model, times(0.4, 21), y0=m.y0).y
-    alone = [run(m) for m in made]
-    with ThreadPoolExecutor(2) as pool:
-        both = list(pool.map(run, [*made, *made]))
-    assert all(torch.equal(a, b) for a, b in zip(both, [*alone, *alone]))
-    assert not torch.equal(*alone)
 
 
 def test_an_unstable_loop_ends_in_an_error_that_says_so():

@@ -12,7 +12,7 @@ import pytest
 import torch
 from conftest import COARSE
 
-from torchsoft import Parameters, Profile, Sampled
+from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.sysid import (
     RIG,
@@ -465,20 +465,3 @@ def test_catalogue_begins_at_rest_and_can_be_written_down():
         assert model.penetration("L", state).gt(0).any(), name
         with torch.no_grad():
             assert model(0.0, y0)[model.layout.slices["velocity", "disc"]][1].abs() < 1e-6, name
-
-
-def test_a_sampled_set_point_follows_the_profile_it_was_taken_from():
-    profile = Profile([0.0, 0.3, 0.8], [0.0, 1e-2, -5e-3])
-    t = torch.linspace(0, 0.8, 161, dtype=torch.float64)
-    between = torch.linspace(0.0, 0.8, 777, dtype=torch.float64)
-    value, rate = profile(t)
-    want, want_rate = profile(between)
-    for rates, near in ((rate.tolist(), 1e-7), (None, 1e-6)):
-        sampled = Sampled(t.tolist(), value.tolist(), rates)
-        got, got_rate = sampled(between)
-        assert float((got - want).abs().max()) < near
-        assert float((got_rate - want_rate).abs().max()) < 200 * near
-        step = 1e-6
-        slope = (sampled(between[1:-1] + step)[0] - sampled(between[1:-1] - step)[0]) / (2 * step)
-        assert float((slope - got_rate[1:-1]).abs().max()) < 1e-6
-    assert float(sampled(torch.tensor([5.0], dtype=torch.float64))[0]) == pytest.approx(-5e-3)

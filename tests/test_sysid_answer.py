@@ -14,7 +14,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, times
 from test_sysid_friction import Viscous
 
 from torchsoft import Parameters, SoftGrasp, simulate
@@ -241,7 +241,7 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path)
         float(result.model(name).parameter("contact.R_n").detach()) for name in ("first", "second")
     ] == own
     assert own[0] != own[1]
-    t = torch.linspace(0.0, 0.2, 30, dtype=torch.float64)
+    t = times(0.2, 30)
     begun = result.rigs["second"]
     y0 = AtRest().begin(begun, {})({}).detach()
     runs = [simulate(rig, t, y0=y0, reference=begun.reference, rtol=1e-3).y for rig in (mine, its)]

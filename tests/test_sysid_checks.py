@@ -33,7 +33,7 @@ from torchsoft.sysid.assumptions import (
     scaled,
     unramped,
 )
-from torchsoft.sysid.identification import notices_on
+from torchsoft.sysid.identification import held_by, notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import AMOUNTS, End, Joint, difference, ended, joint_fit, refit, varied
@@ -267,7 +267,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
         for one in assumptions(problem.recordings, set(TRUTH))
         if one.name in ("disc.mass", "pad.nu", "contact.eta", "mesh")
     ]
-    found = joint_fit(problem, end, suspects, "linear", lambda chi2: None)
+    found = joint_fit(problem, end, suspects, 1.1 * len(at.r), "linear", lambda chi2: None)
     assert found.left < 1.1 * len(at.r)
     assert found.parts.keys() == {"disc.mass", "pad.nu", "contact.eta"}
     assert max(found.parts, key=lambda name: found.parts[name]) == "disc.mass"
@@ -276,24 +276,32 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
 
 
 @pytest.mark.parametrize(
-    ("left", "cause", "tried"),
-    [(10.0, "b", ["b"]), (10.0, "nothing", ["b", "a", "law"]), (500.0, "law", ["law"])],
+    ("joint_left", "lefts", "tried"),
+    [
+        (10.0, {"b": 50.0}, ["b"]),
+        (10.0, {}, ["b", "a", "law"]),
+        (500.0, {"law": 50.0}, ["law"]),
+        (500.0, {"law": 150.0}, ["law"]),
+        (500.0, {"law": 200.0}, ["law", "a", "b"]),
+    ],
 )
-def test_a_joint_fit_decides_what_is_tried(left, cause, tried, monkeypatch):
-    """Where it explains the data, numbers by their part; where not, no number before a law."""
+def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, monkeypatch):
+    """Where it explains the data, numbers by their part; where not, no number before a law, and
+    none at all after a law that leaves much less than all numbers together."""
     taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
-        nearly_all=lambda left: left < 100,
-        nearly=lambda one: one.gain > 900,
+        little=100.0,
+        misfit=lambda left: left - 10.0,
+        nearly=lambda one: one.left < 100.0,
         fit=lambda one, again, stated, linear: replace(
-            linear, gain=950.0 if one.name == cause else 1.0
+            linear, left=lefts.get(one.name, 999.0), refitted=True
         ),
     )
-    joint = Joint({}, left, {"a": 0.25, "b": 0.9})
+    joint = Joint({}, joint_left, {"a": 0.25, "b": 0.9})
     monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)
     monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
     end: Any = SimpleNamespace(far=True)
@@ -455,6 +463,17 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
 def test_no_bound_is_to_be_widened_for_what_is_not_identifiable():
     for seen in (False, True):
         one: Any = SimpleNamespace(identifiable=seen, at_bound=True, relative_sd=2.0, label="a",
-                                   last=1.0, step_bias_sd=0.0)  # fmt: skip
-        said = notices_on([one], True, 1e-5, False)
+                                   name="a", last=1.0, step_bias_sd=0.0)  # fmt: skip
+        said = notices_on([one], {}, True, 1e-5, False)
         assert any("widen" in text for text in said) == seen
+
+
+def test_a_known_number_that_holds_an_unknown_one_is_named():
+    """mu_s ends at the mu_k that is taken for known."""
+    problem = Problem([recorded()], SENSORS, {"contact.mu_s": Unknown()})
+    held = held_by(problem)
+    assert held == {"contact.mu_s": ("contact.mu_k", BASE.contact.mu_k)}
+    one: Any = SimpleNamespace(identifiable=True, at_bound=True, label="mu_s", name="contact.mu_s",
+                               last=1.0001 * BASE.contact.mu_k, step_bias_sd=0.0)  # fmt: skip
+    (said,) = notices_on([one], held, True, 1e-5, False)
+    assert "contact.mu_k = 0.7, which is known, holds it there; is that right?" in said

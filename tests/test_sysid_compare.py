@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from conftest import COARSE, towards
 from scipy import stats
-from test_experiments import experiment
 from test_sysid_friction import Viscous
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp
@@ -252,14 +251,3 @@ def test_densities_are_those_of_the_normal_distribution():
     white = density(SimpleNamespace(**vars(problem) | {"noise": {}}), ["one"], e / sigma)
     score = white.s / sigma - np.linalg.solve(K, e)
     assert ratio(plain, white).stated == pytest.approx(score @ K @ score, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_law_comparison_smoke(tmp_path):
-    """Named where contacts slip, and not where they roll."""
-    module = experiment("law_comparison")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    *near, far, other = summary["cases"]
-    assert [case["answer"] for case in (*near, far, other)] == ["right"] * 2 + ["cannot tell"] * 2
-    assert min(case["D"] for case in near) > 20 > 1 > max(far["D"], other["D"])

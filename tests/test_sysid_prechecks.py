@@ -191,6 +191,13 @@ def test_a_mistake_gets_the_sentence_that_helps(recordings, runs, name):
     assert (found.severity == "error") == grave
 
 
+def test_noise_in_another_unit_is_told_by_samples_that_are_too_near_to_each_other(recordings, runs):
+    one = recordings["rolling"]
+    (found,) = looked_at(one, runs["rolling"], SENSORS | {"x_C": Sensor(noise=10.0)})
+    assert (found.code, found.severity) == ("noise of x_C", "error")
+    assert "the noise of x_C is stated as 10 m, but all of its samples are within" in found.message
+
+
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_nothing_is_said_of_what_is_right(recordings, runs, motion):
     """With a start that is off by a factor of three, with fewer sensors, and with faults that were

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, RUBBER, dry
+from conftest import COARSE, RUBBER, dry, f64
 from scipy import stats
 from scipy.optimize import least_squares
 from test_sysid import check_derivatives
@@ -150,9 +150,7 @@ def jaws():
 
 def test_another_rig_is_identified_by_its_own_names(jaws):
     y0 = torch.zeros(jaws.layout.size, dtype=torch.float64)
-    y0[jaws.layout.slices["pose", "disc"]] = torch.tensor(
-        [3e-4, 23.94e-3, 0.0], dtype=torch.float64
-    )
+    y0[jaws.layout.slices["pose", "disc"]] = f64(3e-4, 23.94e-3, 0.0)
     t = np.linspace(0.0, 0.2, 81)
     run, rng = simulate(jaws, torch.from_numpy(t), y0=y0, rtol=1e-6), np.random.default_rng(1)
     sensors = {

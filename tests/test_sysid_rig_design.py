@@ -71,8 +71,8 @@ def test_candidates_are_ranked_by_what_they_tell(out):
     assert "the body was lost" in last["lost"]
     stated = read_config(out / "fit.toml")
     file = RigFile.from_toml(RIG).override(**stated.settings)
-    built = file.override(**stated.design.candidates["twist"]).build()
-    made = planned(stated, built, "twist", stated.design.rtol, noise=0.0)
+    twisted = file.override(**stated.design.candidates["twist"])
+    made = planned(stated, twisted, "twist", stated.design.rtol, noise=0.0)
     problem = Problem([made], stated.sensors, stated.unknowns)
     x, free = problem.coordinates.start, problem.coordinates.free
     J = problem.residuals(Runner([made]), x, ["twist"], stated.design.rtol, free).J

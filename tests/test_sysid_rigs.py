@@ -28,6 +28,7 @@ from torchsoft.sysid.measured import load
 from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.refits import since
 from torchsoft.sysid.rig_recordings import vocabulary
+from torchsoft.sysid.runs import Runner
 
 RIG = Path(__file__).parents[1] / "rigs" / "two_fingers.toml"
 SENSORS = {"x_disc": 10e-6, "y_disc": 10e-6, "x_left": 10e-6, "F_left_x": 0.05}
@@ -269,3 +270,26 @@ def test_a_grasp_in_mid_air_says_that_its_poses_are_to_be_measured():
     (said,) = result.notices
     assert "not smooth in start." in said
     assert "measure every coordinate of the bodies when the recording begins" in said
+
+
+def test_a_body_rests_where_the_parameters_let_it_rest(tmp_path, folder):
+    """It sinks deeper into softer pads: at the truth nothing but noise is left, though the file has
+    another modulus; derivatives by it count that."""
+    truth = TRUTH | {"materials.silicone.E": 0.3e6}
+    rig, y0, _ = coarse(
+        materials={"silicone": {"E": truth["materials.silicone.E"]}},
+        actuators={"left_x": {"Kd": truth["actuators.left_x.Kd"]}},
+    ).build()
+    run = simulate(rig, torch.linspace(0, 0.1, 51, dtype=torch.float64), y0=y0, rtol=1e-6)
+    table = np.stack([run.t.numpy(), run["y_disc"].numpy()], 1)
+    np.savetxt(folder / "run.csv", table, "%.12g", ",", header="t [s],y_disc [m]", comments="")
+    fit = FIT.partition("x_disc.noise")[0].replace('columns.camera = "x_disc"\n', "")
+    (folder / "fit.toml").write_text(fit + "y_disc.noise = 1e-7\n", encoding="utf-8")
+    problem = load([folder / "run.csv"], folder / "fit.toml").problem
+    c, runner = problem.coordinates, Runner(problem.recordings)
+    x = np.array([np.log(truth[name]) for name in c.names])
+    at, steps = problem.freeze(runner, x, problem.names, 1e-6, c.free)
+    assert np.abs(at.r).max() < 0.05
+    h = np.array([1e-4, 0.0])
+    ends = [problem.residuals(runner, x + s * h, problem.names, steps).r for s in (1, -1)]
+    assert at.J[:, 0] == pytest.approx((ends[0] - ends[1]) / 2e-4, abs=1e-4 * np.abs(at.J).max())

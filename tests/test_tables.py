@@ -45,7 +45,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "not finite": ({"step": float("nan")}, "step should be a finite number, not nan"),
     "too many digits": ({"step": 10**400}, "step should be a valid number, not 1000"),
     "bounds": ({"step": -1}, "step should be greater than 0, not -1"),
-    "unknown": ({"steps": 1.0}, "steps is not known here"),
+    "unknown": ({"steps": 1.0}, "`steps` is not known here; did you mean `step`?"),
     "missing": ({"motions": [{"kind": "roll"}, {}]}, "motions.1.kind is missing"),
     "another kind": (
         {"motions": [{"kind": "hop"}]},
@@ -61,7 +61,8 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "not a table": ({"rolls": {"a": 3}}, "rolls.a should be a table, not 3"),
     "together": ({"step": 7.0}, "step must not be seven"),
-    "several": ({"step": -1, "count": 0, "a": 1, "b": 2}, "; and 1 more"),
+    "several unknown": ({"a": 1, "b": 2}, "`a` is not known here, nor are `b`; known are step"),
+    "several": ({"step": -1, "count": 0, "checked": 3, "rolls": {"a": 3}}, "; and 1 more"),
 }
 
 

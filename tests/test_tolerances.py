@@ -4,7 +4,7 @@ met."""
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, grasped, times, towards
+from conftest import coarse, f64, grasped, times, towards
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
@@ -114,7 +114,7 @@ def test_steps_of_another_run_are_taken_again(start):
 def test_outputs_lie_within_their_steps_however_these_differ():
     """A last step that is longer by far must not decide where the outputs of the short ones lie."""
     knots = np.array([0.0, 1e-9, 2e-9, 0.1])
-    t = torch.tensor([0.0, 5e-10, 1e-9, 1.05e-9, 2e-9, 0.1], dtype=torch.float64)
+    t = f64(0.0, 5e-10, 1e-9, 1.05e-9, 2e-9, 0.1)
     (plan,) = given_steps(t, knots)
     assert plan.out_step.tolist() == [0, 0, 1, 1, 2]
     assert plan.out_part.tolist() == pytest.approx([0.5, 1.0, 0.05, 1.0, 1.0])
@@ -134,7 +134,7 @@ def test_a_signal_of_ones_own_is_followed():
     t = times(0.1, 6)
     run, fine = (simulate(model, t, y0=y0, reference=own, rtol=rtol) for rtol in (1e-4, 1e-7))
     assert float((run["x_C"] - fine["x_C"]).abs().max()) < 1e-7
-    knots = torch.linspace(0, 0.1, 2001, dtype=torch.float64)
+    knots = times(0.1, 2001)
     value, rate = Wave()(knots)
     pieces = towards(model, Sampled(knots.tolist(), value.tolist(), rate.tolist()))
     same = simulate(model, t, y0=y0, reference=pieces, rtol=1e-7)
@@ -189,7 +189,7 @@ def test_a_run_whose_steps_cannot_get_shorter_ends(at):
     """However the shortest step is rounded at that time."""
     model = coarse()
     y0 = grasped(model)
-    t = torch.tensor([at - 0.02, at + 0.02], dtype=torch.float64)
+    t = f64(at - 0.02, at + 0.02)
     with pytest.raises(SimulationFailed, match="steps below 1e-09 s"):
         simulate(model, t, y0=y0, reference=towards(model, Jump(1e9, at)), rtol=1e-4)
 

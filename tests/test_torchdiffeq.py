@@ -112,9 +112,7 @@ def rolling():
     model = coarse()
     manipulation = grasp_and_roll(model, grasp_force=75.0)
     with torch.no_grad():
-        y = odeint(
-            model, manipulation.y0, torch.tensor([0, 0.3, 0.5], dtype=torch.float64), method=METHOD
-        )
+        y = odeint(model, manipulation.y0, f64(0, 0.3, 0.5), method=METHOD)
     y0 = torch.stack((y[1], y[2])).detach()
     y0[:, model.layout.slices["velocity", "disc"]] += f64(0.02, 0.0, 0.0)
     return model, y0
@@ -125,7 +123,7 @@ def gradients(
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     model.zero_grad(set_to_none=True)
     start = y0.clone().requires_grad_(True)
-    t = torch.tensor([0.3, 0.31, 0.325, 0.34], dtype=torch.float64)
+    t = f64(0.3, 0.31, 0.325, 0.34)
     y = verb(model, start, t, method=METHOD, options=dict(OPTIONS))
     state = model.unpack(y)
     x, theta, speed = (
@@ -149,7 +147,7 @@ def test_odeint_adjoint_equals_odeint(rolling):
 
 def test_odeint_adjoint_of_a_forgotten_run_says_so(rolling):
     model, y0 = rolling
-    t = torch.tensor([0.3, 0.31], dtype=torch.float64)
+    t = f64(0.3, 0.31)
     y = odeint_adjoint(model, y0[0].clone().requires_grad_(True), t, method=METHOD)
     for shift in range(5):
         odeint(model, y0[0] + 1e-6 * shift, t, method=METHOD)

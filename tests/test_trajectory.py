@@ -8,7 +8,7 @@ import meshio
 import numpy as np
 import pytest
 import torch
-from conftest import coarse
+from conftest import coarse, f64, times
 from torch import Tensor
 
 import torchsoft
@@ -19,6 +19,7 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
+from torchsoft.physics.extensions import extend
 from torchsoft.physics.setup import von_mises
 from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.rigs.written import template
@@ -26,7 +27,7 @@ from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.inputs import SharedStart
 from torchsoft.solve.trajectory import load, save
 
-T = torch.linspace(0, 0.1, 11, dtype=torch.float64)
+T = times(0.1, 11)
 
 
 def ran(**changes: object) -> tuple[SoftGrasp, Trajectory]:
@@ -112,11 +113,16 @@ def test_channels_have_one_name_everywhere(done):
         run["x_c"]
 
 
-def test_points_stick_slip_and_part_as_the_graph_says():
-    """The same as the graph at the same states, in a fast stroke that slips."""
+@pytest.mark.parametrize("extended", [False, True])
+def test_points_stick_slip_and_part_as_the_graph_says(extended):
+    """The same as the graph at the same states, in a fast stroke that slips, also where a pad has
+    retardation times of its own."""
     model = coarse(contact__mu_s=0.05, contact__mu_k=0.04)
+    for name in ("pads.L.tau_ratio", "pad.slow(0.1 s)") if extended else ():
+        extend(model, [name])
+        torch.nn.init.constant_(model.parameter(name), 0.5)
     start = grasp_and_roll(model, grasp_force=80.0)
-    t = torch.linspace(0, 3.0, 61, dtype=torch.float64)
+    t = times(3.0, 61)
     run = simulate(model, t, y0=start.y0)
     rows = torch.arange(0, len(t), 4)
     state = model.unpack(run.y[rows], model.follow(t[rows]))
@@ -262,7 +268,7 @@ def test_numbers_may_be_given_in_any_form(as_given):
     run = simulate(model, as_given(t), y0=as_given(y0))
     assert run.t.dtype == run.y.dtype == torch.float64
     assert equal(run.y, simulate(model, t32, y0=y32).y)
-    K_n = torch.tensor([8e4, 1e5], dtype=torch.float64)
+    K_n = f64(8e4, 1e5)
     batch = simulate_batch(
         model, as_given(t), parameters={"contact.K_n": as_given(K_n)}, y0=as_given(y0)
     )

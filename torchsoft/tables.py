@@ -12,8 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 from unicodedata import category
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationError, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Strict,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
 
+from torchsoft.display import suggestion
 from torchsoft.files import check_file
 
 T = TypeVar("T")
@@ -52,8 +61,8 @@ def refusing(data: Any = None, within: str = "") -> Iterator[None]:
 
 
 class Table(BaseModel):
-    """A frozen table: unknown keys, numbers that are not finite, and text or booleans for numbers
-    are `InvalidTable`."""
+    """A frozen table: unknown keys, with the one that may be meant, numbers that are not finite,
+    and text or booleans for numbers are `InvalidTable`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
@@ -68,6 +77,17 @@ class Table(BaseModel):
         def __setattr__(self, name: str, value: Any) -> None:
             with refusing():
                 super().__setattr__(name, value)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known(cls, data: Any) -> Any:
+        known, given = cls.model_fields, data if isinstance(data, Mapping) else {}
+        if strange := [line(str(key), 80) for key in given if key not in known]:
+            more = f", nor are `{'`, `'.join(strange[1:4])}`" if strange[1:] else ""
+            raise ValueError(
+                f"`{strange[0]}` is not known here{more}; {suggestion(strange[0], known)}"
+            )
+        return data
 
     @classmethod
     def model_validate(cls, obj: Any, **how: Any) -> Self:

@@ -21,7 +21,7 @@ from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost as dataset_cost
 from torchsoft.datasets.rig_files import embedded
-from torchsoft.datasets.simulation import points, task
+from torchsoft.datasets.simulation import points
 from torchsoft.excitation import Excitation, begin
 from torchsoft.sysid import measured
 from torchsoft.sysid.measured import cost
@@ -138,7 +138,7 @@ def design_briefly(config: Config) -> None:
         assert expected.seconds > 3600 or expected.memory > 1
     few = config.model_copy(update={"trajectories": min(config.trajectories, 4)})
     for i, u in enumerate(points(few)):
-        one = task(few, i, u)
+        one = few.subject.task(i, u)
         assert np.isfinite([x for x in one.labels.values() if not isinstance(x, str)]).all()
     if max(pad.mesh.memory for pad in few.subject.template.pads.values()) <= SMALL:
         rig, y0 = few.subject.begin(one)

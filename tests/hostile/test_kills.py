@@ -115,7 +115,7 @@ def test_results(memory, tally):
         mock.patch.object(page, "page", return_value=text),
         mock.patch.object(page, "traces", return_value=([], {})),
     ):
-        checked = lambda: check.main([str(memory / "set"), *picture])
+        checked = lambda: main(["dataset", "check", str(memory / "set"), *picture])
         crash(tally("crash points of a check"), checked, out, 20)
         crash(tally("crash points of an identification's results"), report, out, 60)
         for begin in ("none", "old"):

@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 from unittest import mock
 
@@ -198,7 +198,7 @@ PATHS = (
     "a\nb.csv", "x" * 300, "é.toml", "",
 )  # fmt: skip
 OPTIONS = "--workers", "--out", "--yes", "--seed", "--rtol", "--checkpoint", "--no-progress"
-IDENTIFY, GENERATE = ("torchsoft", "identify"), ("torchsoft.datasets.generate",)
+IDENTIFY, GENERATE = ("torchsoft", "identify"), ("torchsoft", "dataset", "make")
 COMMANDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     (IDENTIFY, "data.csv rig.toml --rtol 1e-300", "rtol"),
     (IDENTIFY, "data.csv many.toml", "--yes"),
@@ -251,9 +251,9 @@ def test_random_arguments(folder, tally, capsys):
     """In this process, with the work itself left out: no traceback, and one line says why."""
     begun = mock.patch.object(identification, "identify", side_effect=RuntimeError("begun"))
     generated = mock.patch.object(generation, "generate", return_value=0)
-    for name, main, options in (
-        ("identify", lambda words: cli.main(["identify", *words]), OPTIONS),
-        ("generate", generation.main, OPTIONS[:4]),
+    for name, command, options in (
+        ("identify", IDENTIFY[1:], OPTIONS),
+        ("generate", GENERATE[1:], OPTIONS[:4]),
     ):
         line, rng = tally(f"command lines: {name}"), random(name)
         for _ in range(count(400)):
@@ -262,9 +262,9 @@ def test_random_arguments(folder, tally, capsys):
                 values = ["o", "data.csv", "none/x"] if option == "--out" else NUMBERS
                 arguments += [option, str(rng.choice(values))]
 
-            def ended(main: Callable = main, arguments: list[str] = arguments) -> None:
+            def ended(words: Sequence[str] = (*command, *arguments)) -> None:
                 try:
-                    status = main(arguments)
+                    status = cli.main(words)
                 except SystemExit as end:
                     status = end.code
                 said = capsys.readouterr().err
@@ -295,7 +295,7 @@ def test_terminals_that_know_ascii_only(tally, tmp_path):
     data.write_text(csv_text(cells()), encoding="utf-8")
     identify = "-m", "torchsoft", "identify"
     experiment = str(ROOT / "experiments" / "grasp_and_roll.py")
-    for command in (identify, ("-m", "torchsoft.datasets.generate"), (experiment,)):
+    for command in (identify, ("-m", "torchsoft", "dataset", "make"), (experiment,)):
         expect(line, *command, "--help", **LOCALES[-1])
     command = *identify, str(data), str(config), "--out", str(out), "--no-progress"
     config.write_text("# Reibung µ, Größe θ\n" + IDENTIFICATION, encoding="utf-8")

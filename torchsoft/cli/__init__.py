@@ -1,5 +1,4 @@
-"""The command `torchsoft`: rigs in files, identification from files, materials from tests,
-datasets, and pictures of runs."""
+"""The command `torchsoft`: rig files, identification, materials, datasets, and pictures of runs."""
 
 import argparse
 import io
@@ -17,14 +16,14 @@ from torchsoft.cli import dataset, design, identify, material, plan, plot, reduc
 from torchsoft.cli.results import failed, say
 
 GRACE = 1.5
-"""Time [s] that a command has to hear Ctrl-C, before its process ends at once: a factorisation does
-not hear it."""
+"""Time [s] from Ctrl-C to the forced end of the process, for a long library call that cannot be
+interrupted."""
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Ends the process `GRACE` after a Ctrl-C that Python has not come to hear, since it is inside
-    a library's long call."""
+    """End the process `GRACE` after a Ctrl-C that Python has not handled, because it is inside a
+    library's long call."""
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
         yield
@@ -57,7 +56,7 @@ def interruptible() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status is 0, 2 for what the user can fix, 130 for an
+    """Run the command. The exit status is 0, 2 for an error that the user can fix, 130 for an
     interruption."""
     parser = argparse.ArgumentParser(
         prog="torchsoft", description="A differentiable simulator of soft contact manipulation."

@@ -1,4 +1,4 @@
-"""Datasets: made, in parts too, checked, and given to others."""
+"""Commands on datasets: make, slurm, check, export."""
 
 import argparse
 import os
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, failed, say
+from torchsoft.cli.results import add_command, add_yes, failed, say
 
 MAKE = """\
 Simulates the dataset of CONFIG.toml, shard by shard, into a folder or what fsspec opens. Ctrl-C and
@@ -25,22 +25,22 @@ lerobot    motions, forces and set-points as episodes of LeRobot v3
 mcap       a log a trajectory, for Foxglove and the like; `torchsoft identify` reads them"""
 
 CLUSTER = 16
-"""Workers that a cluster is taken to have."""
+"""Assumed number of workers of a cluster."""
 
 MOST = 1000
-"""Local workers."""
+"""Most local workers."""
 
 COARSE = 5e-3
-"""Steps longer than this [s] get a note."""
+"""Step [s] above which a note is printed."""
 
 BRIEF = 10.0
-"""Time [s] that is not worth a word."""
+"""Time [s] below which no estimate is printed."""
 
 HELP = "take fewer trajectories, a looser rtol or a shorter duration"
 
 
 def add_commands(commands: Any) -> None:
-    """The command `dataset` and its own commands."""
+    """Add the command `dataset` and its subcommands."""
     group = commands.add_parser("dataset", help="make datasets, check them, and give them away")
     own = group.add_subparsers(required=True, metavar="COMMAND")
 
@@ -50,9 +50,7 @@ def add_commands(commands: Any) -> None:
     workers = "threads, or processes if more than a few"
     one.add_argument("--workers", type=count, default=os.cpu_count() or 1, help=workers)
     one.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
-    one.add_argument(
-        "--yes", action="store_true", help="begin even what takes hours, or much memory or disk"
-    )
+    add_yes(one)
     one = add_command(
         own, "slurm", slurm, "write the job array that makes a dataset in parts", SLURM
     )
@@ -72,13 +70,13 @@ def add_commands(commands: Any) -> None:
 
 
 def add_config(one: argparse.ArgumentParser) -> None:
-    """The configuration, and the place of the dataset."""
+    """Add the arguments on the configuration and the place of the dataset."""
     one.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
     one.add_argument("--out", required=True, help="folder or fsspec URL of the store")
 
 
 def part(text: str) -> tuple[int, int]:
-    """Number and count of parts."""
+    """Parse the number and the count of parts."""
     number, _, count = text.partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise argparse.ArgumentTypeError(f"should be such as 2/8, from 1/8 to 8/8, not {text!r}")
@@ -86,7 +84,7 @@ def part(text: str) -> tuple[int, int]:
 
 
 def count(text: str) -> int:
-    """Number of local workers."""
+    """Parse the number of local workers."""
     if not (text.isdecimal() and int(text) <= MOST):
         raise argparse.ArgumentTypeError(f"should be from 0 to {MOST}, not {text}")
     return int(text)
@@ -98,6 +96,7 @@ def make(options: argparse.Namespace) -> int:
 
     from torchsoft.cost import agree
     from torchsoft.datasets import generate
+    from torchsoft.datasets.check import failures
     from torchsoft.datasets.config import Config
     from torchsoft.datasets.files import listed
     from torchsoft.threads import cores
@@ -135,13 +134,15 @@ def make(options: argparse.Namespace) -> int:
         f"{made} trajectories in {options.out}; of those made now "
         + (f"{bad} failed, each with its reason" if bad else "none failed")
     )
+    if bad:
+        say(failures(options.out)[1])
     if left:
         say(f"of the whole set {len(left)} of {config.shards} shards are left: {listed(left)}")
     return 0
 
 
 def slurm(options: argparse.Namespace) -> int:
-    """Write a job array."""
+    """Print a job array."""
     from torchsoft.datasets.slurm import job_array
 
     script, price = job_array(options.config, options.out, options.parts)
@@ -151,14 +152,14 @@ def slurm(options: argparse.Namespace) -> int:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Print the faults of a dataset; the exit status is 1 for any finding."""
+    """Print the defects of a dataset; the exit status is 1 for any finding."""
     from torchsoft.datasets.check import report
 
     return int(report(options.store, options.picture) > 0)
 
 
 def export(options: argparse.Namespace) -> int:
-    """Write a dataset in the form of another project."""
+    """Export a dataset to the format of another project."""
     from torchsoft.datasets.export import export
 
     say(export(options.store, options.to, options.out))

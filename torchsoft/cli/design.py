@@ -1,10 +1,10 @@
-"""Design of motions for an identification."""
+"""The command `design`: motions for an identification."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, add_progress, failed, say, try_folder
+from torchsoft.cli.results import add_command, add_out, add_progress, say, sorted_files, try_folder
 
 DESIGN = """\
 Which motion of the rig should be recorded?
@@ -17,7 +17,7 @@ there are already."""
 
 
 def add_commands(commands: Any) -> None:
-    """The command that designs motions."""
+    """Add the command `design`."""
     one = add_command(
         commands, "design", design, "find a motion that identifies parameters", DESIGN
     )
@@ -25,17 +25,14 @@ def add_commands(commands: Any) -> None:
         "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml",
         help="recordings, if there are any, and one configuration",
     )  # fmt: skip
-    add_out(one, default=Path("out/design"), help="folder for the results (%(default)s)")
+    add_out(one, "design")
     one.add_argument("--workers", type=int, default=1, help="threads of the search (%(default)s)")
     add_progress(one)
 
 
 def design(options: argparse.Namespace) -> int:
-    """Choose a motion, and write it."""
-    configs = [file for file in options.files if file.suffix == ".toml"]
-    data = [file for file in options.files if file.suffix != ".toml"]
-    if len(configs) != 1:
-        return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
+    """Choose a motion and write it."""
+    config, data = sorted_files(options.files)
     from torchsoft.files import write_json
     from torchsoft.plot.figures import save
     from torchsoft.rigs import written
@@ -43,12 +40,10 @@ def design(options: argparse.Namespace) -> int:
     from torchsoft.sysid.figures import design_figure
     from torchsoft.sysid.rig_design import choose
 
-    stated = measured.read_config(configs[0])
-    recorded = measured.load(data, configs[0]).problem.recordings if data else ()
+    stated = measured.read_config(config)
+    recorded = measured.load(data, config).problem.recordings if data else ()
     try_folder(options.out, options.force)
-    chosen = choose(
-        configs[0], stated, recorded, workers=options.workers, progress=options.progress
-    )
+    chosen = choose(config, stated, recorded, workers=options.workers, progress=options.progress)
     written.save(chosen.file, options.out / "motion.toml")
     write_json(options.out / "design.json", chosen.summary())
     say(chosen.table())

@@ -1,11 +1,20 @@
-"""Identification from files."""
+"""The commands `identify`, `explain` and `rehearse`."""
 
 import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, add_progress, failed, say, try_folder
+from torchsoft.cli.results import (
+    add_command,
+    add_out,
+    add_progress,
+    add_yes,
+    failed,
+    say,
+    sorted_files,
+    try_folder,
+)
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
@@ -36,7 +45,7 @@ intervals. The CSV files it writes are templates of those to record."""
 
 
 def add_commands(commands: Any) -> None:
-    """The commands that identify, that explain a misfit, and that rehearse."""
+    """Add the commands `identify`, `explain` and `rehearse`."""
     for name, help, description in (
         ("identify", "find parameters in recordings", IDENTIFY),
         ("explain", "find what is wrong where a model does not explain recordings", EXPLAIN),
@@ -46,12 +55,12 @@ def add_commands(commands: Any) -> None:
 
 
 def add_arguments(one: argparse.ArgumentParser) -> None:
-    """Arguments of either."""
+    """Add the arguments of any of these commands."""
     metavar, said = "DATA.csv ... CONFIG.toml", "data files and a configuration"
     if one.prog.endswith("rehearse"):
         metavar, said = "CONFIG.toml", "the configuration"
     one.add_argument("files", nargs="+", type=Path, metavar=metavar, help=said)
-    add_out(one, default=Path("out/identify"), help="folder for the results (%(default)s)")
+    add_out(one, "identify")
     one.add_argument("--workers", type=int, help="threads, one recording each (fit.workers)")
     one.add_argument(
         "--rtol",
@@ -61,20 +70,15 @@ def add_arguments(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)"
     )
-    one.add_argument(
-        "--yes", action="store_true", help="begin even what takes hours, or much memory"
-    )
+    add_yes(one)
     add_progress(one)
     verb = one.prog.split()[-1]
     one.set_defaults(explains=verb == "explain", rehearses=verb == "rehearse")
 
 
 def identify(options: argparse.Namespace) -> int:
-    configs = [file for file in options.files if file.suffix == ".toml"]
-    data = [file for file in options.files if file.suffix != ".toml"]
+    config, data = sorted_files(options.files)
     unfinished: Path = options.checkpoint or options.out / "unfinished"
-    if len(configs) != 1:
-        return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
     try:
         # these take seconds to import, so that `--help` does without
         from torchsoft.cost import agree
@@ -94,9 +98,9 @@ def identify(options: argparse.Namespace) -> int:
                 if data:
                     return failed(f"a rehearsal makes its own data: leave {data[0]} out")
                 try_folder(options.out, options.force)
-                planned = measured.read_config(configs[0])
-                stated, data = rehearsed(configs[0], planned, options.out)
-            case = measured.load(data, configs[0], stated)
+                planned = measured.read_config(config)
+                stated, data = rehearsed(config, planned, options.out)
+            case = measured.load(data, config, stated)
             fit, tables = case.config.fit, case.tables
             changed = {
                 "rtol": options.rtol, "workers": options.workers,
@@ -145,7 +149,7 @@ def identify(options: argparse.Namespace) -> int:
 
 
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
-    """Fits the competing laws, and says which one made the data."""
+    """Fit the competing laws and write the comparison; returns its table and verdict."""
     from torchsoft.sysid.compare import compare
     from torchsoft.sysid.runs import forget
 

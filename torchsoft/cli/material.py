@@ -1,4 +1,4 @@
-"""Materials from tests and from the literature."""
+"""The command `material`: fits to tests, and presets from the literature."""
 
 import argparse
 from pathlib import Path
@@ -23,7 +23,7 @@ Rubbers from the literature, every coefficient marked `published`, with where, o
 
 
 def add_commands(commands: Any) -> None:
-    """The commands on materials."""
+    """Add the command `material`."""
     material = commands.add_parser(
         "material", help="fit a material to a test, or list some", description="Materials of pads."
     )
@@ -31,7 +31,7 @@ def add_commands(commands: Any) -> None:
     help = "fit a material to a relaxation or creep test"
     one = add_command(commands, "fit", fit_material, help, MATERIAL_FIT)
     one.add_argument("file", type=Path, metavar="FILE.csv", help="the test")
-    add_out(one, default=Path("out/material"), help="folder for the results (%(default)s)")
+    add_out(one, "material")
     one.add_argument(
         "--test",
         choices=("relaxation", "creep"),

@@ -1,4 +1,4 @@
-"""Plans: a goal of a rig file reached by gradient."""
+"""The command `plan`: a motion that reaches a goal."""
 
 import argparse
 from pathlib import Path
@@ -19,18 +19,18 @@ and run.png; the exit status is 1 where a target or limit is not kept."""
 
 
 def add_commands(commands: Any) -> None:
-    """The command that plans motions."""
+    """Add the command `plan`."""
     one = add_command(commands, "plan", plan, "find a motion that reaches a goal", PLAN)
     one.add_argument("rig", type=Path, metavar="RIG.toml")
     one.add_argument("goal", type=Path, metavar="GOAL.toml")
     said = "draw what an identification of the rig leaves unknown"
     one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=said)
-    add_out(one, default=Path("out/plan"), help="folder for the results (%(default)s)")
+    add_out(one, "plan")
     add_progress(one)
 
 
 def plan(options: argparse.Namespace) -> int:
-    """Plan, and write the motion."""
+    """Plan and write the motion."""
     from torchsoft.files import write_json
     from torchsoft.plot import figures
     from torchsoft.plot.dashboard import dashboard

@@ -1,4 +1,4 @@
-"""Pictures of a run that was saved, and the version."""
+"""The commands `plot` and `version`."""
 
 import argparse
 import platform
@@ -14,12 +14,9 @@ forces with the friction cone, points that stick and slip, stress and energies. 
 interactive player, one file for any browser that needs no network; --pdf a camera-ready dashboard,
 as wide as a page or a column, with --only for some of its panels."""
 
-PAGE = 250
-"""Height of a page [mm]."""
-
 
 def add_commands(commands: Any) -> None:
-    """The commands `plot` and `version`."""
+    """Add the commands `plot` and `version`."""
     one = add_command(commands, "plot", plot, "draw a saved run", PLOT)
     one.add_argument("file", type=Path, metavar="FILE.nc", help="the run")
     one.add_argument("--html", action="store_true", help="write the interactive player")
@@ -39,8 +36,8 @@ def add_commands(commands: Any) -> None:
 
 def plot(options: argparse.Namespace) -> int:
     """Draw a saved run."""
-    from torchsoft.plot.dashboard import dashboard
-    from torchsoft.plot.figures import save
+    from torchsoft.plot.dashboard import dashboard, named
+    from torchsoft.plot.figures import SIZES, save
     from torchsoft.plot.player import player
     from torchsoft.solve.trajectory import Trajectory
 
@@ -54,8 +51,12 @@ def plot(options: argparse.Namespace) -> int:
     if options.pdf:
         written.append(made.with_name(f"{made.name}.pdf"))
         figure = dashboard(run, look=options.width, **common)
-        if (tall := 25.4 * figure.get_figheight()) > PAGE:
-            say(f"the figure is {tall:.0f} mm tall, a page {PAGE}: choose panels with --only")
+        tall, most = figure.get_figheight(), SIZES[options.width].height
+        if tall > most + 1e-6:
+            say(
+                f"the figure is {25.4 * tall:.0f} mm tall, a page {25.4 * most:.0f}: choose panels "
+                f"with --only, of {', '.join(named(run))}"
+            )
         save(figure, written[-1])
     if options.vtk:
         listed = made.with_name(f"{made.name}.pvd")
@@ -72,7 +73,7 @@ def plot(options: argparse.Namespace) -> int:
 
 
 def versions(options: argparse.Namespace) -> int:
-    """Say which versions are at work."""
+    """Print the versions of torchsoft and its main dependencies."""
     names = ("torchsoft", "torch", "numpy", "numba")
     listed = ", ".join(f"{name} {version(name)}" for name in names)
     say(f"{listed}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")

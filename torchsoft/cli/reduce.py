@@ -1,10 +1,13 @@
-"""Reduced models: sparse equations from runs that were saved."""
+"""The command `reduce`: sparse equations from saved runs."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
 from torchsoft.cli.results import add_command, add_out, say, try_folder
+
+LARGEST = 2.0
+"""Rolling radius over the farthest point of the body that rolls."""
 
 REDUCE = """\
 Which sparse equations do saved runs of a rig obey?
@@ -17,7 +20,7 @@ and the error of the prediction; the exit status is 1 where that is no better th
 
 
 def add_commands(commands: Any) -> None:
-    """The command that finds reduced models."""
+    """Add the command `reduce`."""
     one = add_command(commands, "reduce", reduce, "find sparse equations of saved runs", REDUCE)
     one.add_argument("files", type=Path, nargs="+", metavar="RUN.nc", help="runs")
     one.add_argument("--held-out", type=Path, metavar="RUN.nc", help="run that is predicted")
@@ -27,11 +30,11 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--bracket", default="bracket", help="body of the other pad (%(default)s)")
     said = "least part of a rate that a term must account for (%(default)s)"
     one.add_argument("--threshold", type=float, default=0.05, help=said)
-    add_out(one, default=Path("out/reduced"), help="folder for the result (%(default)s)")
+    add_out(one, "reduced")
 
 
 def reduce(options: argparse.Namespace) -> int:
-    """Fit the runs, and predict the one held out."""
+    """Fit the runs and predict the held-out one."""
     from torchsoft.files import write_json
     from torchsoft.reduced import (
         Recipe,
@@ -59,6 +62,12 @@ def reduce(options: argparse.Namespace) -> int:
     ]
     try_folder(options.out, options.force)
     radius = options.radius or rolling_radius(records[:1])
+    size = Trajectory.load(fitted[0]).setup.bodies[options.disc].size
+    if not radius < LARGEST * size:
+        raise ValueError(
+            f"a rolling radius of {radius:g} m is not that of `{options.disc}`, which reaches "
+            f"{size:.3g} m from its centre; give it in metres by --radius"
+        )
     recipe = Recipe(threshold=options.threshold, width=0.004, window=0.3)
     model = fit(assemble(records[:-1], mechanics(radius), recipe), recipe, loop(records[:-1]))
     predicted = score(model, records[-1])

@@ -1,8 +1,8 @@
-"""Results of a command: the folder that they are written to, and sentences on the terminal."""
+"""Shared parts of commands: arguments, the folder of results, and messages on the terminal."""
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -14,7 +14,7 @@ from torchsoft.tables import line, plain
 def add_command(
     commands: Any, name: str, run: Callable[[argparse.Namespace], int], help: str, description: str
 ) -> argparse.ArgumentParser:
-    """A command that `run` carries out, its description as it is written."""
+    """Add a command that `run` carries out; the help shows its description verbatim."""
     one = commands.add_parser(
         name, help=help, description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -23,16 +23,23 @@ def add_command(
     return one
 
 
-def add_out(command: Any, **more: Any) -> None:
-    """The options on the folder."""
-    command.add_argument("--out", type=Path, **more)
+def add_out(command: Any, folder: str, **more: Any) -> None:
+    """Add the options on the folder of results, which is out/`folder` by default."""
+    help = f"folder for the results (out/{folder})"
+    command.add_argument("--out", type=Path, help=help, **{"default": Path("out", folder)} | more)
     command.add_argument(
         "--force", action="store_true", help="write to a folder that holds other files"
     )
 
 
+def add_yes(command: Any) -> None:
+    """Add the option on costly work."""
+    said = "begin even what takes hours, or much memory or disk"
+    command.add_argument("--yes", action="store_true", help=said)
+
+
 def add_progress(command: Any) -> None:
-    """The option on progress, which only a terminal is shown."""
+    """Add the option on progress, which is shown on terminals only."""
     command.add_argument(
         "--no-progress", dest="progress", action="store_false", default=sys.stderr.isatty(),
         help="show no progress; only a terminal is shown any",
@@ -40,19 +47,28 @@ def add_progress(command: Any) -> None:
 
 
 def say(*text: object, error: bool = False) -> None:
-    """Print text without characters that a terminal obeys."""
+    """Print text without control characters."""
     print(plain(" ".join(map(str, text))), file=sys.stderr if error else sys.stdout)
 
 
 def failed(reason: str) -> int:
-    """Say why a command failed; its exit status."""
+    """Print the reason of a failure; returns the exit status."""
     print(f"torchsoft: error: {line(reason, 2000)}", file=sys.stderr)
     return 2
 
 
+def sorted_files(files: Sequence[Path]) -> tuple[Path, list[Path]]:
+    """The configuration among some files, and the others, which are data. Raises `ValueError`
+    unless there is one configuration."""
+    configs = [file for file in files if file.suffix == ".toml"]
+    if len(configs) != 1:
+        raise ValueError(f"one CONFIG.toml is needed, but {len(configs)} were given")
+    return configs[0], [file for file in files if file.suffix != ".toml"]
+
+
 def try_folder(out: Path, force: bool) -> None:
-    """Make the folder, and try that files can be written to it. Raises `ValueError` where they
-    cannot, and for a folder of other files, unless by `force`."""
+    """Make the folder and test that files can be written to it. Raises `ValueError` where they
+    cannot, and for a folder with other files unless `force` is set."""
     try:
         claim(out, force)
         with TemporaryFile(dir=out):

@@ -1,11 +1,19 @@
-"""Commands on rig files: run, check, init."""
+"""The commands `run`, `check` and `init` on rig files."""
 
 import argparse
 import shlex
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, add_progress, failed, say, try_folder
+from torchsoft.cli.results import (
+    add_command,
+    add_out,
+    add_progress,
+    add_yes,
+    failed,
+    say,
+    try_folder,
+)
 
 RUN = """\
 Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and
@@ -26,27 +34,23 @@ every number in a comment. A folder that is not there is made."""
 
 
 def add_commands(commands: Any) -> None:
-    """The commands on rig files."""
+    """Add the commands `run`, `check` and `init`."""
     one = add_command(commands, "run", run_rig, "simulate a rig file", RUN)
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
-    add_out(one, help="folder for the results (out/RIG)")
+    add_out(one, "RIG", default=None)
     one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
     add_progress(one)
-    one.add_argument(
-        "--yes", action="store_true", help="begin without asking, however long it takes"
-    )
+    add_yes(one)
     one = add_command(commands, "check", check_rig, "say what is wrong in a rig file", CHECK)
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
-    one.add_argument(
-        "--yes", action="store_true", help="begin without asking, however long it takes"
-    )
+    add_yes(one)
     one = add_command(commands, "init", init_rig, "write a rig file to start from", INIT)
     one.add_argument("name", metavar="NAME", help="the file's name, with or without .toml")
     one.add_argument("--material", help="a rubber of `torchsoft material presets` for its pads")
 
 
 def run_rig(options: argparse.Namespace) -> int:
-    """Check a rig file, simulate it, and write the results."""
+    """Check a rig file, simulate it and write the results."""
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
@@ -82,7 +86,7 @@ def run_rig(options: argparse.Namespace) -> int:
 
 
 def check_rig(options: argparse.Namespace) -> int:
-    """Print the faults of a rig file."""
+    """Print the findings on a rig file."""
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check

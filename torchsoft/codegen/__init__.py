@@ -30,16 +30,13 @@ class Law:
     rows, w (linear,), and p_bar (parameters,), to which Σ w[o]·∂out[o]/∂p[j] is added.
     """
 
-    inputs: int
     parameters: int
     outputs: int
     linear: int
     differentiated: int
-    names: tuple[str, ...]
     value: int
     linearise: int
     pullback: int
-    nodes: int
 
 
 def compile_law(
@@ -74,21 +71,10 @@ def compile_law(
         )
     linear = _count("linear", linear, len(outputs))
     differentiated = _count("differentiated", differentiated, x.numel())
-    names = tuple(
-        itertools.chain.from_iterable(_names(name, tensor) for name, tensor in parameters.items())
-    )
-    engine = emit.compiled(_functions(graph, outputs, linear, differentiated, len(names)))
+    count = sum(tensor.numel() for tensor in parameters.values())
+    engine = emit.compiled(_functions(graph, outputs, linear, differentiated, count))
     addresses = [engine.get_function_address(name) for name in ("value", "linearise", "pullback")]
-    return Law(
-        x.numel(),
-        len(names),
-        len(outputs),
-        linear,
-        differentiated,
-        names,
-        *addresses,
-        nodes=len(graph.ops),
-    )
+    return Law(count, len(outputs), linear, differentiated, *addresses)
 
 
 def _functions(
@@ -113,11 +99,6 @@ def _functions(
             g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p + lookups, p_bar)}
         ),
     ]
-
-
-def _names(name: str, tensor: Tensor) -> list[str]:
-    places = itertools.product(*(range(n) for n in tensor.shape))
-    return [f"{name}[{','.join(map(str, place))}]" if place else name for place in places]
 
 
 def _count(name: str, count: int | None, available: int) -> int:

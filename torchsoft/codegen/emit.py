@@ -149,7 +149,7 @@ def compiled(functions: Iterable[str]) -> llvm.ExecutionEngine:
     if key not in _engines:
         _engines.setdefault(
             key, _engine(source)
-        )  # where threads were at it together, all take the first one's
+        )  # of several threads that compiled it, all take the first engine
     return _engines[key]
 
 

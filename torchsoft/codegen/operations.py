@@ -40,7 +40,7 @@ def mapped(function: Callable[..., Any], *arrays: Nodes) -> Nodes:
 
 
 def _extremum(op: str, better: str) -> Callable[..., int]:
-    """The better of two numbers; none where one of them is none."""
+    """The better of two numbers; NaN where one of them is NaN."""
     return lambda g, a, b: g(op, g("select", g("or", g(better, a, b), g("ne", a, a)), a, b), a, b)
 
 
@@ -62,7 +62,7 @@ def _div(g: Graph, a: int, b: int, rounding_mode: str | None = None) -> int:
 
 
 def _converted(g: Graph, a: int, dtype: Any = None, **_: Any) -> int:
-    """The same number; to a whole one the part after the point is cut off."""
+    """The same number; conversion to int64 truncates."""
     if dtype != torch.int64:
         return a
     return g("select", g("lt", a, g.zero), g("neg", g("floor", g("neg", a))), g("floor", a))

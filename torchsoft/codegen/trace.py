@@ -83,8 +83,8 @@ class Trace(TorchDispatchMode):
         self.refusal: UnknownOperation | None = None
 
     def refused(self, what: str, remedy: str) -> UnknownOperation:
-        """The error for `what`. It is kept, since torch's operators swallow a TypeError and report
-        another."""
+        """Error for an operation. It is kept, since torch's operators swallow a TypeError and
+        report another."""
         self.refusal = UnknownOperation(
             f"The law cannot be compiled because of {what} at {_place()}; {remedy}."
         )

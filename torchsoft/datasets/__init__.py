@@ -1,4 +1,4 @@
-"""Synthetic rolling datasets: designed, simulated, written shard by shard, checked, and read for
+"""Synthetic datasets: designed, simulated and written shard by shard, checked, and read for
 training."""
 
 from torchsoft.extras import needed

@@ -17,7 +17,7 @@ from torchsoft.tables import line
 UNSTATED = "Not stated: say it here and at the top before others are given the data."
 
 REASONS = 5
-"""Reasons of failures that it lists."""
+"""Most reasons for failures that the card lists."""
 
 
 def write_card(url: str) -> None:
@@ -28,7 +28,8 @@ def write_card(url: str) -> None:
 
 
 def card(url: str) -> str:
-    """The card of a finished dataset. Raises `StoreError` for another."""
+    """The text of the card of a finished dataset. Raises `StoreError` for an unfinished or damaged
+    one."""
     manifest, data = Manifest.read(url), Vouched(url).data(chunks=None)
     config = Config.model_validate(manifest.config)
     example = next(iter(config.subject.signals), "stored_energy")
@@ -68,17 +69,21 @@ windows = Trajectories("FOLDER", ["{example}"], split="train", window=20)  # for
 
 
 def counts(data: xr.Dataset) -> str:
-    """Numbers of trajectories: all, of every split, and failed for which reasons."""
+    """Number of trajectories in all and in each split, number of failures, and their reasons."""
     failed = data.failed.values.astype(bool)
-    said = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
-    out = f"{len(failed)} ({said}; {int(failed.sum())} failed, their series are NaN"
+    out = f"{len(failed)} ({by_split(data)}; {int(failed.sum())} failed, their series are NaN"
     reasons = sorted({line(x, 100) for x in data.reason.values[failed]})
     more = ["..."] if len(reasons) > REASONS else []
     return "; ".join([out, *reasons[:REASONS], *more]) + ")"
 
 
+def by_split(data: xr.Dataset) -> str:
+    """Number of trajectories in each split."""
+    return ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
+
+
 def rig(config: Config) -> str:
-    """The parts of the rig, and what touches."""
+    """Bodies, pads, contacts and actuators of the rig."""
     it = config.subject.template
     touching = (f"{one.body} on {one.pad}" for one in it.contacts.values())
     groups = {"bodies": it.bodies, "pads": it.pads, "contacts": touching, "actuators": it.actuators}
@@ -87,7 +92,7 @@ def rig(config: Config) -> str:
 
 
 def drawn(config: Config) -> Iterable[tuple[str, ...]]:
-    """What is drawn: numbers of the rig, and of its motions."""
+    """Rows of the table of drawn parameters: name, distribution, unit."""
     for name, one in config.parameters.items():
         unit = "1" if one.ratio_to else variables(config)[name].unit
         yield f"`{name}`", distribution(one), unit
@@ -110,12 +115,12 @@ def distribution(one: Distribution) -> str:
 
 
 def arrays(config: Config) -> Iterable[tuple[str, ...]]:
-    """Every array: dimensions, unit, meaning."""
+    """Rows of the table of arrays: name, dimensions, unit, meaning."""
     for name, one in variables(config).items():
         parts = f": {', '.join(one.components)}" if one.components else ""
         yield f"`{name}`", ", ".join(one.sizes), one.unit, one.meaning + parts
 
 
 def table(heading: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    """A table in Markdown, whatever its cells hold."""
+    """A table in Markdown; bars within its cells become slashes."""
     return markdown(heading, ([cell.replace("|", "/") for cell in one] for one in rows))

@@ -1,6 +1,6 @@
-"""Re-read a dataset, list what is wrong with it, and draw what it covers."""
+"""Validation of a dataset: read it again, list its defects, and draw its coverage."""
 
-import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from torchsoft.datasets.card import by_split
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import (
     CARD,
@@ -23,14 +24,16 @@ from torchsoft.datasets.files import (
 )
 from torchsoft.datasets.reader import Vouched, open_dataset
 from torchsoft.datasets.schema import not_finite, variables
-from torchsoft.datasets.simulation import points, task
-from torchsoft.datasets.subject import SPLITS
+from torchsoft.datasets.simulation import points
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line
 
+MANY = 0.5
+"""Share of trajectories that failed from which a set is called wrong."""
+
 MOST = 3
-"""Trajectories that it shows, of every kind of motion."""
+"""Most trajectories of each kind in the picture."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -44,7 +47,7 @@ def check(url: str) -> Iterator[str]:
 
 
 def findings(url: str) -> Iterator[str]:
-    """Every finding; raises what keeps it from going on."""
+    """Every finding, as a sentence. Raises the error that ends the check."""
     manifest = Manifest.read(url)
     try:
         config = Config.model_validate(manifest.config)
@@ -74,11 +77,26 @@ def findings(url: str) -> Iterator[str]:
     design = points(config)
     for shard in sorted(store.finished):
         yield from check_shard(data, config, shard, design)
+    share, sentence = failures(url)
+    if share > MANY:
+        yield sentence
+
+
+def failures(url: str) -> tuple[float, str]:
+    """Share of the finished trajectories that failed, and a sentence with the commonest reason."""
+    store = Vouched(url, unfinished=True)
+    config, data = Config.model_validate(Manifest.read(url).config), store.data(chunks=None)
+    rows = [i for shard in sorted(store.finished) for i in config.rows(shard)]
+    failed = data.failed.values[rows].astype(bool)
+    if not failed.any():
+        return 0.0, "none failed"
+    reason, _ = Counter(data.reason.values[rows][failed].tolist()).most_common(1)[0]
+    said = f"{failed.sum()} of {len(rows)} trajectories failed, most often: {line(reason, 200)}"
+    return float(failed.mean()), said
 
 
 def check_files(url: str, manifest: Manifest) -> Iterator[str]:
-    """Files laid out at the start that are missing or damaged, and files that do not belong
-    there."""
+    """Files that are missing, damaged or foreign to the dataset."""
     layout, there = manifest.layout, keys(url)
     for key in manifest.digests:
         try:
@@ -93,7 +111,7 @@ def check_files(url: str, manifest: Manifest) -> Iterator[str]:
 
 
 def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
-    """Arrays, their shapes, dimensions and units."""
+    """Arrays that are missing, or whose dimensions, unit or shard size differ from the schema."""
     for name, variable in variables(config).items():
         if name not in data:
             yield f"{name}: missing"
@@ -115,7 +133,7 @@ def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
 def check_shard(
     data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]
 ) -> Iterator[str]:
-    """Everything about the trajectories of one finished shard."""
+    """Findings on the trajectories of one finished shard."""
     schema, columns, here = variables(config), dict[str, Any](), config.rows(shard)
     for name in schema:
         try:
@@ -126,12 +144,14 @@ def check_shard(
                 return  # nothing vouches for the others either
     for row, index in enumerate(here if len(columns) == len(schema) else []):
         one = {name: values[row] for name, values in columns.items()}
-        for finding in check_trajectory(config, one, task(config, index, design[index]).labels):
+        labels = config.subject.task(index, design[index]).labels
+        for finding in check_trajectory(config, one, labels):
             yield f"trajectory {index}: {finding}"
 
 
 def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]) -> Iterator[str]:
-    """What the design says of it; that it is finite, or failed for a reason; energy and contact."""
+    """Findings on one trajectory: labels unlike the design, numbers that are not finite, a failure
+    without a reason, and physics."""
     for name, value in labels.items():
         if one[name] != value:
             yield f"{name} is {one[name]}, but the design has {value}"
@@ -150,7 +170,7 @@ def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]
 
 
 def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
-    """The energy balance, and contact where there is force."""
+    """Findings on the energy balance, and on contact forces without contact."""
     stored, dissipated, supplied = (
         one[f"{x}_energy"].sum(-1) for x in ("stored", "dissipated", "supplied")
     )
@@ -178,18 +198,17 @@ def summary(url: str, data: xr.Dataset) -> str:
     """Sizes and counts."""
     fs, root = filesystem(url)
     stored = [info["size"] for info in fs.find(root, detail=True).values()]
-    counts = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
     return (
-        f"{data.sizes['trajectory']} trajectories ({counts}; {int(data.failed.sum())} failed) of "
-        f"{data.sizes['time']} samples, {data.nbytes / 1e6:.1f} MB of arrays in "
+        f"{data.sizes['trajectory']} trajectories ({by_split(data)}; {int(data.failed.sum())} "
+        f"failed) of {data.sizes['time']} samples, {data.nbytes / 1e6:.1f} MB of arrays in "
         f"{sum(stored) / 1e6:.1f} MB and {len(stored)} files"
     )
 
 
 @rc_context(STYLE)
 def figure(data: xr.Dataset, config: Config) -> Figure:
-    """Each parameter over the next by split, failures crossed; trajectories of each kind of motion
-    and split; some sound motions."""
+    """Coverage of a dataset: scatter plots of neighbouring parameters by split, with failures
+    crossed; counts by kind and split; time series of some sound trajectories."""
     ranged = config.parameters
     by = [name for name in ("kind", "split") if name in data]
     names, series = list(ranged), moving(data, config)
@@ -255,14 +274,3 @@ def report(url: str, picture: Path | None = None) -> int:
             print(found[-1])
     print(f"{len(found)} finding{'s' * (len(found) > 1)}" if found else "sound")
     return len(found)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The command `torchsoft dataset check`."""
-    from torchsoft.cli import main as command
-
-    return command(["dataset", "check", *(sys.argv[1:] if arguments is None else arguments)])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""What a dataset is made of: the TOML file, validated."""
+"""Configuration of a dataset: the TOML file, validated."""
 
 import hashlib
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ STEP = 0.02
 percents."""
 
 OUTDATED = ("grasp_depth", "settle", "feed_forward")
-"""Fields of configurations that knew the paper's rig only."""
+"""Fields of configurations from before version 0.3, which had no rig file."""
 
 
 class Fractions(Table):
@@ -129,7 +129,7 @@ class Config(Table):
 
     @property
     def subject(self) -> Subject:
-        """What the trajectories are of, kept between calls."""
+        """The subject of this configuration, cached by its hash."""
         key = self.hash
         if key not in _subjects:
             while len(_subjects) >= SUBJECTS:
@@ -153,7 +153,7 @@ class Config(Table):
 
     @property
     def hash(self) -> str:
-        """Of everything in the file."""
+        """Sixteen hexadecimal digits of the SHA-256 of the configuration."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
     @classmethod
@@ -164,6 +164,6 @@ class Config(Table):
 
 
 SUBJECTS = 4
-"""Subjects that a process keeps."""
+"""Most subjects in the cache of a process."""
 
 _subjects: dict[str, Subject] = {}

@@ -1,5 +1,5 @@
-"""Distributions of the numbers that differ between trajectories: functions of a place u in [0, 1]
-of the design."""
+"""Distributions of the parameters that differ between trajectories, as quantile functions of u in
+[0, 1], a coordinate of the design."""
 
 import math
 from collections.abc import Mapping
@@ -18,15 +18,16 @@ from scipy.special import ndtr, ndtri
 from torchsoft.tables import LISTED, Table
 
 WIDTH = 4.0
-"""Standard deviations from the mean at which a normal distribution is cut by default."""
+"""Default distance of both bounds of a normal distribution from its mean, in standard
+deviations."""
 
 SURE = 1e-12
-"""Standard deviation over the width of the interval below which quantiles are rounding."""
+"""Least probability between the bounds of a normal distribution; below it, quantiles are rounding
+errors."""
 
 
 class Related(Table):
-    """A number that is drawn; with `ratio_to` the parameter is so many times the one of that
-    name."""
+    """A drawn parameter; with `ratio_to`, a multiple of the parameter of that name."""
 
     ratio_to: str | None = None
 
@@ -37,8 +38,8 @@ class Related(Table):
 
 
 class Uniform(Related):
-    """From `low` to `high`, uniformly in the value or in its logarithm; with `either_sign` as
-    often below zero as above."""
+    """Uniform from `low` to `high`, in the value or in its logarithm; with `either_sign`, the sign
+    is positive or negative with equal probability."""
 
     low: float
     high: float
@@ -65,14 +66,14 @@ class Uniform(Related):
         return low + u * (high - low)
 
     def ends(self, where: str) -> dict[str, float]:
-        """The ends by what messages call them."""
+        """Both bounds by their names in messages, and their negatives where the sign varies."""
         ends = {f"{where}.low": self.low, f"{where}.high": self.high}
         return ends | {f"-{name}": -x for name, x in ends.items() if self.either_sign}
 
 
 class Normal(Related):
-    """About `mean` with the standard deviation `sd`, cut at `low` and `high`, four standard
-    deviations away if not given."""
+    """Normal with mean `mean` and standard deviation `sd`, truncated at `low` and `high`, by
+    default four standard deviations from the mean."""
 
     mean: float
     sd: float = Field(gt=0)
@@ -103,7 +104,7 @@ class Normal(Related):
 
     @property
     def _tails(self) -> tuple[float, float]:
-        """Probabilities of the normal distribution below both ends."""
+        """Cumulative probabilities of the untruncated distribution at both bounds."""
         ends = (self.low - self.mean) / self.sd, (self.high - self.mean) / self.sd
         return float(ndtr(ends[0])), float(ndtr(ends[1]))
 
@@ -114,12 +115,12 @@ class Normal(Related):
         return min(max(value, self.low), self.high)
 
     def ends(self, where: str) -> dict[str, float]:
-        """Both ends by what messages call them."""
+        """Both bounds by their names in messages."""
         return {f"{where}.low": self.low, f"{where}.high": self.high}
 
 
 class Choice(Related):
-    """One of the numbers `choices`, each as likely as the others."""
+    """One of the numbers `choices`, with equal probability."""
 
     choices: Annotated[tuple[float, ...], LISTED] = Field(min_length=1, max_length=10_000)
     scale: ClassVar[Literal["linear"]] = "linear"
@@ -133,16 +134,16 @@ class Choice(Related):
         return max(self.choices)
 
     def at(self, u: float) -> float:
-        """The number at u in [0, 1]."""
+        """The quantile at u in [0, 1]."""
         return self.choices[min(int(u * len(self.choices)), len(self.choices) - 1)]
 
     def ends(self, where: str) -> dict[str, float]:
-        """Every number by what messages call it."""
+        """Every choice by its name in messages."""
         return {f"{where}.choices.{i}": x for i, x in enumerate(self.choices)}
 
 
 def distribution(given: Any) -> str:
-    """Which distribution a table states, by its keys."""
+    """Tag of the distribution that a table states, by its keys."""
     keys = given if isinstance(given, Mapping) else getattr(type(given), "model_fields", ())
     return "choice" if "choices" in keys else "normal" if {"mean", "sd"} & {*keys} else "uniform"
 
@@ -156,8 +157,9 @@ Distribution = Annotated[
 
 
 class Kind(Table):
-    """A kind of trajectory, drawn in proportion to `weight`: what is `fixed` in it, such as a whole
-    motion, and the `parameters` that are drawn besides those of all kinds, or otherwise."""
+    """A kind of trajectory, drawn with probability proportional to `weight`. `fixed` holds its
+    constants, such as a whole motion; `parameters` are added to those of all kinds, or replace
+    them."""
 
     name: str = Field(min_length=1, max_length=100)
     """in the array `kind`"""

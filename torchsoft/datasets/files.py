@@ -1,10 +1,10 @@
-"""The files of a dataset: a folder, or what fsspec opens; how they were made, and a digest
-(SHA-256) of every one of them.
+"""Files of a dataset, in a local folder or any store of fsspec: their layout, the manifest, and a
+digest (SHA-256) of each.
 
-Digests of what is laid out at the start are in `manifest.json`, those of a shard's files in a
-record of its own, which is written after them and says that the shard is finished. A record has the
-form of `sha256sum`: `cd SET && sha256sum --check --quiet finished/*.sha256` checks all shards.
-Errors say what to do about them.
+`manifest.json` holds the digests of the files laid out at the start. Each shard has a record with
+the digests of its own files; the record is written last and marks the shard as finished. A record
+has the form of `sha256sum`: `cd SET && sha256sum --check --quiet finished/*.sha256` checks all
+shards.
 """
 
 import errno
@@ -42,15 +42,15 @@ REMEDIES = {
     errno.EEXIST: FILE,
     errno.EROFS: "may not be written, the file system is read-only; choose another folder",
 }
-"""What the operating system's errors mean for a dataset."""
+"""Remedies for errors of the operating system, by number."""
 
 
 MOST = 20
-"""Spans of shards that a message lists."""
+"""Most spans of shards that a message lists."""
 
 
 class StoreError(RuntimeError):
-    """A dataset that cannot be used, and what to do about it."""
+    """A dataset that cannot be used; the message names the remedy."""
 
 
 @contextmanager
@@ -75,8 +75,7 @@ def store_errors(url: str) -> Iterator[None]:
 
 
 def filesystem(url: str) -> tuple[Any, str]:
-    """The filesystem and the path in it, with nothing remembered of what others may have written
-    since."""
+    """The filesystem with its cache emptied, since others may write, and the path in it."""
     try:
         fs, root = fsspec.url_to_fs(url)
     except ImportError as error:  # a known protocol whose package is not installed
@@ -92,8 +91,8 @@ def folder(url: str) -> Path | None:
 
 
 def read_bytes(url: str, key: str) -> bytes | None:
-    """A file of the dataset, None where there is none. Raises `StoreError` for what cannot be
-    read."""
+    """Content of a file of the dataset, None where there is none. Raises `StoreError` for a file
+    that cannot be read."""
     fs, root = filesystem(url)
     try:
         return fs.cat_file(f"{root}/{key}")
@@ -104,8 +103,7 @@ def read_bytes(url: str, key: str) -> bytes | None:
 
 
 def write_bytes(url: str, key: str, data: bytes) -> None:
-    """Write a file of the dataset, which appears whole or not at all; object stores put whole
-    objects."""
+    """Write a file of the dataset atomically."""
     if here := folder(url):
         with replacing(here / key) as partial:
             partial.write_bytes(data)
@@ -115,7 +113,7 @@ def write_bytes(url: str, key: str, data: bytes) -> None:
 
 
 def keys(url: str, under: str = "") -> list[str]:
-    """Keys of all files, or of those in the folder `under`, in order."""
+    """Sorted keys of all files, or of those in the folder `under`."""
     fs, root = filesystem(url)
     return sorted(
         path.removeprefix(root).lstrip("/") for path in fs.find(f"{root}/{under}".rstrip("/"))
@@ -128,8 +126,8 @@ def digest(data: bytes) -> str:
 
 
 class Layout(Table):
-    """Number and size of the shards, and the keys of a shard's files, with its number for
-    `{shard}`."""
+    """Number and size of the shards, and the keys of a shard's files, in which `{shard}` stands for
+    its number."""
 
     shards: Annotated[int, Ge(1)]
     trajectories_per_shard: Annotated[int, Ge(1)]
@@ -140,7 +138,7 @@ class Layout(Table):
         return [key.replace("{shard}", str(shard)) for key in self.files]
 
     def shard(self, key: str) -> int | None:
-        """The shard whose file or record this is."""
+        """The shard that the file or record belongs to, None for others."""
         found = re.fullmatch(r"(.+/c/|finished/)(0|[1-9]\d*)((?:/0)*|\.sha256)", key)
         if found is None or f"{found[1]}{{shard}}{found[3]}" not in (*self.files, RECORD):
             return None
@@ -151,8 +149,8 @@ class Layout(Table):
         return {shard for key in keys(url, FINISHED) if (shard := self.shard(key)) is not None}
 
     def vouch(self, url: str, key: str, content: T | None, sound: bool) -> T:
-        """The content of a file if it is there and `sound`. Raises `StoreError` that says what to
-        do otherwise."""
+        """The content of a file. Raises `StoreError` with the remedy where it is missing or not
+        `sound`."""
         if content is not None and sound:
             return content
         remedy = COPY
@@ -163,8 +161,8 @@ class Layout(Table):
 
 
 class Manifest(Table):
-    """How the dataset was made. `digests` are those of the files that were laid out, `digest` is
-    that of all else in here."""
+    """Origin of the dataset. `digests` are those of the files laid out at the start, `digest` is
+    that of the other fields."""
 
     torchsoft: str
     commit: str
@@ -177,7 +175,7 @@ class Manifest(Table):
     digest: str = ""
 
     def text(self) -> str:
-        """The file, with its own digest."""
+        """Content of the file, with its own digest."""
         content = self.model_dump(mode="json", exclude={"digest"})
         return (
             json.dumps(content | {"digest": digest(json.dumps(content).encode())}, indent=2) + "\n"
@@ -185,8 +183,8 @@ class Manifest(Table):
 
     @classmethod
     def read(cls, url: str) -> Self:
-        """The manifest of the dataset. Raises `StoreError` where there is none, or one that is not
-        what was written."""
+        """The manifest of the dataset. Raises `StoreError` where it is missing, damaged or of
+        another version."""
         data = read_bytes(url, MANIFEST)
         if data is None:
             raise StoreError(
@@ -205,14 +203,14 @@ class Manifest(Table):
         return manifest
 
     def laid_out(self, url: str, key: str) -> bytes:
-        """A file that was laid out at the start. Raises `StoreError` for one that is not what was
-        written."""
+        """Content of a file that was laid out at the start. Raises `StoreError` where it is missing
+        or damaged."""
         data = read_bytes(url, key)
         return self.layout.vouch(url, key, data, digest(data or b"") == self.digests[key])
 
 
 def listed(shards: Iterable[int]) -> str:
-    """Numbers of shards as people write them: 0, 3-7, 9."""
+    """Numbers of shards as spans: 0, 3-7, 9."""
     spans = list[list[int]]()
     for shard in sorted(shards):
         if spans and shard == spans[-1][-1] + 1:
@@ -234,8 +232,8 @@ def record(digests: dict[str, str]) -> bytes:
 
 
 def read_record(url: str, layout: Layout, shard: int, data: bytes | None) -> dict[str, str]:
-    """Digests of a shard's files by their keys, from its record. Raises `StoreError` for one that
-    is not what was written."""
+    """Digests of a shard's files by their keys, from its record. Raises `StoreError` for a record
+    that is missing or damaged."""
     lines = re.findall(rb"([0-9a-f]{64})  (.+)\n", data or b"")
     digests = {key.decode(errors="replace"): found.decode() for found, key in lines}
     layout.vouch(

@@ -1,6 +1,7 @@
-"""Make a dataset, or a part of one; started again on the same folder, what is missing of it.
+"""Generation of a dataset, or of one part. A second run on the same folder makes the missing
+shards.
 
-Shards are shared out: a part has its own, and no two processes make one at the same time.
+Each part has shards of its own, and no two processes make one shard at the same time.
 """
 
 import math
@@ -20,31 +21,31 @@ from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, read_bytes
 from torchsoft.datasets.schema import variables
-from torchsoft.datasets.simulation import points, simulate_task, task
+from torchsoft.datasets.simulation import points, simulate_task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.processes import local_processes
 
 THREADS = 3
-"""Threads of one process at the most: a third of a trajectory's time is not compiled, and holds the
+"""Most threads of one process: a third of a trajectory's time is interpreted code, which holds the
 interpreter's lock."""
 
 STATICS = 0.5
-"""Time [s] that a trajectory takes besides its steps: statics of the start and of the grasp,
+"""Time [s] of a trajectory besides its steps: static equilibrium of the start and of the grasp, and
 energies."""
 
 MANY, TRIED = 200, 8
-"""Trajectories from which on the first are tried before the others, and how many: a power of two,
-so that a Sobol sequence has every kind among them in its proportion."""
+"""Number of trajectories from which some are timed for the estimate, and the number timed: a power
+of two, so that a Sobol sequence has every kind among them in proportion."""
 
 PATIENCE = 60.0
-"""Time [s] that these may take."""
+"""Longest time [s] that the timed trajectories may take."""
 
 SURE = 2.0
-"""Standard errors of their mean to both ends of the range of times."""
+"""Half width of the estimated range of times, in standard errors of the mean."""
 
 
 class Part(NamedTuple):
-    """Every `of`-th shard, from number - 1 on. Parts have no shard in common."""
+    """Every `of`-th shard, from number - 1 on. Parts are disjoint."""
 
     number: int = 1
     of: int = 1
@@ -64,7 +65,7 @@ WHOLE = Part()
 
 
 def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
-    """Shards of a part that nobody has finished, in a place that may be empty yet."""
+    """Unfinished shards of a part, all of them where no dataset is begun."""
     begun = read_bytes(url, MANIFEST) is not None
     finished = Manifest.read(url).layout.finished(url) if begun else set[int]()
     return [shard for shard in part.shards(config) if shard not in finished]
@@ -74,8 +75,8 @@ def cost(
     config: Config, workers: int, count: int | None = None,
     each: tuple[float, float, float] | None = None,
 ) -> Cost:  # fmt: skip
-    """Of `count` trajectories, all by default, made by that many workers, where one takes `each`:
-    least and longest time [s] and steps, those of a usual one by default."""
+    """Cost of `count` trajectories, by default all, on `workers` workers. `each` is the least and
+    the longest time [s] of one trajectory and its steps, by default those of `usual`."""
     subject = config.subject
     count = config.trajectories if count is None else count
     at_once = max(min(workers, config.shards), 1)
@@ -97,8 +98,7 @@ def cost(
 
 
 def usual(config: Config) -> tuple[float, float, float]:
-    """Least and longest time [s], here one, and steps of a trajectory by experience, rather too
-    many."""
+    """Time [s] of a trajectory, twice, and its steps by experience, on the high side."""
     subject = config.subject
     seconds, step = config.duration, subject.steps.get("step")
     if step is not None:
@@ -110,13 +110,14 @@ def usual(config: Config) -> tuple[float, float, float]:
 
 
 def measured(config: Config) -> tuple[float, float, float]:
-    """The same of the first trajectories of the set in the mean, after one run that loads the
-    kernels: time of the processor, which other programs on the machine hardly change."""
+    """Least and longest time [s] and steps of a trajectory, from the first trajectories of the set.
+    One run before them loads the kernels; the times are of the processor, which other programs
+    hardly change."""
     design, times, steps = points(config), list[float](), 0
     with threads.single_threaded():
         for i in (0, *range(TRIED)):
             began = time.thread_time()
-            row = simulate_task(config, task(config, i, design[i]))
+            row = simulate_task(config, config.subject.task(i, design[i]))
             steps += row["steps"] if times else 0
             times.append(time.thread_time() - began)
     mean, error = statistics.mean(times[1:]), SURE * statistics.stdev(times[1:]) / TRIED**0.5
@@ -124,14 +125,15 @@ def measured(config: Config) -> tuple[float, float, float]:
 
 
 def estimate(config: Config, url: str, workers: int, part: Part = WHOLE) -> Cost:
-    """What is left of a part will cost; of many trajectories, by a few of them."""
+    """Cost of the unfinished shards of a part; a few trajectories are timed where there are
+    many."""
     count = sum(len(config.rows(shard)) for shard in unfinished(config, url, part))
     tried = count >= MANY and (TRIED + 1) * usual(config)[1] < PATIENCE
     return cost(config, workers, count, measured(config) if tried else None)
 
 
 class Serial(Executor):
-    """Runs every call at once, in this process."""
+    """An executor that runs every call at once, in this process."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -140,8 +142,8 @@ class Serial(Executor):
 
 
 def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
-    """Simulate and write one shard; how many of its trajectories are finished, and how many of
-    those simulated here failed. None are where another process makes the shard."""
+    """Simulate and write one shard. Returns how many of its trajectories are finished and how many
+    of those simulated here failed, (0, 0) where another process makes the shard."""
     config, rows = store.config, list[dict[str, Any]]()
     with store.claim(shard) as simulated, threads.single_threaded():
         if simulated is None:
@@ -149,7 +151,7 @@ def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
         if store.finished(shard):  # by another process, since it was submitted
             return len(config.rows(shard)), 0
         for i, u in zip(config.rows(shard), design, strict=True):
-            rows.append(simulate_task(config, task(config, i, u)))
+            rows.append(simulate_task(config, config.subject.task(i, u)))
             simulated()
         store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
@@ -201,8 +203,8 @@ def generate(
 
 
 def local_workers(workers: int) -> AbstractContextManager[Executor]:
-    """So many threads of this process, which begin at once; processes where there are too many for
-    one; with 0 neither."""
+    """An executor: threads of this process up to `THREADS` workers, processes above, and plain
+    calls for 0."""
     if workers > THREADS:
         return local_processes(workers)
     return threads.executor(workers) if workers else Serial()
@@ -210,22 +212,10 @@ def local_workers(workers: int) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """An existing Dask cluster behind the same interface; shards of a lost worker are made by the
-    others."""
+    """An existing Dask cluster as an executor; shards of a lost worker go to the others."""
     try:
         from distributed import Client
     except ImportError:
         raise StoreError("--scheduler needs Dask: pip install 'torchsoft[scale]'") from None
     with Client(address) as client:
         yield client.get_executor(retries=3, pure=False)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The command `torchsoft dataset make`."""
-    from torchsoft.cli import main as command
-
-    return command(["dataset", "make", *(sys.argv[1:] if arguments is None else arguments)])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,5 +1,5 @@
-"""Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray. What was not
-written so is refused."""
+"""Reading of a dataset, for torch's `DataLoader` and for xarray. Files unlike their digests are
+refused."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,17 +30,17 @@ from torchsoft.display import suggestion
 from torchsoft.physics.arguments import whole
 
 DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
-"""What numbers may be given as."""
+"""Types in which windows can be read."""
 
 HELD = 0.25
-"""Part of the machine's memory that windows take by default at the most."""
+"""Largest fraction of the machine's memory that windows take by default."""
 
 ALL = slice(None)
 
 
 class Vouched(WrapperStore[Store]):
-    """Reads the files laid out at the start and those of the `finished` shards, each checked
-    against its digest when it is first touched; what no digest vouches for is not there.
+    """A read-only store of the files laid out at the start and of those of the `finished` shards.
+    Each is checked against its digest when it is first touched; files without a digest are hidden.
 
     Raises `StoreError` for a file that is missing or not what was written (zarr alone would give
     its fill value), and for a dataset that is not finished unless that is allowed.
@@ -98,8 +98,8 @@ class Vouched(WrapperStore[Store]):
 
 
 def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
-    """The whole store, lazily, with named dimensions and units; without unfinished trajectories
-    where that is allowed.
+    """The whole store, lazily, with named dimensions and units; without the trajectories of
+    unfinished shards where `unfinished` allows them.
 
     Raises `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is
     first touched.
@@ -188,7 +188,7 @@ class Trajectories(Dataset[dict[str, Tensor]]):
 
     @property
     def data(self) -> xr.Dataset:
-        """The store, opened on first use; once more after a fork, which connections do not
+        """The store, opened on first use, and again after a fork, which connections do not
         survive."""
         if os.getpid() not in self._opened:
             self._opened = {
@@ -222,8 +222,8 @@ class Trajectories(Dataset[dict[str, Tensor]]):
     def _item(
         self, held: dict[str, Tensor], row: int, trajectory: int, start: int, at: int | None = None
     ) -> dict[str, Tensor]:
-        """A window of row `row` of what was read, which begins there at `at`, `start` by
-        default."""
+        """The window from sample `at` of row `row` of `held`, by default from `start`; `trajectory`
+        and `start` are its labels."""
         first = start if at is None else at
         item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
         for name, values in held.items():
@@ -236,7 +236,7 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         return {name: "time" in self.data.variables[name].dims for name in self.variables}
 
     def _read(self, trajectories: np.ndarray[Any, Any], at: slice = ALL) -> dict[str, Tensor]:
-        """Variables of some trajectories, of a stretch of time, shard by shard. Raises `ValueError`
+        """Variables of some trajectories in a stretch of time, shard by shard. Raises `ValueError`
         for a number that the dtype cannot hold."""
         size, out = self._shard_size, dict[str, Tensor]()
         for name in self.variables:
@@ -263,9 +263,9 @@ class Trajectories(Dataset[dict[str, Tensor]]):
 
 
 class Streamed(IterableDataset[dict[str, Tensor]]):
-    """The windows of `Trajectories` in one sweep, shuffled within some shards at a time; workers of
-    a `DataLoader` share the shards out. Every sweep has an order of its own, which follows from
-    `seed`, and with workers from torch's seed too."""
+    """The windows of `Trajectories` in one sweep, shuffled within groups of shards; workers of a
+    `DataLoader` share the shards. The order is new in every sweep; it follows from `seed`, and with
+    workers from torch's seed too."""
 
     def __init__(self, windows: Trajectories, shards: int, seed: int) -> None:
         self.windows, self.shards, self.seed, self.sweep = windows, shards, seed, 0

@@ -1,4 +1,4 @@
-"""The rig file of a dataset: embedded in its configuration, and what its names lead to."""
+"""The rig file of a dataset, embedded in its configuration, and places in it by name."""
 
 import base64
 from collections.abc import Iterator, Mapping
@@ -24,15 +24,17 @@ from torchsoft.solve.trajectory import units
 from torchsoft.tables import line, read_toml, shown
 
 EMBEDDED = 2e6
-"""Size [B] of all files that a rig file names, at the most: they are part of the configuration."""
+"""Largest total size [B] of the files that a rig file names, since the configuration embeds
+them."""
 
 OWN = {"title": "title", "outputs": "duration and sample_interval", "solver": "rtol and step"}
-"""Tables of a rig file that have no part in a dataset, and what stands in their place there."""
+"""Tables of a rig file that a dataset does not use, and the fields of the dataset in their
+place."""
 
 
 def embedded(tree: Any, folder: Path) -> Any:
-    """The configuration with the rig file that it names in it, and the files that this one names.
-    Raises `ValueError` naming the file, and `OSError`."""
+    """The configuration with its rig file embedded, and the files that the rig file names. Raises
+    `ValueError` naming the file, and `OSError`."""
     name = tree.get("rig") if isinstance(tree, Mapping) else None
     if name is None:
         return tree
@@ -58,7 +60,7 @@ def embedded(tree: Any, folder: Path) -> Any:
 
 
 def outputs_of(rig: Any) -> dict[str, Any]:
-    """Times of a dataset that are those of the rig file, as far as it states them."""
+    """Duration and sample interval of the rig file, as far as it states them."""
     outputs = rig.get("outputs")
     given = outputs if isinstance(outputs, Mapping) else {}
     named = {"duration": given.get("duration"), "sample_interval": given.get("interval", 0.01)}
@@ -66,8 +68,8 @@ def outputs_of(rig: Any) -> dict[str, Any]:
 
 
 def place(file: RigFile, name: str) -> Place:
-    """The place of a name in the rig file of a dataset. Raises `ValueError` for one that leads
-    nowhere, and for what the dataset decides."""
+    """The place of a name in the rig file of a dataset. Raises `ValueError` for an unknown name,
+    and for a table that the dataset replaces."""
     found = places.place(file, name)
     if (own := OWN.get(str(found.keys[0]))) is not None:
         raise ValueError(f"`{line(name, 80)}` has no part in a dataset, whose own {own} decide it")
@@ -80,19 +82,20 @@ def hint(field: FieldInfo) -> Any:
 
 
 def number_or_word(field: FieldInfo) -> NumberOr | None:
-    """What a field says that takes a number or a word."""
+    """The declaration of a field that takes a number or a word, None for other fields."""
     return next((one for one in metadata(hint(field)) if isinstance(one, NumberOr)), None)
 
 
 def own_points(rig: Rig, name: str) -> NDArray[np.float64]:
-    """Places (points, 2) [m] of a pad's contact points in its own frame."""
+    """Positions (points, 2) [m] of a pad's contact points in its own frame."""
     pad = rig.pads[name]
     surface = pad.mesh.nodes[pad.mesh.free[pad.mesh.surface]]
     return np.einsum("pk,pkj->pj", pad.point_shares, surface[pad.point_nodes])
 
 
 def differs(one: Rig, other: Rig) -> str | None:
-    """What two rigs do not have in common of what the arrays of a dataset are made for."""
+    """The first difference between two rigs that would change the arrays of a dataset, None if
+    there is none."""
     for name in one.pads:
         a, b = own_points(one, name), own_points(other, name)
         if a.shape != b.shape or np.abs(a - b).max() > 1e-12:
@@ -106,7 +109,7 @@ def differs(one: Rig, other: Rig) -> str | None:
 
 
 def channel_meanings(rig: Rig) -> Iterator[tuple[str, str]]:
-    """Every channel that a rig may have, and what it is."""
+    """Every channel that a rig may have, and its meaning."""
     rates = ("v_x", "v_y", "omega")
     for name, symbol in rig.symbols.items():
         for axis, rate in zip(COORDINATES, rates):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Label(NamedTuple):
-    """A channel, or a number or text of every trajectory: unit, meaning and type."""
+    """Unit, meaning and type of a channel, or of a number or text of every trajectory."""
 
     unit: str
     meaning: str
@@ -30,16 +30,15 @@ RUN = {
     "reason": Label("1", "why it failed; empty where it did not", "str"),
 }
 SPLIT = {"split": Label("1", "train, validation or test", "str")}
-"""Numbers and texts of every trajectory of any rig."""
+"""Labels of every trajectory of any rig."""
 
 KIND = {"kind": Label("1", "kind of trajectory", "str")}
-"""Where there are several."""
+"""Label of datasets with several kinds."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One array; `components` names the entries of its last dimension where that has no
-    coordinate."""
+    """One array; `components` names the entries of a last dimension that has no coordinate."""
 
     sizes: dict[str, int]
     unit: str
@@ -58,12 +57,12 @@ class Variable:
 
     @property
     def empty(self) -> Any:
-        """What stands where nothing is known."""
+        """The value that stands for an unknown."""
         return {"O": "", "f": np.nan}.get(self.kept.kind, 0)
 
 
 def energies(subject: "Subject") -> dict[str, tuple[str, tuple[str, ...]]]:
-    """Dimension of each kind of energy, and its parts by their names in a run."""
+    """Dimension and parts of each kind of energy, by its name in a run."""
     integrals = Integrals(subject.template)
     active = tuple(name for name in integrals.supplied if name in integrals.active)
     return {
@@ -74,7 +73,7 @@ def energies(subject: "Subject") -> dict[str, tuple[str, tuple[str, ...]]]:
 
 
 def nodal(subject: "Subject") -> dict[str, Variable]:
-    """What is kept of every contact point: forces by contacts, displacements by pads."""
+    """Arrays of every contact point: forces by contact, displacements by pad."""
     config, rig, out = subject.config, subject.template, dict[str, Variable]()
     series = {"trajectory": config.trajectories, "time": config.samples}
     precision = config.node_precision
@@ -96,8 +95,8 @@ def nodal(subject: "Subject") -> dict[str, Variable]:
 
 
 def arrays(subject: "Subject") -> dict[str, Variable]:
-    """Everything that is kept of a trajectory, by name. Raises `ValueError` for names that two
-    arrays would have."""
+    """Every array of the dataset by name. Raises `ValueError` for a name that two arrays would
+    share."""
     config, out = subject.config, dict[str, Variable]()
     single = {"trajectory": config.trajectories}
     series = single | {"time": config.samples}
@@ -137,12 +136,13 @@ def taken(name: str) -> str:
 
 
 def variables(config: "Config") -> dict[str, Variable]:
-    """Everything that is kept of a trajectory, by name."""
+    """Every array of the dataset by name."""
     return config.subject.variables
 
 
 def not_finite(config: "Config", row: dict[str, Any]) -> list[str]:
-    """Names of the arrays that are not finite in a trajectory, unless it is marked as failed."""
+    """Names of arrays with numbers that are not finite, in a trajectory that is not marked as
+    failed."""
     known = (
         name
         for name, v in variables(config).items()

@@ -1,5 +1,5 @@
-"""Trajectory number `index`: parameters and motion by the configuration alone, then the run, or why
-there is none."""
+"""One trajectory: its parameters and motion from the configuration and its index alone, and its run
+or the reason of its failure."""
 
 import numpy as np
 import torch
@@ -8,13 +8,11 @@ from scipy.stats import qmc
 
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.schema import energies, not_finite, variables
-from torchsoft.datasets.subject import Row, Subject, Task, split
+from torchsoft.datasets.subject import Row, Subject, Task
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 from torchsoft.solve.trajectory import Trajectory
-
-__all__ = ["Row", "Task", "points", "simulate_task", "split", "task"]
 
 COUNTS = ("steps", "newton_iterations")
 
@@ -30,11 +28,6 @@ def points(config: Config) -> NDArray[np.floating]:
         return qmc.LatinHypercube(dimensions, rng=rng).random(config.trajectories)
     power = int(np.ceil(np.log2(config.trajectories)))
     return qmc.Sobol(dimensions, scramble=True, rng=rng).random_base2(power)[: config.trajectories]
-
-
-def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
-    """Trajectory `index` at the point u (dimensions,) of the design."""
-    return config.subject.task(index, u.tolist())
 
 
 def simulate_task(config: Config, task: Task) -> Row:

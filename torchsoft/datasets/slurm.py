@@ -1,4 +1,4 @@
-"""A job array of SLURM that makes a dataset in parts, each by itself and as often as need be."""
+"""A job array of SLURM for a dataset in parts; each part can be submitted alone and repeatedly."""
 
 import math
 import shlex
@@ -11,10 +11,13 @@ from torchsoft.datasets.files import folder
 from torchsoft.datasets.generate import Part, estimate, unfinished
 
 SPARE, LEAST = 3.0, 600.0
-"""Time that is asked for over the estimate [1], and at least [s]."""
+"""Requested time over the estimate [1], and least requested time [s]."""
 
 BASE = 1.5
 """Memory of a process [GiB] besides its shard."""
+
+BEGINNING = 5
+"""Time [s] that a process takes to begin with its first shard."""
 
 SCRIPT = """\
 #!/bin/bash
@@ -33,7 +36,7 @@ exec {command} --part "$SLURM_ARRAY_TASK_ID/{parts}" --workers "${{SLURM_CPUS_PE
 
 def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
     """The script for `sbatch`, and a sentence on its cost. Raises `ValueError` for more parts than
-    shards, and where nothing is left to be made."""
+    shards, and where no shard is left to make."""
     config = Config.from_toml(path)
     lacking = set(unfinished(config, url))
     left = [i for i in range(1, parts + 1) if lacking & set(Part(i, parts).shards(config))]
@@ -50,7 +53,8 @@ def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
     minutes = math.ceil(max(SPARE * price.seconds, LEAST) / 60)
     told = (
         f"each of {len(left)} tasks: {price.sentence}; all of them: "
-        f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk"
+        f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk; "
+        f"besides, every task takes {BEGINNING:g} s to start and {BASE:g} GiB for its process"
     )
     script = SCRIPT.format(
         name=f"torchsoft-{path.stem}".replace(" ", "-"), parts=parts,

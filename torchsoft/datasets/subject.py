@@ -1,4 +1,5 @@
-"""The subject of a dataset: the rig of a file, the numbers that are drawn, and one trajectory."""
+"""The subject of a dataset: the rig of a file, the drawn parameters, and the rig of each
+trajectory."""
 
 import base64
 import itertools
@@ -38,8 +39,7 @@ if TYPE_CHECKING:
     from torchsoft.datasets.config import Config
 
 RTOL = 1e-4
-"""Relative tolerance of the stepper where neither it nor a step is given: data are not
-differentiated."""
+"""Default relative tolerance of the stepper: coarse, since data are not differentiated."""
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -50,14 +50,14 @@ POSITION, NODAL_FORCE = 10, 8
 solvers differ in the last bits with the alignment of memory, and a run may amplify that."""
 
 MIDDLE = 0.5
-"""Where other numbers are while the ends of one are tried."""
+"""Quantile of the other parameters while the bounds of one are tried."""
 
 Row = dict[str, Any]
 
 
 class Task(NamedTuple):
-    """One trajectory: its number, the number of its kind, the values of the rig file's numbers by
-    name, and what is known before it is simulated."""
+    """One trajectory: its index, the index of its kind, parameters of the rig file by name, and the
+    labels known before the simulation."""
 
     index: int
     kind: int
@@ -66,16 +66,16 @@ class Task(NamedTuple):
 
 
 class Subject:
-    """What a configuration makes trajectories of: runs of the rig of a file. Parameters are any of
-    its numbers, by the names of its tables; what moves are its own motions, or those that a kind
-    fixes, whose numbers are among them."""
+    """The rig file of a configuration and the trajectories made from it. Any number of the rig file
+    can be a parameter, by the names of its tables, those of its motions included."""
 
     def __init__(self, config: "Config") -> None:
         self.config = config
 
     @cached_property
     def _folder(self) -> Path:
-        """The files that the rig file names, as long as this object is there."""
+        """A temporary folder with the files that the rig file names; it lives as long as this
+        object."""
         if not self.config.files:
             return Path()
         folder = Path(mkdtemp(prefix="torchsoft-rig-"))
@@ -89,7 +89,8 @@ class Subject:
 
     @cached_property
     def file(self) -> RigFile:
-        """The rig file with the times of the dataset and what is fixed. Raises `ValueError`."""
+        """The rig file with the times and the `fixed` parameters of the dataset. Raises
+        `ValueError`."""
         config = self.config
         try:
             file = RigFile.from_tree(config.rig, self._folder).override(
@@ -104,7 +105,7 @@ class Subject:
 
     @cached_property
     def kinds(self) -> list[tuple[RigFile, dict[str, Distribution]]]:
-        """Of every kind the rig file with what is fixed in it, and all that is drawn."""
+        """The rig file of every kind, with its `fixed` parameters, and its distributions."""
         config = self.config
         return [
             (
@@ -116,7 +117,7 @@ class Subject:
 
     @cached_property
     def template(self) -> Rig:
-        """The parts and meshes of every trajectory's rig."""
+        """A rig with the parts and meshes that all trajectories share."""
         try:
             return self.file.assemble()
         except ValueError as error:
@@ -137,13 +138,13 @@ class Subject:
 
     @property
     def signals(self) -> dict[str, Label]:
-        """Channels that are kept."""
+        """Channels that the dataset keeps."""
         kept = self.config.channels
         return self.there if kept is None else {name: self.there[name] for name in kept}
 
     @cached_property
     def surfaces(self) -> dict[str, list[str]]:
-        """Pads that something may touch, and their contacts."""
+        """Pads that have contacts, and their contacts."""
         out: dict[str, list[str]] = {}
         for name, one in self.template.contacts.items():
             out.setdefault(one.pad, []).append(name)
@@ -155,7 +156,7 @@ class Subject:
         return arrays(self)
 
     def columns(self) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64], str, str]]:
-        """Places of the contact points: dimensions, values, unit and meaning."""
+        """Coordinates of the contact points: dimensions, values, unit and meaning."""
         out = {}
         for pad in self.surfaces if self.config.nodal else ():
             at, surface = own_points(self.template, pad), f"{pad}_point"
@@ -172,7 +173,7 @@ class Subject:
 
     @property
     def labels(self) -> dict[str, Label]:
-        """Numbers of every trajectory, besides those of any run."""
+        """Labels of the drawn parameters of every trajectory."""
         return {name: self._label(name) for name in self.config.parameters}
 
     def _label(self, name: str) -> Label:
@@ -185,7 +186,7 @@ class Subject:
         return Label(unit, f"parameter {name} of the rig file{said}")
 
     def _unit_of(self, name: str, keys: tuple[Any, ...]) -> str | None:
-        """Unit of a number whose field takes several: of a motion, or of a gain."""
+        """Unit of a parameter whose field takes several units, such as a motion or a gain."""
         group, part, *way = keys
         if group == "motion":
             return self.file.unit(part)
@@ -200,7 +201,7 @@ class Subject:
 
     @property
     def constants(self) -> dict[str, Any]:
-        """Numbers and words that all trajectories share, by name."""
+        """Parameters that all trajectories share, by name."""
         rig = self.template
         names = {own: name for name, own in rig.aliases.items()}
         parameters: dict[str, Any] = rig.description()["parameters"]
@@ -215,37 +216,36 @@ class Subject:
 
     @property
     def steps(self) -> dict[str, Any]:
-        """How `simulate` is to choose its steps."""
+        """Step control of `simulate`, as its keyword arguments."""
         given = {"step": self.config.step, "rtol": self.config.rtol}
         stated = {name: value for name, value in given.items() if value is not None}
         solver = self.file.solver.model_dump(exclude_unset=True, exclude_none=True)
         own = {name: x for name, x in solver.items() if name != "tolerance"}
         return {"tolerance": self.file.solver.tolerance} | (stated or own or {"rtol": RTOL})
 
-    def task(self, index: int, u: list[float]) -> Task:
-        """Trajectory `index` at the point u of the design: the common numbers, the kind, and its
-        own numbers."""
-        config, kind = self.config, 0
+    def task(self, index: int, u: NDArray[np.floating]) -> Task:
+        """Trajectory `index` at the point u (dimensions,) of the design, whose entries are the
+        common parameters, the kind, and the parameters of the kind."""
+        config, kind, at = self.config, 0, u.tolist()
         if config.kinds:
             edges = np.cumsum([one.weight for one in config.kinds])
-            which = u.pop(len(config.parameters)) * edges[-1]
+            which = at.pop(len(config.parameters)) * edges[-1]
             kind = min(int(np.searchsorted(edges, which, side="right")), len(edges) - 1)
         file, parameters = self.kinds[kind]
-        drawn = {name: one.at(x) for (name, one), x in zip(parameters.items(), u)}
+        drawn = {name: one.at(x) for (name, one), x in zip(parameters.items(), at)}
         values = in_ratio(file, parameters, drawn)
         labels: Row = {name: values[name] for name in config.parameters}
         labels |= {"kind": config.kinds[kind].name} if config.kinds else {}
         return Task(index, kind, values, labels | {"split": split(config, index)})
 
     def begin(self, task: Task) -> tuple[Rig, Tensor]:
-        """The rig of a trajectory, ready to run, and its state (size,) at the start. Raises what
-        its statics do."""
+        """The rig of a trajectory, ready to run, and its initial state (size,). Raises the errors
+        of its static equilibrium."""
         rig, y0, _ = replaced(self.kinds[task.kind][0], task.values).build()
         return rig, rounded(rig, y0)
 
     def check(self) -> None:
-        """Raises `ValueError` with the field's name for a configuration that cannot be carried
-        out."""
+        """Raises `ValueError` with the field's name for an impossible configuration."""
         config = self.config
         if not (config.parameters or config.kinds) and config.trajectories > 1:
             raise ValueError(
@@ -271,8 +271,8 @@ class Subject:
 
 
 class Drawn(NamedTuple):
-    """What is drawn for a trajectory of some kind: parameters of a rig file, besides those that are
-    fixed; fields within the table `where`."""
+    """The drawn and the fixed parameters of one kind, and the checks of them; messages begin with
+    the table `where`."""
 
     subject: Subject
     file: RigFile
@@ -281,13 +281,14 @@ class Drawn(NamedTuple):
     where: str
 
     def check(self, names: Iterable[str]) -> None:
-        """Raises `ValueError` for parameters that are no numbers, or impossible together."""
+        """Raises `ValueError` for parameters that are not numbers, or impossible together."""
         for name in names:
             self._check_number(name)
         self._check_ends({*names})
 
     def _check_number(self, name: str) -> None:
-        """Raises `ValueError` for a name that is no number, and for a ratio to none."""
+        """Raises `ValueError` for a parameter that is not a number, or a ratio to something that is
+        not."""
         where, parameters = f"{self.where}parameters.{line(name, 80)}", self.parameters
         if name in self.fixed:
             raise ValueError(f"{where} is in `fixed` as well; leave one of them out")
@@ -314,8 +315,9 @@ class Drawn(NamedTuple):
             raise ValueError(f"{where}.ratio_to: {line(base, 80)} is no number, but {shown(of)}")
 
     def _check_ends(self, names: set[str]) -> None:
-        """Raises `ValueError` where ends of distributions with these names are impossible, each
-        alone and those of one part or ratio together, the others in their middle."""
+        """Raises `ValueError` where bounds of the distributions with these names are impossible:
+        each bound alone, and pairs of bounds in one part or ratio; the other parameters are at
+        their medians."""
         parameters, within = self.parameters, f"{self.where}parameters"
         middle = {name: one.at(MIDDLE) for name, one in parameters.items()}
         ends = {name: one.ends(f"{within}.{name}") for name, one in parameters.items()}
@@ -347,8 +349,8 @@ class Drawn(NamedTuple):
                     check({one: a, other: b})
 
     def _impossible(self, values: Mapping[str, float], moves: bool = False) -> str | None:
-        """Why the rig file cannot have these values, or what they change that all trajectories
-        share; `moves` says that it is motions only."""
+        """The reason why the rig file cannot have these values: they are impossible, or change
+        something that all trajectories share. `moves` says that they belong to motions only."""
         template = self.subject.template
         try:
             file = replaced(self.file, values)
@@ -361,7 +363,7 @@ class Drawn(NamedTuple):
 
 
 def with_fixed(file: RigFile, fixed: Mapping[str, Any], where: str) -> RigFile:
-    """The rig file with what is fixed. Raises `ValueError`."""
+    """The rig file with these values set. Raises `ValueError`."""
     for name, value in fixed.items():
         try:
             place(file, name)
@@ -374,7 +376,7 @@ def with_fixed(file: RigFile, fixed: Mapping[str, Any], where: str) -> RigFile:
 def in_ratio(
     file: RigFile, parameters: Mapping[str, Distribution], drawn: Mapping[str, float]
 ) -> dict[str, float]:
-    """Parameters by name, of what is drawn for each: the number, or its ratio to another."""
+    """Parameters by name from the drawn numbers, which are values or ratios to other parameters."""
     out = dict(drawn)
     for name, one in parameters.items():
         if (base := one.ratio_to) is not None:
@@ -384,20 +386,20 @@ def in_ratio(
 
 
 def extremes(ends: Mapping[str, float]) -> tuple[str, str]:
-    """The least and the largest of some numbers, by what messages call them."""
+    """Names of the least and the largest of some numbers."""
     return min(ends, key=lambda where: ends[where]), max(ends, key=lambda where: ends[where])
 
 
 def split(config: "Config", index: int) -> str:
-    """Train, validation or test: the golden-ratio sequence from a seeded start, so that small sets
-    keep the fractions."""
+    """Train, validation or test, by the golden-ratio sequence from a seeded start, so that small
+    sets keep the fractions."""
     u = (np.random.default_rng((config.seed, 0)).random() + index * GOLDEN) % 1.0
     edges = (config.splits.train, config.splits.train + config.splits.validation)
     return SPLITS[int(np.searchsorted(edges, u, side="right"))]
 
 
 def rounded(rig: Rig, y0: Tensor) -> Tensor:
-    """The state (size,) at the start, rounded."""
+    """The initial state (size,), rounded."""
     y0 = y0.detach().clone()
     for (part, name), where in rig.layout.slices.items():
         forces = part == "pads" and not rig.pads[name].inertial

@@ -1,5 +1,5 @@
-"""The writing of a dataset: laid out whole at the start, then one shard at a time, each with its
-record after its data."""
+"""Writing of a dataset: the whole layout first, then one shard at a time, and its record after its
+data."""
 
 import os
 import subprocess
@@ -43,8 +43,8 @@ checksum by default."""
 
 
 class Store:
-    """A dataset at `url` (a folder, or what fsspec opens). Trajectories lie in shards of equal
-    size, along `trajectory`.
+    """A dataset at `url`, a local folder or any store of fsspec. Trajectories lie in shards of
+    equal size, along `trajectory`.
 
     Every array has the same shard boundaries, so that one task writes whole files only and no two
     tasks share one.
@@ -64,9 +64,9 @@ class Store:
 
     @contextmanager
     def claim(self, shard: int) -> Iterator[Callable[[], object] | None]:
-        """A shard for one process alone: what is to be called for every trajectory simulated, None
-        while another process makes the shard. Object stores, and file systems without locks, give
-        a shard to everybody, who make the same of it."""
+        """Claim a shard for one process. Yields a function to call after every simulated
+        trajectory, or None while another process makes the shard. Object stores, and file systems
+        without locks, let several processes claim one shard; they write the same content."""
         if (path := self.claim_file(shard)) is None:
             yield lambda: None
             return
@@ -74,12 +74,13 @@ class Store:
             yield None if handle is None else lambda: os.write(handle, b".")
 
     def claim_file(self, shard: int) -> Path | None:
-        """A file that is there while the shard is made, a byte for every trajectory simulated."""
+        """The lock file of a shard in the making, which has one byte for every simulated
+        trajectory."""
         here = folder(self.url)
         return here and here / f"{record_key(shard)}.{0:016}.partial"
 
     def simulated(self, shard: int) -> int:
-        """Trajectories of an unfinished shard that are simulated, whoever makes it."""
+        """Number of simulated trajectories of an unfinished shard, in whichever process."""
         with suppress(OSError):
             return path.stat().st_size if (path := self.claim_file(shard)) else 0
         return 0
@@ -135,7 +136,7 @@ def open_or_create(url: str, config: Config) -> Store:
 
 
 def create(url: str, config: Config) -> None:
-    """Lay the whole store out; the manifest comes last, and a store without one is no store."""
+    """Lay the whole store out. The manifest comes last: a store without one counts as none."""
     fs, root = filesystem(url)
     if fs.exists(root) and not fs.isdir(root):
         raise StoreError(f"{url} is a file; give a folder")
@@ -152,8 +153,8 @@ def create(url: str, config: Config) -> None:
 
 
 def is_part(url: str, content: dict[str, bytes]) -> bool:
-    """Whether all that is at `url` are files of this content, whole or partial, as a killed run
-    leaves them behind."""
+    """Whether all files at `url` are of this content, whole or partial, as a killed run leaves
+    them."""
     fs, root = filesystem(url)
     names = (
         {PARTIAL.sub("", Path(path).name) for path in fs.ls(root, detail=False)}
@@ -171,8 +172,9 @@ def is_part(url: str, content: dict[str, bytes]) -> bool:
 
 
 def laid_out(config: Config) -> dict[str, bytes]:
-    """The content of every file of an empty dataset by its key: the metadata of every array, and
-    the coordinates. It follows from the configuration, so that several may lay out one folder."""
+    """Content of every file of an empty dataset by its key: the metadata of every array, and the
+    coordinates. It follows from the configuration, so that several processes may lay out one
+    folder."""
     content: dict[str, Buffer] = {}
     about: Any = {
         "title": config.title,
@@ -216,17 +218,14 @@ def laid_out(config: Config) -> dict[str, bytes]:
             name, data=values, chunks=values.shape, dimension_names=dimensions, compressors=SMALL,
             attributes={"units": unit, "long_name": meaning}, config={"write_empty_chunks": True},
         )  # fmt: skip
-    with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # consolidated metadata is zarr-python's and xarray's own addition
+    # consolidated metadata is zarr-python's and xarray's own addition
+    with warnings.catch_warnings(action="ignore"):
         zarr.consolidate_metadata(group.store)
     return {key: data.to_bytes() for key, data in content.items()}
 
 
 def manifest(config: Config, content: dict[str, bytes]) -> Manifest:
-    """How the dataset is made, and the digests of the files that are laid out. Every array has one
-    file in each shard."""
+    """The manifest of a dataset with these files. Every array has one file in each shard."""
     files = (
         f"{name}/c/{{shard}}" + "/0" * (len(v.shape) - 1) for name, v in variables(config).items()
     )
@@ -244,7 +243,7 @@ def manifest(config: Config, content: dict[str, bytes]) -> Manifest:
 
 
 def commit() -> str:
-    """The commit that made it, empty outside a repository."""
+    """The commit of torchsoft's source, empty outside a repository."""
     try:
         here = Path(__file__).parent
         found = subprocess.run(

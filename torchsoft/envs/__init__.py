@@ -1,7 +1,8 @@
-"""Environments of gymnasium made of rig files, with gradients through a step, and a ready one.
+"""Gymnasium environments from rig files, with gradients through a step, and one ready-made
+environment.
 
 `gymnasium.make("torchsoft/Reorient-v0")`, after `import torchsoft.envs`: two soft jaws turn a disc
-to an angle that each episode draws, by set-points of their own and by their grip.
+to an angle drawn for each episode, by the set-points and the grip of the jaws.
 """
 
 from pathlib import Path
@@ -20,7 +21,7 @@ __all__ = ["Dynamics", "Goal", "Moment", "RigEnv", "RigVectorEnv", "Transition",
 
 
 RIG = Path(__file__).with_name("reorient.toml")
-"""The rig file of the ready environment."""
+"""Rig file of the ready-made environment."""
 
 
 def reorient(**changes: Any) -> RigEnv:
@@ -41,7 +42,7 @@ def reorient(**changes: Any) -> RigEnv:
 
 
 def reorient_vector(num_envs: int, **changes: Any) -> RigVectorEnv:
-    """So many of these environments side by side in threads."""
+    """Vector of `num_envs` of these environments, in threads."""
     return RigVectorEnv([lambda: reorient(**changes)] * num_envs)
 
 

@@ -1,5 +1,5 @@
 """A rig under actions at a control rate, in torch: from a state and an action to the next state, an
-observation and a reward, with gradients through all of them."""
+observation and a reward, all differentiable."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -23,26 +23,26 @@ from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import Trajectory, channels, measurable
 
 Ranges = Mapping[str, tuple[float, float]]
-"""Low and high by name, in SI units."""
+"""Lower and upper bound by name, in SI units."""
 
 Reward = Callable[[Trajectory, Tensor], Any]
-"""Reward of the run over one control interval and the action (actions,) at its end."""
+"""Reward of the run over one control interval, and of the action (actions,) at its end."""
 
 SHORTEST = 1e-4
-"""Control interval [s] at the least."""
+"""Shortest control interval [s]."""
 
 LOOK = 1e-3
-"""Length [s] of the run whose first sample shows a moment."""
+"""Length [s] of a run made for the sake of its first sample."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """A pose of a body to be reached: the reward of a step is 1 / (1 + d^2), d^2 being the sum of
-    the squares of the distances of its coordinates over their `scale` [m, rad], less `changes`
-    times the sum of the squared changes of the action.
+    """Target pose of a body. The reward of a step is 1 / (1 + d^2) less `changes` times the squared
+    change of the action; d^2 is the sum of squared distances of the coordinates over their `scale`
+    [m, rad].
 
-    target: by coordinate ("x", "y", "theta"), a number [m, rad], or a low and a high between which
-    each episode draws one.
+    target: by coordinate ("x", "y", "theta"), a number [m, rad], or lower and upper bound of a
+    uniform draw in each episode.
     """
 
     body: str
@@ -52,10 +52,10 @@ class Goal:
 
 
 class Moment(NamedTuple):
-    """Everything that the next step starts from: the state y (size,), the action (actions,) that
-    was reached, the control intervals since the begin, the target (coordinates,) [m, rad] of the
-    goal, and the control interval after which each disturbance peaks, with its peak,
-    (disturbances, 2); and the forces recorded there (recorded,), which observations read."""
+    """State of an episode at a control time: the rig's state y (size,); the last action (actions,);
+    the number of control intervals so far; the target (coordinates,) [m, rad] of the goal; the
+    index of the interval after which each disturbance peaks, with its peak (disturbances, 2); and
+    the recorded forces (recorded,) for observations."""
 
     y: Tensor
     action: Tensor
@@ -67,7 +67,7 @@ class Moment(NamedTuple):
 
 class Transition(NamedTuple):
     """Result of an action: the next moment, the observation (n,) and the reward (), both float64
-    with their graph, and the run between."""
+    and differentiable, and the run between."""
 
     moment: Moment
     observation: Tensor
@@ -76,7 +76,7 @@ class Transition(NamedTuple):
 
     @property
     def knots(self) -> Tensor:
-        """Steps that were taken [s], to be frozen in another run."""
+        """Times [s] of the steps, for a run with frozen steps."""
         return torch.from_numpy(self.outcome.solved.out.knots)
 
 
@@ -131,7 +131,7 @@ class Dynamics:
         self.size = len(self._order) + len(self._goal_at) + len(self.actions)
 
     def _set_observed(self, ranges: Ranges) -> None:
-        """Channels by where they are read: in the state, as sums of forces, each by itself."""
+        """Sort observed channels into entries of the state, sums of recorded forces, and others."""
         rig, self._touch = self.rig, Touch(self.rig)
         at = dict(zip(measurable(rig), rig.layout.rigid))
         with torch.no_grad():
@@ -154,7 +154,7 @@ class Dynamics:
         goal, free = self.goal, self.coordinates
         wanted = dict(goal.target) if goal else {}
         body = goal.body if goal else ""
-        checked("goal.target", {f"{body}.{x}": (0.0, 1.0) for x in wanted}, free, "free are")
+        check_names("goal.target", [f"{body}.{x}" for x in wanted], free, "free are")
         if goal and wanted.keys() != goal.scale.keys():
             raise ValueError(
                 f"`goal.scale` must have the coordinates of `goal.target`, {', '.join(wanted)}, "
@@ -167,8 +167,8 @@ class Dynamics:
         self._scale = torch.tensor(scale, dtype=torch.float64)
 
     def begin(self, target: Tensor | None = None) -> Moment:
-        """The moment at `begin`, after the rig's own motion, without a disturbance. An episode has
-        the parameters as they are now, whose graph serves one backward pass. Raises
+        """The moment at the time `begin`, after the rig's own motion, without disturbance. The
+        parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
         self._stepper = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver).stepper
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
@@ -182,9 +182,9 @@ class Dynamics:
         return Moment(rows.y[there], reached, 0, target, none, rows.recorded[there])
 
     def step(self, now: Moment, action: Tensor, knots: Tensor | None = None) -> Transition:
-        """From a moment to the next control time, with an action (actions,) in [-1, 1]; `knots` are
-        the steps of another run, frozen. Under `torch.no_grad()` without any graph. Raises
-        `ValueError` for an action outside, and `SimulationFailed`."""
+        """The transition from a moment to the next control time, with an action (actions,) in [-1,
+        1]; `knots` are the frozen steps of another run. There is no graph under `torch.no_grad()`.
+        Raises `ValueError` for an action out of range, and `SimulationFailed`."""
         self.check_action(action)
         begin = self.start + now.steps * self.interval
         end = self.start + (now.steps + 1) * self.interval
@@ -209,7 +209,7 @@ class Dynamics:
         return Transition(moment, self.observe(moment, reference), value, outcome)
 
     def look(self, now: Moment) -> Trajectory:
-        """A short run that begins at a moment, whose first sample shows it."""
+        """A short run from a moment, whose first sample is that moment."""
         t = self.start + now.steps * self.interval + torch.tensor([0.0, LOOK]).double()
         held = self._low + self._half * (1 + now.action)
         held = torch.cat((held, self._disturbed(now)[:, 0]))[:, None]
@@ -218,11 +218,12 @@ class Dynamics:
             return self._run(t, now.y, reference).trajectory()
 
     def distance(self, now: Moment) -> Tensor:
-        """Distances of the goal's coordinates to their targets, over their scales."""
+        """Distances of the goal's coordinates from their targets, over their scales."""
         return (now.target - now.y[self._goal_at]) / self._scale
 
     def observe(self, now: Moment, reference: Reference | None = None) -> Tensor:
-        """The observation (n,) of a moment, which `reference` led to, by default the rig's own."""
+        """The observation (n,) at a moment; `reference` is the motion that led to it, by default
+        the rig's own."""
         y, rig = now.y, self.rig
         parts = [y[self._state], self._sums @ now.recorded[: self._sums.shape[1]]]
         if self._other:
@@ -236,8 +237,7 @@ class Dynamics:
         return torch.cat((seen, self.distance(now), now.action))
 
     def check_action(self, action: Tensor) -> None:
-        """Raises `ValueError` for an action of another shape, one that is not finite and one
-        outside of [-1, 1]."""
+        """Raises `ValueError` for an action of another shape, not finite, or out of [-1, 1]."""
         names = list(self.actions)
         if action.shape != (len(names),):
             raise ValueError(
@@ -252,7 +252,7 @@ class Dynamics:
                 )
 
     def _disturbed(self, now: Moment) -> Tensor:
-        """Disturbed signals (disturbances, 2) at both ends of the interval that begins now."""
+        """Disturbed signals (disturbances, 2) at both ends of the next interval."""
         if not self.disturbances:
             return now.peaks
         steps = now.steps + torch.arange(2)
@@ -262,8 +262,8 @@ class Dynamics:
         return own + torch.where((when == steps) & (steps > 0), peak, 0.0)
 
     def _following(self, times: Tensor, values: Tensor) -> Reference:
-        """The rig's own reference with lines through values (signals, T) where actions or
-        disturbances set them."""
+        """The rig's own reference, with linear interpolation of values (signals, T) for signals set
+        by actions or disturbances."""
         own = {name: self.rig.reference[name] for name in self.rig.signals}
         lines = [Lines(times, row) for row in values]
         return Reference(**own | dict(zip((*self.actions, *self.disturbances), lines)))
@@ -279,13 +279,18 @@ class Dynamics:
         return run(task, TAPE_BYTES, explained=False)
 
 
-def checked(field: str, ranges: Ranges, known: Iterable[str], listed: str) -> Ranges:
-    """Ranges as they are. Raises `ValueError` for a name that is not known, and a range that is
-    none."""
+def check_names(field: str, given: Iterable[str], known: Iterable[str], listed: str) -> None:
+    """Raises `ValueError` for an unknown name."""
     names = list(known)
-    for name, given in ranges.items():
+    for name in given:
         if name not in names:
             raise ValueError(f"`{field}` names `{name}`; {suggestion(name, names, listed)}")
+
+
+def checked(field: str, ranges: Ranges, known: Iterable[str], listed: str) -> Ranges:
+    """The ranges as given. Raises `ValueError` for an unknown name, and for an invalid range."""
+    check_names(field, ranges, known, listed)
+    for name, given in ranges.items():
         try:
             low, high = map(float, given)
         except (TypeError, ValueError):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, checked
+from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, check_names, checked
 from torchsoft.physics.arguments import number
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
@@ -28,14 +28,14 @@ Mode = Literal["rgb_array", "human"]
 FRAMES_PER_SECOND = 10
 
 DRAWS = 10
-"""Draws of parameters that are tried for one episode."""
+"""Most draws of parameters for one episode."""
 
 SOLVER = {"rtol": 1e-3}
-"""How steps are chosen where a rig file leaves it open."""
+"""Default step control, where the rig file states none."""
 
 
 class RedrawnStart(UserWarning):
-    """An episode began with other parameters than those first drawn, which no start exists for."""
+    """The first draw of an episode's parameters had no initial state; others were drawn."""
 
 
 class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -87,13 +87,19 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             "disturbances": disturbances or {},
         }  # fmt: skip
         self.dynamics = Dynamics(built, **self._how)
-        left = float(built.t[-1]) - begin if duration is None else number("duration", duration)
+        rest = float(built.t[-1]) - begin
+        if rest <= 0:
+            raise ValueError(
+                f"`begin` = {begin:g} s is not before the end of the rig's own motion, "
+                f"{float(built.t[-1]):g} s"
+            )
+        left = rest if duration is None else number("duration", duration)
         self.limit = int(left / interval + 1e-9) if math.isfinite(left) else 0
         if self.limit < 1 or (duration is not None and abs(self.limit * interval - left) > 1e-9):
-            rest = "" if duration is not None else ", the rest of the run after `begin`"
+            why = "" if duration is not None else ", the rest of the run after `begin`"
             raise ValueError(
                 f"`duration` must be a multiple of `interval` = {interval:g} s, but is {left:g} s"
-                f"{rest}"
+                f"{why}"
             )
         free = self.dynamics.coordinates
         self.bounds = checked("bounds", bounds or {}, free, "free are")
@@ -124,14 +130,15 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return dict(ranges)
 
     def _checked_held(self, held: Sequence[str]) -> dict[str, list[slice]]:
-        """The recorded forces of the contacts of each body that is to be held."""
+        """Recorded forces of the contacts of each body in `held`."""
         rig, at, slices = self.dynamics.rig, 0, dict[str, list[slice]]()
         for contact in rig.contacts.values():
             size = 2 * len(rig.pads[contact.pad].point_nodes)
             slices.setdefault(contact.body, []).append(slice(at, at + size, 2))
             at += size
-        names = dict.fromkeys([held] if isinstance(held, str) else held, (0.0, 1.0))
-        return {body: slices[body] for body in checked("held", names, slices, "there are")}
+        names = [held] if isinstance(held, str) else held
+        check_names("held", names, slices, "there are")
+        return {body: slices[body] for body in names}
 
     def _built(self, values: Mapping[str, float]) -> BuiltRig[Rig]:
         if isinstance(self._file, RigFile):
@@ -154,12 +161,13 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._seen(self.dynamics.observe(self.moment)), self._info(self.moment)
 
     def _drawn_target(self, options: Mapping[str, Any]) -> Tensor:
-        """The target of an episode, as far as it is not given."""
-        checked("options", dict.fromkeys(options, (0.0, 1.0)), ["target"], "known is")
+        """Target of an episode: the given coordinates, and draws of the others."""
+        check_names("options", options, ["target"], "known is")
         goal, (low, high) = self.dynamics.goal, self.dynamics.targets.numpy().T
         target, axes = self.np_random.uniform(low, high), list(goal.target) if goal else []
         given = options.get("target") or {}
-        for name in checked("target", dict.fromkeys(given, (0.0, 1.0)), axes, "the goal has"):
+        check_names("target", given, axes, "the goal has")
+        for name in given:
             target[axes.index(name)] = number("target", given[name])
         if not np.isfinite(target).all():
             raise ValueError(f"`target` must be finite, but is {given}")
@@ -172,7 +180,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return torch.tensor(peaks, dtype=torch.float64).reshape(-1, 2)
 
     def _drawn_start(self) -> Moment:
-        """The begin with parameters drawn anew."""
+        """The first moment, with newly drawn parameters."""
         why = ""
         for _ in range(DRAWS):
             values = {k: float(self.np_random.uniform(*x)) for k, x in self.parameters.items()}
@@ -196,8 +204,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Carry out an action over one control interval. Raises `ValueError` for one that is not
-        finite or outside of [-1, 1], and before `reset`."""
+        """Apply an action over one control interval. Raises `ValueError` for an action that is not
+        finite or out of [-1, 1], and before `reset`."""
         now, dynamics = self.moment, self.dynamics
         if now is None or self._over:
             raise ValueError("the episode is over, or has not begun; call `reset` first")
@@ -223,7 +231,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._seen(done.observation), reward, bool(ended), truncated, info
 
     def ended(self, now: Moment) -> str:
-        """Why an episode terminates at a moment, empty where it goes on."""
+        """Reason why an episode terminates at a moment, empty where it goes on."""
         for name, (low, high) in self.bounds.items():
             x = now.y[self.dynamics.coordinates[name]].item()
             if not low <= x <= high:
@@ -243,7 +251,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return {"time": self.dynamics.start + now.steps * self.dynamics.interval} | goal
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The picture (height, width, 3), or None where it is shown in a window."""
+        """The picture (height, width, 3), or None in the mode "human", which shows it in a
+        window."""
         from torchsoft.envs.view import View
 
         if self.moment is None or self.render_mode is None:

@@ -1,4 +1,4 @@
-"""Environments side by side in threads."""
+"""Vectors of environments in threads."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -12,8 +12,8 @@ from torchsoft.threads import cores, executor, parallel_map
 
 
 class RigVectorEnv(SyncVectorEnv):
-    """Environments that take their steps side by side in `threads` threads, one a core by default,
-    and so do the resets of those that are over. Results do not depend on the number of threads.
+    """Environments whose steps and resets run in `threads` threads, by default one for each core.
+    Results do not depend on the number of threads.
 
     Only one thread at a time computes in Python, which is two thirds of a short step; where that
     counts, gymnasium's `AsyncVectorEnv` takes processes.
@@ -30,7 +30,7 @@ class RigVectorEnv(SyncVectorEnv):
         self._pool = executor(min(threads, len(make)))
 
     def step(self, actions: Any) -> Any:
-        """As of gymnasium's `SyncVectorEnv`."""
+        """Step all environments, as gymnasium's `SyncVectorEnv` does."""
         every, todo = self.envs, list(iterate(self.action_space, actions))
         again = self.autoreset_mode is AutoresetMode.NEXT_STEP
 
@@ -55,7 +55,7 @@ class RigVectorEnv(SyncVectorEnv):
 
 
 class _Done(NamedTuple):
-    """What an environment has done, as if it did it when it is asked to."""
+    """Results of an environment, in the interface of an environment."""
 
     stepped: Any
     begun: Any

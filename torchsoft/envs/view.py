@@ -1,4 +1,4 @@
-"""Pictures of an environment, by matplotlib."""
+"""Pictures of an environment with matplotlib."""
 
 import matplotlib
 import numpy as np
@@ -11,11 +11,11 @@ from torchsoft.plot.scene import Scene, force_scale, instants
 from torchsoft.solve.trajectory import Trajectory
 
 ROOM = 0.25
-"""Room around the first picture, over its size."""
+"""Margin around the first picture, over its size."""
 
 
 class View:
-    """The scene of an episode, with the limits and the scale of forces of its first picture."""
+    """The scene of an episode, with the limits and the force scale of its first picture."""
 
     def __init__(self, run: Trajectory) -> None:
         (first,) = instants(run, [float(run.t[0])])
@@ -36,7 +36,8 @@ class View:
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
 
     def show(self, picture: NDArray[np.uint8]) -> None:
-        """Show a picture in a window. Raises `ValueError` where matplotlib has none."""
+        """Show a picture in a window. Raises `ValueError` where matplotlib's backend has no
+        windows."""
         from matplotlib import pyplot
 
         if matplotlib.get_backend() not in backend_registry.list_builtin(BackendFilter.INTERACTIVE):

@@ -1,5 +1,5 @@
 """Static, frictionless equilibria of the paper's rig: the object at rest under its weight, and
-pressed between the pads."""
+clamped between the pads."""
 
 import warnings
 
@@ -14,13 +14,13 @@ from torchsoft.physics.statics import RESIDUAL, NoEquilibrium, resting, standing
 from torchsoft.physics.validity import check_values
 
 MOMENT_ARM = 1e-2
-"""Largest moment on the object, over its size and the load, that is not worth a warning."""
+"""Largest moment on the object without a warning, over its size and the load."""
 
 CLEAR = 1e-16
-"""Gap [m] of surfaces that just touch: above rounding, so that no force is between them."""
+"""Gap [m] between surfaces that just touch: above rounding errors, so that no force acts."""
 
 TOUCHING = 30
-"""Iterations of Newton's method for the height at which an undeformed pad is just touched."""
+"""Newton iterations for the height of first touch on an undeformed pad."""
 
 
 def rest(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
@@ -45,11 +45,11 @@ def rest(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
 
 
 def press(model: SoftGrasp, bracket_height: float) -> Tensor:
-    """State (size,): the object between the pads with the bracket held at `bracket_height` [m],
+    """State (size,): the object between the pads, with the bracket held at `bracket_height` [m],
     without friction.
 
-    Raises `NoEquilibrium` when the bracket is too high for its pad to touch the object, sunk in
-    under its weight.
+    Raises `NoEquilibrium` when the bracket is too high for its pad to touch the object, which sinks
+    in under its weight.
     """
     check_statics(model)
     number("bracket_height", bracket_height)
@@ -72,7 +72,7 @@ def press(model: SoftGrasp, bracket_height: float) -> Tensor:
 
 @torch.no_grad()
 def holding_force(model: SoftGrasp, y: Tensor) -> float:
-    """Force [N] on the bracket, downwards, that balances the upper pad's normal forces in the
+    """Downward force [N] on the bracket that balances the normal forces of the upper pad in the
     frictionless state y (size,)."""
     pad, part = model.pads["U"], model.unpack(y).pads["U"]
     force = pad.elastic_force(part) if pad.inertial else part[0]
@@ -80,7 +80,7 @@ def holding_force(model: SoftGrasp, y: Tensor) -> float:
 
 
 def check_statics(model: SoftGrasp) -> None:
-    """Raises `ValueError` for a model whose statics would be nonsense, or have no graph."""
+    """Raises `ValueError` for impossible parameters, and in inference mode, which has no graphs."""
     if torch.is_inference_mode_enabled():
         raise ValueError(
             "statics need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()"
@@ -89,18 +89,17 @@ def check_statics(model: SoftGrasp) -> None:
 
 
 def reaches(model: SoftGrasp) -> list[float]:
-    """How far the object reaches downwards and upwards from its centre [m]."""
+    """Extent of the object below and above its centre [m]."""
     return model.shape.support(torch.tensor([[0.0, -1.0], [0.0, 1.0]]).double()).tolist()
 
 
 def place(x: Tensor, y: Tensor) -> Tensor:
-    """Pose (3,) of a body that is not turned."""
+    """Pose (3,) of a body at angle zero."""
     return torch.stack((x, y, torch.zeros_like(y)))
 
 
 def touching(model: SoftGrasp, x: Tensor, y_Br: Tensor) -> State:
-    """The object where it just touches the undeformed lower pad: the rest of a body without
-    weight."""
+    """The object just touching the undeformed lower pad: the equilibrium of a weightless body."""
     state = model.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
     y = torch.tensor(model.settings.pad.height + 0.9 * reaches(model)[0], dtype=torch.float64)
     for _ in range(TOUCHING):
@@ -114,8 +113,8 @@ def touching(model: SoftGrasp, x: Tensor, y_Br: Tensor) -> State:
 
 
 def balanced(model: SoftGrasp, x: Tensor, y: float, y_Br: Tensor) -> State:
-    """The object in balance at x [m], looked for from the height y [m], with the bracket held at
-    y_Br [m]. Warns where the pads turn it."""
+    """The object in equilibrium at x [m], from the initial guess y [m] of its height, with the
+    bracket held at y_Br [m]. Warns where the pads exert a moment on it."""
     pose = {"disc": place(x, torch.full_like(x, y)), "bracket": place(x, y_Br)}
     try:
         pose = resting(model, pose, {"disc": [1]}, actuators=(), residual=RESIDUAL)

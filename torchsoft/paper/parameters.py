@@ -1,5 +1,5 @@
-"""Settings of the paper's rig: defaults and their sources; units, bounds and meanings are those of
-the parts' constructors.
+"""Parameters of the paper's rig: defaults and their sources. Units, bounds and meanings are those
+of the parts' constructors.
 
 Every number is `published` (printed in the paper) or `assumed` (chosen here, because the paper does
 not give it). A value that differs from its default is `assumed` whatever the default was.
@@ -30,8 +30,8 @@ Source = Literal["published", "assumed"]
 def of(
     part: type, name: str, default: float, source: Source, note: str = "", unit: str = ""
 ) -> Any:
-    """A number of the paper's rig: an argument of a part's constructor, with its default and
-    source; `note` says more."""
+    """A parameter of the paper's rig: an argument of a part's constructor, with its default and
+    source; `note` replaces its meaning."""
     declared = quantities(part)[name]
     return number(
         default,
@@ -44,7 +44,7 @@ def of(
 
 
 def number(default: float, unit: str, source: Source, meaning: str, low: float, high: float) -> Any:
-    """A number with its bounds."""
+    """A field for a number with its bounds."""
     return Field(
         default,
         description=meaning,
@@ -55,7 +55,7 @@ def number(default: float, unit: str, source: Source, meaning: str, low: float, 
 
 
 def choice(default: Any, source: Source, meaning: str) -> Any:
-    """A setting that is no number."""
+    """A field for a setting that is not a number."""
     return Field(default, description=meaning, json_schema_extra={"unit": "1", "source": source})
 
 
@@ -295,8 +295,8 @@ class Parameters(Table):
 
     @classmethod
     def paper_like(cls) -> "Parameters":
-        """The friction set whose lateral forces fade in the grasp, as the paper reports:
-        dashpot-dominated."""
+        """Parameters whose lateral forces fade in the grasp, as the paper reports: the dashpots
+        dominate the friction."""
         return cls().override({"contact.K_t": 100.0})
 
     @classmethod
@@ -334,7 +334,6 @@ def adapter(name: str) -> TypeAdapter[Any]:
 
 
 def check(name: str, value: Any, where: str) -> None:
-    """Raises `InvalidTable` naming `where` for a value that the parameter may not have, whatever
-    the others are."""
+    """Raises `InvalidTable` naming `where` for a value out of the parameter's own bounds."""
     with refusing(within=where):
         adapter(name).validate_python(value)

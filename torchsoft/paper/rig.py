@@ -33,7 +33,7 @@ NAMES = {
     "bracket.mass": "bracket.mass",
     "scenario.gravity": "gravity",
 }
-"""Name of a number of `Parameters` among the module's parameters."""
+"""Names of the rig's module parameters by the names of `Parameters`."""
 
 
 class SoftGrasp(Rig):
@@ -99,15 +99,14 @@ class SoftGrasp(Rig):
 
     @property
     def aliases(self) -> Mapping[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """`NAMES`, but for "disc.radius" where the object is not round: the radius of a box is that
-        of its corners."""
+        """`NAMES`, but without "disc.radius" where the object is not round: the radius of a box is
+        that of its corners."""
         return {
             name: own for name, own in NAMES.items() if name != "disc.radius" or self.shape.round
         }
 
     def _values(self) -> dict[str, float | int | str | bool]:
-        """The numbers of `Parameters` that stand in the modules, parametrised or not, as they are
-        now."""
+        """Current values of the parameters of `Parameters` that this rig has."""
         out: dict[str, float | int | str | bool] = {}
         for name, own in self.aliases.items():
             owner, _, last = own.rpartition(".")
@@ -131,8 +130,8 @@ class SoftGrasp(Rig):
 
     @property
     def settings(self) -> Parameters:
-        """The numbers of this model as they are now, read from its modules; the scenario, and what
-        other parts in the place of the usual ones have not, as they were given."""
+        """Current values of the parameters, read from the modules. The scenario, and parameters
+        that this rig's parts lack, have the values first given."""
         values: dict[str, dict[str, Any]] = {}
         for name, value in self._values().items():
             group, _, field = name.partition(".")
@@ -144,8 +143,7 @@ class SoftGrasp(Rig):
         return self._settings.model_copy(update=groups)
 
     def description(self) -> dict[str, Any]:
-        """The numbers and laws as they are now; numbers of `Parameters` that this model has not are
-        left out."""
+        """Current parameters and laws, without those of `Parameters` that this rig lacks."""
         own, said = self._values(), super().description()
         absent = {name for name in (*NAMES, "contact.friction") if name not in own}
         given = {
@@ -161,7 +159,7 @@ class SoftGrasp(Rig):
 
     @property
     def shape(self) -> Shape:
-        """The shape of the object that is manipulated."""
+        """Shape of the manipulated object."""
         shape = self.bodies["disc"].shape
         assert shape is not None
         return shape
@@ -174,6 +172,6 @@ class SoftGrasp(Rig):
 
 
 def apart(p: Parameters) -> float:
-    """Height [m] of the bracket over the ground at which undeformed pads just touch an undeformed
+    """Height [m] of the bracket above the ground at which both undeformed pads just touch the
     disc."""
     return 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height

@@ -25,11 +25,7 @@ def number(name: str, value: Any) -> float:
 
 def positive(name: str, value: Any) -> float:
     """Raises `ValueError` unless a value is a positive, finite number."""
-    if (
-        not isinstance(value, Real)
-        or isinstance(value, bool)
-        or not (math.isfinite(value) and float(value) > 0)
-    ):
+    if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
         raise ValueError(f"`{name}` must be positive and finite, but is {value!r}")
     return float(value)
 
@@ -85,6 +81,6 @@ def names(name: str, value: Any, known: tuple[str, ...]) -> None:
 
 
 def line(value: Any) -> str:
-    """A value in one short line."""
+    """Representation of a value in one short line."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."

@@ -21,8 +21,7 @@ def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
     [m/(N.s)], for the forces z (..., branches, nodes, 2) that have set in at the stage's start."""
     fractions, times = pad.chain()
     C, rest = pad.compliance(), fractions / (times + stage)
-    free = -((rest[:, None, None] * z).sum(-3).flatten(-2) @ C.mT).unflatten(-1, (-1, 2))
-    return free, rest.sum() * C
+    return -nodal(C, (rest[:, None, None] * z).sum(-3)), rest.sum() * C
 
 
 def nodal(A: Tensor, F: Tensor) -> Tensor:

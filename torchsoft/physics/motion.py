@@ -31,18 +31,10 @@ class Piecewise(nn.Module):
     def __init__(self, times: Sequence[float] | Tensor, values: Sequence[float] | Tensor) -> None:
         super().__init__()
         knots = torch.as_tensor(times, dtype=torch.float64).contiguous()
-        listed = (
-            values
-            if isinstance(values, Tensor)
-            else [torch.as_tensor(v, dtype=torch.float64) for v in values]
-        )
-        many = (
-            listed
-            if isinstance(listed, Tensor)
-            else torch.stack(listed)
-            if listed
-            else torch.zeros(0)
-        )
+        many = values
+        if not isinstance(many, Tensor):
+            listed = [torch.as_tensor(v, dtype=torch.float64) for v in many]
+            many = torch.stack(listed) if listed else torch.zeros(0)
         self.register_buffer("times", knots)
         # a tensor with a graph keeps it; anything else becomes a parameter that is not trained
         # unless asked for

@@ -16,11 +16,10 @@ from torch import Tensor
 
 
 class Junction(NamedTuple):
-    """A 1-junction: `nodes` flow vectors of `width` components, the field that stores or sets its
-    flow, and the paper's name."""
+    """A 1-junction: how many flow vectors it has, the field that stores or sets its flow, and the
+    paper's name."""
 
     nodes: int
-    width: int
     element: str
     label: str
 
@@ -28,7 +27,7 @@ class Junction(NamedTuple):
 class Block(NamedTuple):
     """One junction's modulus: matrix (..., bonds or 1, m, width), after an interpolation of the
     junction's nodes at the bonds, spread (bonds, nodes); None where bonds are nodes, or the
-    junction has only one."""
+    junction has a single node."""
 
     matrix: Tensor
     spread: Tensor | None = None

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.material import Material
-from torchsoft.physics.mesh import Array, Mesh, lame_moduli, unit_compliance
+from torchsoft.physics.mesh import Array, Mesh, dofs_of, lame_moduli, unit_compliance, unit_loads
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Ratio
 
@@ -81,11 +81,7 @@ class Pad(nn.Module):
         own = mesh.surface if inertial else np.arange(len(kept))
         self.register_buffer("surface", torch.from_numpy(own.copy()), persistent=False)
         self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
-        spread = np.zeros((len(self.point_nodes), len(kept)))
-        for j in (0, 1):
-            spread[np.arange(len(spread)), self.surface.numpy()[self.point_nodes[:, j]]] += (
-                self.point_shares[:, j]
-            )
+        spread = shape_functions(own[self.point_nodes], self.point_shares, len(kept))
         self.register_buffer("spread", torch.from_numpy(spread), persistent=False)
 
     def remeshed(self, finer: int, points: int) -> "Pad":
@@ -203,19 +199,16 @@ class Pad(nn.Module):
         out, as in the paper."""
         return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
 
-    def stiffness(self, modulus: int) -> sparse.csr_array:
-        """K_lambda (0) or K_mu (1) per modulus and depth, in the base's axes."""
+    def stiffness(self, lame_lambda: float, lame_mu: float) -> sparse.csr_array:
+        """Global stiffness per depth, in the base's axes."""
         turn = sparse.kron(sparse.eye_array(len(self.mesh.free)), self.axes.numpy())
-        return sparse.csr_array(turn @ self.mesh.assemble(self.mesh.matrices[modulus]) @ turn.T)
+        return sparse.csr_array(turn @ self.mesh.stiffness(lame_lambda, lame_mu) @ turn.T)
 
     def static_displacement(self, F: Tensor) -> Tensor:
         """Displacements (nodes, 2) [m] of an inertial pad's nodes under forces F (surface, 2) [N]
         on its surface, with their derivative by E, depth and F; the one by nu is left out."""
-        moduli = lame_moduli(1.0, self.material.nu.item())
-        K = (moduli[0] * self.stiffness(0) + moduli[1] * self.stiffness(1)).tocsc()
-        columns = (2 * self.surface[:, None] + torch.arange(2)).flatten()
-        loads = np.zeros((2 * self.nodes, len(columns)))
-        loads[columns.numpy(), np.arange(len(columns))] = 1.0
+        K = self.stiffness(*lame_moduli(1.0, self.material.nu.item())).tocsc()
+        loads = unit_loads(2 * self.nodes, dofs_of(self.surface.numpy()))
         everywhere = torch.from_numpy(splu(K).solve(loads))
         u = everywhere @ F.flatten() / (self.E * self.material.depth)
         return u.unflatten(0, (-1, 2))
@@ -237,6 +230,14 @@ class Pad(nn.Module):
         )
         f = torch.zeros_like(padded).index_add(-2, connectivity.flatten(), f_e.flatten(-3, -2))
         return f[..., :-1, :] @ self.axes.mT
+
+
+def shape_functions(nodes: Any, shares: Array, count: int) -> Array:
+    """Shape functions of `count` nodes at points (points, count), from the two nodes of every point
+    (points, 2) and those of these."""
+    out = np.zeros((len(nodes), count))
+    np.add.at(out, (np.arange(len(nodes))[:, None], nodes), shares)
+    return out
 
 
 def contact_points(mesh: Mesh, points: int) -> tuple[Any, Array, Array]:

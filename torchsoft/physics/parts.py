@@ -379,8 +379,8 @@ def controller(
     the coordinate that each pushes, in the order of the efforts: {"x": "bracket.x"}; the channel of
     the first is then F_x. `feed_forward` names signals that are added to efforts. The module is
     shared: its parameters are those of the first of the actuators, and those of the rig's group if
-    it is one (`Rig(groups=)`). Raises `ValueError` for another number of efforts, and what
-    `Actuator` does.
+    it is one (`Rig(groups=)`). Raises `ValueError` for another number of efforts, and the
+    errors of `Actuator`.
     """
     several, fed = tuple(measures), dict(feed_forward or {})
     if not isinstance(module, nn.Module):

@@ -19,7 +19,7 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
-from torchsoft.physics.shapes import parameter
+from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import Layout, State
 from torchsoft.physics.taxels import Taxels, check_taxels
 from torchsoft.quantity import Gravity, Quantity, quantity_of
@@ -45,11 +45,6 @@ class Interface(NamedTuple):
     def F_N(self) -> Tensor:
         """Normal forces [N] (..., points)."""
         return self.out[..., 3]
-
-    @property
-    def F_T(self) -> Tensor:
-        """Friction forces [N] (..., points)."""
-        return self.out[..., 4]
 
 
 class Evaluation(NamedTuple):
@@ -107,7 +102,7 @@ class Rig(Shown, nn.Module):
     actuators: Mapping[str, Actuator]
 
     def check_names(self) -> None:
-        """Raises what the class does for parts that do not fit together."""
+        """Raises the errors of the class for parts that do not fit together."""
         for name, pad in self.pads.items():
             if pad.base is not None and pad.base not in self.bodies:
                 raise ValueError(
@@ -256,7 +251,7 @@ class Rig(Shown, nn.Module):
         """Where everything stands in the state vector."""
         return Layout(
             pads={name: pad.state_shape for name, pad in self.pads.items()},
-            stretch={name: len(self.pads[c.pad].point_nodes) for name, c in self.contacts.items()},
+            stretch=self.point_counts,
             free={
                 name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
                 for name, body in self.bodies.items()
@@ -276,6 +271,12 @@ class Rig(Shown, nn.Module):
                 f"{body_name}.{axis}" for axis in COORDINATES if body.freedom[axis] == "driven"
             ]
         return tuple(dict.fromkeys(name for name in names if name is not None))
+
+    @property
+    def fixed_values(self) -> list[Tensor]:
+        """Values of the fixed coordinates, in the order of all coordinates."""
+        every = [(body.fixed, axis) for body in self.bodies.values() for axis in COORDINATES]
+        return [fixed[axis] for fixed, axis in every if axis in fixed]
 
     def follow(self, t: Tensor | float, reference: Reference | None = None) -> Tensor:
         """The signals at t (...) [s]: values and rates (..., signals, 2)."""
@@ -321,26 +322,38 @@ class Rig(Shown, nn.Module):
         if pad.inertial:
             return part
         fractions, _ = pad.chain()
-        zeta = (fractions[:, None, None] * part).sum(-3)
-        return (zeta.flatten(-2) @ pad.compliance().mT).unflatten(-1, (-1, 2))
+        return nodal(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
 
     def penetration(self, name: str, state: State, u: Tensor | None = None) -> Tensor:
         """Depth of the points of a contact in the body [m], (..., points); negative where they are
         apart. `u` are the pad's displacements, where they are known already."""
+        pad = self.contacts[name].pad
+        u = self.displacement(pad, state) if u is None else u
+        p = self.pads[pad].point_positions + self.pads[pad].at_points(u)
+        return moving_frame(self.shape_of(name), *self._arms(name, state, p)).g
+
+    def _arms(self, name: str, state: State, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Moment arms (..., points, 2) [m] of points p from the centre of a contact's body, and the
+        body's angle (..., 1), in the frame of the pad's base."""
         contact = self.contacts[name]
-        pad, shape, pose = (
-            self.pads[contact.pad],
-            self.bodies[contact.body].shape,
-            state.pose[contact.body],
-        )
+        (r_B, _), r_C = self.base_motion(contact.pad, state), state.pose[contact.body]
+        centre = turned(r_C[..., :2] - r_B[..., :2], -r_B[..., 2])
+        return p - centre[..., None, :], r_C[..., 2:] - r_B[..., 2:]
+
+    def shape_of(self, name: str) -> Shape:
+        """Shape of a contact's body."""
+        shape = self.bodies[self.contacts[name].body].shape
         assert shape is not None
-        (r_B, _), u = (
-            self.base_motion(contact.pad, state),
-            self.displacement(contact.pad, state) if u is None else u,
-        )
-        centre = turned(pose[..., :2] - r_B[..., :2], -r_B[..., 2])
-        d = pad.point_positions + pad.at_points(u) - centre[..., None, :]
-        return -shape(turned(d, r_B[..., 2, None] - pose[..., 2, None]))[0]
+        return shape
+
+    def contacts_of(self, pad: str) -> list[str]:
+        """Names of the contacts of a pad."""
+        return [name for name, contact in self.contacts.items() if contact.pad == pad]
+
+    @property
+    def point_counts(self) -> dict[str, int]:
+        """Numbers of contact points, by contact."""
+        return {name: len(self.pads[c.pad].point_nodes) for name, c in self.contacts.items()}
 
     def forward(self, t: Tensor | float, y: Tensor, reference: Reference | None = None) -> Tensor:
         """dy/dt, shaped like y. Raises `ValueError` for a state of another length or dtype."""
@@ -387,15 +400,15 @@ class Rig(Shown, nn.Module):
         out = {}
         for name, pad in self.pads.items():
             element = f"I: [I_{name}]" if pad.inertial else "R: tau K"
-            out[f"pad_{name}"] = Junction(pad.nodes, 2, element, f"1: nodes of pad {name}")
-        out[GROUND] = Junction(1, 2, "Sf: 0", "1: ground")
+            out[f"pad_{name}"] = Junction(pad.nodes, element, f"1: nodes of pad {name}")
+        out[GROUND] = Junction(1, "Sf: 0", "1: ground")
         for name, body in self.bodies.items():
             free = [body.freedom[axis] for axis in COORDINATES]
             source = {"driven": "Sf: drive", "fixed": "Sf: 0"}
             flow = f"I: m_{self.symbols[name]}" if "free" in free[:2] else source[free[0]]
             spin = f"I: I_{self.symbols[name]}" if free[2] == "free" else source[free[2]] + " "
-            out[name] = Junction(1, 2, flow, f"1: {name}")
-            out[f"{name}_spin"] = Junction(1, 1, spin, f"1: {name} spin")
+            out[name] = Junction(1, flow, f"1: {name}")
+            out[f"{name}_spin"] = Junction(1, spin, f"1: {name} spin")
         return out
 
     def evaluate(
@@ -416,7 +429,7 @@ class Rig(Shown, nn.Module):
             flows[f"{name}_spin"] = state.velocity[name][..., None, 2:]
         ports, interfaces = {}, {}
         for name, pad in self.pads.items():
-            own = [key for key, contact in self.contacts.items() if contact.pad == name]
+            own = self.contacts_of(name)
             r_B, v_B = self.base_motion(name, state)
             u, angle = self.displacement(name, state), r_B[..., 2, None]
             moment_arm = turned(pad.positions + u, angle)
@@ -458,20 +471,15 @@ class Rig(Shown, nn.Module):
         if which is not None:
             X, weight, s = X[which], weight[which], s[..., which]
         r_B, v_B = self.base_motion(contact.pad, state)
-        r_C, v_C = state.pose[contact.body], state.velocity[contact.body]
-        angle = r_B[..., 2]
-        centre, glide = (
-            turned(r_C[..., :2] - r_B[..., :2], -angle),
-            turned(v_C[..., :2] - v_B[..., :2], -angle),
-        )
-        p = X + u
-        d = p - centre[..., None, :]
+        v_C, p = state.velocity[contact.body], X + u
+        d, theta = self._arms(key, state, p)
+        glide = turned(v_C[..., :2] - v_B[..., :2], -r_B[..., 2])
         w = glide[..., None, :] - v_B[..., None, 2:] * cross(p) - u_dot
         one = torch.ones_like(d[..., 0])
         parts = (
             v_C[..., 2:] * one,
             d,
-            (r_C[..., 2:] - r_B[..., 2:]) * one,
+            theta * one,
             s * one,
             weight * one,
             0.0 * one,
@@ -485,15 +493,8 @@ class Rig(Shown, nn.Module):
         the base's frame."""
         total = torch.zeros_like(u)
         for key in own:
-            contact = self.contacts[key]
-            shape = self.bodies[contact.body].shape
-            assert shape is not None
-            total = (
-                total
-                + interface_law(contact.law, shape, self.point_inputs(key, state, u, u_dot))[
-                    ..., :2
-                ]
-            )
+            x = self.point_inputs(key, state, u, u_dot)
+            total = total + interface_law(self.contacts[key].law, self.shape_of(key), x)[..., :2]
         return total
 
     def _rates(self, name: str, own: Sequence[str], state: State, u: Tensor) -> Tensor:
@@ -515,12 +516,11 @@ class Rig(Shown, nn.Module):
         self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]
     ) -> Interface:
         contact = self.contacts[key]
-        pad, body = self.pads[contact.pad], self.bodies[contact.body]
-        assert body.shape is not None
+        pad, shape = self.pads[contact.pad], self.shape_of(key)
         r_B, _ = self.base_motion(contact.pad, state)
         x = self.point_inputs(key, state, pad.spread @ u, pad.spread @ u_dot)
         d, angle = x[..., 3:5], r_B[..., 2, None]
-        local = moving_frame(body.shape, d, x[..., 5])
+        local = moving_frame(shape, d, x[..., 5])
         n, moment_arm = turned(local.n, angle), turned(d, angle)
         R = torch.stack((n, cross(n)), -2)  # world -> (normal, tangential), the rows of [iR0]
         arm = torch.einsum("...ij,...j->...i", R, cross(moment_arm))[..., None]
@@ -533,7 +533,7 @@ class Rig(Shown, nn.Module):
         )
         frame = Frame(moment_arm, n, cross(n), local.g)
         return Interface(
-            frame, interface_law(contact.law, body.shape, x), transformer, transformer.flow(flows)
+            frame, interface_law(contact.law, shape, x), transformer, transformer.flow(flows)
         )
 
     def _pad_port(

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
-from torchsoft.physics.mesh import Array, Mesh, StoredMesh, lame_moduli
+from torchsoft.physics.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
 from torchsoft.physics.mesh.mesh import gradients, strains
-from torchsoft.physics.pads import contact_points
+from torchsoft.physics.pads import contact_points, shape_functions
 from torchsoft.physics.rig import Rig
 
 
@@ -25,13 +25,8 @@ def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], 
 
     The interior's displacement depends on the surface's only, for any E and depth; both are 1.
     """
-    K_lambda, K_mu, _ = mesh.matrices
-    lame_lambda, lame_mu = lame_moduli(1.0, nu)
-    K = mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu).tocsc()
-    surface = (2 * mesh.surface[:, None] + np.arange(2)).ravel()
-    inside = np.ones(2 * len(mesh.free), np.bool_)
-    inside[surface] = False
-    interior = np.flatnonzero(inside)
+    K, surface = mesh.stiffness(*lame_moduli(1.0, nu)).tocsc(), dofs_of(mesh.surface)
+    interior = np.setdiff1d(np.arange(2 * len(mesh.free)), surface)
     return splu(K[interior][:, interior]), interior, K[interior][:, surface].toarray()
 
 
@@ -67,10 +62,7 @@ class PadSetup:
     def spread(self) -> Array:
         """Shape functions of the surface nodes at the contact points (points, surface nodes)."""
         nodes, shares, _ = contact_points(self.mesh, self.points)
-        spread = np.zeros((len(nodes), len(self.mesh.surface)))
-        for j in (0, 1):
-            spread[np.arange(len(nodes)), nodes[:, j]] += shares[:, j]
-        return spread
+        return shape_functions(nodes, shares, len(self.mesh.surface))
 
     def displacement(self, u: Array) -> Array:
         """Displacements of all nodes of the mesh (..., mesh nodes, 2) [m], bonded ones too.
@@ -86,16 +78,11 @@ class PadSetup:
             free[:] = own
         else:
             factor, interior, K_is = interior_solver(mesh, self.nu)
-            free[:, (2 * mesh.surface[:, None] + np.arange(2)).ravel()] = own
+            free[:, dofs_of(mesh.surface)] = own
             free[:, interior] = -factor.solve(K_is @ own.T).T
         out = np.zeros((len(own), len(mesh.nodes), 2))
         out[:, mesh.free] = free.reshape(len(own), -1, 2)
         return out.reshape(*u.shape[:-2], -1, 2)
-
-    def deformed(self, u: Array) -> Array:
-        """Places (..., mesh nodes, 2) [m] of all nodes in the frame of the base; u as for
-        `displacement`."""
-        return self.placed(self.mesh.nodes + self.displacement(u))
 
     def surface_points(self, u: Array) -> Array:
         """Places (..., points, 2) [m] of the contact points in the frame of the base."""

@@ -90,11 +90,7 @@ def settled(
             )
     check_given("pose", pose, dict.fromkeys(rig.bodies, 3))
     check_given("velocity", velocity, dict.fromkeys(rig.bodies, 3))
-    check_given(
-        "stretch",
-        stretch,
-        {name: len(rig.pads[c.pad].point_nodes) for name, c in rig.contacts.items()},
-    )
+    check_given("stretch", stretch, rig.point_counts)
     still = State(
         {},
         dict(stretch),
@@ -130,7 +126,7 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
     of a Jacobian.
     """
     pad = rig.pads[name]
-    own = [key for key, contact in rig.contacts.items() if contact.pad == name]
+    own = rig.contacts_of(name)
     batch = next(iter(state.pose.values())).shape[:-1]
     law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
     undeformed = torch.zeros(*batch, pad.nodes, 2, dtype=torch.float64)
@@ -179,10 +175,9 @@ def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
 
 def unstretched(rig: Rig, batch: Sequence[int]) -> dict[str, Tensor]:
     """No stretch (*batch, points) [m] at any contact."""
-    counts = {
-        name: len(rig.pads[contact.pad].point_nodes) for name, contact in rig.contacts.items()
+    return {
+        name: torch.zeros(*batch, n, dtype=torch.float64) for name, n in rig.point_counts.items()
     }
-    return {name: torch.zeros(*batch, count, dtype=torch.float64) for name, count in counts.items()}
 
 
 @one_torch_thread()
@@ -191,7 +186,7 @@ def resting(
     signals: Tensor | None = None, actuators: Container[str] | None = None,
     residual: float = RESIDUAL,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Poses (3,) [m, m, rad] by body of a rig at rest, looked for from `pose`: the coordinates
+    """Poses (3,) [m, m, rad] by body of a rig at rest, searched for from `pose`: the coordinates
     `free`, numbers by body (by default all that can move), are brought into balance, and all others
     stay as given.
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torchsoft.physics.condensed import nodal
+from torchsoft.physics.condensed import free_rates, nodal
 from torchsoft.physics.contact import cross, interface_law, moving_frame, turned
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
@@ -24,13 +24,12 @@ def contact_states(rig: Rig, state: State, force: Mapping[str, Tensor]) -> dict[
     """
     out = {}
     for name, pad in rig.pads.items():
-        own = [key for key, contact in rig.contacts.items() if contact.pad == name]
+        own = rig.contacts_of(name)
         touched = {key: force[key][..., 0].flatten(0, -2).any(0).nonzero()[:, 0] for key in own}
         u = rig.displacement(name, state)
         rate = _rates(rig, name, touched, state, u, force)
         for key, which in touched.items():
-            law, shape = rig.contacts[key].law, rig.bodies[rig.contacts[key].body].shape
-            assert shape is not None
+            law, shape = rig.contacts[key].law, rig.shape_of(key)
             spread = pad.spread[which]
             x = rig.point_inputs(key, state, spread @ u, spread @ rate, which)
             slips = torch.zeros(force[key].shape[:-1], dtype=torch.int8)
@@ -53,14 +52,11 @@ def _rates(
         return turned(state.rates[name] - carried, -angle)
     f = torch.zeros_like(u)
     for key, which in touched.items():
-        shape = rig.bodies[rig.contacts[key].body].shape
-        assert shape is not None
         spread = pad.spread[which]
         at = spread @ u
         x = rig.point_inputs(key, state, at, torch.zeros_like(at), which)
-        frame = moving_frame(shape, x[..., 3:5], x[..., 5])
+        frame = moving_frame(rig.shape_of(key), x[..., 3:5], x[..., 5])
         F_N, F_T = force[key][..., which, :].split(1, -1)
         f = f + spread.mT @ (F_N * frame.n + F_T * frame.t)
-    fractions, times = pad.material.chain()
-    setting = (fractions / times)[:, None, None] * (f[..., None, :, :] - state.pads[name])
-    return nodal(pad.compliance(), setting.sum(-3))
+    free, P = free_rates(pad, state.pads[name], 0.0)
+    return free + nodal(P, f)

@@ -180,7 +180,7 @@ def check_shape(where: str, shape: Shape) -> None:
     """Raises `ValueError` unless phi is a distance with the normal n as its slope, and `support`
     and `size` are the body's.
 
-    Tried at some points near the boundary, which is looked for along rays from outside. The
+    Tried at some points near the boundary, which is searched for along rays from outside. The
     package's own are not tried.
     """
     if type(shape).__module__.startswith("torchsoft."):
@@ -284,7 +284,7 @@ def slip_rates(where: str, law: Any, E: Tensor, F_N: Tensor, R: float) -> Tensor
     no such tensor."""
     try:
         rate = law(E, F_N, torch.tensor(R, dtype=torch.float64))
-    except Exception as error:  # whatever somebody's own code raises
+    except Exception as error:  # any error of user code
         raise ValueError(
             f"the slip law of `{where}` must take three tensors (effort, normal force, dashpot) "
             f"and give the slip rate, but {type(error).__name__}: {error}"

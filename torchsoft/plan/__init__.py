@@ -1,5 +1,5 @@
-"""Plans: motions, gains, networks and shapes of any rig that reach targets within limits, by exact
-gradients through contact and friction."""
+"""Planning for any rig: motions, gains, networks and shapes that reach targets within limits, by
+exact gradients through contact and friction."""
 
 from torchsoft.plan.goals import Limit, Target
 from torchsoft.plan.knots import Bounds

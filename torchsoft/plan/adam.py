@@ -1,4 +1,4 @@
-"""Adam within bounds, of plans with many variables and of designed motions."""
+"""Projected Adam, for plans with many variables and for designed motions."""
 
 from collections.abc import Callable
 
@@ -8,8 +8,8 @@ from torchsoft.plan.knots import Array
 
 
 class ProjectedAdam:
-    """A point z (n,) that Adam moves, and that `nearest` brings back within bounds. `memory` is how
-    much of the slopes, and of their squares, is remembered from one step to the next."""
+    """Adam from a point z (n,) with projection by `nearest`. `memory` holds the decay rates of the
+    first and second moments of the gradient."""
 
     def __init__(
         self, start: Array, nearest: Callable[[Array], Array], memory: tuple[float, float]
@@ -22,12 +22,12 @@ class ProjectedAdam:
         return self._z.detach().numpy().copy()
 
     def step(self, slope: Array, rate: float) -> None:
-        """Against the slope (n,), each number by about `rate`."""
+        """Step against the gradient (n,), each variable by about `rate`."""
         self._adam.param_groups[0]["lr"] = rate
         self._z.grad = torch.from_numpy(slope)
         self._adam.step()
         self.set(self._nearest(self.z))
 
     def set(self, z: Array) -> None:
-        """Go to another point, and remember the slopes."""
+        """Move to another point and keep the moments of the gradient."""
         self._z.data.copy_(torch.from_numpy(z))

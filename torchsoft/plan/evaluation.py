@@ -1,4 +1,4 @@
-"""Runs of a plan: values, targets and limits of every draw of uncertain parameters, and their
+"""Runs of a plan: values, targets and limits for every draw of uncertain parameters, and their
 derivatives by the free variables."""
 
 import warnings
@@ -19,8 +19,8 @@ from torchsoft.solve.trajectory import Trajectory
 
 
 class Terms(NamedTuple):
-    """Functions of a run: an objective that is lowered, targets whose error over a tolerance is to
-    vanish, limits that are not to be positive."""
+    """Functions of a run: an objective to minimise, targets whose errors over a tolerance should
+    vanish, and limits whose excess should not be positive."""
 
     objective: Term | None
     targets: Mapping[str, Term]
@@ -38,7 +38,7 @@ class Terms(NamedTuple):
         return parts[0].sum(), parts[1], parts[2]
 
     def labels(self, run: Trajectory) -> tuple[list[str], list[str]]:
-        """Names of the errors and of the excess, one each."""
+        """Names of the single errors, and of the single excesses."""
 
         def named(terms: Mapping[str, Term], field: str) -> list[str]:
             sizes = {name: len(v) for name, v in evaluated(terms, run, field).items()}
@@ -52,7 +52,7 @@ class Terms(NamedTuple):
 
 class Look:
     """A plan at z (n,): value (draws,), errors (draws, k) and excess (draws, m) of its runs, and
-    their derivatives. `lost` says why a run failed."""
+    their derivatives. `lost` is the reason of a failed run."""
 
     def __init__(
         self, z: Array, rows: Tensor, batch: Batch | None, terms: Terms, lost: str
@@ -68,8 +68,8 @@ class Look:
 
     @cached_property
     def slopes(self) -> tuple[Array, Array, Array]:
-        """Derivatives by z: of values (draws, n), errors (draws, k, n) and excess (draws, m, n);
-        one backward sweep of every run for each column. Raises `GradientFailed`."""
+        """Derivatives by z of values (draws, n), errors (draws, k, n) and excess (draws, m, n); one
+        backward pass over every run for each column. Raises `GradientFailed`."""
 
         def by(columns: Tensor) -> Array:
             if not columns.requires_grad:  # nothing of the run is in it
@@ -84,8 +84,8 @@ class Look:
 
 
 class Evaluator:
-    """The runs of a plan. `over` holds draws of parameters by name (draws, ...), y0 their starts
-    (size,) or (draws, size)."""
+    """Evaluation of plans by runs. `over` holds draws of parameters by name (draws, ...), y0 their
+    initial states (size,) or (draws, size)."""
 
     def __init__(
         self, rig: Rig, t: Tensor, variables: Variables, terms: Terms, y0: Tensor,
@@ -104,12 +104,12 @@ class Evaluator:
         self.over, self.rtol, self.threads, self.looks = dict(over), rtol, threads, 0
 
     def look(self, z: Array, rtol: float | None = None, *, gradient: bool = True) -> Look:
-        """The plan at z, by the evaluator's relative tolerance or another. Raises `ValueError` for
-        values that no run could have."""
+        """The plan at z, with the evaluator's relative tolerance or another. Raises `ValueError`
+        for impossible values."""
         self.looks += 1
         rows = torch.from_numpy(np.tile(z, (self.draws, 1))).requires_grad_(gradient)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the run that is kept is made again, and warns
+        # the run that is kept is made again, and warns
+        with warnings.catch_warnings(action="ignore"):
             batch = simulate_batch(
                 self.rig, self.t, parameters=self.over | self.variables.parameters(rows),
                 reference=[self.variables.reference(row) for row in rows], y0=self.y0,

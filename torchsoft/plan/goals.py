@@ -1,4 +1,4 @@
-"""Targets and limits of a plan: functions of a run."""
+"""Targets and limits of a plan, as functions of a run."""
 
 from collections.abc import Callable, Mapping
 from typing import Self
@@ -12,11 +12,11 @@ from torchsoft.solve.trajectory import Trajectory
 from torchsoft.tables import Table
 
 Term = Callable[[Trajectory], Tensor]
-"""A function in torch of a run; its result has the run's graph."""
+"""A torch function of a run, differentiable through the run."""
 
 
 def samples(run: Trajectory, channel: str) -> Tensor:
-    """A channel (T,). Raises `ValueError` for one that the run has not."""
+    """A channel (T,). Raises `ValueError` for an unknown one."""
     if channel not in run:
         raise ValueError(
             f"there is no channel `{channel}`; {suggestion(channel, run.keys(), 'the run has')}"
@@ -25,8 +25,8 @@ def samples(run: Trajectory, channel: str) -> Tensor:
 
 
 class Target(Table):
-    """A channel is to be `value` [its unit] at a time [s], the end of the run by default, but for
-    `tolerance`."""
+    """Target for a channel: `value` [its unit] at the time `at` [s], by default the end of the run,
+    within `tolerance`."""
 
     channel: str
     value: float
@@ -34,7 +34,7 @@ class Target(Table):
     at: float | None = None
 
     def __call__(self, run: Trajectory) -> Tensor:
-        """Error () over the tolerance, between two outputs by a straight line."""
+        """Error () over the tolerance, interpolated linearly between outputs."""
         y, t = samples(run, self.channel), run.t
         at = float(t[-1]) if self.at is None else self.at
         if not float(t[0]) <= at <= float(t[-1]) * (1 + 1e-12):
@@ -47,7 +47,7 @@ class Target(Table):
 
 
 class Limit(Table):
-    """A channel is to stay between `low` and `high` [its unit], or on one side of one of them, from
+    """Limit of a channel: between `low` and `high` [its unit], one of which may be missing, from
     `since` to `until` [s]."""
 
     channel: str
@@ -66,14 +66,14 @@ class Limit(Table):
 
     @property
     def scale(self) -> float:
-        """Unit of the excess [the channel's unit]."""
+        """Scale of the excess [the channel's unit]."""
         if self.low is not None and self.high is not None:
             return self.high - self.low
         bound = self.high if self.low is None else self.low
         return abs(bound or 0.0) or 1.0
 
     def __call__(self, run: Trajectory) -> Tensor:
-        """Largest excess (bounds,) over the scale; not positive where the limit is kept."""
+        """Largest excess (bounds,) over the scale; not positive within the limit."""
         y, t = samples(run, self.channel), run.t
         first = float(t[0]) if self.since is None else self.since
         last = float(t[-1]) if self.until is None else self.until
@@ -86,7 +86,7 @@ class Limit(Table):
 
 
 def evaluated(terms: Mapping[str, Term], run: Trajectory, field: str) -> dict[str, Tensor]:
-    """Every term of a run, as vectors. Raises `ValueError` naming the term."""
+    """Values of all terms on a run, as vectors. Raises `ValueError` naming the term."""
     out = {}
     for name, term in terms.items():
         try:

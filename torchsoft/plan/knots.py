@@ -1,4 +1,4 @@
-"""Motions whose knots may move: their bounds, and the variables that a search moves."""
+"""Motions with movable knots: bounds, and variables of a search."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Self
@@ -17,7 +17,7 @@ from torchsoft.tables import Table
 Array = NDArray[np.float64]
 
 PEAK = 35 / 16
-"""Largest over mean speed of the 7th-order profile."""
+"""Peak over mean speed of the 7th-order profile."""
 
 
 class Range(Table):
@@ -47,7 +47,8 @@ class Bounds(Range):
 
 
 def profile(reference: Reference, name: str) -> Profile:
-    """A signal of the reference. Raises `ValueError` where it is none, or no `Profile`."""
+    """A signal of the reference. Raises `ValueError` for an unknown one, and for one that is not a
+    `Profile`."""
     try:
         found = reference[name]
     except KeyError:
@@ -64,7 +65,7 @@ def profile(reference: Reference, name: str) -> Profile:
 
 
 def knots(reference: Reference, names: Iterable[str]) -> dict[str, Any]:
-    """Tables of a rig file of the profiles of some signals."""
+    """Profiles of some signals, as tables of a rig file."""
     signals = {name: profile(reference, name) for name in names}
     return {
         name: {
@@ -77,12 +78,12 @@ def knots(reference: Reference, names: Iterable[str]) -> dict[str, Any]:
 
 
 class Moves:
-    """The variables z (n,) of a motion: values, and times where they are free, of the free knots of
-    some signals, which end by `end` [s]; none where `bounds` names no signal. Each is over a unit
-    of its own, the way or the time between two knots that are as far apart as speed allows.
+    """The variables z (n,) of a motion: values, and times where these are free, of the free knots
+    of some signals, which end by `end` [s]; none for empty `bounds`. Each is over a unit of its
+    own: the largest distance that the speed allows between two knots, or the time between them.
 
-    Raises `ValueError` for signals without free knots, and where the motion given is more than the
-    bounds leave to it.
+    Raises `ValueError` for signals without free knots, and for bounds that no motion of these knots
+    can keep.
     """
 
     def __init__(self, reference: Reference, bounds: Mapping[str, Bounds], end: float) -> None:
@@ -116,8 +117,7 @@ class Moves:
         self.start = self.nearest(flat / self.unit)
 
     def split(self, z: Any) -> dict[str, tuple[Any, Any]]:
-        """Times and values of the free knots by signal, of z over its units, as arrays or
-        tensors."""
+        """Times and values of the free knots by signal, from z, as arrays or tensors."""
         physical, out, at = (
             z * (torch.from_numpy(self.unit) if isinstance(z, Tensor) else self.unit),
             {},
@@ -133,7 +133,7 @@ class Moves:
         return out
 
     def ways(self) -> Array:
-        """Matrix (n, n) from the variables to the ways between knots, and the times."""
+        """Matrix (n, n) from the variables to the distances between knots, and the times."""
         D, at = np.eye(self.n), 0
         for name, (times, _, first) in self.knots.items():
             count = len(times) - first
@@ -143,7 +143,7 @@ class Moves:
         return D
 
     def box(self) -> list[tuple[float, float]]:
-        """Least and largest value of every variable."""
+        """Lower and upper bound of every variable."""
         out, at = list[tuple[float, float]](), 0
         for name, (times, _, first) in self.knots.items():
             one, count = self.bounds[name], len(times) - first
@@ -156,7 +156,7 @@ class Moves:
         return out
 
     def reference(self, z: Tensor) -> Reference:
-        """The motion, with the graph of z."""
+        """The motion, differentiable by z."""
         signals = {name.replace(":", "."): signal for name, signal in self.given.signals.items()}
         for name, (times, values) in self.split(z).items():
             known_times, known_values, first = self.knots[name]
@@ -168,8 +168,8 @@ class Moves:
         return Reference(**signals)
 
     def _excess(self, z: Array) -> Array:
-        """Violations, which must not be positive: beyond the bounds, faster than allowed, closer
-        than `shortest`, too late."""
+        """Excess over the constraints, not positive where they are kept: bounds of values, speed,
+        `shortest` and the end."""
         rows = [np.zeros(0)]
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]
@@ -182,8 +182,8 @@ class Moves:
         return np.concatenate(rows)
 
     def nearest(self, z: Array) -> Array:
-        """The motion within the bounds that is nearest to z, by the sum of what variables move.
-        Raises `ValueError` where there is none."""
+        """The nearest z within the bounds, by the sum of absolute changes. Raises `ValueError`
+        where there is none."""
         if not self.n or (self.A @ z <= self.b + 1e-9 * np.abs(self.A).max(1)).all():
             return z
         I, scale = np.eye(self.n), np.abs(self.A).max(1)
@@ -202,7 +202,7 @@ class Moves:
         return np.asarray(out.x[: self.n], np.float64)
 
     def active(self, z: Array) -> list[str]:
-        """Which bounds a motion touches, and at how many knots, in words."""
+        """Active bounds of a motion, with the number of their knots, in words."""
         out = []
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]

@@ -1,4 +1,4 @@
-"""`plan`: free variables of a rig that reach targets within limits, by exact gradients."""
+"""`plan`: the free variables of a rig that reach targets within limits, by exact gradients."""
 
 import time as clock
 from collections.abc import Mapping
@@ -26,13 +26,13 @@ from torchsoft.plan.variables import Free, Variables
 from torchsoft.solve.trajectory import Trajectory
 
 RTOL = 1e-4
-"""Relative tolerance of the search's runs."""
+"""Relative tolerance of runs in a search."""
 
 CHECK = 0.01
-"""Tolerance of the run that checks a plan, over that of the search."""
+"""Relative tolerance of the run that checks a plan, over that of the search."""
 
 POLISH = 0.1
-"""Tolerance of a second search, over that of the first, where the check fails."""
+"""Relative tolerance of a second search, over that of the first, where the check fails."""
 
 Method = Literal["slsqp", "adam"]
 Robust = Literal["mean", "worst"]
@@ -40,14 +40,14 @@ Robust = Literal["mean", "worst"]
 
 @dataclass(frozen=True, repr=False)
 class Plan(Shown):
-    """A plan, and how it was found.
+    """A plan, and its provenance.
 
-    `reference` and `parameters` are the free variables as they are now. `reached` says whether
-    every target and limit is kept in the first draw, by runs of a hundredth of the tolerance;
-    `holds` is the part of draws in which they are. `errors` holds the errors of targets over their
+    `reference` and `parameters` are the planned motion and parameters. `reached` is whether every
+    target and limit is kept in the first draw, by runs of a hundredth of the tolerance; `holds` is
+    the fraction of draws in which they are. `errors` holds the errors of targets over their
     tolerance and `excess` that of limits over their scale, (draws,) by name. `trajectory` is the
-    run of the first draw. `reasons` names targets that are not reached with their obstacles,
-    `notices` the other facts that a reader must know.
+    run of the first draw. `reasons` names missed targets and their obstacles, `notices` other facts
+    about the search.
     """
 
     rig: Rig = field(repr=False)
@@ -164,7 +164,7 @@ def plan(
 
 
 def kept(look: Look) -> NDArray[np.bool_]:
-    """Draws (draws,) in which every target and limit is kept; none of a lost look."""
+    """Mask of the draws (draws,) with every target and limit kept; False for a failed run."""
     if look.lost:
         return np.zeros(1, bool)
     return np.logical_and(
@@ -175,8 +175,8 @@ def kept(look: Look) -> NDArray[np.bool_]:
 def finished(
     search: Search, checked: Look | None, rig: Rig, notices: list[str], made_by: dict[str, Any]
 ) -> Plan:
-    """The best plan of a search by a run of a finer tolerance: `checked`, if that is of this plan.
-    A plan whose finer run fails is not reached."""
+    """The best plan of a search, judged by a run of a finer tolerance: `checked`, if that is of
+    this plan. A plan whose finer run fails is not reached."""
     evaluator, z = search.evaluator, search.found.z
     rtol = CHECK * made_by["rtol"]
     if checked is None or not np.array_equal(checked.z, z):
@@ -227,7 +227,7 @@ def finished(
 
 
 def slips(run: Trajectory) -> list[str]:
-    """Contacts whose points all slip at some time, in words."""
+    """Sentences on contacts whose points all slip at some time."""
     out = []
     for name, state in run.contact_state.items():
         touching = state > 0

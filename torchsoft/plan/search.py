@@ -1,4 +1,4 @@
-"""Searches for the variables of a plan: SLSQP by SciPy, and projected Adam by torch for many
+"""Optimisation of a plan's variables: SLSQP by SciPy, and projected Adam by torch for many
 variables."""
 
 import time as clock
@@ -17,39 +17,41 @@ from torchsoft.plan.knots import Array
 from torchsoft.solve.adjoint import GradientFailed
 
 WITHIN = 0.5
-"""Part of a target's tolerance that a search keeps: runs by a finer tolerance differ a little."""
+"""Fraction of a target's tolerance that a search aims for, since runs by a finer tolerance differ a
+little."""
 
 SLACK = 1e-3
-"""Excess of a limit, over its scale, that counts as kept."""
+"""Largest excess of a limit, over its scale, that counts as kept."""
 
 EXCESS = 100.0
-"""Weight of excess over its scale beside errors over their tolerance."""
+"""Weight of excess over its scale, relative to errors over their tolerance."""
 
 UNIT = 0.3
-"""Length of the first step along the objective, over the units of the variables."""
+"""Length of the first step along the objective, in units of the variables."""
 
 PRICE = 30.0
-"""Weight of squared excess for Adam."""
+"""Penalty factor of squared excess for Adam."""
 
 CLIPPED = 1.0
-"""Norm of a slope at the most, for Adam."""
+"""Largest norm of a gradient for Adam."""
 
 MEMORY = 0.9, 0.999
-"""How much of its slopes, and of their squares, Adam remembers."""
+"""Adam's decay rates of the first and second moments of the gradient."""
 
 STAGES, SHORTER, SHORTEST = 30, 0.4, 0.01
-"""Stages of SLSQP at the most; the part of the way to the targets that is aimed at when a run
-fails, over the part before; and the least."""
+"""Most stages of SLSQP; the factor on the fraction of the way to the targets after a failed run;
+and the least such fraction."""
 
 DONE = 0.1
-"""Errors, over those at its start, with which a stage on the way to the targets is done."""
+"""Errors, over those at the start, at which a stage on the way to the targets ends."""
 
 ACCURACY = 1e-4
 """Change of the value and excess below which SLSQP ends."""
 
 
 class Visit(NamedTuple):
-    """An evaluation: its time [s], the value, and the miss of targets and limits, 0 if none."""
+    """An evaluation: its time [s], the value, and the miss of targets and limits, 0 if all are
+    kept."""
 
     seconds: float
     value: float
@@ -57,32 +59,33 @@ class Visit(NamedTuple):
 
 
 PATIENCE, ENOUGH, BETTER = 6, 3, 3e-3
-"""SLSQP ends after so many evaluations, or so many where all is kept, without a value lower by this
-part of it: runs whose steps are chosen by a tolerance are not smooth beyond that."""
+"""Evaluations without improvement after which SLSQP ends: in general, and where all targets and
+limits are kept; and the least relative improvement, below which runs with step control are not
+smooth."""
 
 
 SAME = 1e-12
-"""Difference of variables, over their units, that rounding makes."""
+"""Largest difference of variables, in their units, that counts as rounding."""
 
 
 class Stopped(Exception):
-    """The time is over."""
+    """The time limit is reached."""
 
 
 class Settled(Exception):
-    """No evaluation is any better, or a stage is done."""
+    """The search no longer improves, or a stage is complete."""
 
 
 class Failed(Exception):
-    """A run of a step of the search failed."""
+    """A run within a step of the search failed."""
 
 
 class Search:
-    """Evaluates plans, and keeps the best: the smaller miss, then the lower value.
+    """Evaluates plans and keeps the best: the smaller miss, then the lower value.
 
-    With one draw, or `robust` "mean", the mean of the objective is lowered, the mean errors of the
-    draws are brought to zero, and their spread is lowered; with "worst" the largest sum of the
-    objective and half the squared errors.
+    With one draw, or `robust` "mean", the search minimises the mean of the objective and the spread
+    of the errors, and brings the mean errors of the draws to zero; with "worst" it minimises the
+    largest sum of the objective and half the squared errors.
     """
 
     def __init__(
@@ -105,7 +108,7 @@ class Search:
         self._last: Look | None = None
 
     def look(self, z: Array, *, gradient: bool = True) -> Look:
-        """The plan at z, counted. Raises `Stopped`."""
+        """Evaluate the plan at z, and record it. Raises `Stopped`."""
         for known in (self._last, self.best):
             if known is not None and np.allclose(known.z, z, rtol=0, atol=SAME):
                 return known
@@ -137,7 +140,7 @@ class Search:
         return look
 
     def value(self, look: Look) -> float:
-        """Objective, lowered while targets and limits are kept."""
+        """The function to minimise within targets and limits."""
         if self._worst:
             combined = self._costs(look).max()
         else:
@@ -146,13 +149,14 @@ class Search:
         return float(combined) + self.changed(look.z)[0]
 
     def changed(self, z: Array) -> tuple[float, Array]:
-        """Price of the change of ways and parameters since the start, and its slope (n,)."""
+        """Penalty of the change of distances and parameters since the start, and its gradient
+        (n,)."""
         D = self.evaluator.variables.D
         way = D @ (z - self.origin)
         return 0.5 * self.change * float(way @ way), self.change * D.T @ way
 
     def missed(self, look: Look) -> float:
-        """Miss of targets beyond a part of their tolerance, and of limits beyond their slack."""
+        """Miss of targets beyond `WITHIN` of their tolerance, and of limits beyond their slack."""
         errors = np.abs(look.errors).max(initial=0.0)
         excess = look.excess.max(initial=0.0)
         return float(max(errors - WITHIN, 0.0) + EXCESS * max(excess - SLACK, 0.0))
@@ -164,8 +168,8 @@ class Search:
         return self.best
 
     def refine(self, rtol: float) -> None:
-        """Go on by another relative tolerance, from the best plan so far, which is looked at anew,
-        with its slopes; it stays the best where that fails or is interrupted."""
+        """Change the relative tolerance, and evaluate the best plan anew, with its gradient. The
+        old best is kept where that fails or is interrupted."""
         self.evaluator.rtol, z, known = rtol, self.found.z, (self.best, self.best_visit)
         self.best, self._last, self.best_visit = None, None, Visit(0.0, np.inf, np.inf)
         try:
@@ -175,7 +179,7 @@ class Search:
                 self.best, self.best_visit = known
 
     def begin(self, starts: int, seed: int) -> None:
-        """Look at so many starts: the plan as it is given, and Sobol points of all bounds. Raises
+        """Evaluate the starts: the given plan, and Sobol points within all bounds. Raises
         `ValueError` where none can be run."""
         variables = self.evaluator.variables
         self.look(self.origin, gradient=starts == 1)
@@ -193,8 +197,8 @@ class Search:
             self.best_visit = self.best_visit._replace(value=self.value(self.best))
 
     def slsqp(self, z: Array, iterations: int) -> None:
-        """Sequential quadratic programming from z on. Where a step leads to a run that fails, only
-        a part of the way to the targets is aimed at, and then the rest."""
+        """Sequential quadratic programming from z. Where a step leads to a run that fails, it aims
+        for a fraction of the way to the targets first."""
         share = 1.0
         for _ in range(STAGES):
             start = self.look(z)
@@ -230,7 +234,7 @@ class Search:
             self.damping = min(1.0, self.damping / SHORTER)
 
     def adam(self, z: Array, iterations: int, rate: float) -> None:
-        """Projected Adam from z on, with squared errors and excess as a price."""
+        """Projected Adam from z, with a penalty on squared errors and excess."""
         adam = ProjectedAdam(z, self.evaluator.variables.nearest, MEMORY)
         for _ in range(iterations):
             look = self.look(adam.z)
@@ -249,7 +253,7 @@ class Search:
         self.look(adam.z, gradient=False)
 
     def _priced(self, look: Look) -> Array:
-        """Slope (n,) of the value with squared errors and excess beside it."""
+        """Gradient (n,) of the value with penalties on squared errors and excess."""
         dx = look.slopes[2]
         over = 2 * PRICE * np.maximum(look.excess, 0.0)
         each = self._cost_slopes(look) + np.einsum("dm,dmn->dn", over, dx)
@@ -265,7 +269,7 @@ class Search:
         return np.append(ways, self._costs(self.look(z)).max()) if self._worst else ways
 
     def _by_x(self, slopes: Array, s: float = 0.0) -> Array:
-        """Derivatives (..., n) by z as those by x."""
+        """Derivatives (..., n) by z, converted to derivatives by x."""
         by_ways = slopes @ self._inverse
         pad = [(0, 0)] * (slopes.ndim - 1) + [(0, int(self._worst))]
         return np.pad(by_ways, pad, constant_values=s)
@@ -333,11 +337,9 @@ class Search:
         return self.robust == "worst"
 
     def _costs(self, look: Look) -> Array:
-        """Cost (draws,) of every draw."""
         return self.scale * look.value + 0.5 * np.square(look.errors).sum(1)
 
     def _cost_slopes(self, look: Look) -> Array:
-        """Its slopes (draws, n)."""
         dv, de, _ = look.slopes
         return self.scale * dv + np.einsum("dk,dkn->dn", look.errors, de)
 

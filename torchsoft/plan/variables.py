@@ -11,15 +11,15 @@ from torchsoft.physics.rig import Rig
 from torchsoft.plan.knots import Array, Bounds, Moves
 
 Free = Mapping[str, Bounds | tuple[float, float]]
-"""Bounds of the knots of a motion by its name, or least and largest value of a parameter by its."""
+"""Bounds of a motion's knots by its name, or lower and upper bound of a parameter by its name."""
 
 
 class Variables:
-    """The vector z (n,) of a plan's free variables, each over a unit of its own: for knots the way
-    that speed allows between two of them, for parameters their range, or their largest value where
-    they have none.
+    """The vector z (n,) of a plan's free variables. Each is over a unit of its own: for knots the
+    distance that speed allows between two of them, for parameters their range, or their largest
+    value where the range is infinite.
 
-    Raises `ValueError` for names that the rig has not, and bounds that leave nothing.
+    Raises `ValueError` for names that the rig does not have, and for bounds that leave no freedom.
     """
 
     def __init__(self, rig: Rig, reference: Reference, free: Free, end: float) -> None:
@@ -64,11 +64,11 @@ class Variables:
         self.b = self.moves.b
 
     def reference(self, z: Tensor) -> Reference:
-        """The motion of z (n,), with its graph."""
+        """The motion, differentiable by z (n,)."""
         return self.moves.reference(z[: self.moves.n])
 
     def parameters(self, z: Tensor) -> dict[str, Tensor]:
-        """Parameters by name of many z (..., n), with their graph."""
+        """Parameters by name for one or more z (..., n), differentiable by z."""
         out, at = {}, self.moves.n
         physical = z * torch.from_numpy(self.unit)
         for name, shape in self.shapes.items():
@@ -78,15 +78,15 @@ class Variables:
         return out
 
     def nearest(self, z: Array) -> Array:
-        """The z within all bounds that is nearest to another one."""
+        """The nearest z within all bounds."""
         k = self.moves.n
         return np.concatenate(
             (self.moves.nearest(z[:k]), np.clip(z[k:], self.low[k:], self.high[k:]))
         )
 
     def spread(self, u: Array) -> Array:
-        """The z of a point u (n,) of the unit cube that covers all bounds. Raises `ValueError`
-        for parameters without."""
+        """The z at a point u (n,) of the unit cube, which is mapped to the bounds. Raises
+        `ValueError` for parameters without bounds."""
         low, high = self.low.copy(), self.high.copy()
         for i, (least, most) in enumerate(self.moves.box()):
             low[i], high[i] = least, most
@@ -97,7 +97,7 @@ class Variables:
         return self.nearest(low + u * (high - low))
 
     def active(self, z: Array) -> list[str]:
-        """Bounds that z touches, in words."""
+        """Active bounds at z, in words."""
         out, at = self.moves.active(z[: self.moves.n]), self.moves.n
         for name, shape in self.shapes.items():
             part = slice(at, at + shape.numel())

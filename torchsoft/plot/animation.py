@@ -35,7 +35,7 @@ from torchsoft.plot.scene import (
 from torchsoft.solve.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12.5
-"""A pause of GIF is a multiple of 10 ms."""
+"""Frame rate; the delay of a GIF's frame is a multiple of 10 ms."""
 
 Picture = NDArray[np.uint8]
 
@@ -55,7 +55,7 @@ def frame_times(run: Trajectory, frames: int, slow: float) -> Array:
 
 
 def pace(speed: float) -> str:
-    """How fast time is shown, where that is not as fast as it went by."""
+    """Playback speed in words, empty at real time."""
     times = float(f"{max(speed, 1 / speed):.2g}")
     if times == 1:
         return ""
@@ -63,8 +63,8 @@ def pace(speed: float) -> str:
 
 
 def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
-    """RGB pictures (height, width, 3) at `times` [s]: the scene, and a coordinate over time under
-    it. The axes are drawn once; each picture redraws moving parts only."""
+    """RGB pictures (height, width, 3) at `times` [s]: the scene, and below it the coordinate
+    `follow` over time. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
     curve = next(curve for curve in curves(run) if curve.name == follow)
     scale = force_scale(setup, shown)
@@ -143,8 +143,8 @@ def animate(
 
 
 def write_gif(pictures: Iterable[Picture], path: Path) -> None:
-    """All pictures on the first one's palette, which keeps still areas identical and so the file
-    small."""
+    """Write a GIF with the palette of one picture, so that still areas stay identical and the file
+    is small."""
     images = [Image.fromarray(picture) for picture in pictures]
     middle = images[len(images) // 2].copy()
     for i, colour in enumerate(
@@ -158,7 +158,7 @@ def write_gif(pictures: Iterable[Picture], path: Path) -> None:
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path) -> None:
-    """H.264 through the ffmpeg that imageio-ffmpeg brings along."""
+    """Write H.264 through the ffmpeg of imageio-ffmpeg."""
     import imageio_ffmpeg  # pyright: ignore[reportMissingImports] -- an optional dependency
 
     writer = None

@@ -47,24 +47,24 @@ from torchsoft.plot.scene import (
 from torchsoft.solve.trajectory import Trajectory
 
 STILL = 1e-3
-"""Range [mm, or rad] below which a coordinate has not moved."""
+"""Range [mm, or rad] below which a coordinate counts as still."""
 
 SAMPLES = 400
-"""Samples at which stresses are taken at the most."""
+"""Most samples at which stresses are computed."""
 
 RIPPLES = 6
-"""Changes of the number of touching points from which on a ripple is explained."""
+"""Number of changes of the touching points from which the figure explains ripples."""
 
 RIPPLE = (
     "Ripples of forces: points touch and part one by one; more contact points an element smooth "
     "them."
 )
-"""Cause of a zigzag of the forces."""
+"""Explanation of ripples of the forces."""
 
 
 class Curve(NamedTuple):
-    """A coordinate over the run: its name, its label and its values (T,) as drawn; the set-point,
-    where a loop has one."""
+    """A coordinate over the run: name, label, values (T,) in drawn units, and set-point if a loop
+    follows one."""
 
     name: str
     label: str
@@ -87,8 +87,8 @@ def curves(run: Trajectory) -> Iterator[Curve]:
 
 
 def liveliest(run: Trajectory) -> str:
-    """The free coordinate that moves most, an angle counting by the body's size; one without a loop
-    if there is any."""
+    """The free coordinate with the largest range, angles times the body's size; one that no loop
+    pushes if there is any."""
     looped = {one.pushes for one in run.setup.actuators.values()}
 
     def way(curve: Curve) -> tuple[bool, float]:
@@ -102,7 +102,7 @@ def liveliest(run: Trajectory) -> str:
 
 
 def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
-    """A coordinate, with its set-point."""
+    """Draw a coordinate and its set-point."""
     t = timeline(axes, curve.label, run)
     if curve.setpoint is not None:
         axes.plot(t, curve.setpoint, color=DESIRED, lw=3, label="set-point")
@@ -112,9 +112,9 @@ def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
 
 
 def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
-    """Sums over the points of every contact over time, with their unit, by contact (T,): forces,
-    part of the friction cone that is used (of the normal force where a law has no mu_s; NaN without
-    force), points that touch, and those of them that slip."""
+    """Sums over the points of each contact, by kind: unit, and values (T,) by contact. Kinds are
+    the forces, the used share of the friction cone (of the normal force where a law has no mu_s;
+    NaN without force), and the numbers of touching and of slipping points."""
     laws = {name: contact.friction for name, contact in run.setup.contacts.items()}
     known = all("mu_s" in law for law in laws.values())
     share_of = "friction in its cone" if known else "friction over normal force"
@@ -137,7 +137,7 @@ def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
 def contact_sums(
     axes: Axes, run: Trajectory, kind: str, unit: str, series: Mapping[str, Array]
 ) -> None:
-    """One of the sums over all contacts."""
+    """Draw one of the sums for all contacts."""
     for (name, values), colour in zip(series.items(), COLOURS * len(series)):
         axes.plot(timeline(axes, f"{kind} [{unit}]", run), values, color=colour, label=name)
     if kind == "friction":
@@ -151,7 +151,7 @@ def contact_sums(
 def points(
     axes: Axes, run: Trajectory, touching: Mapping[str, Array], slipping: Mapping[str, Array]
 ) -> None:
-    """How many points touch, and how many of these slip."""
+    """Draw the number of touching points, and of slipping ones among them."""
     t = timeline(axes, "contact points", run)
     for name, colour in zip(touching, COLOURS * len(touching)):
         axes.step(t, touching[name], where="mid", color=colour, label=name)
@@ -165,14 +165,14 @@ def points(
 
 
 def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
-    """Effort of an actuator."""
+    """Draw the effort of an actuator."""
     scale, unit = (MM, "N mm") if one.unit == "N.m" else (1.0, "N")
     t = timeline(axes, f"on {one.pushes} [{unit}]", run)
     axes.plot(t, scale * run[one.channel].detach().numpy(), color=ACTUAL)
 
 
 def stresses(axes: Axes, run: Trajectory) -> None:
-    """Largest von Mises stress in every pad."""
+    """Draw the largest von Mises stress in every pad."""
     rows = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).round().astype(int))
     for (name, pad), colour in zip(run.setup.pads.items(), COLOURS * len(run.setup.pads)):
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
@@ -184,7 +184,8 @@ def stresses(axes: Axes, run: Trajectory) -> None:
 
 
 def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
-    """Label, energy [mJ] (T,) and colour of energies stored and dissipated, each counted once."""
+    """Label, energy [mJ] (T,) and colour of groups of stored and dissipated energies; each energy
+    is in one group."""
     zero = torch.zeros_like(run.t)
     stored, lost = dict(run.energy), dict(run.dissipated)
 
@@ -192,7 +193,7 @@ def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
         names = [name for name in energies if name.startswith(prefix)]
         return MM * sum((energies.pop(name) for name in names), zero).detach().numpy()
 
-    groups = [
+    return [
         ("stored in pads", taken(stored, "strain_"), "#2171b5"),
         ("in contact springs", taken(stored, "normal_springs") + taken(stored, "tangential"),
          "#9ecae1"),
@@ -201,11 +202,10 @@ def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
         ("by slip", taken(lost, "slip"), "#fdae6b"),
         ("by dashpots", taken(lost, ""), "#7f2704"),
     ]  # fmt: skip
-    return groups
 
 
 def energies(axes: Axes, run: Trajectory) -> None:
-    """Energy stored and dissipated, stacked, against what the sources supplied."""
+    """Draw stored and dissipated energies, stacked, and the energy supplied by the sources."""
     t = timeline(axes, "energy [mJ]", run)
     labels, parts, colours = zip(*energy_groups(run))
     axes.stackplot(t, *parts, labels=labels, colors=colours, lw=0)
@@ -217,7 +217,7 @@ def energies(axes: Axes, run: Trajectory) -> None:
 
 
 def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
-    """Forces along one contact at an instant, with the cone."""
+    """Draw the forces along one contact at an instant, with the friction cone."""
     forces_on(axes, run.setup, instant, contact)
     if not len(instant.near(contact)):
         axes.set(xticks=[], yticks=[], ylim=(-1, 1), xlabel="no point touches")
@@ -229,7 +229,7 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
 
 
 def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
-    """Panels over time, by title."""
+    """Functions that draw the panels over time, by title."""
     moving = [one for one in curves(run) if np.ptp(one.values) > STILL] or list(curves(run))[:1]
     out: dict[str, Callable[[Axes], None]] = {
         curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving
@@ -247,8 +247,12 @@ def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
     return out | {"energy": lambda axes: energies(axes, run)}
 
 
+FLATTEST = 0.8
+"""Height of a panel, over its usual one, down to which panels become flatter to fit on a page."""
+
+
 def ripples(run: Trajectory) -> bool:
-    """Whether points touch and part often enough for forces to show it."""
+    """Whether points touch and part often enough to make the forces ripple."""
     late = run.t >= run.t[0] + 0.05 * (run.t[-1] - run.t[0])
     counts = [(state[late] != 0).sum(-1).diff() for state in run.contact_state.values()]
     on_nodes = any(pad.points == 0 for pad in run.setup.pads.values())
@@ -256,12 +260,17 @@ def ripples(run: Trajectory) -> bool:
 
 
 def chosen(only: Sequence[str], known: Iterable[str]) -> list[str]:
-    """The panels asked for, all by default. Raises `ValueError`."""
+    """The panels in `only`, or all. Raises `ValueError` for an unknown one."""
     names = list(known)
     for name in only:
         if name not in names:
             raise ValueError(f"there is no panel `{name}`; {suggestion(name, names, 'there are')}")
     return list(only) or names
+
+
+def named(run: Trajectory) -> list[str]:
+    """Names of the panels that a dashboard of the run has."""
+    return ["scene", *(f"contact {key}" for key in list(run.setup.contacts)[::-1]), *panels(run)]
 
 
 def dashboard(
@@ -290,7 +299,7 @@ def dashboard(
     few = [*list(contacts)[:2], *(name for name in drawn if name == "friction")]
     if look == "column" and not only:
         only = ("scene", *few)
-    wanted = chosen(only, ("scene", *drawn))
+    wanted = chosen(only, named(run))
     pictured = "scene" in wanted
     wanted = [name for name in wanted if name != "scene"]
     with looking(look) as size:
@@ -308,6 +317,8 @@ def dashboard(
         top = max(1, beside) if pictured else 0
         rows = -(-(len(wanted) - beside) // columns)
         heading = (title or "Run") if size.titled else ""
+        room = (size.height - tall - 0.06 * size.font) / max(rows, 1)
+        each = room if FLATTEST * each <= room < each else each
         figure = new_figure(heading, width * columns, tall + rows * each + 0.06 * size.font)
         heights = [*[tall / max(top, 1)] * top, *[each] * rows]
         # Rows under the scene are as if it had no colour bar, but a column has one left edge.

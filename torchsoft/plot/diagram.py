@@ -41,10 +41,10 @@ BANDS = {
     "bracket": (13.1, 14.9),
     "controllers": (14.9, 17.6),
 }
-"""Subsystems of the paper's rig, from y to y."""
+"""Subsystems of the paper's rig, with their least and largest y in the drawing."""
 
 Hub = tuple[float, float, float, float, float]
-"""x, y; angle and step [deg] and radius of the fan of its elements."""
+"""x and y; angle and step [deg] and radius of the fan of its elements."""
 
 HUBS: dict[str, Hub] = {  # of the paper's rig
     "ground": (1.2, 1.8, 180, 0, 2.1),
@@ -84,7 +84,7 @@ sources."""
 
 
 def graph_of(rig: Rig) -> nx.DiGraph:
-    """The topology of the rig's ports; it does not depend on the state, here with the bodies far
+    """The topology of the rig's ports. It does not depend on the state; here bodies are far
     apart."""
     with torch.no_grad():
         signals = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
@@ -109,8 +109,8 @@ def is_hub(kind: str) -> bool:
 
 
 def hubs_of(graph: nx.DiGraph) -> dict[str, Hub]:
-    """Place of every junction and transformer: as in `HUBS`, or layer by layer from the ground to
-    the actuators."""
+    """Place of every junction and transformer: `HUBS` for the paper's rig, else layer by layer from
+    the ground to the actuators."""
     hubs = [name for name, data in graph.nodes(data=True) if is_hub(data["kind"])]
     if set(hubs) == set(HUBS):
         return HUBS
@@ -124,7 +124,7 @@ def hubs_of(graph: nx.DiGraph) -> dict[str, Hub]:
     x = {name: float(i) for layer in layers for i, name in enumerate(layer)}
 
     def near(name: str) -> float:
-        """Middle of a hub's neighbours; a body and its spin stay side by side."""
+        """Mean place of a hub's neighbours; a body and its spin stay side by side."""
         pair = {name, name.removesuffix("_spin"), f"{name}_spin"} & set(graph)
         own = [
             x[n] for one in pair for n in nx.all_neighbors(graph, one) if n in x and n not in pair
@@ -146,7 +146,7 @@ def hubs_of(graph: nx.DiGraph) -> dict[str, Hub]:
 
 
 def positions(graph: nx.DiGraph) -> dict[str, Array]:
-    """Position of every node: hubs as `hubs_of` has them, elements fanned out around theirs."""
+    """Position of every node: hubs by `hubs_of`, and elements in a fan around their hub."""
     hubs = hubs_of(graph)
     at = {name: np.array(place[:2]) for name, place in hubs.items()}
     for hub, (_, _, angle, step, radius) in hubs.items():
@@ -158,7 +158,7 @@ def positions(graph: nx.DiGraph) -> dict[str, Array]:
 
 
 def node_text(name: str, kind: str, label: str, captions: Mapping[str, str]) -> str:
-    """The text at a node, in mathtext; `captions` replace those of the rig's own names."""
+    """Text of a node in mathtext; `captions` replace names of the rig."""
     if is_hub(kind):
         caption = captions.get(name, label.removeprefix("1: ").replace("_", " "))
         return rf"$\mathbf{{{kind}}}$" + "\n" + caption
@@ -183,8 +183,8 @@ def node_text(name: str, kind: str, label: str, captions: Mapping[str, str]) -> 
 def bond(
     axes: Axes, tail: Array, head: Array, sizes: tuple[Array, Array], signal_x: float | None
 ) -> None:
-    """A bond between two boxes of half `sizes`: half arrow for power; dashed with a full arrow, by
-    way of x = `signal_x`, for a signal."""
+    """Draw a bond between two boxes of half `sizes`: solid with a half arrow for power; dashed with
+    a full arrow, by way of x = `signal_x`, for a signal."""
     activated = signal_x is not None
     path = (
         np.array([tail, [signal_x, tail[1]], [signal_x, head[1]], head])
@@ -206,7 +206,7 @@ def bond(
 
 @rc_context(STYLE)
 def multibond_graph(rig: Rig) -> Figure:
-    """The rig's multibond graph, the paper's subsystem by subsystem."""
+    """The rig's multibond graph; the paper's rig is drawn by subsystems."""
     graph = graph_of(rig)
     at, half, papers = positions(graph), {}, hubs_of(graph) is HUBS
     every = np.stack(list(at.values()))

@@ -1,4 +1,4 @@
-"""The look of figures, and pictures of instants of a run.
+"""Style of figures, and pictures of instants of a run.
 
 Times in s, lengths in mm, forces in N, stresses in kPa.
 """
@@ -57,34 +57,37 @@ STYLE: Any = {
 DESIRED, ACTUAL, OTHER = "#999999", "#0077bb", "#ee7733"
 
 COLOURS = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#bbbbbb")
-"""One after the other for bodies, contacts and actuators."""
+"""Colours of bodies, contacts and actuators, in order."""
 
 SNAPSHOTS = (0.375, 2.5, 5.0, 7.5, 10.0, 17.5, 20.0, 22.5, 25.0)
 """Times [s] of the paper's Fig. 16."""
 
 Look = Literal["screen", "page", "column"]
-"""For a screen, with titles; or camera-ready for the width of a page or a column, without."""
+"""Style of a figure: for a screen, with a title; or camera-ready without one, for the width of a
+page or a column."""
 
 
 class Size(NamedTuple):
-    """Width of a figure [in], its font [pt], panels side by side, and whether it has a title."""
+    """Width of a figure [in], its font [pt], panels side by side, whether it has a title, and the
+    height [in] that it should not exceed."""
 
     width: float
     font: float
     columns: int
     titled: bool
+    height: float
 
 
 SIZES: dict[str, Size] = {
-    "screen": Size(13.0, 10.0, 3, True),
-    "page": Size(7.1, 7.0, 3, False),
-    "column": Size(3.46, 7.5, 1, False),
+    "screen": Size(13.0, 10.0, 3, True, float("inf")),
+    "page": Size(7.1, 7.0, 3, False, 9.8),
+    "column": Size(3.46, 7.5, 1, False, 9.8),
 }
 
 
 @contextmanager
 def looking(look: Look) -> Iterator[Size]:
-    """The style of a look. Raises `ValueError` for another one."""
+    """Apply the style of a look. Raises `ValueError` for an unknown one."""
     if look not in SIZES:
         raise ValueError(
             f"`look` must be one of {', '.join(get_args(Look))}, but is {look!r}; "
@@ -106,15 +109,24 @@ def save(figure: Figure, path: Path, dpi: int = 150) -> None:
         figure.savefig(partial, dpi=dpi, format=path.suffix[1:])
 
 
+class EmbeddedFonts(Figure):
+    """A figure that is saved as `save` does, with text as text: journals refuse Type 3 fonts."""
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:
+        """As matplotlib's."""
+        with rc_context({name: STYLE[name] for name in ("pdf.fonttype", "svg.fonttype")}):
+            super().savefig(*args, **kwargs)
+
+
 def new_figure(title: str, width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = EmbeddedFonts(figsize=(width, height), layout="constrained")
     if title:
         figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
 def timeline(axes: Axes, label: str, run: Trajectory) -> NDArray[np.float64]:
-    """Label an axis over time, and return the times [s]."""
+    """Label the axis of a panel over time; returns the times [s]."""
     axes.set_ylabel(label)
     t = run.t.numpy()
     axes.set_xlim(float(t[0]), float(t[-1]) + 0.01 * float(t[-1] - t[0]))
@@ -122,7 +134,7 @@ def timeline(axes: Axes, label: str, run: Trajectory) -> NDArray[np.float64]:
 
 
 def legend_above(axes: Axes) -> None:
-    """A legend above the drawing, in room made for it."""
+    """Add a legend at the top of the panel, and extend its y axis to make room."""
     room, count = axes.get_window_extent(), len(axes.get_legend_handles_labels()[1])
     for rows in range(1, count + 1):
         legend = axes.legend(
@@ -133,16 +145,16 @@ def legend_above(axes: Axes) -> None:
         if box.width <= room.width:
             break
     low, high = axes.get_ylim()
-    axes.set_ylim(low, low + (high - low) / (1.0 - min(0.6, box.height / room.height)))
+    axes.set_ylim(low, low + (high - low) / (1.0 - min(0.7, 1.1 * box.height / room.height)))
 
 
 def letter(i: int) -> str:
-    """Of a panel."""
+    """Letter of panel i."""
     return f"{'abcdefghijklmnopqrstuvwxyz'[i % 26]})"
 
 
 def stress_bar(figure: Figure, axes: Any, largest: float, size: Size) -> None:
-    """The scale of von Mises' stress."""
+    """Add the colour bar of the von Mises stress."""
     if largest > 0:
         colours = ScalarMappable(Normalize(0.0, largest), STRESS)
         bar = figure.colorbar(colours, ax=axes, shrink=0.6, pad=0.01, aspect=30)
@@ -151,8 +163,8 @@ def stress_bar(figure: Figure, axes: Any, largest: float, size: Size) -> None:
 
 
 def forces_on(axes: Axes, setup: Setup, instant: Instant, contact: str) -> None:
-    """Normal force and friction at one contact's points [N] against their place along the surface
-    [mm], friction with the cone that bounds it where the law has one, and points by their state."""
+    """Draw normal force and friction at one contact's points [N] over their place along the surface
+    [mm]; friction with its cone where the law has one, and points by their state."""
     x, force = around_contact(instant, contact)
     state = instant.state[contact][instant.near(contact)]
     mu = setup.contacts[contact].friction.get("mu_s")

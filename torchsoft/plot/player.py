@@ -1,5 +1,4 @@
-"""The interactive player: a run as one HTML file with everything in it, for any browser, without a
-network.
+"""The interactive player: a run as one self-contained HTML file for any browser.
 
 Pads deform and show a quantity, bodies move, contact points show their state and forces; charts
 follow the time.
@@ -33,16 +32,16 @@ from torchsoft.solve.trajectory import Trajectory
 TEMPLATE = Path(__file__).with_name("player.html")
 
 CHART_SAMPLES = 1500
-"""Samples of a chart at the most."""
+"""Most samples of a chart."""
 
 LEVELS = 65535
 
 DENSER = 0.3
-"""Part of the frames that follows the steps, not the time."""
+"""Share of the frames that are spaced by steps, not by time."""
 
 
 def packed(values: Array) -> dict[str, Any]:
-    """Numbers in 16 bits between their ends, in base 64; their shape is told beside them."""
+    """Numbers quantised to 16 bits between their extremes, in base 64, with their shape."""
     low, high = float(np.min(values, initial=np.inf)), float(np.max(values, initial=-np.inf))
     if not values.size:
         low = high = 0.0
@@ -56,8 +55,8 @@ def encoded(values: NDArray[Any]) -> str:
 
 
 def frame_rows(run: Trajectory, frames: int) -> list[int]:
-    """Rows of the run at so many frames or less, each once: denser where the stepper took shorter
-    steps."""
+    """Rows of the run for `frames` frames or fewer, each once; denser where the steps were
+    shorter."""
     t, knots = run.t.numpy(), run.knots.numpy()
     count = np.interp(t, knots, np.linspace(0.0, 1.0, len(knots)))
     clock = (1 - DENSER) * (t - t[0]) / (t[-1] - t[0]) + DENSER * count
@@ -65,7 +64,8 @@ def frame_rows(run: Trajectory, frames: int) -> list[int]:
 
 
 def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
-    """Meshes, their places in the frame of the base [mm] and quantities of the elements [kPa]."""
+    """Meshes, node positions in the frame of the base [mm] and stresses of the elements [kPa], by
+    pad."""
     out = {}
     for name, pad in run.setup.pads.items():
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
@@ -92,8 +92,8 @@ def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
 
 
 def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
-    """Places of the points in the frame of the base [mm], forces [N] and states; `into` is the
-    direction into the pad there."""
+    """Positions of the points in the frame of the base [mm], forces [N] and states, by contact;
+    `along` is the direction along the surface, `up` its outward normal."""
     out = {}
     for name, contact in run.setup.contacts.items():
         pad = run.setup.pads[contact.pad]
@@ -112,8 +112,8 @@ def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
 
 
 def charts(run: Trajectory) -> list[dict[str, Any]]:
-    """Groups of curves over time, each group in one unit; forces of less than a billionth of the
-    largest are none."""
+    """The times, then groups of curves over time, each group with one unit. Forces of less than a
+    billionth of the largest are drawn as zero."""
     rows = np.unique(np.linspace(0, len(run.t) - 1, CHART_SAMPLES).round().astype(int))
     t = run.t.numpy()[rows].round(9).tolist()
     out: list[dict[str, Any]] = []

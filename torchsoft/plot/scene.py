@@ -1,5 +1,5 @@
-"""The picture of one instant of any run: deformed pads on their bases, coloured by their stress,
-bodies with a spoke, contact points by their state, and the contact forces as curves.
+"""Picture of one instant of a run: deformed pads coloured by stress, bodies with a spoke, contact
+points by their state, and contact forces as curves.
 
 Figures and animation share it. Everything on axes is in millimetres and newtons.
 """
@@ -22,12 +22,12 @@ from torchsoft.physics.sticking import SEPARATED, SLIPPING, STICKING
 from torchsoft.solve.trajectory import Trajectory
 
 NORMAL, FRICTION, INK = "#cc3311", "#0077bb", "#333333"
-"""Red and blue as in the paper, a pair that colour-blind readers can distinguish."""
+"""Red and blue as in the paper, which colour-blind readers can distinguish."""
 
 PAD, LAYER, DISC, STEEL = "#f6ecd6", "#8a6d3b", "#dfe5ea", "#b8bec4"
 
 STRESS = "YlOrBr"
-"""Colours of von Mises' stress, from none to the largest shown."""
+"""Colour map of the von Mises stress, from zero to the largest in the picture."""
 
 STATES = {
     STICKING: ("sticks", "o", "#222222"),
@@ -35,21 +35,21 @@ STATES = {
     SEPARATED: ("apart", ".", "#9aa0a6"),
     -1: ("touches", "s", "#666666"),
 }
-"""Words, marker and colour of the states of contact points; of -1 nobody knows more."""
+"""Word, marker and colour of the states of contact points; -1 is contact without a known state."""
 
 MM = 1e3
 
 
 def in_world(places: Array, pose: Array) -> Array:
-    """Places (..., 2) in the frame of a body, in the world; pose (3,): the body's x, y and angle
+    """Points (..., 2) in the world from the frame of a body; pose (3,) is the body's x, y and angle
     [rad]."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return places @ np.array([[c, s], [-s, c]]) + pose[:2]
 
 
 def straight_up(outline: Array) -> Array:
-    """The highest place (2,) where a closed outline (points, 2) crosses the y axis; the origin if
-    it does nowhere."""
+    """The highest point (2,) where a closed outline (points, 2) crosses the y axis; the origin if
+    it never does."""
     (x, y), (x_next, y_next) = outline[:-1].T, outline[1:].T
     k = np.flatnonzero((x > 0) != (x_next > 0))
     crossed = y[k] + (y_next - y)[k] * x[k] / (x - x_next)[k]
@@ -57,8 +57,8 @@ def straight_up(outline: Array) -> Array:
 
 
 class Instant(NamedTuple):
-    """One sample as drawn: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm, rad],
-    places [mm], forces [N].
+    """One sample in drawn units: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm,
+    rad], positions [mm], forces [N].
 
     mesh: pad -> (mesh nodes, 2); stress: pad -> von Mises' (elements,) [kPa]; points: contact ->
     (points, 2); force: contact -> (points, 2), normal force and friction on the pad, the latter
@@ -77,13 +77,13 @@ class Instant(NamedTuple):
     state: dict[str, NDArray[np.int8]]
 
     def near(self, contact: str, margin: int = 1) -> NDArray[np.int64]:
-        """Numbers of the points under a normal force, and of `margin` more on each side."""
+        """Indices of the points under a normal force, and of `margin` neighbours on each side."""
         around = np.ones(2 * margin + 1)
         return np.flatnonzero(np.convolve(self.force[contact][:, 0] > 0, around, "same") > 0)
 
 
 def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
-    """The samples of a run nearest to `times` [s], as drawn."""
+    """The samples of a run nearest to `times` [s], in drawn units."""
     rows, setup = [run.at(time) for time in times], run.setup
     u = {name: run.displacement[name][rows].detach().numpy() for name in setup.pads}
     whole = {name: pad.displacement(u[name]) for name, pad in setup.pads.items()}
@@ -118,19 +118,19 @@ def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
 
 
 def own_axes(pad: PadSetup, base: Array) -> Array:
-    """A pad's own x and y (2, 2) as unit vectors of the world; base (3,) is the pose of its
+    """A pad's x and y axes (2, 2) as unit vectors of the world; base (3,) is the pose of its
     base."""
     return in_world(pad.axes.T, base) - base[:2]
 
 
 def along_surface(pad: PadSetup, base: Array) -> Array:
-    """The direction (2,) along a pad's surface that points to the right, or straight up."""
+    """Unit vector (2,) along a pad's surface that points to the right, or straight up."""
     x = own_axes(pad, base)[0]
     return x if x[0] + 1e-6 * x[1] > 0 else -x
 
 
 def outwards(setup: Setup, instant: Instant) -> str:
-    """Where friction points that is drawn outwards."""
+    """Direction of positive friction in the picture, in words."""
     steep = any(
         abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in setup.pads.items()
     )
@@ -138,30 +138,30 @@ def outwards(setup: Setup, instant: Instant) -> str:
 
 
 def own_places(pad: PadSetup, base: Array, own: Array) -> Array:
-    """Places (..., 2) [mm] in the pad's own frame, in the world [mm]."""
+    """Points (..., 2) [mm] in the world from the pad's own frame [mm]."""
     return in_world(MM * pad.placed(own / MM), base)
 
 
 def around_contact(instant: Instant, contact: str) -> tuple[Array, Array]:
-    """Places along the pad's surface [mm] and forces [N] of the touching points and of one more on
-    each side."""
+    """Positions along the pad's surface [mm] and forces [N] of the points under a normal force, and
+    of one neighbour on each side."""
     rows = instant.near(contact)
     return instant.along[contact][rows], instant.force[contact][rows]
 
 
 def unit(setup: Setup) -> float:
-    """Unit of margins and curves [mm]: one for the paper's pads of 120 mm."""
+    """Length unit of margins and curves [mm]: one for the paper's pads of 120 mm."""
     return MM * max((pad.mesh.length for pad in setup.pads.values()), default=0.12) / 120
 
 
 def curve_height(setup: Setup) -> float:
-    """Height [mm] of the largest force's curve."""
+    """Height [mm] of the curve of the largest force."""
     return 16.0 * unit(setup)
 
 
 def force_scale(setup: Setup, shown: Sequence[Instant]) -> tuple[float, float]:
-    """mm per N at which the largest force is as high as `curve_height`, and a round force [N] for
-    the scale bar."""
+    """Scale of the force curves [mm/N], at which the largest force has `curve_height`, and a round
+    force [N] for the scale bar."""
     largest = max(
         (float(np.abs(force).max()) for instant in shown for force in instant.force.values()),
         default=0.0,
@@ -175,8 +175,9 @@ def force_scale(setup: Setup, shown: Sequence[Instant]) -> tuple[float, float]:
 
 
 def plates(setup: Setup) -> dict[str, float]:
-    """Thickness [mm] of the plate behind each pad: symmetric about its base's centre, none on a
-    base that has a shape, that of the others where the centre is not behind the pad."""
+    """Thickness [mm] of the plate drawn behind each pad. It is symmetric about the centre of the
+    base; none on a base with a shape, and the thickest of the others where that centre is not
+    behind the pad."""
     out = {}
     for name, pad in setup.pads.items():
         if pad.base is not None:
@@ -192,13 +193,12 @@ def plates(setup: Setup) -> dict[str, float]:
 
 
 class Scene:
-    """The artists of one picture on `axes`; `show` puts the `moving` ones, in drawing order, where
-    another instant has them.
+    """The artists of one picture on `axes`; `show` moves the artists in `moving`, which are in
+    drawing order, to another instant.
 
-    The mesh is the real one, in finer lines where it is dense. With `curves` = (mm per N, scale bar
-    in N) the contact forces stand behind the pads, normal force red, friction blue. `stress` [kPa]
-    is the one that the darkest colour stands for; pads are plain without it. `size` scales markers
-    and lines.
+    The mesh is the real one, in finer lines where it is dense. `curves` = (mm per N, scale bar in
+    N) draws the contact forces behind the pads, normal force red, friction blue. `stress` [kPa] is
+    the value of the darkest colour; pads are plain without it. `size` scales markers and lines.
     """
 
     def __init__(
@@ -266,7 +266,7 @@ class Scene:
         axes.set_aspect("equal")
 
     def show(self, instant: Instant) -> None:
-        """Put everything where it is at `instant`."""
+        """Move all artists to `instant`."""
         for k, nodes in instant.mesh.items():
             mesh = self.setup.pads[k].mesh
             self.outlines[k].set_xy(nodes[mesh.outline])
@@ -299,8 +299,8 @@ class Scene:
                 area.set_xy(own_places(pad, base, around) if len(x) else np.zeros((1, 2)))
 
     def behind(self, instant: Instant, name: str, side: float, depth: float) -> Array:
-        """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider than it by `side`
-        [mm] on each side."""
+        """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider by `side` [mm] on
+        each side."""
         pad = self.setup.pads[name]
         (left, face), (right, _) = MM * pad.mesh.base + [[-side, 0.0], [side, 0.0]]
         corners = np.array(
@@ -309,8 +309,7 @@ class Scene:
         return own_places(pad, instant.base[name], corners)
 
     def limits(self, shown: Sequence[Instant]) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Limits of x and y [mm] that hold every instant shown, with the force curves behind the
-        pads."""
+        """Limits of x and y [mm] for all instants, force curves included."""
         step, rows = unit(self.setup), []
         for instant in shown:
             for k, outline in self.shapes.items():
@@ -326,7 +325,7 @@ class Scene:
         return (float(left), float(right)), (float(low), float(high))
 
     def scale_bar(self, axes: Axes) -> None:
-        """A vertical bar in the upper right corner, as long as the scale's force."""
+        """Draw a vertical bar in the upper right corner, with the length of the scale's force."""
         assert self.curves
         millimetres, force = self.curves
         step, (_, right), (_, high) = unit(self.setup), axes.get_xlim(), axes.get_ylim()
@@ -343,18 +342,18 @@ class Scene:
 
 
 def largest_stress(shown: Sequence[Instant]) -> float:
-    """Von Mises' stress [kPa] that the darkest colour stands for."""
+    """Largest von Mises stress [kPa] of some instants."""
     return max((float(one.max()) for at in shown for one in at.stress.values()), default=0.0)
 
 
-def keys(setup: Setup, shown: Sequence[Instant], forces: bool = True) -> list[Artist]:
-    """Handles of a legend: forces, and the states of points that occur."""
+def keys(setup: Setup, shown: Sequence[Instant]) -> list[Artist]:
+    """Handles of a legend: the contact states that occur, and forces."""
     there = {int(x) for at in shown for one in at.state.values() for x in np.unique(one)}
     out: list[Artist] = [
         Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=f"point {word}")
         for state, (word, marker, colour) in STATES.items() if state in there
     ]  # fmt: skip
-    if forces and setup.contacts:
+    if setup.contacts:
         out += [
             Line2D([], [], color=NORMAL, lw=1.4, label="normal force"),
             Line2D([], [], color=FRICTION, lw=1.4, label=f"friction ({outwards(setup, shown[0])})"),

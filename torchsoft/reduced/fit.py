@@ -23,29 +23,29 @@ from torchsoft.reduced.records import KINEMATICS, STATES, Record
 from torchsoft.reduced.terms import Candidates
 
 GROSS = 1.0
-"""Root mean square error of a rollout, in standard deviations of the record, that says that the
-model is not one of the record: a constant would do as well."""
+"""Root mean square error of a rollout, in standard deviations of the record, above which the model
+is useless: a constant would do as well."""
 
 LAW_OFF = 0.3
-"""Root mean square error of a control law's effort, in standard deviations of the record's, that
-says that it is another law."""
+"""Root mean square error of a control law's effort, in standard deviations of the record's, above
+which the record has another law."""
 
 ROWS_PER_TERM = 10
 """Fewest rows of a regression per candidate term."""
 
 DEPENDENT = 1e-9
-"""Part of a scaled column that the other columns must leave unexplained."""
+"""Least part of a scaled column that the other columns leave unexplained."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to fit. threshold: the smallest part of a rate's root mean square that a term may account
-    for.
+    """Settings of a fit. `threshold` is the smallest part of a rate's root mean square for which a
+    term may account.
 
-    Rows are integrals against test functions of half-width `width` [s], `domains` a window of
-    `window` [s]. models: ensemble members, 0 for none. Coefficients of an ensemble are medians,
-    their intervals the 5th and 95th percentiles: how much the fit depends on the choice of rows,
-    which overlap, and not how wrong the form of the equation may be.
+    Rows are integrals against test functions of half-width `width` [s], `domains` in each window of
+    `window` [s]. `models` is the number of ensemble members, 0 for none. Coefficients of an
+    ensemble are medians; their intervals are the 5th and 95th percentiles, the spread over the
+    choice of overlapping rows, and not the error of the equation's form.
     """
 
     threshold: float = 0.02
@@ -56,10 +56,14 @@ class Recipe:
     seed: int = 0
 
 
+SAMPLED = 4
+"""Samples in half of a test function of the weak form at the least."""
+
+
 @dataclass(frozen=True, repr=False)
 class Regression:
-    """Rows of one equation: columns (rows, terms) and rate (rows,), each of unit root mean square,
-    and those sizes."""
+    """The scaled regression of one equation: columns (rows, terms) and rate (rows,) of unit root
+    mean square, and their original sizes."""
 
     terms: list[Term]
     columns: np.ndarray
@@ -70,8 +74,7 @@ class Regression:
 
 @dataclass(frozen=True, repr=False)
 class Problem(Shown):
-    """The regressions of all equations, which every threshold shares, and the records behind
-    them."""
+    """The regressions of all equations, shared by all thresholds, and their records."""
 
     regressions: dict[str, Regression]
     states: tuple[str, ...]
@@ -153,7 +156,7 @@ def assemble(
 
 
 class Equation(NamedTuple):
-    """(term, coefficient) pairs of one rate, SI units, and their intervals, if there is an
+    """(term, coefficient) pairs of one rate in SI units, and intervals of the coefficients from an
     ensemble."""
 
     pairs: list[tuple[Term, float]]
@@ -161,8 +164,8 @@ class Equation(NamedTuple):
 
 
 def solve(problem: Problem, target: str, recipe: Recipe) -> Equation:
-    """The sparse equation of one state at the recipe's threshold; candidates whose coefficient is
-    zero are left out."""
+    """The sparse equation of one state at the recipe's threshold, without terms whose coefficient
+    is zero."""
     rows, optimizer = problem.regressions[target], _optimizer(recipe)
     with _quiet_pysindy(recipe.seed):
         optimizer.fit(rows.columns, rows.rate[:, None])
@@ -181,7 +184,7 @@ def build(
     equations: Mapping[str, Equation],
     feedback: Mapping[str, Mapping[str, float]] | None = None,
 ) -> ReducedModel:
-    """The model of one equation for each velocity."""
+    """The model with these equations, one for each velocity."""
     intervals = [interval for equation in equations.values() for interval in equation.intervals]
     return ReducedModel(
         problem.states, problem.inputs,
@@ -209,8 +212,8 @@ def fit(
 
 
 def loop(records: Sequence[Record]) -> dict[str, dict[str, float]]:
-    """The PD law of F_x, by least squares over records, on the coordinate that it follows best;
-    `feedback` of `fit`. Raises `ValueError` where F_x is no such law of x_d."""
+    """The PD law of F_x, by least squares over records, on the coordinate that it follows best, in
+    the form of `feedback` of `fit`. Raises `ValueError` where F_x is no PD law of x_d."""
     best: tuple[float, dict[str, float]] = np.inf, {}
     (F,) = np.concatenate([one.columns(["F_x"]) for one in records]).T
     for x, v in (("x_C", "v_C"), ("x_Br", "v_Br")):
@@ -253,8 +256,7 @@ class Score(Shown):
 
 
 def rollout_of(model: ReducedModel, on: Record) -> Rollout:
-    """The model let go from the record's first sample, with the record's inputs and nothing
-    else."""
+    """Rollout of the model from the record's first sample, with the record's inputs."""
     inputs, states = (
         on.columns(model.outer) if model.outer else np.empty((len(on.t), 0)),
         on.columns(model.states),
@@ -277,8 +279,8 @@ def score(model: ReducedModel, on: Record) -> Score:
 def _warn_of_misses(
     model: ReducedModel, records: Sequence[Record], scores: Sequence[Score]
 ) -> None:
-    """Warn of the record whose rollout is the worst, if it is a gross miss or under another law,
-    with the remedy."""
+    """Warn of the record with the worst rollout, with the remedy, if it is a gross miss or has
+    another control law."""
     misses = [max(one.over_deviation.values()) for one in scores]
     i = int(np.argmax(misses))
     on, out = records[i], scores[i]
@@ -319,8 +321,8 @@ def _warn_of_misses(
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen model, its index among those tried, and the results of each: thresholds, terms,
-    nrmse, diverged."""
+    """The chosen model, its index among those tried, and the results of each: thresholds, number of
+    terms, NRMSE, diverged rollouts."""
 
     model: ReducedModel
     index: int
@@ -395,10 +397,16 @@ def choose(
 def _weak(
     columns: list[np.ndarray], velocities: list[np.ndarray], step: float, recipe: Recipe
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrals of columns and rates against pysindy's test functions, over windows of one
+    """Integrals of columns and rates against pysindy's test functions, over windows of equal
     length."""
     pysindy = needed("pysindy", "reduced")
     length = min(round(recipe.window / step) + 1, *(len(one) for one in columns))
+    if recipe.width < SAMPLED * step:
+        raise ValueError(
+            f"a sample every {1e3 * step:g} ms is too seldom for the weak form's test functions, "
+            f"{1e3 * recipe.width:g} ms to each side; sample every "
+            f"{1e3 * recipe.width / SAMPLED:g} ms or faster, or take a larger `width`"
+        )
     if 2 * recipe.width > 0.9 * (length - 1) * step:
         raise ValueError(
             f"too little data: the shortest record is {length} samples, {(length - 1) * step:g} s, "
@@ -435,8 +443,8 @@ def _optimizer(recipe: Recipe) -> Any:
 
 @contextlib.contextmanager
 def _quiet_pysindy(seed: int) -> Iterator[None]:
-    """pysindy draws from numpy's global generator: seeded here, and left as it was. Its own array
-    class warns of itself."""
+    """Seed numpy's global generator, from which pysindy draws, and restore it; silence pysindy's
+    warnings."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:

@@ -1,10 +1,9 @@
-"""Small ordinary differential equations y' = S y + C phi(y, u): their text, their torch module,
-their fast rollout.
+"""Small ordinary differential equations y' = S y + C phi(y, u): text, torch module, and fast
+rollout.
 
-One list of terms describes a model: the equations in text and LaTeX, the right-hand side that
-torchdiffeq integrates and the compiled rollout are read off it. A linear model is rolled out by an
-exact recursion, every other one by an L-stable step: scipy's stiff solvers call Python at every
-step and cost more than the simulator that is being reduced.
+One list of terms defines the equations in text and LaTeX, the right-hand side for torchdiffeq, and
+the compiled rollout. A linear model is rolled out by an exact recursion, any other by an L-stable
+step: scipy's stiff solvers call Python at every step and cost more than the full simulator.
 """
 
 import math
@@ -26,20 +25,19 @@ from torchsoft.display import Shown
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 
 ALIASES = {"v_C": "v_x", "v_Br": "v_x_Br"}
-"""Channels by a reduced model's name for them, which leaves the only direction out."""
+"""Channels by their names in a reduced model, which omit the only direction."""
 
 BEYOND = 100.0
-"""A rollout that leaves this many times the states' scale has diverged."""
+"""Largest state of a rollout, over the states' scale; beyond, it has diverged."""
 
 GAMMA = 1 + 1 / math.sqrt(2)
-"""Of the Rosenbrock method ROS2: second order, L-stable."""
+"""Coefficient of the Rosenbrock method ROS2: second order, L-stable."""
 
 TOLERANCE = 1e-3
-"""Largest difference, in parts of the states' scale, between a rollout and that with half its
-step."""
+"""Largest difference, over the states' scale, between rollouts of one step and of half of it."""
 
 HALVINGS = 8
-"""Halvings of the step after which a rollout is taken as it is."""
+"""Most halvings of the step of a rollout."""
 
 
 def symbol(name: str) -> tuple[str, str]:
@@ -49,7 +47,7 @@ def symbol(name: str) -> tuple[str, str]:
 
 
 class Factor(NamedTuple):
-    """shape(form / scale), the form being a linear combination of variables by name."""
+    """shape(form / scale), with a linear combination `form` of variables by name."""
 
     form: Mapping[str, float]
     shape: Literal["linear", "tanh", "abs"] = "linear"
@@ -58,7 +56,7 @@ class Factor(NamedTuple):
 
 @dataclass(frozen=True)
 class Term:
-    """A candidate term: the product of its factors, with its formula as text and its unit."""
+    """A candidate term, the product of its factors, with its formula as text and its unit."""
 
     text: str
     unit: str
@@ -77,8 +75,8 @@ class Term:
 
 
 class Table(NamedTuple):
-    """A list of terms: forms (terms * factors, variables), and where a factor is a tanh or a
-    modulus (terms, factors)."""
+    """Terms as tensors: forms (terms * factors, variables), and masks of the factors that are a
+    tanh or a modulus (terms, factors)."""
 
     forms: Tensor
     tanh: Tensor
@@ -86,8 +84,8 @@ class Table(NamedTuple):
 
 
 def tabulate(terms: Sequence[Term], variables: Sequence[str]) -> Table:
-    """Terms as tensors over `variables`, to which "1" is added. Raises `ValueError` for a variable
-    that is not there."""
+    """Terms as tensors over `variables` and the constant "1". Raises `ValueError` for an unknown
+    variable."""
     names, most = [*variables, "1"], max((len(term.factors) for term in terms), default=1)
     forms = np.zeros((len(terms), most, len(names)))
     shapes = np.full((len(terms), most), "linear", dtype=object)
@@ -119,7 +117,7 @@ def features(z: Tensor, table: Table) -> Tensor:
 
 
 class Held(nn.Module):
-    """Inputs u (T, inputs) sampled at t (T,) [s], straight lines between."""
+    """Inputs u (T, inputs) sampled at t (T,) [s], interpolated linearly."""
 
     t: Tensor
     u: Tensor
@@ -138,8 +136,8 @@ class Held(nn.Module):
 
 @dataclass(frozen=True, repr=False)
 class Rollout(Shown):
-    """States y (T, states) at t (T,) [s], NaN from `diverged_at` [s] on if it diverged; wall time
-    [s]."""
+    """States y (T, states) at t (T,) [s], NaN from the time of divergence `diverged_at` [s] on, and
+    the wall time [s]."""
 
     t: np.ndarray
     y: np.ndarray
@@ -154,6 +152,11 @@ class Rollout(Shown):
         return (
             "bounded" if self.diverged_at is None else f"diverged at t = {self.diverged_at:.4g} s"
         )
+
+
+def indices(places: Sequence[tuple[int, int]]) -> tuple[Tensor, ...] | None:
+    """Places (row, column) of a matrix, as `index_put` takes them; None if there are none."""
+    return tuple(torch.tensor(one, dtype=torch.long) for one in zip(*places)) or None
 
 
 class ReducedModel(Shown, nn.Module):
@@ -205,18 +208,12 @@ class ReducedModel(Shown, nn.Module):
         self.signal: nn.Module | None = None
         self._table = tabulate(self.terms, (*self.states, *self.inputs))
         entries = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
-        self._entries = (
-            tuple(torch.tensor(index, dtype=torch.long) for index in zip(*entries))
-            if entries
-            else None
-        )
+        self._entries = indices(entries)
         law = [
             (self.inputs.index(name), [*self.states, *self.outer].index(other))
             for name, gains in self.feedback.items() for other in gains
         ]  # fmt: skip
-        self._law = (
-            tuple(torch.tensor(index, dtype=torch.long) for index in zip(*law)) if law else None
-        )
+        self._law = indices(law)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         rows = [tuple(line.split(" = ", 1)) for line in self.text()]
@@ -235,7 +232,7 @@ class ReducedModel(Shown, nn.Module):
         )  # fmt: skip
 
     def equations(self) -> dict[str, list[tuple[Term, float]]]:
-        """Terms and coefficients by the state whose rate they make."""
+        """(term, coefficient) pairs by the state of whose rate they are part."""
         out: dict[str, list[tuple[Term, float]]] = {
             name: [] for name in self.states if name not in self.kinematics
         }
@@ -394,8 +391,8 @@ def _power(value: float) -> str:
 def linear_rollout(
     A: np.ndarray, B: np.ndarray, h: float, y0: np.ndarray, w: np.ndarray
 ) -> np.ndarray:
-    """y' = A y + B w (T, states) from y0 at steps of h [s], w (T, inputs) straight between them:
-    exact."""
+    """Exact solution (T, states) of y' = A y + B w from y0 at steps of h [s], with w (T, inputs)
+    linear between them."""
     n = len(A)
     discrete: Any = cont2discrete((A, B, np.eye(n), np.zeros_like(B)), h, method="foh")
     F, G, _, D, _ = discrete
@@ -427,7 +424,7 @@ def nonlinear_rollout(
     scale: np.ndarray,
 ) -> np.ndarray:
     """y (T, states) at t (T,) [s], NaN once it is beyond `limit` (states,); the step is halved
-    until nothing changes.
+    until the solution converges.
 
     value, linearise: addresses of the compiled rates of (y, w), differentiated by y.
     """

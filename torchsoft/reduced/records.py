@@ -1,4 +1,4 @@
-"""Records: the variables of a reduced model over time, from trajectories and datasets."""
+"""Records: time series of a reduced model's variables, from trajectories and datasets."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ VARIABLES = (*STATES, "F_x", "x_d", "x_d_dot")
 """Series of a record."""
 
 ALIKE = 1e-9
-"""Starts [m] that differ by no more are the same."""
+"""Largest difference [m] between starts that count as equal."""
 
 
 @dataclass(frozen=True, repr=False)
 class Record(Shown):
-    """One motion: times t (T,) [s], equally spaced, and series (T,) by variable, SI units,
-    positions from their start."""
+    """One motion: equally spaced times t (T,) [s] and series (T,) by variable in SI units,
+    positions relative to their start."""
 
     t: np.ndarray
     series: dict[str, np.ndarray]
@@ -43,8 +43,7 @@ class Record(Shown):
         return float(self.t[1] - self.t[0])
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
-        """Series side by side (T, names). Raises `ValueError` for one that the record does not
-        have."""
+        """Series side by side (T, names). Raises `ValueError` for a missing one."""
         lacking = [name for name in names if name not in self.series]
         if lacking:
             raise ValueError(
@@ -77,6 +76,8 @@ def record(
         measured = measured or own
     times = np.asarray(source["time"] if t is None else t, dtype=float)
     keep = times >= (times[0] if begin is None else begin)
+    if not keep.any():
+        raise ValueError(f"`begin` = {begin:g} s is after the last sample, at {times[-1]:g} s")
     if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
         raise ValueError("`t` must hold at least three equally spaced times")
     series = {}
@@ -107,7 +108,7 @@ def record(
 def _start(
     source: Mapping[Any, Any], keep: np.ndarray, origin: Mapping[str, float], measured: str | None
 ) -> float:
-    """Where the coordinate starts that the loop of x_d measures [m]."""
+    """Start [m] of the coordinate that the loop of x_d measures."""
     if measured is not None:
         if measured not in source:
             raise ValueError(f"`measured` = {measured!r} is not in `source`; give its series too")
@@ -124,7 +125,8 @@ def _start(
 
 
 def _of_run(run: Trajectory, disc: str, bracket: str) -> tuple[dict[str, np.ndarray], str | None]:
-    """Series of a run by their names in a dataset, and the one that the loop of x_d measures."""
+    """Series of a run by their names in a dataset, and the name of the coordinate that the loop of
+    x_d measures."""
     setup, state = run.setup, run.state
     for field, name in (("disc", disc), ("bracket", bracket)):
         if name not in setup.bodies:
@@ -156,6 +158,6 @@ def _of_run(run: Trajectory, disc: str, bracket: str) -> tuple[dict[str, np.ndar
 
 
 def rolling_radius(records: Sequence[Record]) -> float:
-    """r [m] of v_Br = -2 r omega, by least squares over records of slow rolling."""
+    """Rolling radius r [m] in v_Br = -2 r omega, by least squares over records of slow rolling."""
     v, omega = (np.concatenate([one.series[name] for one in records]) for name in ("v_Br", "omega"))
     return float(-0.5 * (v @ omega) / (omega @ omega))

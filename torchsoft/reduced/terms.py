@@ -21,23 +21,23 @@ from torchsoft.reduced.ode import Factor, Term, symbol
 from torchsoft.reduced.records import KINEMATICS
 
 Candidates = Mapping[str, Sequence[Term]]
-"""Terms by the state whose rate they may make."""
+"""Candidate terms by the state whose rate they may be part of."""
 
 
 def slip(text: str, **form: float) -> tuple[Term, Term]:
-    """The term of a combination of positions [m], and that of its rate."""
+    """The term of a linear combination of positions [m], and the term of its rate."""
     rates = {KINEMATICS[name]: value for name, value in form.items()}
     rate_text = text.replace("x_C", "v_C").replace("x_Br", "v_Br").replace("theta", "omega")
     return Term(text, "m", (Factor(form),)), Term(rate_text, "m/s", (Factor(rates),))
 
 
 def variable(name: str) -> Term:
-    """The term that is a variable itself."""
+    """The term of a variable itself."""
     return Term(name, symbol(name)[1], (Factor({name: 1.0}),))
 
 
 def slips(r: float) -> dict[str, tuple[Term, Term]]:
-    """The slips s_L and s_U of a rolling radius r [m], their difference s_U - s_L and their sum,
+    """The slips s_L and s_U for a rolling radius r [m], their difference s_U - s_L and their sum,
     each with its rate."""
     return {
         "lower": slip("x_C + r theta", x_C=1.0, theta=r),
@@ -65,8 +65,8 @@ def mechanics(r: float, *, alike: bool = True) -> dict[str, list[Term]]:
 
 
 def friction(r: float, speed: float) -> dict[str, list[Term]]:
-    """Saturating candidates tanh(s' / speed) of the slips below and above, `speed` [m/s] a small
-    one."""
+    """Saturating candidates tanh(s' / speed) of the slips below and above, with a small `speed`
+    [m/s]."""
     lower, upper = (
         Term(f"tanh(({rate.text})/{speed:g})", "1", (Factor(rate.factors[0].form, "tanh", speed),))
         for rate in (slips(r)[side][1] for side in ("lower", "upper"))
@@ -75,7 +75,7 @@ def friction(r: float, speed: float) -> dict[str, list[Term]]:
 
 
 def joined(*libraries: Candidates) -> dict[str, list[Term]]:
-    """Several libraries as one."""
+    """The union of several libraries."""
     targets = dict.fromkeys(target for library in libraries for target in library)
     return {
         target: [term for library in libraries for term in library.get(target, ())]

@@ -1,5 +1,4 @@
-"""Rigs in files: a TOML file, or the same tables in Python, to a run with its figures, for somebody
-who writes no Python."""
+"""Rigs from TOML files, or from the same tables in Python, through to a run with its figures."""
 
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile

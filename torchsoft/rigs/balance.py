@@ -1,5 +1,5 @@
-"""Checks of a rig in balance at some moments of its motions: room, strains, modes and steps,
-friction."""
+"""Checks of a rig in static equilibrium at some moments of its motions: room, strains, modes and
+steps, friction."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -22,26 +22,26 @@ from torchsoft.solve.ledger import COMPRESSED
 from torchsoft.solve.stability import NEUTRAL, modes
 
 LINEAR = 0.25
-"""Part of its height by which a pad may be pressed in without a warning (assumed): strains under a
-contact are of that order, and the stress of rubber leaves the straight line of small strains by
-some ten per cent there."""
+"""Largest indentation over a pad's height without a warning (assumed): strains under a contact are
+of that order, and there the stress of rubber deviates from linear elasticity by some ten per
+cent."""
 
 MOMENTS = 5
-"""Times at which the rig is brought into balance, at the most."""
+"""Most times at which the rig is brought into equilibrium."""
 
 NEAR = 1e-4
-"""A gap [m] that loops close before their measured coordinate has moved."""
+"""Gap [m] below which a body counts as touching a pad."""
 
 STEPS_PER_PERIOD = 5
-"""Steps that a period of an oscillation needs at the least."""
+"""Fewest steps in a period of an oscillation."""
 
 STEPS_PER_PROFILE = 20
-"""Steps from one value of a profile to the next at the least."""
+"""Fewest steps between two values of a profile."""
 
 
 class Moment(NamedTuple):
-    """The rig, pads without inertia, in balance at a time [s], before and after its pads have
-    settled: state (size,) and its parts, and the signals, held."""
+    """The rig with massless pads in equilibrium at a time [s]: the scene, the state (size,) with
+    settled pads and its parts, and the signals as constants."""
 
     time: float
     scene: Scene
@@ -52,7 +52,7 @@ class Moment(NamedTuple):
 
 @torch.no_grad()
 def at_moments(e: Estimate) -> list[Diagnostic]:
-    """Findings on the rig in balance at some of its motions' knots: strains, modes, steps,
+    """Findings on the rig in equilibrium at some knots of its motions: room, strains, modes, steps,
     friction."""
     rig, found, there = massless(e.rig), list[Diagnostic](), list[Moment]()
     for time in e.moments(MOMENTS):
@@ -87,7 +87,7 @@ def at_moments(e: Estimate) -> list[Diagnostic]:
 
 
 def fits(time: float, scene: Scene) -> Iterator[Diagnostic]:
-    """Bodies that pads have no room for."""
+    """Errors on bodies that do not fit between their pads."""
     pairs = [pair for body in scene.rig.bodies for pair in scene.facing(body)]
     alone = [(key,) for key in scene.rig.contacts if not any(key in pair for pair in pairs)]
     for group in [*pairs, *alone]:
@@ -103,13 +103,13 @@ def fits(time: float, scene: Scene) -> Iterator[Diagnostic]:
 
 
 def named(scene: Scene, group: Sequence[str]) -> str:
-    """The pads of some contacts."""
+    """Names of the pads of some contacts."""
     return " and ".join(f"`{scene.rig.contacts[key].pad}`" for key in group)
 
 
 def room(scene: Scene, group: Sequence[str]) -> float:
-    """By how much the pads of some contacts of one body have to give way [m], together; negative
-    where they are apart, or the body is beyond the end of one."""
+    """Total indentation [m] of the pads of some contacts of one body; negative where they are
+    apart, or the body is beyond the end of one."""
     beside = max(
         scene.surface(key).off(scene.pose[scene.rig.contacts[key].body][:2]) for key in group
     )
@@ -117,7 +117,7 @@ def room(scene: Scene, group: Sequence[str]) -> float:
 
 
 def presses(there: list[Moment]) -> Iterator[Diagnostic]:
-    """Pads that face each other and never press a body between them."""
+    """Warnings on facing pads that never press a body between them."""
     scene = there[0].scene
     for pair in sorted(
         {
@@ -137,7 +137,7 @@ def presses(there: list[Moment]) -> Iterator[Diagnostic]:
 
 
 def strains(there: list[Moment]) -> Iterator[Diagnostic]:
-    """Pads that are pressed in beyond linear elasticity."""
+    """Warnings on pads that are indented beyond linear elasticity."""
     rig = there[0].scene.rig
     for name, pad in rig.pads.items():
         parts = [
@@ -155,9 +155,9 @@ def strains(there: list[Moment]) -> Iterator[Diagnostic]:
 
 
 def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
-    """Loops that are unstable or not tied to their measured coordinate, and steps that are too
-    long. A motion that no loop reaches may be unstable: a disc on the top of a node rolls off
-    it."""
+    """Findings on loops that are unstable or not tied to their measured coordinate, and on steps
+    that are too long. Coordinates out of reach of every loop may be unstable: a disc on the top of
+    a node rolls off it."""
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = {key: float(rig.penetration(key, moment.state).max()) for key in rig.contacts}
@@ -209,8 +209,7 @@ def shown(mode: complex) -> str:
 
 
 def flight(e: Estimate, scene: Scene) -> float:
-    """The largest speed over its size [1/s] with which a body that starts in the air reaches a
-    pad."""
+    """Largest speed over size [1/s] with which a body that starts in the air reaches a pad."""
     most = 0.0
     for key, contact in scene.rig.contacts.items():
         body = e.file.bodies[contact.body]
@@ -224,8 +223,8 @@ def flight(e: Estimate, scene: Scene) -> float:
 
 
 def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Diagnostic]:
-    """Equal steps that are too long for the rig's modes, its motions, or a body that comes
-    flying."""
+    """Warnings on equal steps that are too long for the rig's modes, its motions, or a flying
+    body."""
     limits: list[tuple[float, str]] = []
     for name, motion in e.file.motion.items():
         if isinstance(motion, ProfileTable) and len(motion.times) > 1:
@@ -265,7 +264,7 @@ def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Di
 
 
 def slips(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
-    """Friction that falls with slip faster than is single-valued."""
+    """Warnings on friction whose decrease with slip makes the slip rate ambiguous."""
     rig = there[0].scene.rig
     for key, contact in rig.contacts.items():
         if rig.pads[contact.pad].points:

@@ -1,5 +1,5 @@
-"""A rig file: tables, from TOML or from Python, and the result of building them: the rig with its
-reference, its state at the start, and the times of its outputs."""
+"""A rig file as tables, from TOML or from Python, and its result: the rig with its reference, its
+initial state, and the output times."""
 
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -50,29 +50,29 @@ M = TypeVar("M")
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 ENTRY = re.compile(r"(.+?)((?:_\d+)+)")
-"""Name of an entry of a list."""
+"""Name of an entry of a list, such as tau_2."""
 
 TAKEN = frozenset(dir(nn.ModuleDict()))
 """Names that parts of a torch module cannot have."""
 
 ROWS = 1_000_000
-"""Outputs of one run at the most."""
+"""Most outputs of one run."""
 
 STIFF = 100.0
-"""How many times as stiff as a point of the pad a contact may be for statics to be sure of
-balance."""
+"""Largest stiffness of a contact, over that of a point of its pad, at which a failed equilibrium is
+not blamed on the contact."""
 
 REFERENCES = (
     ("pads", "material", "materials"), ("pads", "base", "bodies"), ("contacts", "pad", "pads"),
     ("contacts", "body", "bodies"), ("contacts", "law", "laws"), ("taxels", "pad", "pads"),
 )  # fmt: skip
-"""Tables and fields that name another table, and where that is."""
+"""Fields that name an entry of another table, and that table."""
 
 USED = {
     "materials": ("pads", "material", "no pad is made of it; name it as the material of one"),
     "laws": ("contacts", "law", "no contact follows it; name it as the law of one"),
 }
-"""Tables that something must name, and by which field."""
+"""Tables whose every entry must be named by others, with the naming table and field."""
 
 
 class OutputsTable(Group):
@@ -122,7 +122,7 @@ class OutputsTable(Group):
         return self
 
     def times(self) -> Tensor:
-        """Equal intervals, and the times of snapshots [s]."""
+        """Output times [s]: equal intervals, and the times of snapshots."""
         count = max(1, round(self.duration / self.interval)) + 1
         grid = torch.linspace(0, self.duration, count, dtype=torch.float64)
         more = [t for t in self.snapshots if float((grid - t).abs().min()) > 1e-6]
@@ -183,7 +183,7 @@ class RigFile(Group):
 
     @classmethod
     def from_tree(cls, tree: Any, folder: Path = Path()) -> Self:
-        """From the parsed TOML of a file that lies in a folder. Raises `ValueError`."""
+        """Read from the parsed TOML of a file in `folder`. Raises `ValueError`."""
         if isinstance(tree, dict) and "motion" in tree:
             tree = tree | {"motion": flattened(tree["motion"])}
         file = cls.model_validate(tree)
@@ -191,10 +191,10 @@ class RigFile(Group):
         return file
 
     def override(self, **groups: dict[str, Any]) -> Self:
-        """Another file with some fields replaced: `override(outputs={"duration": 0.1},
-        pads={"lower": {"elements_x": 30}})`. Entries of lists are counted from one: tau_2, or
-        gain_1_3, the third of the first row. A table of another kind replaces the whole of the old
-        one. Raises `ValueError`."""
+        """A copy with some fields replaced: `override(outputs={"duration": 0.1}, pads={"lower":
+        {"elements_x": 30}})`. Entries of lists are counted from one: tau_2, or gain_1_3, the third
+        of the first row. A table of another kind replaces the old one as a whole. Raises
+        `ValueError`."""
 
         def merged(old: Any, new: Any) -> Any:
             both = isinstance(old, dict) and isinstance(new, dict)
@@ -216,7 +216,7 @@ class RigFile(Group):
 
     @property
     def folder(self) -> Path:
-        """Where files that it names are looked for: its own folder, or the working directory."""
+        """Base of relative file names: the folder of the rig file, or the working directory."""
         return self._folder
 
     def coordinates(self) -> Iterator[tuple[str, str, float | str]]:
@@ -226,7 +226,7 @@ class RigFile(Group):
                 yield name, axis, kind
 
     def loops(self) -> list[Loop]:
-        """Coordinates that follow motions, by actuators and by controllers."""
+        """Control loops of all actuators and controllers."""
         groups = *self.actuators.items(), *self.controllers.items()
         return [loop for name, one in groups for loop in one.loops(name)]
 
@@ -342,7 +342,7 @@ class RigFile(Group):
         return self
 
     def _check_coordinate(self, field: str, coordinate: str) -> None:
-        """Raises `ValueError` for a coordinate that a loop can neither measure nor push."""
+        """Raises `ValueError` for a coordinate that is unknown or not free."""
         kinds = {f"{body}.{axis}": kind for body, axis, kind in self.coordinates()}
         if coordinate not in kinds:
             there = ", ".join(name for name, kind in kinds.items() if kind == "free") or "none"
@@ -426,7 +426,7 @@ class RigFile(Group):
         return rig
 
     def _own_name(self, rig: Rig, group: str, part: str = "", *rest: str) -> str:
-        """This file's name of a parameter of its rig, such as "materials.silicone.E"."""
+        """Name in this file of a parameter of its rig, such as "materials.silicone.E"."""
         made = {a: name for name, one in self.controllers.items() for a in one.actuators(name)}
         if group == "pads" and rest[:1] == ("material",):
             material = rig.pads[part].material
@@ -447,7 +447,7 @@ class RigFile(Group):
     @single_threaded()
     @torch.no_grad()
     def build(self) -> BuiltRig[Rig]:
-        """The rig and its start, ready for `simulate(rig, t, y0=y0)`.
+        """The rig, its initial state and its output times, ready for `simulate(rig, t, y0=y0)`.
 
         Pads are settled around the bodies where these start. Raises `ValueError` with the field's
         name: for motions that cannot be, recorded ones that cannot be read, bodies that find no
@@ -471,7 +471,7 @@ class RigFile(Group):
     def reference(
         self, pose: Mapping[str, Array], held: Callable[[str, float], float]
     ) -> Reference:
-        """All motions, with bodies that start at `pose` (3,); `held` is the effort that holds a
+        """All motions, for bodies that start at `pose` (3,); `held` gives the effort that holds a
         coordinate at a time [s]. Raises `ValueError` naming the field."""
         return Reference(**{name: self._signal(name, pose, held) for name in self.motion})
 
@@ -479,7 +479,6 @@ class RigFile(Group):
         self, name: str, pose: Mapping[str, Array] | None = None,
         held: Callable[[str, float], float] | None = None,
     ) -> Piecewise:  # fmt: skip
-        """One motion."""
         roles: dict[str, set[str]] = {}
         for role, coordinate in self.followers()[name]:
             roles.setdefault(role, set()).add(coordinate)
@@ -502,8 +501,8 @@ class RigFile(Group):
         self, pose: dict[str, Array], time: float, roles: Collection[str],
         start: Mapping[str, Array] | None = None,
     ) -> set[tuple[str, int]]:  # fmt: skip
-        """Puts the coordinates that follow motions in these roles where they are to be at a time
-        [s], and says which ones these are."""
+        """Set the coordinates that follow motions in these roles to the motions' values at a time
+        [s]; returns those coordinates."""
         moved = set[tuple[str, int]]()
         for name, who in self.followers().items():
             for body, axis in (at(coordinate) for role, coordinate in who if role in roles):
@@ -513,31 +512,32 @@ class RigFile(Group):
         return moved
 
     def _starts(self, rig: Rig) -> dict[str, Array]:
-        """Poses (3,) [m, m, rad] by body at the start, solved for where bodies rest or touch."""
+        """Initial poses (3,) [m, m, rad] by body, solved for where bodies rest or touch."""
         pose = {name: np.zeros(3) for name in self.bodies}
         for name, axis, kind in self.coordinates():
             given = getattr(self.bodies[name].start, axis) if kind == "free" else kind
             if given == TOUCH or not isinstance(given, str):
-                value = AWAY if given == TOUCH else given or 0.0
-                pose[name][COORDINATES.index(axis)] = value
+                pose[name][COORDINATES.index(axis)] = AWAY if given == TOUCH else given or 0.0
         self._follow(pose, 0.0, ("driven",))
-        for name, axes in (wanted := self._wanted()).items():
+        for name, axes in (wanted := self.rests()).items():
             if 1 in axes:
                 pose[name][1] = above(Scene(rig, pose), name)
         try:
             pose = self._rested(rig, pose, wanted)
         except NoEquilibrium as error:
             name, (axis, *_) = next(iter(wanted.items()))
+            weight = self.bodies[name].weighted * rig.bodies[name].mass.item() * rig.gravity.item()
+            why = f"no rest under its weight of {weight:.3g} N is found; {error}"
             raise ValueError(
-                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}"
+                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {why}"
             ) from None
         for name, body in self.bodies.items():
             if body.y == "free" and body.start.y == TOUCH:
                 pose[name][1] = upon(Scene(rig, pose), name)
         return pose
 
-    def _wanted(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
-        """Coordinates that are where their body rests, by body, but for some."""
+    def rests(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
+        """Coordinates with the start "rest", by body, without those in `but`."""
         out: dict[str, list[int]] = {}
         for name, axis, kind in self.coordinates():
             i = COORDINATES.index(axis)
@@ -549,7 +549,8 @@ class RigFile(Group):
     def _rested(
         self, rig: Rig, pose: Mapping[str, Array], wanted: Mapping[str, list[int]]
     ) -> dict[str, Array]:
-        """Poses with these coordinates in balance, no actuator pushing. Raises `NoEquilibrium`."""
+        """Poses with these coordinates in equilibrium, without efforts of actuators. Raises
+        `NoEquilibrium`."""
         if not wanted:
             return dict(pose)
         places = {name: torch.from_numpy(x) for name, x in pose.items()}
@@ -558,14 +559,14 @@ class RigFile(Group):
         return {name: x.numpy() for name, x in found.items()}
 
     def _held(self, rig: Rig, start: Mapping[str, Array], coordinate: str, time: float) -> float:
-        """The effort [N, N.m] on a coordinate that holds it with bodies where set-points are at a
-        time [s], or where they rest or start, without friction. Raises `ValueError`."""
+        """The effort [N, N.m] that holds a coordinate, without friction, with bodies at their
+        set-points at a time [s], or else where they rest or start. Raises `ValueError`."""
         pose = {name: x.copy() for name, x in start.items()}
         known = self._follow(pose, time, ("driven", "setpoint"), start)
         soft, (body, axis) = massless(rig), at(coordinate)
         still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
         try:
-            pose = self._rested(soft, pose, self._wanted(known))
+            pose = self._rested(soft, pose, self.rests(known))
             y = standing(soft, {name: torch.from_numpy(x) for name, x in pose.items()})
         except NoEquilibrium as error:
             raise ValueError(
@@ -576,7 +577,7 @@ class RigFile(Group):
 
 
 def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any]:
-    """A list with another entry at `places`, counted from one. Raises `ValueError`."""
+    """A copy of a list with another entry at `places`, counted from one. Raises `ValueError`."""
     if not isinstance(values, list | tuple) or not 1 <= places[0] <= len(values):
         raise ValueError(f"{key}: there is no such entry")
     out, (first, *rest) = list(values), places
@@ -585,8 +586,7 @@ def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any
 
 
 def too_stiff(file: RigFile, rig: Rig) -> str:
-    """The law of a contact so much stiffer than its pad that its force is rounding of its depth;
-    empty if there is none."""
+    """Error message on a contact too stiff for its pad to be solved; empty if there is none."""
     for name, contact in rig.contacts.items():
         give = float(rig.pads[contact.pad].compliance().diagonal().max())
         ratio = float((rig.weight(name) * contact.law.K_n).max()) * give

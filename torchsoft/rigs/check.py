@@ -1,14 +1,14 @@
-"""Faults and dangers in a rig file, found before any run, each with its severity, its field and a
-sentence.
+"""Checks of a rig file before any run; each finding has a severity, a field and a sentence.
 
-Every check is a function of the estimated course of the bodies. Checks of the rig in balance are in
-`balance`.
+Each check here is a function of the estimated course of the bodies. Checks in static equilibrium
+are in `balance`.
 """
 
 import itertools
 from collections.abc import Callable, Iterator
 
 import networkx as nx
+import numpy as np
 import torch
 
 from torchsoft.diagnostic import SEVERITIES, Diagnostic
@@ -24,13 +24,17 @@ from torchsoft.solve.ledger import COMPRESSED
 from torchsoft.threads import single_threaded
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
-"""How far a set-point may be from its coordinate at the start without a warning."""
+"""Largest initial distance between a set-point and its coordinate without a warning."""
 
 TOUCH = 1e-6
-"""Depth [m] up to which things that touch do not overlap."""
+"""Depth [m] up to which touching things do not count as overlapping."""
+
+LONGER, FARTHER, TURNED = 100.0, 10.0, 20 * np.pi
+"""How often a recorded motion is longer than the run, how often a set-point goes farther than the
+rig is large, and how far it turns [rad], from where units are in doubt."""
 
 OUTPUTS_PER_PERIOD = 4
-"""Outputs that a period of a motion needs at the least."""
+"""Fewest outputs in a period of a motion."""
 
 
 @single_threaded()
@@ -50,8 +54,8 @@ def check(file: RigFile) -> list[Diagnostic]:
 
 
 def ties(e: Estimate) -> Iterator[Diagnostic]:
-    """Loops that measure a body which they cannot move, and efforts of controllers that move none
-    of the coordinates that these measure."""
+    """Errors on loops that cannot move the body that they measure, and on efforts of controllers
+    that move none of the measured coordinates."""
     graph = tied(e.rig, e.rig.contacts)
     wanted = [(one.field, one.pushes, (one.measured,)) for one in e.loops]
     wanted += [
@@ -71,7 +75,8 @@ def ties(e: Estimate) -> Iterator[Diagnostic]:
 
 
 def recordings(e: Estimate) -> Iterator[Diagnostic]:
-    """Recorded motions that do not cover the run, and waves that outputs do not show."""
+    """Findings on recorded motions that do not cover the run, and on waves too fast for the
+    outputs."""
     interval = e.file.outputs.interval
     for name, motion in e.file.motion.items():
         one, fastest = e.rig.reference[name], motion.fastest()
@@ -84,6 +89,12 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
                     f"{e.file.outputs.duration:g} s: nothing says what is wanted then; shorten "
                     f"outputs.duration to {last:g}, or record longer",
                 )  # fmt: skip
+            if last > LONGER * e.file.outputs.duration:
+                yield Diagnostic(
+                    "warning", f"motion.{name}.file",
+                    f"{motion.file} lasts {last:g} s, and the run shows "
+                    f"{e.file.outputs.duration:g} s of it: are its times in milliseconds?",
+                )  # fmt: skip
             if first > 0:
                 sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
                 yield Diagnostic("warning", f"motion.{name}.file", sentence)
@@ -95,8 +106,25 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
             )  # fmt: skip
 
 
+def travels(e: Estimate) -> Iterator[Diagnostic]:
+    """Motions that go much farther than the rig is large, or turn it round and round."""
+    scene, every = Scene(e.rig, e.start), [signals(e.rig, time) for time in e.knots()]
+    shapes = [scene.outline(name) for name, body in e.rig.bodies.items() if body.shape is not None]
+    places = np.concatenate([*(nodes(pad, scene.pose) for pad in e.rig.pads.values()), *shapes])
+    size = float(np.ptp(places, axis=0).max())
+    limits = {
+        "m": (FARTHER * size, "m", f"the whole rig is {size:.2g} m large", "millimetres"),
+        "rad": (TURNED, "rad", f"that is more than {TURNED / (2 * np.pi):g} turns", "degrees"),
+    }
+    for name in e.file.motion:
+        most, unit, beside, other = limits.get(e.file.unit(name), (np.inf, "", "", ""))
+        if (far := float(np.ptp([values[name] for values in every]))) > most:
+            sentence = f"it goes {far:.3g} {unit}, and {beside}: is it in {other}?"
+            yield Diagnostic("warning", f"motion.{name}", sentence)
+
+
 def jumps(e: Estimate) -> Iterator[Diagnostic]:
-    """Set-points that begin elsewhere than their coordinate."""
+    """Warnings on set-points that begin away from their coordinate."""
     values, followed = signals(e.rig, 0.0), e.rig.follow(0.0)
     for loop in e.loops:
         body, axis = at(loop.measured)
@@ -116,7 +144,7 @@ def jumps(e: Estimate) -> Iterator[Diagnostic]:
 
 
 def carried(e: Estimate) -> Iterator[Diagnostic]:
-    """Bodies that nothing carries against gravity."""
+    """Errors on bodies without support against gravity."""
     scene = Scene(e.rig, e.start)
     pushed = {one.pushes for one in e.file.actuators.values()}
     pushed |= {coordinate for one in e.file.controllers.values() for coordinate in one.pushes}
@@ -152,8 +180,8 @@ def carried(e: Estimate) -> Iterator[Diagnostic]:
 
 
 def overlaps(e: Estimate) -> Iterator[Diagnostic]:
-    """Things that lie in each other without a contact between them: at the start, and those whose
-    course is known later."""
+    """Errors on overlapping things without a contact between them: at the start, and later those of
+    known course."""
     said, rig = set[tuple[str, str]](), e.rig
     contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
     for time, scene in e.course:
@@ -189,7 +217,7 @@ def overlaps(e: Estimate) -> Iterator[Diagnostic]:
 
 
 def corners(e: Estimate) -> Iterator[Diagnostic]:
-    """Corners that fall between contact points."""
+    """Warnings on corners sharper than the spacing of contact points."""
     for contact in e.rig.contacts.values():
         spacing, sharpest = (
             float(e.rig.pads[contact.pad].point_lengths.max()),
@@ -206,8 +234,8 @@ def corners(e: Estimate) -> Iterator[Diagnostic]:
 
 
 def overloads(e: Estimate) -> Iterator[Diagnostic]:
-    """Efforts that would press the pads of a body in too far, however they were spread over
-    them."""
+    """Errors on efforts that would compress the pads of a body too far, however the load were
+    shared."""
     for actuator in e.file.actuators.values():
         body, axis = at(actuator.pushes)
         pads = {
@@ -233,7 +261,7 @@ def overloads(e: Estimate) -> Iterator[Diagnostic]:
 
 
 def bears(pad: Pad) -> float:
-    """The force [N] that presses the whole face of a pad in by the most that can be run."""
+    """Force [N] on the whole face of a pad at the largest compression that can be run."""
     C = pad.compliance().detach()[1::2, 1::2]
     return (
         float(torch.linalg.solve(C, torch.ones(len(C), dtype=C.dtype)).sum())
@@ -243,6 +271,6 @@ def bears(pad: Pad) -> float:
 
 
 CHECKS: tuple[Callable[[Estimate], Iterator[Diagnostic]], ...] = (
-    ties, recordings, jumps, carried, overlaps, corners, overloads,
+    ties, recordings, travels, jumps, carried, overlaps, corners, overloads,
 )  # fmt: skip
-"""Another check is one more of these."""
+"""All checks, in order; a new one is added here."""

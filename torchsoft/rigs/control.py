@@ -1,7 +1,7 @@
-"""Actuators of a rig file: PD loops, networks, efforts that are fed forward, and controllers of
-several coordinates.
+"""Actuators of a rig file: PD loops, networks, feed-forward efforts, and controllers of several
+coordinates.
 
-Networks come from files of weights: data that are computed with, never programs that are run.
+Networks come from files of weights, which are data and never programs.
 """
 
 import io
@@ -24,10 +24,10 @@ from torchsoft.rigs.fields import Group, at_field
 from torchsoft.tables import LISTED, line
 
 WEIGHTS = 2000
-"""Numbers of a network at the most: every one of them becomes machine code."""
+"""Most numbers of a network, since each becomes machine code."""
 
 LARGEST = 10e6
-"""Size [B] of a file of weights at the most."""
+"""Largest size [B] of a file of weights."""
 
 PYTHON = (
     "a module of another kind is given in Python: torchsoft.Actuator(measures, pushes, module, "
@@ -39,8 +39,7 @@ LOOP = "set-point", "its rate", "coordinate", "its rate"
 
 
 class NetworkPD(PD):
-    """A PD law and a network of (set-point, its rate, coordinate, its rate), whose efforts [N or
-    N.m] are added."""
+    """Sum of a PD law and a network of (set-point, its rate, coordinate, its rate) [N or N.m]."""
 
     def __init__(self, Kp: float, Kd: float, network: nn.Module, reversed: bool = False) -> None:
         super().__init__(Kp, Kd)
@@ -58,8 +57,8 @@ class NetworkPD(PD):
 
 
 class FedNetwork(nn.Module):
-    """State feedback and a network of (set-points, their rates, coordinates, their rates), whose
-    efforts [N or N.m] are added; either may be missing."""
+    """Sum of state feedback and a network of (set-points, their rates, coordinates, their rates) [N
+    or N.m]; either may be missing."""
 
     def __init__(self, feedback: StateFeedback | None, network: nn.Module | None) -> None:
         super().__init__()
@@ -102,8 +101,8 @@ def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequ
 
 
 def declared(path: Path) -> int:
-    """Numbers that the headings of an .npz file declare, before any is read. Raises `ValueError`
-    for another kind of file."""
+    """Number of values that the headings of an .npz file declare, without reading the values.
+    Raises `ValueError` for another kind of file."""
     total = 0
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
@@ -121,7 +120,7 @@ def declared(path: Path) -> int:
 
 
 def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -> nn.Sequential:
-    """Raises `ValueError` for a network of other layers."""
+    """Linear layers with tanh between them. Raises `ValueError` for arrays of another network."""
     found = sorted(
         int(name[1])
         for name in (re.fullmatch(r"(\d{1,3})\.weight", name) for name in arrays)
@@ -168,8 +167,8 @@ Rows = Annotated[tuple[Annotated[tuple[Gain, ...], LISTED], ...], LISTED]
 
 
 class Loop(NamedTuple):
-    """A coordinate that is to follow a motion: its field, and the coordinate that actuators of the
-    rig push for it."""
+    """A coordinate with a set-point: the field of its controller, the coordinate pushed for it, and
+    the actuators of the rig."""
 
     field: str
     measured: str
@@ -231,13 +230,13 @@ class ActuatorTable(Group):
         return self.measures or self.pushes
 
     def loops(self, name: str) -> list[Loop]:
-        """Coordinates by the motions that they follow."""
+        """The control loop of the actuator, none without a set-point."""
         if self.setpoint is None:
             return []
         return [Loop(f"actuators.{name}", self.measured, self.pushes, self.setpoint, (name,))]
 
     def build(self, folder: Path) -> Actuator:
-        """The actuator; `folder` is where its network lies. Raises `ValueError`."""
+        """The actuator; its network is in `folder`. Raises `ValueError`."""
         followed = (
             self.setpoint or self.feed_forward
         )  # without gains it does not matter which signal is the set-point
@@ -312,12 +311,12 @@ class ControllerTable(Group):
         return self
 
     def actuators(self, name: str) -> dict[str, str]:
-        """Pushed coordinates, by the names of the actuators."""
+        """Pushed coordinates by the names of the actuators."""
         return {f"{name}_{pushed.replace('.', '_')}": pushed for pushed in self.pushes}
 
     def loops(self, name: str) -> list[Loop]:
-        """Coordinates by the motions that they follow. The coordinate pushed for one is itself
-        where it is pushed, else one along the same axis, else the first."""
+        """Control loops of the controller. The coordinate pushed for a measured one is itself if it
+        is pushed, else one along the same axis, else the first."""
 
         def towards(coordinate: str) -> str:
             same = [
@@ -332,7 +331,7 @@ class ControllerTable(Group):
         ]
 
     def build(self, name: str, folder: Path) -> dict[str, Actuator]:
-        """Its actuators; `folder` is where its network lies. Raises `ValueError`."""
+        """Its actuators; its network is in `folder`. Raises `ValueError`."""
         network, inputs = None, [*self.setpoints, *(f"{one}'" for one in self.setpoints)]
         inputs += [*self.measures, *(f"{one}'" for one in self.measures)]
         if self.network is not None:

@@ -1,10 +1,10 @@
-"""Estimated course of bodies, before any run: driven ones, those that loops move, and those gripped
-between two pads.
+"""Estimated course of the bodies before any run: driven bodies, bodies moved by loops, and bodies
+gripped between two pads.
 
-Two estimates. By geometry alone, at any time: loops are taken to reach their set-points, a body
-between two pads that press it to be in their middle, and to go along with them if both are on
-bodies. By statics, at a few moments: loops and efforts that are fed forward press pads against
-bodies until both are in balance, without friction. Everything else is taken to stay where it is.
+There are two estimates. The geometric one holds at any time: loops reach their set-points, a body
+between two pressing pads is midway between them, and moves with them if both are on bodies. The
+static one, at a few moments, balances the forces of loops and feed-forward efforts with those of
+pads, without friction. All other coordinates keep their place.
 """
 
 from functools import cached_property
@@ -21,20 +21,21 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.geometry import Scene, at, turned
 
 ALONG = 0.7
-"""Least part of a surface's normal along an axis by which two pads hold a body along this axis."""
+"""Least component of a surface's normal along an axis by which two pads hold a body along this
+axis."""
 
 BALANCED = 1e-9
-"""Residual [m] of an estimate by statics."""
+"""Residual [m] of the static estimate."""
 
 KNOTS = 100
-"""A motion with more knots than these is a recording."""
+"""Most knots of a motion that are looked at one by one; a motion with more is a recording."""
 
 SAMPLES = 61
-"""Times at which the course of the bodies is looked at, besides the motions' knots."""
+"""Number of times of the estimated course, besides the motions' knots."""
 
 
 class Estimate:
-    """The poses of a rig's bodies at any time of its run."""
+    """Estimated poses of a rig's bodies at any time of its run."""
 
     def __init__(self, file: RigFile, ready: BuiltRig[Rig]) -> None:
         self.file, self.rig, self.end = file, ready.rig, float(ready.t[-1])
@@ -46,22 +47,22 @@ class Estimate:
         self.unbalanced: dict[float, str] = {}
 
     def known(self, body: str) -> bool:
-        """Whether no coordinate of a body is left to the run."""
+        """Whether the motions alone determine every coordinate of a body."""
         return not any(self.is_own(body, axis) for axis in range(3))
 
     def is_own(self, body: str, axis: int) -> bool:
-        """Whether a coordinate is free, and no loop measures it."""
+        """Whether a coordinate is free and measured by no loop."""
         name = COORDINATES[axis]
         return name in self.file.bodies[body].free and f"{body}.{name}" not in self.measured
 
     def __call__(self, time: float) -> dict[str, Array]:
-        """Poses (3,) by body, by geometry."""
+        """Poses (3,) by body, by the geometric estimate."""
         before = [pose for knot, pose in self._past if knot < time]
         return self._next(before[-1] if before else self.start, time)
 
     @cached_property
     def _past(self) -> list[tuple[float, dict[str, Array]]]:
-        """The knots, and the poses there."""
+        """The knots, and the poses at them."""
         past, pose = [], self.start
         for knot in self.knots():
             pose = self._next(pose, knot)
@@ -69,7 +70,7 @@ class Estimate:
         return past
 
     def _next(self, before: dict[str, Array], time: float) -> dict[str, Array]:
-        """At a time [s], after the poses of the knot before."""
+        """Poses at a time [s] from those at the knot before."""
         pose = {name: x.copy() for name, x in before.items()}
         followed = self.rig.follow(time).detach()
         values, (held, _) = signals(self.rig, time), self.rig.held(followed)
@@ -94,8 +95,7 @@ class Estimate:
         return pose
 
     def _carry(self, name: str, was: Scene, now: Scene) -> None:
-        """Takes a body along with the two others between whose pads it was gripped: as they move in
-        the mean."""
+        """Move a body with the two bodies whose pads grip it, by their mean motion."""
         for pair in was.facing(name):
             bases = [base for key in pair if (base := was.pad(key).base) is not None]
             if len(bases) < 2 or min(was.pressed(key) for key in pair) <= 0:
@@ -110,8 +110,9 @@ class Estimate:
 
     @torch.no_grad()
     def balanced(self, time: float) -> dict[str, Array]:
-        """By statics: the coordinates in balance are those whose own loop pushes them, and bodies
-        between pads along the direction of the press. By geometry where no balance is found."""
+        """Poses by the static estimate, by the geometric one where no equilibrium is found.
+        Coordinates in equilibrium are those pushed by their own loop, and those of bodies between
+        pads along the direction of the press."""
         scene = Scene(self.rig, self(time))
         own = [name for name, one in self.file.actuators.items() if one.measured == one.pushes]
         freed = {at(self.file.actuators[name].pushes) for name in own}
@@ -134,8 +135,8 @@ class Estimate:
         return {name: x.numpy() for name, x in found.items()}
 
     def knots(self) -> list[float]:
-        """Times [s] at which motions begin or end, or are furthest out, and those of the run's
-        begin and end."""
+        """Times [s] of the run's ends, and those at which motions begin, end or have their
+        extremes."""
         found, fine = {0.0, self.end}, torch.linspace(0.0, self.end, 401, dtype=torch.float64)
         for name in self.rig.signals:
             one = self.rig.reference[name]
@@ -147,7 +148,8 @@ class Estimate:
 
     @cached_property
     def course(self) -> list[tuple[float, Scene]]:
-        """Times [s] over the whole run, knots among them, and the poses there by geometry."""
+        """Times [s] over the whole run, knots included, and the scenes there by the geometric
+        estimate."""
         times = np.union1d(np.linspace(0.0, self.end, SAMPLES), self.knots())
         return [(float(time), Scene(self.rig, self(float(time)))) for time in times]
 

@@ -1,8 +1,8 @@
-"""Fields of rig files: tables made from constructors, numbers or words, and tables that know their
-own keys."""
+"""Fields of rig files: tables derived from constructors, and fields that take a number or a
+word."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import lru_cache, reduce
@@ -20,14 +20,13 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from torchsoft.display import suggestion
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import metadata, quantity
 from torchsoft.tables import LISTED, Table, shown
 
 
 class Refused(ValueError):
-    """A refused value, with its field."""
+    """An invalid value, with its field."""
 
     def __init__(self, field: str, sentence: str) -> None:
         super().__init__(f"{field}: {sentence}")
@@ -36,7 +35,7 @@ class Refused(ValueError):
 
 @contextmanager
 def at_field(field: str) -> Iterator[None]:
-    """Turns errors in the value of a field into `Refused`, those of a field within it too."""
+    """Turn errors in the value of a field into `Refused`, with the whole path of fields."""
     try:
         yield
     except Refused as error:
@@ -76,18 +75,7 @@ class NumberOr:
 
 
 class Group(Table):
-    """A table of a rig file; a key that it has not is refused with the one that may be meant."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _known(cls, data: Any) -> Any:
-        if isinstance(data, Mapping):
-            for key in data:
-                if key not in cls.model_fields:
-                    raise ValueError(
-                        f"`{key}` is not known here; {suggestion(key, cls.model_fields)}"
-                    )
-        return data
+    """A table of a rig file."""
 
     @model_validator(mode="after")
     def _has_its_kind(self) -> Self:
@@ -104,15 +92,14 @@ class PartTable(Group):
     part: ClassVar[Callable[..., Any]]
 
     def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
-        """Arguments of the constructor by name; `folder` is where a file that a table names
-        lies."""
+        """Arguments of the constructor by name; `folder` is the base of relative file names."""
         given = ((name, getattr(self, name)) for name in signature(self.part).parameters)
         return tuple(
             (name, one.build(folder) if isinstance(one, PartTable) else one) for name, one in given
         )
 
     def build(self, folder: Path) -> Any:
-        """The part, physical by itself. Raises `ValueError`."""
+        """The part, with valid parameters. Raises `ValueError`."""
         return deepcopy(made(type(self).part, self.arguments(folder)))
 
     @model_validator(mode="after")
@@ -124,15 +111,15 @@ class PartTable(Group):
 
 @lru_cache(maxsize=32)
 def made(part: Callable[..., Any], arguments: tuple[tuple[str, Any], ...]) -> Any:
-    """A part, made once: its log appears once, and a contour takes a while. Raises `ValueError`."""
+    """A cached part: its log appears once, and a contour takes a while. Raises `ValueError`."""
     return sound(part(**dict(arguments)))
 
 
 def table_of(
     part: Callable[..., Any], kind: str = "", base: type[PartTable] = PartTable, **fields: Any
 ) -> type[PartTable]:
-    """The table of a part, called `kind` in files; `fields` are annotations, or defaults, in the
-    place of the constructor's."""
+    """The table of a part, called `kind` in files; `fields` are annotations or defaults that
+    replace the constructor's."""
     found: dict[str, Any] = {"kind": (Literal[kind], kind)} if kind else {}
     for name, argument in signature(part).parameters.items():
         given = fields.get(name, argument.default)
@@ -154,8 +141,8 @@ def table_of(
 
 
 def listed(hint: Any) -> Any:
-    """The annotation of a field that lists what the constructor iterates over: a tuple, which TOML
-    gives as a list."""
+    """The annotation of a field, with a tuple in place of an iterable, which TOML gives as a
+    list."""
     bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
     if get_origin(bare) is Iterable:
         (inner,), entry = get_args(bare), quantity(hint)
@@ -171,5 +158,5 @@ def listed(hint: Any) -> Any:
 
 
 def one_of(*tables: type[PartTable] | type[Group]) -> Any:
-    """A table whose `kind` says which of these it is."""
+    """A union of tables, told apart by their `kind`."""
     return Annotated[reduce(or_, tables), Field(discriminator="kind")]

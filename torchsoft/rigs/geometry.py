@@ -1,5 +1,5 @@
-"""Where things are: surfaces of pads and outlines of bodies in the world, gaps and overlaps,
-without any elasticity."""
+"""Geometry of undeformed rigs: surfaces of pads and outlines of bodies in the world, gaps and
+overlaps."""
 
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
@@ -16,28 +16,29 @@ from torchsoft.physics.shapes import Shape
 from torchsoft.rigs.parts import REST, TOUCH
 
 FACING = -0.9
-"""Product of two surfaces' normals below which they face each other."""
+"""Scalar product of two surfaces' normals below which they face each other."""
 
 CORNERS = 1440
-"""Points of an outline at which its curvature is looked at."""
+"""Number of points of an outline at which its curvature is computed."""
 
 UPWARDS = 0.1
-"""Least upward part of the normal of a pad that something may rest on."""
+"""Least upward component of the normal of a pad that can carry a body."""
 
 AWAY = 100.0
-"""Height [m] of a body whose pads are to come down until they touch."""
+"""Height [m] of a body before its pads are lowered until they touch."""
 
 CLEAR, DESCENTS = 1e-16, 50
-"""Gap [m] of what just touches, above rounding, and the steps down to it."""
+"""Gap [m] between surfaces that just touch, above rounding errors, and the number of steps down to
+it."""
 
 Poses = Mapping[str, Array]
 """Poses (3,) [m, m, rad] by body."""
 
 
 class Surface(NamedTuple):
-    """An undeformed pad in the world: the middle of its free surface, at its highest [m], outward
-    normal, direction along it (2,); half its length and its height [m]; the surface itself from
-    left to right (nodes, 2) [m], along it from the middle and outwards from there."""
+    """An undeformed pad in the world: highest middle of its free surface [m], outward normal and
+    direction along it (2,); its half length and its height [m]; and its profile from left to right
+    (nodes, 2) [m], along the surface from the middle and outwards."""
 
     middle: Array
     normal: Array
@@ -47,40 +48,40 @@ class Surface(NamedTuple):
     profile: Array
 
     def depth(self, place: Array) -> Array:
-        """How deep places (..., 2) lie under the surface [m], along its middle's normal; negative
+        """Depth [m] of points (..., 2) under the surface, along the normal at its middle; negative
         above it."""
         outwards = np.interp((place - self.middle) @ self.along, *self.profile.T)
         return outwards - (place - self.middle) @ self.normal
 
     def off(self, place: Array) -> float:
-        """How far a place (2,) lies beyond the pad's ends [m]; negative between them."""
+        """Distance [m] of a point (2,) beyond the pad's ends; negative between them."""
         return float(abs((place - self.middle) @ self.along) - self.half)
 
     def faces(self, other: "Surface") -> bool:
-        """Whether two surfaces look at each other."""
+        """Whether two surfaces face each other."""
         return bool(self.normal @ other.normal < FACING)
 
 
 def at(coordinate: str) -> tuple[str, int]:
-    """Body and number of a coordinate such as "disc.x"."""
+    """Body and index of a coordinate such as "disc.x"."""
     body, _, axis = coordinate.partition(".")
     return body, COORDINATES.index(axis)
 
 
 def turned(v: Array, angle: float) -> Array:
-    """Vectors (..., 2) turned by an angle."""
+    """Vectors (..., 2) rotated by an angle."""
     c, s = np.cos(angle), np.sin(angle)
     return v @ np.array([[c, s], [-s, c]])
 
 
 def in_world(pad: Pad, pose: Poses, placed: Array) -> Array:
-    """Places (..., 2) in the frame of a pad's base [m], in the world."""
+    """Points (..., 2) in the world from the frame of a pad's base [m]."""
     base = np.zeros(3) if pad.base is None else pose[pad.base]
     return base[:2] + turned(placed, base[2])
 
 
 def surface(pad: Pad, pose: Poses) -> Surface:
-    """A pad with its base at its pose."""
+    """Surface of a pad with its base at its pose."""
     mesh = pad.mesh
     own = mesh.nodes[mesh.free[mesh.surface]]
     left, right, top = own[:, 0].min(), own[:, 0].max(), own[:, 1].max()
@@ -100,12 +101,12 @@ def nodes(pad: Pad, pose: Poses) -> Array:
 
 
 PARTS = 32
-"""Points on a side of a pad's outline that are looked for inside another pad."""
+"""Number of points on each side of a pad's outline that are tested for being inside another pad."""
 
 
 def collision(one: Pad, other: Pad, pose: Poses) -> float:
-    """Depth [m] of the deepest node, or point of a side, of two undeformed pads, which may be
-    hollow, inside the other pad; 0 where they are apart."""
+    """Depth [m] of the deepest point on the outline of either of two undeformed pads, which may be
+    hollow, inside the other; 0 where they are apart."""
     corners = [nodes(pad, pose)[pad.mesh.outline] for pad in (one, other)]
     parts = np.linspace(0.0, 1.0, PARTS, endpoint=False)[:, None, None]
     sides = [(ends + parts * (np.roll(ends, -1, 0) - ends)).reshape(-1, 2) for ends in corners]
@@ -113,9 +114,9 @@ def collision(one: Pad, other: Pad, pose: Poses) -> float:
 
 
 def depth_inside(places: Array, corners: Array) -> float:
-    """How far the innermost of some places (n, 2) inside a polygon (corners, 2) is from its sides;
-    0 where all are outside. A line to the right of what is inside crosses the sides an odd number
-    of times."""
+    """Largest distance from the sides among points (n, 2) inside a polygon (corners, 2); 0 where
+    all are outside. A point is inside where a line to its right crosses the sides an odd number of
+    times."""
     places = places[((places > corners.min(0)) & (places < corners.max(0))).all(1)]
     way = np.roll(corners, -1, 0) - corners
     to = places[:, None] - corners
@@ -143,16 +144,16 @@ class Scene(NamedTuple):
         return self.rig.pads[self.rig.contacts[contact].pad]
 
     def surface(self, contact: str) -> Surface:
-        """Of a contact's pad."""
+        """Surface of a contact's pad."""
         return surface(self.pad(contact), self.pose)
 
     def points(self, contact: str) -> Array:
-        """The contact points (points, 2) of the pad of a contact in the world [m]."""
+        """Contact points (points, 2) of a contact's pad in the world [m]."""
         pad = self.pad(contact)
         return in_world(pad, self.pose, pad.point_positions.numpy())
 
     def reach(self, body: str, direction: Array) -> float:
-        """How far a body reaches from its centre along a unit vector of the world [m]."""
+        """Extent [m] of a body from its centre along a unit vector of the world."""
         return float(
             self.shape(body)
             .support(torch.from_numpy(turned(direction, -self.pose[body][2])))
@@ -160,26 +161,26 @@ class Scene(NamedTuple):
         )
 
     def inside(self, body: str, places: Array) -> float:
-        """How deep the deepest of some places (n, 2) of the world is in a body [m]; negative where
-        all are outside."""
+        """Depth [m] of the deepest of some points (n, 2) of the world in a body; negative where all
+        are outside."""
         own = turned(places - self.pose[body][:2], -self.pose[body][2])
         return -float(self.shape(body)(torch.from_numpy(own))[0].detach().min())
 
     def pressed(self, contact: str) -> float:
-        """How deep the undeformed pad of a contact is in the body [m]; negative where they are
+        """Depth [m] of the undeformed pad of a contact in the body; negative where they are
         apart."""
         return self.inside(self.rig.contacts[contact].body, self.points(contact))
 
     def outline(self, body: str) -> Array:
-        """Points around a body (points, 2) [m]."""
+        """Points on the outline of a body (points, 2) [m]."""
         return self.pose[body][:2] + turned(self.shape(body).outline().numpy(), self.pose[body][2])
 
     def corner(self, body: str) -> float:
-        """The smallest radius of curvature of a body where it bulges outwards [m]."""
+        """Smallest convex radius of curvature of a body [m]."""
         return 1 / float(self.shape(body).curvature(self.shape(body).outline(CORNERS)).max())
 
     def facing(self, body: str) -> list[tuple[str, str]]:
-        """Pairs of contacts between whose pads, which face each other, a body is."""
+        """Pairs of contacts of a body whose pads face each other across it."""
         at = {
             key: self.surface(key)
             for key, contact in self.rig.contacts.items()
@@ -194,8 +195,8 @@ class Scene(NamedTuple):
 
 
 def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:
-    """Bodies, with an edge where one of the contacts is between a body and a pad of the other; the
-    ground ties nothing."""
+    """Graph of the bodies, with an edge where one of the contacts is between a body and a pad on
+    another body. The ground connects nothing."""
     graph = nx.Graph()
     graph.add_nodes_from(rig.bodies)
     pairs = ((rig.pads[rig.contacts[key].pad].base, rig.contacts[key].body) for key in contacts)
@@ -205,7 +206,7 @@ def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:
 
 def above(scene: Scene, body: str) -> float:
     """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there
-    is none."""
+    is no pad under it."""
     below, *beside = (
         scene.reach(body, np.array(way)) for way in ([0.0, -1.0], [-1.0, 0.0], [1.0, 0.0])
     )
@@ -233,8 +234,8 @@ def above(scene: Scene, body: str) -> float:
 
 
 def upon(scene: Scene, body: str) -> float:
-    """The height [m] at which the pads of a body, come down from above, just touch. Raises
-    `ValueError` where they touch nothing."""
+    """Height [m] at which the pads of a body, lowered from above, just touch. Raises `ValueError`
+    where they touch nothing."""
     rig, pose = scene.rig, {name: x.copy() for name, x in scene.pose.items()}
     own = [key for key, one in rig.contacts.items() if rig.pads[one.pad].base == body]
     gap = np.inf

@@ -1,4 +1,4 @@
-"""Goal of a rig file's motion, as a TOML file states it, and the plan that reaches it."""
+"""Goal of a rig file's motion, from a TOML file, and the plan that reaches it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,9 +24,9 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class Goal(Table):
-    """Goal of a run of a rig file: `free` motions and numbers of the file, by their names;
-    `targets` and `limits` of channels; `uncertain` numbers of the file, of which the plan sees
-    `draws` besides the stated ones."""
+    """Goal of a run of a rig file: `free` motions and parameters of the file, by their names;
+    `targets` and `limits` of channels; `uncertain` parameters of the file, of which the plan sees
+    `draws` besides their stated values."""
 
     free: dict[Name, Bounds | Range] = Field(min_length=1)
     targets: dict[Name, Target] = Field(min_length=1)
@@ -48,7 +48,7 @@ class Goal(Table):
 
     @property
     def variables(self) -> Free:
-        """Free variables as `plan` takes them."""
+        """Free variables in the form that `plan` takes."""
         return {
             name: one if isinstance(one, Bounds) else (one.low, one.high)
             for name, one in self.free.items()
@@ -56,7 +56,7 @@ class Goal(Table):
 
 
 Draws = Mapping[str, Sequence[float] | NDArray[np.float64]]
-"""Draws (1 + count,) of numbers of a rig file by name, the estimates first."""
+"""Draws (1 + count,) of parameters of a rig file by name, the estimates first."""
 
 
 class Planned(NamedTuple):
@@ -67,7 +67,7 @@ class Planned(NamedTuple):
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables within tables of values by dotted names."""
+    """Nested tables from values by dotted names."""
     out: dict[str, Any] = {}
     for name, value in values.items():
         *tables, last = name.split(".")
@@ -81,9 +81,9 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 def drawn(
     file: RigFile, goal: Goal, count: int, seed: int, known: Draws | None = None
 ) -> tuple[BuiltRig[Rig], dict[str, Tensor], Tensor]:
-    """The rig with the stated numbers; uncertain numbers by name (1 + count, ...), the stated ones
-    first, those of `known` as they are drawn there; and the starts (1 + count, size) of rigs that
-    have them. Raises `ValueError`."""
+    """The rig with the stated parameters; draws (1 + count, ...) of the uncertain ones by name, the
+    stated values first, with the draws of `known` as given; and the initial states (1 + count,
+    size). Raises `ValueError`."""
     rng, every, known = np.random.default_rng(seed), list[BuiltRig[Rig]](), known or {}
     if twice := known.keys() & goal.uncertain.keys():
         raise ValueError(f"uncertain.{min(twice)} is drawn by the identification; leave it out")
@@ -102,12 +102,13 @@ def drawn(
 def plan_file(
     file: RigFile, goal: Goal, known: Draws | None = None, *, progress: bool = False
 ) -> Planned:
-    """The plan that reaches a goal, and the rig file with it. Numbers of materials and laws that
-    are free leave the start as the file has it. `known` are draws of what an identification of the
-    file leaves unknown, `goal.draws` of them after the estimates
-    (`IdentificationResult.draws`); the file that is written has the estimates.
+    """The plan that reaches a goal, and the rig file with it. Free parameters of materials and laws
+    do not change the initial state. `known` are draws of the parameters that an identification of
+    the file left uncertain (`IdentificationResult.draws`), `goal.draws` of them after the
+    estimates; the written file has the estimates.
 
-    Raises `ValueError` for names that the rig or its run has not, and where no start can be run.
+    Raises `ValueError` for names that the rig or its run does not have, and where no start can be
+    run.
     """
     if known:
         estimates = nested({name: float(one[0]) for name, one in known.items()})

@@ -1,5 +1,5 @@
-"""Motions of a rig file: set-points of loops, feed-forward efforts and driven coordinates, as
-functions of time."""
+"""Motions of a rig file as functions of time: set-points of loops, feed-forward efforts and driven
+coordinates."""
 
 import csv
 from collections.abc import Callable
@@ -20,16 +20,16 @@ from torchsoft.rigs.fields import Group, NumberOr
 from torchsoft.tables import LISTED, line, shown
 
 START = "start"
-"""The word for where the coordinate that follows a motion is when the run begins."""
+"""The word for the initial value of the coordinate that follows a motion."""
 
 HELD = "held"
-"""The word for the effort, fed forward, that holds a coordinate in place."""
+"""The word for the feed-forward effort that holds a coordinate in place."""
 
 STROKES = 10_000
-"""Strokes of one motion at the most."""
+"""Most strokes of one motion."""
 
 PERIODS = 1e5
-"""Periods of a wave in one run at the most."""
+"""Most periods of a wave in one run."""
 
 Value = Annotated[float | str, NumberOr("m, rad, N or N.m", START, HELD)]
 
@@ -40,10 +40,10 @@ Frequency = Annotated[float, Quantity("Hz", 1e-6, 1e5)]
 
 
 class MotionContext(NamedTuple):
-    """Context of a motion: its name, its unit, where the coordinate that follows it starts
-    (None: no coordinate that is free does), the effort at a time [s] that holds the coordinate
-    that it is fed forward to (None: there is no such one), the end of the run [s], and the folder
-    of the rig's file."""
+    """Context of a motion: its name and unit; the initial value of the one free coordinate that
+    follows it (None if there is none); the effort, at a time [s], that holds the one coordinate to
+    which it is fed forward (None if there is none); the end of the run [s]; and the folder of the
+    rig file."""
 
     name: str
     unit: str
@@ -53,7 +53,8 @@ class MotionContext(NamedTuple):
     folder: Path
 
     def value(self, field: str, value: float | str, time: float = 0.0) -> float:
-        """A number, the start, or the effort that holds at a time [s]. Raises `ValueError`."""
+        """The number of a field, which may be the word "start", or "held" at a time [s]. Raises
+        `ValueError`."""
         if not isinstance(value, str):
             return value
         if value == HELD:
@@ -82,7 +83,7 @@ class Motion(Group):
         raise NotImplementedError
 
     def fastest(self) -> float:
-        """Its highest frequency [Hz]; 0 where it has none."""
+        """Highest frequency [Hz], 0 for motions without waves."""
         return 0.0
 
 
@@ -125,7 +126,7 @@ class Knots(Motion):
         return self
 
     def knots(self, asked: MotionContext) -> tuple[list[float], list[float]]:
-        """Times and values."""
+        """Times and values as numbers."""
         offset = asked.value("offset", self.offset)
         known = zip(self.values, self.times)
         return list(self.times), [offset + asked.value("values", *one) for one in known]
@@ -288,10 +289,9 @@ class CsvTable(Motion):
 def read_column(
     path: Path, column: str, unit: str, time: str = "t"
 ) -> tuple[list[float], list[float]]:
-    """Times [s], under the heading `time`, and values, in SI units, of a column that is to be in
-    `unit` or one that converts to it; other columns are left out. Raises `ValueError` naming the
-    file, the row (the heading is row 1) and the column.
-    """
+    """Times [s], from the column `time`, and values, in SI units, from a column in `unit` or one
+    that converts to it. Raises `ValueError` naming the file, the row (the heading is row 1) and the
+    column."""
     try:
         there = names(path)
         for name in (time, column):
@@ -326,7 +326,7 @@ def read_column(
 
 
 def names(path: Path) -> list[str]:
-    """The names in the heading of a file, without their units."""
+    """Names in the heading of a CSV file, without their units."""
     try:
         with check_file(path, csvfile.LARGEST).open(newline="", encoding="utf-8-sig") as file:
             return [csvfile.name_and_unit(cell)[0] for cell in next(csv.reader(file), [])]
@@ -341,8 +341,8 @@ MotionTable = Annotated[
 
 
 def flattened(motion: object, within: str = "") -> object:
-    """Motions by name, where TOML nests them: [motion.upper.y] is the motion of the coordinate
-    "upper.y"."""
+    """Motions by their full names, from TOML's nested tables: [motion.upper.y] is the motion of the
+    coordinate "upper.y"."""
     if not isinstance(motion, dict):
         return motion
     out: dict[str, object] = {}
@@ -358,7 +358,7 @@ def flattened(motion: object, within: str = "") -> object:
 
 
 def is_nest(value: object) -> bool:
-    """Whether a table holds motions, and is none itself."""
+    """Whether a table holds motions and is not one itself."""
     return (
         isinstance(value, dict)
         and "kind" not in value

@@ -64,10 +64,10 @@ else:
     )
 
 REST = "rest"
-"""The word for a coordinate that is to start where the body rests."""
+"""The word for a coordinate that starts in equilibrium."""
 
 TOUCH = "touch"
-"""The word for the height at which a body's pads just touch what is under them."""
+"""The word for the height at which a body's pads just touch the bodies under them."""
 
 
 class StartTable(Group):
@@ -225,7 +225,7 @@ class RubberTable(PartTable):
 
 
 OWN = tuple(table_of(part, kind, RubberTable, nu=0.45, rho=1100.0) for kind, part in KINDS.items())
-"""Tables that hold their own numbers."""
+"""Tables of materials with numbers of their own."""
 
 
 class PresetTable(Group):
@@ -288,7 +288,7 @@ class FileTable(Group):
 
 
 OwnTable: TypeAdapter[PartTable] = TypeAdapter(one_of(*OWN))
-"""The materials that a file may hold: no further files."""
+"""Validator of the materials that a file may hold; they refer to no further files."""
 
 if TYPE_CHECKING:
     MaterialTable = PartTable
@@ -322,8 +322,7 @@ class PadTable(PartTable):
     )
 
     def mesh(self, folder: Path) -> Mesh:
-        """Finite elements; `folder` is where a file that a table names lies. Raises
-        `ValueError`."""
+        """The finite elements; `folder` is the base of relative file names. Raises `ValueError`."""
         mesh = PartTable.build(self, folder)
         mesh.check_memory()
         return mesh
@@ -372,7 +371,7 @@ class MeshTable(PadTable):
 
 
 def a_block_by_default(given: Any) -> Any:
-    """A table without a kind is a block's."""
+    """The table, of the kind "block" if it states none."""
     return (
         {"kind": "block"} | dict(given)
         if isinstance(given, Mapping) and "kind" not in given

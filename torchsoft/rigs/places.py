@@ -1,4 +1,4 @@
-"""Numbers of a rig file by name: where they stand, and the file with others in their place."""
+"""Access to fields of a rig file by dotted names."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from torchsoft.tables import Table, line
 
 
 class Place(NamedTuple):
-    """Where a name leads in a rig file: keys of its tables, the value there, and its field."""
+    """A place in a rig file: keys of its tables, the value, and its field."""
 
     keys: tuple[str | int, ...]
     value: Any
@@ -19,7 +19,7 @@ class Place(NamedTuple):
 
 def place(file: RigFile, name: str) -> Place:
     """The place of a name such as "materials.silicone.E" or "motion.lift.values.2". Raises
-    `ValueError` for one that leads nowhere."""
+    `ValueError` for an unknown name."""
     at: Any = file
     keys, left, field = list[str | int](), name.split("."), FieldInfo()
     while left:
@@ -50,7 +50,7 @@ def place(file: RigFile, name: str) -> Place:
 
 
 def replaced(file: RigFile, values: Mapping[str, Any]) -> RigFile:
-    """The rig file with other values at the places of these names. Raises `ValueError`."""
+    """A copy of the rig file with other values at these names. Raises `ValueError`."""
     tree, whole = (listed(file.model_dump(exclude_unset=some)) for some in (True, False))
     for name, value in values.items():
         *way, last = place(file, name).keys
@@ -68,7 +68,8 @@ FILES = ("file", "network")
 
 
 def files_renamed(tree: Any, name: Callable[[str], str]) -> Any:
-    """Tables of a rig file, by their names too, with other names of the files that they name."""
+    """A copy of some tables of a rig file, which may have dotted names, with every file name mapped
+    by `name`."""
     if isinstance(tree, dict):
         return {
             key: name(x)
@@ -80,7 +81,7 @@ def files_renamed(tree: Any, name: Callable[[str], str]) -> Any:
 
 
 def listed(value: Any) -> Any:
-    """Tables and lists that can be changed."""
+    """A copy with dictionaries and lists, which can be changed."""
     if isinstance(value, dict):
         return {key: listed(x) for key, x in value.items()}
     return [listed(x) for x in value] if isinstance(value, list | tuple) else value

@@ -1,5 +1,5 @@
-"""From a rig file to a folder of results: the trajectory, a summary in numbers with how it was
-made, figures and a video."""
+"""Run of a rig file into a folder of results: the trajectory, a summary in numbers, figures and a
+video."""
 
 import time
 from importlib.metadata import version
@@ -25,14 +25,14 @@ from torchsoft.solve.trajectory import Trajectory
 from torchsoft.tables import plain
 
 SNAPSHOTS = 6
-"""Pictures of the run where the file does not say when."""
+"""Default number of pictures in snapshots.png."""
 
 FLOPS = 1e10
-"""Operations a second [1/s] of products of blocks on one core of a usual machine."""
+"""Floating-point operations a second [1/s] of block products on one core of a usual machine."""
 
 
 class RunOutcome(NamedTuple):
-    """A run, as far as it went, and the cause of an early end."""
+    """A run, complete or up to its early end, and the cause of that end."""
 
     ready: BuiltRig[Rig]
     trajectory: Trajectory
@@ -40,7 +40,8 @@ class RunOutcome(NamedTuple):
 
 
 def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
-    """Simulate what a file describes. A failure and Ctrl-C end it early, with the run until then.
+    """Simulate a rig file. A failure or Ctrl-C ends the run early; the outcome then holds the run
+    so far.
 
     Raises `ValueError` for a rig that cannot be built, and `KeyboardInterrupt` before anything was
     simulated.
@@ -60,9 +61,9 @@ def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
 def run(
     file: RigFile, out: Path, *, found: list[Diagnostic] | None = None, progress: bool = False
 ) -> RunOutcome:
-    """Simulate and write everything to the folder `out`: data first, pictures only of a run that
-    was not stopped. `found` are the check's findings, for the summary. Raises `OSError` for a
-    folder that cannot be made, and as `carry_out`."""
+    """Simulate and write the results to the folder `out`: data first, pictures only of complete
+    runs. `found` are findings of the check, for the summary. Raises `OSError` for a folder that
+    cannot be made, and the errors of `carry_out`."""
     began = time.perf_counter()
     make_folder(out)
     done = carry_out(file, progress=progress)
@@ -75,7 +76,7 @@ def run(
 
 
 def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[str, Any]:
-    """The run in numbers, in SI units, and how it was made."""
+    """The run in numbers, in SI units, and its provenance."""
     run, rig = done.trajectory, done.ready.rig
     stopped = done.stopped
     why = (
@@ -94,7 +95,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             name: {
                 "largest_normal_force_N": float(force[..., 0].sum(-1).max()),
                 "normal_force_at_end_N": float(force[-1, :, 0].sum()),
-                "largest_friction_N": float(force[..., 1].sum(-1).abs().max()),
+                "largest_net_friction_N": float(force[..., 1].sum(-1).abs().max()),
                 "most_points_touching": int((force[..., 0] > 0).sum(-1).max()),
             }
             for name, force in run.force.items()
@@ -133,16 +134,16 @@ def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, flo
 
 
 def condensing_time(mesh: Mesh) -> float:
-    """Time [s] for condensing a mesh onto its surface: a factorisation in the order of the smallest
-    band, and as many solutions as surface coordinates."""
+    """Time [s] of the static condensation of a mesh to its surface: a factorisation with the
+    smallest band, and one solution for every surface coordinate."""
     surface, free, band = mesh.counts()
     width = max(2 * min(band, free // band), SMALLEST_BLOCK)
     return 2 * free * width * (4 * width + 12 * surface) / FLOPS
 
 
 def cost(file: RigFile, runs: bool) -> Cost:
-    """Cost of a check, and of a run after it. Raises `ValueError` for a mesh file that cannot be
-    read."""
+    """Cost of a check, and with `runs` of a run after it. Raises `ValueError` for a mesh file that
+    cannot be read."""
     meshes = []
     for name, table in file.pads.items():
         with at_field(f"pads.{name}"):
@@ -166,8 +167,8 @@ def cost(file: RigFile, runs: bool) -> Cost:
 
 
 def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]:
-    """Write the figures, the player and the video that a file asks for to `out`; the names of the
-    files written."""
+    """Write the figures, the player and the video of a rig file to `out`; returns the names of the
+    files."""
     # matplotlib takes half a second, which `check` does not need
     from torchsoft.plot import figures
     from torchsoft.plot.animation import animate

@@ -1,5 +1,5 @@
-"""A rig file as TOML text: every field with its unit and meaning as a comment, from the schema;
-what is left at its default is commented out."""
+"""A rig file as TOML text: every field with its unit and meaning from the schema as a comment;
+fields at their default are commented out."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -16,7 +16,7 @@ from torchsoft.tables import read_toml, toml_row
 
 
 def to_toml(file: RigFile) -> str:
-    """The text of a TOML file that `RigFile.from_toml` reads."""
+    """TOML text that `RigFile.from_toml` reads."""
     seen: set[type[Group]] = set()
     lines = [*heading(type(file)), "", *scalars(file, [], seen)]
     for name, field in type(file).model_fields.items():
@@ -33,7 +33,8 @@ def to_toml(file: RigFile) -> str:
 
 
 def save(file: RigFile, path: Path) -> None:
-    """Write the file in another folder, whole or not at all; files that it names stay theirs."""
+    """Write the file to any folder, atomically; files that it names are referred to by absolute
+    paths."""
     with replacing(path) as partial:
         partial.write_text(to_toml(located(file)), encoding="utf-8")
 
@@ -45,7 +46,7 @@ def heading(table: type[Group]) -> list[str]:
 
 
 def section(table: Group, path: str, known: list[str], seen: set[type[Group]]) -> Iterator[str]:
-    """A table under its heading, and the tables in it."""
+    """Lines of a table, its heading, and its inner tables."""
     yield f"[{path}]"
     yield from scalars(table, known, seen)
     for name, field in type(table).model_fields.items():
@@ -55,8 +56,8 @@ def section(table: Group, path: str, known: list[str], seen: set[type[Group]]) -
 
 
 def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[str]:
-    """A line for every field that is no table, with a comment; those at their default only in the
-    first table of its sort."""
+    """A line for every field that is not a table, with a comment; fields at their default only in
+    the first table of each type."""
     again = type(table) in seen
     seen.add(type(table))
     fields = type(table).model_fields
@@ -92,7 +93,7 @@ def remark(field: FieldInfo) -> str:
 
 
 def tables(annotation: Any) -> Iterator[type[Group]]:
-    """The tables that an annotation speaks of."""
+    """The table types within an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, Group):
         yield annotation
     for one in get_args(annotation):
@@ -100,7 +101,7 @@ def tables(annotation: Any) -> Iterator[type[Group]]:
 
 
 def kinds(field: FieldInfo) -> list[str]:
-    """The kinds of table that a field may be."""
+    """The kinds of table that a field accepts."""
     found = (
         one.model_fields["kind"].default
         for one in tables(field.annotation)
@@ -110,14 +111,14 @@ def kinds(field: FieldInfo) -> list[str]:
 
 
 def template(title: str) -> RigFile:
-    """A rig that is meant to be changed: a disc that is pressed between two pads and rolled."""
+    """A rig to start from: a disc pressed and rolled between two pads."""
     return RigFile.from_tree(
         read_toml(Path(__file__).with_name("template.toml")) | {"title": title}
     )
 
 
 def located(file: RigFile) -> RigFile:
-    """The same file, wherever it is written to: files that it names by whole paths."""
+    """A copy with absolute paths of the files that it names."""
     tree = file.model_dump(exclude_unset=True)
     return RigFile.model_validate(
         files_renamed(tree, lambda name: str((file.folder / name).resolve()))

@@ -103,7 +103,7 @@ class _Solutions(torch.autograd.Function):
     def backward(ctx: Any, *given: Tensor | None) -> Any:
         if (
             torch.is_grad_enabled()
-        ):  # a graph of it would lack how the cotangents depend on what ran
+        ):  # its graph would lack the dependence of the cotangents on the run
             raise GradientFailed(
                 "a run has no second derivative; ask for its gradient without create_graph"
             )
@@ -156,8 +156,8 @@ def run_adjoint(
 
 
 class _Recorded(torch.autograd.Function):
-    """A series beside the states that have a gradient: it has none, and says so when one is asked
-    for."""
+    """Series without a gradient beside states that have one: its backward raises
+    `GradientFailed`."""
 
     @staticmethod
     def forward(ctx: Any, name: str, series: Tensor, y: Tensor) -> Tensor:

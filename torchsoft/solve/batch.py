@@ -3,7 +3,7 @@ in threads."""
 
 import time as clock
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,8 +82,8 @@ class Batch(Shown):
         return f"Batch: {count} runs, {len(self.failures)} failed, {wall:.2g} s", rows
 
     def __getitem__(self, channel: str) -> Tensor:
-        """A channel (runs, T). Raises `KeyError` for one that a run has not."""
-        return self._stacked([None if run is None else run[channel] for run in self.trajectories])
+        """A channel (runs, T). Raises `KeyError` for a channel that a run does not have."""
+        return self._stacked(lambda run: run[channel])
 
     def together(self, *channels: str) -> Tensor:
         """Channels side by side (runs, T, channels)."""
@@ -98,13 +98,13 @@ class Batch(Shown):
     @property
     def t(self) -> Tensor:
         """Times [s] (runs, T)."""
-        return self._stacked([None if run is None else run.t for run in self.trajectories])
+        return self._stacked(lambda run: run.t)
 
     @property
     def y(self) -> Tensor:
         """Flat states (runs, T, size). Raises `ValueError` where the rigs have states of different
         sizes."""
-        return self._stacked([None if run is None else run.y for run in self.trajectories])
+        return self._stacked(lambda run: run.y)
 
     @property
     def sensitivities(self) -> Tensor:
@@ -114,11 +114,10 @@ class Batch(Shown):
                 "the batch was run without sensitivities; ask for them with gradient='forward' and "
                 "`wrt`"
             )
-        return self._stacked(
-            [None if run is None else run.sensitivities for run in self.trajectories]
-        )
+        return self._stacked(lambda run: run.sensitivities)
 
-    def _stacked(self, parts: Sequence[Tensor | None]) -> Tensor:
+    def _stacked(self, of: Callable[[Trajectory], Any]) -> Tensor:
+        parts = [None if run is None else of(run) for run in self.trajectories]
         shapes = {part.shape[1:] for part in parts if part is not None}
         if len(shapes) > 1:
             raise ValueError(
@@ -162,9 +161,18 @@ def simulate_batch(
         for name, values in parameters.items():
             check_array(f"parameters[{name!r}]", values)
     t, y0, dy0 = (_rows(name, x) for name, x in (("t", t), ("y0", y0), ("dy0", dy0)))
-    rigs, ts, y0s, references, every_knots, dy0s, count = _spread(
-        rig, t, parameters, y0, reference, knots, dy0
+    # a single rig is a module, single times a vector, a single start too, a single reference a
+    # module
+    runs = _spread(
+        parameters,
+        rig=(rig, isinstance(rig, nn.Module)),
+        t=(t, isinstance(t, Tensor) and t.ndim == 1),
+        y0=(y0, y0 is None or (isinstance(y0, Tensor) and y0.ndim == 1)),
+        reference=(reference, reference is None or isinstance(reference, nn.Module)),
+        knots=(knots, knots is None),
+        dy0=(dy0, dy0 is None or (isinstance(dy0, Tensor) and dy0.ndim == 2)),
     )
+    count = len(runs)
     began, threads = (
         clock.perf_counter(),
         min(count, cores() if threads is None else whole("threads", threads, 1)),
@@ -173,10 +181,8 @@ def simulate_batch(
 
     def work(i: int) -> RunOutcome | Trajectory | Exception:
         try:
-            task = prepare(
-                _own(rigs[i], parameters or {}, i), ts[i], y0=y0s[i], reference=references[i],
-                knots=every_knots[i], dy0=dy0s[i], **options,
-            )  # fmt: skip
+            own = _own(runs[i]["rig"], parameters or {}, i)
+            task = prepare(**runs[i] | {"rig": own}, **options)
             outcome = run(task, budget, explained=False)
             return outcome.trajectory() if outcome.solved.segments is None else outcome
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
@@ -202,9 +208,12 @@ def simulate_batch(
     trajectories = [one if isinstance(one, Trajectory) else None for one in results]
     for (i, outcome), rows in zip(done.items(), states):
         trajectories[i] = outcome.trajectory(rows)
-    _doubt(rigs, trajectories)
+    _doubt([one["rig"] for one in runs], trajectories)
     return Batch(
-        tuple(trajectories), failures, tuple(len(one) for one in ts), clock.perf_counter() - began
+        tuple(trajectories),
+        failures,
+        tuple(len(one["t"]) for one in runs),
+        clock.perf_counter() - began,
     )
 
 
@@ -236,15 +245,10 @@ def _rows(name: str, given: Any) -> Any:
 
 
 def _spread(
-    rig: Any,
-    t: Any,
-    parameters: Mapping[str, Tensor] | None,
-    y0: Any,
-    reference: Any,
-    knots: Any,
-    dy0: Any,
-) -> tuple[Any, Any, Any, Any, Any, Any, int]:
-    """Every argument as one entry a run, and the number of runs."""
+    parameters: Mapping[str, Tensor] | None, **shared: tuple[Any, bool]
+) -> list[dict[str, Any]]:
+    """The arguments of every run, by name, from those of all runs, each with whether it is given
+    once."""
     if parameters is not None and not isinstance(parameters, Mapping):
         raise ValueError(
             f"`parameters` must give tensors by name, but is {type(parameters).__name__}"
@@ -254,16 +258,6 @@ def _spread(
             raise ValueError(
                 f"`parameters[{name!r}]` must have one entry a run, but is a single number"
             )
-    # a single rig is a module, single times a vector, a single start too, a single reference a
-    # module
-    shared = {
-        "rig": (rig, isinstance(rig, nn.Module)),
-        "t": (t, isinstance(t, Tensor) and t.ndim == 1),
-        "y0": (y0, y0 is None or (isinstance(y0, Tensor) and y0.ndim == 1)),
-        "reference": (reference, reference is None or isinstance(reference, nn.Module)),
-        "knots": (knots, knots is None),
-        "dy0": (dy0, dy0 is None or (isinstance(dy0, Tensor) and dy0.ndim == 2)),
-    }
     counts = {name: len(given) for name, (given, single) in shared.items() if not single}
     counts |= {name: len(values) for name, values in (parameters or {}).items()}
     if not counts:
@@ -277,10 +271,10 @@ def _spread(
             "every argument must have one entry a run, and one run at least, but there are: "
             f"{listed}"
         )
-    count = next(iter(counts.values()))
-    entries = [[given] * count if single else list(given) for given, single in shared.values()]
-    rigs, ts, y0s, references, every_knots, dy0s = entries
-    return rigs, ts, y0s, references, every_knots, dy0s, count
+    return [
+        {name: given if single else given[i] for name, (given, single) in shared.items()}
+        for i in range(next(iter(counts.values())))
+    ]
 
 
 def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> Rig:

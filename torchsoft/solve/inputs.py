@@ -49,7 +49,7 @@ def freed(node: Any) -> bool:
 
 
 def shared(y0: Tensor) -> Tensor:
-    """A start as a run takes it: one that was computed explains a second backward pass."""
+    """Start of a run, whose backward explains a second pass through a graph that is freed."""
     if y0.grad_fn is None or not torch.is_grad_enabled():
         return y0
     return _Start.apply(y0, y0.grad_fn)  # pyright: ignore[reportReturnType]

@@ -1,8 +1,8 @@
 """A rig's laws as compiled code: each is compiled once for all models that have it, for any values
 of their parameters.
 
-Laws of this package are known by their structure. Somebody's own code is run once more for every
-run, since nothing else tells whether a number that it reads has changed since.
+Laws of this package are identified by their structure. User code is traced again for every run,
+since nothing else shows whether a number that it reads has changed.
 """
 
 import threading
@@ -65,7 +65,7 @@ class _Called(nn.Module):
 
 def structure(module: object) -> Any:
     """Structure of a module's law, apart from its parameters' values, hashable: two modules of one
-    structure have one law. None where that cannot be told: code that is neither this package's nor
+    structure have one law. None where that is not known: code that is neither this package's nor
     torch's, hooks, other attributes than numbers, text and functions of this package."""
     if isinstance(module, nn.Module) and type(module).__module__.startswith(
         ("torchsoft.", "torch.nn.")
@@ -146,9 +146,7 @@ def compiled_law(
                 differentiated,
             )
 
-        if (
-            not known
-        ):  # what somebody's own code does is known from running it only, and may change any time
+        if not known:  # user code is known by a trace only, and may change any time
             key = expressions()
             if key in _laws:
                 check_backward(law, example, names)
@@ -189,7 +187,7 @@ def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]
         return compiled_law(parameters, _effort, actuator.inputs, 1, actuator.inputs, law=actuator)
     except UnknownOperation as error:
         raise UnknownOperation(f"`actuators.{name}`: {error}") from error
-    except Exception as error:  # whatever somebody's own code raises
+    except Exception as error:  # any error of user code
         raise TypeError(
             f"the law of `actuators.{name}` must take five tensors (set-point, its rate, "
             "feed-forward, coordinate, its rate) and return the effort, a tensor of a "

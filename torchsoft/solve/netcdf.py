@@ -2,6 +2,7 @@
 the names that it has there."""
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,27 +28,25 @@ MESH = {
 
 PARTS = ("channels", "energy", "dissipated", "supplied")
 
-Column = tuple[tuple[str, ...], Any, str, str]
-"""Dimensions, values, unit and meaning."""
+Add = Callable[[str, Sequence[str], Any, str, str], None]
+"""Adds an array: name, dimensions, values, unit and meaning."""
 
 
 def to_xarray(run: Trajectory) -> xr.Dataset:
     """Raises `ValueError` where a channel has the name of another array."""
-    columns = [*recorded(run), *built(run.setup)]
-    names = [name for name, _ in columns]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(
-            f"the channel `{min(twice)}` has the name of another array of the file; give the "
-            "body, signal or actuator another name"
-        )
-    data = {
-        name: (
-            dims,
-            values.detach().numpy() if isinstance(values, Tensor) else values,
-            {"units": unit, "long_name": meaning},
-        )
-        for name, (dims, values, unit, meaning) in columns
-    }
+    data = {}
+
+    def add(name: str, dims: Sequence[str], values: Any, unit: str, meaning: str) -> None:
+        if name in data:
+            raise ValueError(
+                f"the channel `{name}` has the name of another array of the file; give the "
+                "body, signal or actuator another name"
+            )
+        values = values.detach().numpy() if isinstance(values, Tensor) else values
+        data[name] = dims, values, {"units": unit, "long_name": meaning}
+
+    add_results(run, add)
+    add_setup(run.setup, add)
     coords = {
         "time": ("time", run.t.detach().numpy(), {"units": "s", "long_name": "time"}),
         "axis": ["x", "y"], "coordinate": list(COORDINATES), "body": list(run.state.pose),
@@ -61,81 +60,73 @@ def to_xarray(run: Trajectory) -> xr.Dataset:
     return xr.Dataset(data, coords, {name: json.dumps(value) for name, value in about.items()})
 
 
-def recorded(run: Trajectory) -> list[tuple[str, Column]]:
-    """Results of the run, by name."""
+def add_results(run: Trajectory, add: Add) -> None:
+    """Results of the run."""
     time = ("time",)
-    out: list[tuple[str, Column]] = []
     for name, value in run.channels.items():
         known = CHANNELS.get(name)
         unit = run.units.get(name, known.unit if known else "")
         meaning = known.meaning if known and known.unit == unit else f"channel {name}"
-        out.append((name, (time, value, unit, meaning)))
+        add(name, time, value, unit, meaning)
     for key, force in run.force.items():
         points = ("time", f"{key}_point")
         for i, kind in enumerate(("normal", "friction")):
             meaning = f"{kind} force on the pad at the contact {key}"
-            out.append((f"{kind}_force_{key}", (points, force[..., i], "N", meaning)))
-        stretch = run.state.stretch[key]
-        out.append((f"stretch_{key}", (points, stretch, "m", "stretch of the momentary springs")))
-        state = run.contact_state[key]
+            add(f"{kind}_force_{key}", points, force[..., i], "N", meaning)
+        meaning = "stretch of the momentary springs"
+        add(f"stretch_{key}", points, run.state.stretch[key], "m", meaning)
         meaning = "0 separated, 1 sticking, 2 slipping; -1 not known"
-        out.append((f"contact_state_{key}", (points, state, "1", meaning)))
+        add(f"contact_state_{key}", points, run.contact_state[key], "1", meaning)
     for key, u in run.displacement.items():
         nodes = (f"{key}_node", "axis")
         meaning = f"displacements of the nodes of the pad {key}, in its base's frame"
-        out.append((f"displacement_{key}", (("time", *nodes), u, "m", meaning)))
+        add(f"displacement_{key}", ("time", *nodes), u, "m", meaning)
         if key in run.state.rates:
             meaning = f"velocities of the nodes of the pad {key}"
-            values = run.state.rates[key]
-            out.append((f"velocity_{key}", (("time", *nodes), values, "m/s", meaning)))
+            add(f"velocity_{key}", ("time", *nodes), run.state.rates[key], "m/s", meaning)
         else:
             meaning = f"nodal forces of the pad {key} that have set in, by retardation time"
             where = ("time", f"{key}_branch", *nodes)
-            out.append((f"nodal_force_{key}", (where, run.state.pads[key], "N", meaning)))
+            add(f"nodal_force_{key}", where, run.state.pads[key], "N", meaning)
     bodies = ("time", "body", "coordinate")
     for name, values, unit, meaning in (
         ("pose", run.state.pose, "m, m, rad", "x, y and theta of the bodies"),
         ("velocity", run.state.velocity, "m/s, m/s, rad/s", "their rates"),
         ("loads", run.loads, "N, N, N.m", "forces and moment of contacts and pads on the bodies"),
     ):
-        out.append((name, (bodies, torch.stack(list(values.values()), 1), unit, meaning)))
-    out.append(("injected", (time, run.injected, "J", "positive part of the sources' work")))
-    residual = run.energy_residual
-    out.append(("energy_residual", (time, residual, "J", "stored - supplied + dissipated")))
+        add(name, bodies, torch.stack(list(values.values()), 1), unit, meaning)
+    add("injected", time, run.injected, "J", "positive part of the sources' work")
+    add("energy_residual", time, run.energy_residual, "J", "stored - supplied + dissipated")
     for kind in PARTS[1:]:
         for name, value in getattr(run, kind).items():
-            out.append((f"{kind}_{name}", (time, value, "J", f"{kind}: {name}")))
-    out.append(("knots", (("knot",), run.knots, "s", "where the steps began and ended")))
+            add(f"{kind}_{name}", time, value, "J", f"{kind}: {name}")
+    add("knots", ("knot",), run.knots, "s", "where the steps began and ended")
     if run.sensitivities is not None:
-        dims = ("time", "component", "unknown")
         meaning = "derivatives of the state's last components by the unknowns"
-        out.append(("sensitivities", (dims, run.sensitivities, "", meaning)))
+        add("sensitivities", ("time", "component", "unknown"), run.sensitivities, "", meaning)
     for name, value in run.touch_sensitivities.items():
         meaning = f"derivatives of the channel {name} by the unknowns"
-        out.append((f"sensitivities_{name}", (("time", "unknown"), value, "", meaning)))
-    return out
+        add(f"sensitivities_{name}", ("time", "unknown"), value, "", meaning)
 
 
-def built(setup: Setup) -> list[tuple[str, Column]]:
+def add_setup(setup: Setup, add: Add) -> None:
     """Meshes and outlines."""
-    out: list[tuple[str, Column]] = []
     for name, pad in setup.pads.items():
         own = {"nodes": "mesh_node", "bonded": "mesh_node", "elements": "element", "face": "face"}
         for part, (more, unit, meaning) in MESH.items():
             values = np.asarray(getattr(pad.mesh, part))
             values = values.astype(np.int8 if values.dtype == bool else values.dtype)
             dims = (f"{name}_{own[part]}", *more)
-            out.append((f"mesh_{part}_{name}", (dims, values, unit, meaning.format(name))))
+            add(f"mesh_{part}_{name}", dims, values, unit, meaning.format(name))
     for name, body in setup.bodies.items():
         if body.outline is not None:
             dims = (f"{name}_outline", "axis")
             meaning = f"outline of {name} about its centre"
-            out.append((f"outline_{name}", (dims, body.outline, "m", meaning)))
-    return out
+            add(f"outline_{name}", dims, body.outline, "m", meaning)
 
 
 def from_xarray(data: xr.Dataset, source: str = "the dataset") -> Trajectory:
-    """The run of `to_xarray`. Raises `ValueError` naming what is missing."""
+    """The run of `to_xarray`. Raises `ValueError` naming a missing array."""
     about = {}
     for name, value in data.attrs.items():
         try:

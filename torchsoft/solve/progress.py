@@ -62,8 +62,8 @@ class Segment:
 
 
 class Integrals:
-    """Names of the running integrals [J]: dissipated by, supplied by, and the positive part of what
-    the sources supply."""
+    """Names of the running integrals [J]: energies dissipated and supplied by element, and the
+    positive part of the sources' work."""
 
     def __init__(self, rig: Rig) -> None:
         self.dissipated = (*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip")
@@ -79,8 +79,8 @@ class Integrals:
 
 
 @dataclass
-class Marching:
-    """A run on its way: the state, Newton's scratch, the last step, the integrals, and where its
+class RunState:
+    """A run in progress: the state, Newton's scratch, the last step, the integrals, and where its
     results go."""
 
     y: Array

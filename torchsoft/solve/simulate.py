@@ -33,17 +33,12 @@ from torchsoft.solve.trajectory import Stats, Trajectory, channels, units
 from torchsoft.threads import one_torch_thread
 
 Route = Literal["none", "discrete", "forward"]
-"""Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch
-steps; torchdiffeq's own."""
-
+"""Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`."""
 
 VERSION = version("torchsoft")
 
 RTOL = 1e-5
 """Relative tolerance where nothing else is asked for."""
-
-STEP = 2e-3
-"""Step [s] of the routes in plain torch where no other is given."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -299,11 +294,6 @@ def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> Sim
     return out
 
 
-def made_by(rig: Rig, method: str) -> dict[str, object]:
-    """Version, method, and the numbers and laws that ran."""
-    return {"torchsoft": VERSION, "method": method, **rig.description()}
-
-
 def gather(
     task: Task, rows: Rows, out: Progress, wall: float,
     slopes: tuple[Tensor, Tensor] | None = None,
@@ -314,7 +304,7 @@ def gather(
     rig, names, t = stepper.rig, stepper.integrals, task.t[:count]
     y, felt = (part[:count] for part in rows)
     integrals = dict(zip(names.names, torch.from_numpy(out.integrals[:count]).unbind(-1)))
-    sizes = [2 * len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values()]
+    sizes = [2 * count for count in rig.point_counts.values()]
     with torch.set_grad_enabled(y.requires_grad), independent():
         *forces, wrenches, loads = felt.split(
             [*sizes, 3 * len(rig.pads), 3 * len(rig.bodies) + 3], -1
@@ -338,7 +328,8 @@ def gather(
         injected=integrals["injected"],
         stats=Stats(out.steps, out.solves, out.failed, out.refused, wall),
         knots=torch.from_numpy(out.knots), layout=rig.layout, touch=touch,
-        made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=task.wrt,
+        made_by={"torchsoft": VERSION, "method": METHOD, **rig.description(), "steps": steps},
+        wrt=task.wrt,
         sensitivities=None if slopes is None else slopes[0][:count],
         touch_sensitivities={}
         if slopes is None

@@ -44,7 +44,7 @@ from torchsoft.solve.kernel.arrays import (
 )
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.progress import Integrals, Marching, Progress, Segment, SimulationFailed
+from torchsoft.solve.progress import Integrals, Progress, RunState, Segment, SimulationFailed
 from torchsoft.solve.system import Compiled
 from torchsoft.solve.tolerances import Followed, error_parts, part_name
 from torchsoft.threads import others_turn
@@ -135,22 +135,38 @@ class ImplicitStepper:
         return other
 
     def _call(
-        self, s: Any, now: "Marching", outputs: Any, tape: Any, *, given: bool = True,
-        follow: Any = NO_SIGNALS, errors: Any = NO_ERRORS, k: Array = NONE, clock: Array = START,
-        stops: Array = NONE, times: Array = NONE, row: int = 0, rung: float = 0.0,
-        starts: Array = NONE, h: Array = NONE, signals: Array,
-    ) -> list[int]:  # fmt: skip
-        """One call of the compiled run; its counts."""
-        counts = np.zeros(7, np.int64)
+        self, s: Any, now: "RunState", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
+        *, taping: bool, given: bool = True, follow: Any = NO_SIGNALS, errors: Any = NO_ERRORS,
+        k: Array = NONE, clock: Array = START, stops: Array = NONE, times: Array = NONE,
+        row: int = 0, rung: float = 0.0,
+    ) -> tuple[list[int], tuple[Any, Any] | None]:  # fmt: skip
+        """One call of the compiled run, whose outputs go to `rows`: its counts, and the tapes of
+        its stages and outputs with `taping`."""
+        counts, steps, out = np.zeros(7, np.int64), len(plan.h), now.out
+        # look for near points afresh, so that a segment made again has the same bits
+        now.work.travelled[0] = np.inf
+        now.work.low[:] = now.work.high[:] = 0
+        y = out.y[rows]
+        tape, out_tape = (
+            room("Tape", self.still, self.layout.size, stages=n, cap=self._cap)
+            for n in ((2 * steps, len(y) if now.outputs_too else 0) if taping else (0, 0))
+        )
+        if taping and now.outputs_too:
+            out_tape = out_tape._replace(y=y)
+        outputs = Outputs(
+            plan.out_step, plan.out_part, at_outputs, y, out.integrals[rows], out.recorded[rows],
+            out_tape,
+        )  # fmt: skip
         limits = Limits(self.tolerance, self.max_iterations, self.window)
         run = Run(
             s, self.still, now.work, now.step, follow, errors, limits, outputs, tape, given,
             now.y, k, clock, stops, times, row, rung, self.rtol, self.longest, SHORTEST,
-            now.integrals, starts, h, signals, counts,
+            now.integrals, plan.starts, plan.h, signals.reshape(steps, 2, *signals.shape[1:]),
+            counts,
         )  # fmt: skip
         with others_turn():
             call("run", run)
-        return counts.tolist()
+        return counts.tolist(), (tape, out_tape) if taping else None
 
     @property
     def signals_at_start(self) -> Tensor:
@@ -194,7 +210,7 @@ class ImplicitStepper:
         step = room("Step", s, self.layout.size, integrals=len(names))
         y, integrals = y0.numpy().copy(), np.zeros(len(names))
         set_velocities(s, work, y)
-        state = Marching(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
+        state = RunState(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
         self._start(t[0], state)
         set_velocities(s, work, y)
         yield from (
@@ -203,7 +219,7 @@ class ImplicitStepper:
             else self._as_given(t, state)
         )
 
-    def _as_given(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
+    def _as_given(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take the steps of a plan."""
         todo = list(
             given_steps(t, self.knots)
@@ -260,7 +276,7 @@ class ImplicitStepper:
             elif status != CONVERGED:
                 raise self._failure(status, float(plan.starts[steps]), float(plan.h[steps]))
 
-    def _by_tolerance(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
+    def _by_tolerance(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
         times, out = t.numpy(), now.out
         followed = Followed(
@@ -275,30 +291,23 @@ class ImplicitStepper:
         while out.rows < len(t):
             if self.compiled.inertial:
                 rung = 2.0 ** math.floor(math.log2(min(clock[1], self.longest)))
-            s = self.compiled.system(rung or 1.0)
-            starts, h = np.zeros(CHUNK), np.zeros(CHUNK)
-            signals, at_rows = np.zeros((CHUNK, 2, count, 2)), np.zeros((len(t), count, 2))
+            plan = Plan(np.zeros(CHUNK), np.zeros(CHUNK), row_step, row_part)
+            flat, at_rows = np.zeros((2 * CHUNK, count, 2)), np.zeros((len(t), count, 2))
             before = now.copy()
-            tapes = self._empty_tapes(2 * CHUNK, out.y, now) if now.taping else None
-            now.work.travelled[0] = np.inf
-            now.work.low[:] = now.work.high[:] = 0
-            tape, out_tape = tapes or self._no_tapes
-            outputs = Outputs(
-                row_step, row_part, at_rows, out.y, out.integrals, out.recorded, out_tape
-            )
-            steps, done, status, solves, refused, failed, which = self._call(
-                s, now, outputs, tape, given=False, follow=followed.arrays, errors=errors, k=k,
-                clock=clock, stops=stops, times=times, row=out.rows, rung=rung, starts=starts, h=h,
-                signals=signals,
+            (steps, done, status, solves, refused, failed, which), tapes = self._call(
+                self.compiled.system(rung or 1.0), now, plan, flat, at_rows, slice(None),
+                taping=now.taping, given=False, follow=followed.arrays, errors=errors, k=k,
+                clock=clock, stops=stops, times=times, row=out.rows, rung=rung,
             )  # fmt: skip
             if followed.error is not None:
                 raise followed.error
             here = slice(out.rows, out.rows + done)
-            plan = Plan(starts[:steps], h[:steps], row_step[here].copy(), row_part[here].copy())
-            flat = signals[:steps].reshape(2 * steps, count, 2)
+            plan = Plan(
+                plan.starts[:steps], plan.h[:steps], row_step[here].copy(), row_part[here].copy()
+            )
             if tapes is not None:
-                tapes = tape, Tape(*(part[here] for part in out_tape))
-            now.keep(plan, flat, at_rows[here], before, here, tapes)
+                tapes = tapes[0], Tape(*(part[here] for part in tapes[1]))
+            now.keep(plan, flat[: 2 * steps], at_rows[here], before, here, tapes)
             out.rows, out.steps, out.solves = here.stop, out.steps + steps, out.solves + solves
             out.refused, out.failed = out.refused + refused, out.failed + failed
             yield out
@@ -308,7 +317,7 @@ class ImplicitStepper:
                 worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
                 raise self._failure(status, float(clock[0]), float(clock[1]), worst)
 
-    def _start(self, time: Tensor, now: "Marching") -> None:
+    def _start(self, time: Tensor, now: "RunState") -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
         `SimulationFailed`."""
         signals = self.compiled.signals(time[None], self.reference).numpy()
@@ -353,7 +362,7 @@ class ImplicitStepper:
         s, n = self.system(segment), len(segment.plan.out_step)
         work, names = room("Work", s, self.layout.size, columns=1), len(self.integrals.names)
         work.V[:], work.u_dot[:] = segment.V, segment.u_dot
-        again = Marching(
+        again = RunState(
             segment.y.copy(),
             work,
             room("Step", s, self.layout.size, integrals=names),
@@ -368,47 +377,18 @@ class ImplicitStepper:
         assert tapes is not None
         return tapes
 
-    @property
-    def _no_tapes(self) -> tuple[Any, Any]:
-        none = room("Tape", self.still, self.layout.size, stages=0, cap=0)
-        return none, none
-
-    def _empty_tapes(self, stages: int, y: Array, now: Marching) -> tuple[Any, Any]:
-        """Tapes of so many stages and of the outputs whose states go to y (outputs, size)."""
-        tape, outputs = (
-            room("Tape", self.still, self.layout.size, stages=n, cap=self._cap)
-            for n in (stages, len(y) if now.outputs_too else 0)
-        )
-        return tape, outputs._replace(y=y) if now.outputs_too else outputs
-
     def _run(
-        self,
-        plan: Plan,
-        signals: Array,
-        at_outputs: Array,
-        now: "Marching",
-        rows: slice,
+        self, plan: Plan, signals: Array, at_outputs: Array, now: "RunState", rows: slice,
         taping: bool,
-    ) -> tuple[int, int, int, int, tuple[Any, Any] | None]:
-        """One compiled call; with `taping` once more with longer tapes if more points touch than
-        they have room for."""
-        steps, before = len(plan.h), now.copy()
-        s = self.compiled.system(float(plan.h[0])) if steps else self.still
+    ) -> tuple[int, int, int, int, tuple[Any, Any] | None]:  # fmt: skip
+        """One compiled call of given steps; with `taping` once more with longer tapes if more
+        points touch than they have room for."""
+        before = now.copy()
+        s = self.compiled.system(float(plan.h[0])) if len(plan.h) else self.still
         while True:
-            now.work.travelled[0] = (
-                np.inf
-            )  # look for near points afresh, so that a segment made again has the same bits
-            now.work.low[:] = now.work.high[:] = 0
-            tapes = self._empty_tapes(2 * steps, now.out.y[rows], now) if taping else None
-            tape, out_tape = tapes or self._no_tapes
-            outputs = Outputs(
-                plan.out_step, plan.out_part, at_outputs,
-                now.out.y[rows], now.out.integrals[rows], now.out.recorded[rows], out_tape,
-            )  # fmt: skip
-            done, rows_done, status, solves, *_ = self._call(
-                s, now, outputs, tape, starts=plan.starts, h=plan.h,
-                signals=signals.reshape(steps, 2, *signals.shape[1:]),
-            )  # fmt: skip
+            (done, rows_done, status, solves, *_), tapes = self._call(
+                s, now, plan, signals, at_outputs, rows, taping=taping
+            )
             if status != TAPE_FULL:
                 return done, rows_done, status, solves, tapes
             self._cap *= 2

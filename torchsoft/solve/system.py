@@ -16,11 +16,14 @@ import torch
 from scipy import linalg, sparse
 from torch import Tensor
 
-from torchsoft.physics.contact import Friction
-from torchsoft.physics.mesh import banded
+from torchsoft.codegen import Law
+from torchsoft.physics.contact import Friction, SoftContact
+from torchsoft.physics.mesh import banded, dofs_of, unit_loads
 from torchsoft.physics.motion import Reference
+from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import Shape
 from torchsoft.physics.validity import (
     check_array,
     check_groups,
@@ -39,11 +42,11 @@ from torchsoft.solve.kernel.arrays import (
     Points,
     system,
 )
-from torchsoft.solve.kernel.table import Index
+from torchsoft.solve.kernel.table import Index, layout
 from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
 
 NOMINAL = 1e-3
-"""Stage length a h [s] with which slip laws of one's own are tried."""
+"""Stage length a h [s] at which slip laws of users are tried."""
 
 
 @contextmanager
@@ -71,9 +74,7 @@ class Compiled:
         self._known: dict[tuple[int, int], LawSet] = {}
         self._count = 0
         self._systems: dict[float, Any] = {}
-        gravity_at = self._add(rig.gravity)
-        mass_at = [[self._add(mass) for mass in body.masses] for body in rig.bodies.values()]
-        self._bodies = self._make_bodies(gravity_at, mass_at)
+        self._bodies = self._make_bodies()
         self._pads, self._inertia = self._make_pads()
         self._actuators = self._make_actuators()
         self._contacts, self._points = self._make_contacts()
@@ -94,39 +95,30 @@ class Compiled:
 
     def _add_all(self, parameters: Mapping[str, Tensor]) -> int:
         """Append the parameters of a law."""
-        return self._add(
-            torch.cat(
-                [torch.zeros(0).double(), *(value.reshape(-1) for value in parameters.values())]
-            )
-        )
+        values = [value.reshape(-1) for value in parameters.values()]
+        return self._add(torch.cat([torch.zeros(0).double(), *values]))
 
-    def _make_bodies(self, gravity_at: int, mass_at: list[list[int]]) -> Bodies:
-        rig, free, signal, coordinate, masses, weight = self.rig, [], [], [], [], []
-        fixed = len(rig.signals)
-        for b, (name, body) in enumerate(rig.bodies.items()):
-            for i, axis in enumerate(COORDINATES):
-                kind = body.freedom[axis]
-                free.append(len(coordinate) if kind == "free" else -1)
-                signal.append(
-                    rig.signals.index(f"{name}.{axis}")
-                    if kind == "driven"
-                    else fixed
-                    if kind == "fixed"
-                    else -1
-                )
-                fixed += kind == "fixed"
-                if kind == "free":
-                    coordinate.append(3 * b + i)
-                    masses.append(mass_at[b][i])
-                    weight.append(float(axis == "y" and body.weighted))
-        slices = self.layout.slices
-        starts = [
-            min((s.start for (part, _), s in slices.items() if part == kind), default=0)
-            for kind in ("pose", "velocity")
-        ]
-        return Bodies(
-            _ints([*free, -1, -1, -1]), _ints([*signal, -1, -1, -1]), _ints(coordinate),
-            _ints(masses), np.array(weight), gravity_at, *starts,
+    def _start(self, part: str) -> int:
+        """Where a part of the state begins."""
+        return min((s.start for (of, _), s in self.layout.slices.items() if of == part), default=0)
+
+    def _make_bodies(self) -> Bodies:
+        rig = self.rig
+        places = [(name, axis) for name in rig.bodies for axis in COORDINATES]
+        kinds = np.array([rig.bodies[name].freedom[axis] for name, axis in places] + 3 * ["ground"])
+        free, fixed, driven = (kinds == kind for kind in ("free", "fixed", "driven"))
+        signal = np.full(len(kinds), -1)
+        signal[fixed] = len(rig.signals) + np.arange(fixed.sum())
+        for c in np.flatnonzero(driven):
+            signal[c] = rig.signals.index(".".join(places[c]))
+        masses = [self._add(mass) for body in rig.bodies.values() for mass in body.masses]
+        weighted = [rig.bodies[name].weighted and axis == "y" for name, axis in places]
+        coordinate = np.flatnonzero(free)
+        return filled(
+            Bodies, free=np.where(free, free.cumsum() - 1, -1), signal=signal,
+            coordinate=coordinate, mass_at=np.array(masses)[coordinate],
+            weight=np.array(weighted)[coordinate], gravity_at=self._add(rig.gravity),
+            q_start=self._start("pose"), V_start=self._start("velocity"),
         )  # fmt: skip
 
     @property
@@ -137,18 +129,13 @@ class Compiled:
     @property
     def signal_count(self) -> int:
         """How many signals the kernels follow, fixed coordinates included."""
-        return len(self.rig.signals) + sum(len(body.fixed) for body in self.rig.bodies.values())
+        return len(self.rig.signals) + len(self.rig.fixed_values)
 
     @independent()
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
         """The signals that the kernels follow, fixed coordinates last: values and rates (...,
         signals, 2)."""
-        fixed = [
-            body.fixed[axis]
-            for body in self.rig.bodies.values()
-            for axis in COORDINATES
-            if axis in body.fixed
-        ]
+        fixed = self.rig.fixed_values
         followed = self.rig.follow(t, reference)
         if not bool(torch.isfinite(followed).all()):
             bad = torch.nonzero(~torch.isfinite(followed))[0].tolist()
@@ -170,77 +157,49 @@ class Compiled:
         return torch.cat((followed, held.expand(*t.shape, -1, -1)), -2)
 
     def _make_pads(self) -> tuple[Pads, Inertia]:
-        rig, slices = self.rig, self.layout.slices
-        rows: dict[str, list[Any]] = {name: [] for name in Pads._fields}
-        node_start, C_start, dofs, material_at = [0], [0], [0], []
-        contact_pads = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
-        columns = np.full((len(rig.pads), len(self._bodies.coordinate)), -1, np.int64)
-        for number, (name, pad) in enumerate(rig.pads.items()):
-            material, n = pad.material, len(pad.mesh.surface)
-            fractions, times = pad.chain()
-            rows["base"].append(
-                3 * (len(rig.bodies) if pad.base is None else list(rig.bodies).index(pad.base))
-            )
-            rows["branches"].append(len(fractions))
-            rows["chain_at"].append(self._add(fractions))
-            self._add(times)
-            if pad.inertial:
-                lame_lambda, lame_mu = pad.lame()
-                density = material.rho * material.depth
-                material_at.append(
-                    self._add(
-                        torch.stack(
-                            (
-                                material.depth * lame_lambda,
-                                material.depth * lame_mu,
-                                times[0],
-                                density,
-                            )
-                        )
-                    )
-                )
-            else:
-                material_at.append(
-                    self._add(torch.stack((1 / (pad.E * material.depth), material.nu)))
-                )
-            rows["y_start"].append(slices["pads", name].start)
-            rows["v_start"].append(slices["rates", name].start if pad.inertial else -1)
-            node_start.append(node_start[-1] + n)
-            C_start.append(C_start[-1] + 4 * n * n)
-            dofs.append(dofs[-1] + (2 * pad.nodes if pad.inertial else 0))
-            involved = {
-                3 * list(rig.bodies).index(c.body) for c in rig.contacts.values() if c.pad == name
-            } | {rows["base"][-1]}
-            mine = [i for i, c in enumerate(self._bodies.coordinate) if c // 3 * 3 in involved]
-            columns[number, mine] = np.arange(len(mine))
-        points = np.cumsum(
-            [0, *(len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values())]
-        )
-        point_start = points[np.searchsorted(contact_pads, np.arange(len(rig.pads) + 1))]
-        C, dC, reach = np.zeros(C_start[-1]), np.zeros(C_start[-1]), []
-        for i, pad in enumerate(rig.pads.values()):
-            if pad.inertial:
-                reach.append(0.0)
-                continue
-            with torch.no_grad():
-                unit, by_nu = pad.unit_compliance()
-                C[C_start[i] : C_start[i + 1]] = unit.numpy().ravel()
-                dC[C_start[i] : C_start[i + 1]] = by_nu.numpy().ravel()
-            reach.append(1.5 * np.abs(C[C_start[i] : C_start[i + 1]]).max())
-        pads = Pads(
-            _ints(rows["base"]), _ints(node_start), _ints(point_start), _ints(rows["y_start"]),
-            _ints(rows["v_start"]), _ints(rows["chain_at"]), _ints(rows["branches"]),
-            _ints(C_start), C, dC, np.array(reach), columns, (columns >= 0).sum(1),
+        rig, slices, bodies = self.rig, self.layout.slices, list(self.rig.bodies)
+        pads, sizes = rig.pads.values(), [len(pad.mesh.surface) for pad in rig.pads.values()]
+        base = [3 * (len(bodies) if pad.base is None else bodies.index(pad.base)) for pad in pads]
+        chains = [pad.chain() for pad in pads]
+        branches = np.array([len(fractions) for fractions, _ in chains], np.int64)
+        chain_at = [self._add(torch.cat((*chain, moduli(pad)))) for chain, pad in zip(chains, pads)]
+        columns = np.full((len(pads), len(self._bodies.coordinate)), -1, np.int64)
+        for number, name in enumerate(rig.pads):
+            touched = (3 * bodies.index(rig.contacts[key].body) for key in rig.contacts_of(name))
+            mine = np.isin(self._bodies.coordinate // 3 * 3, [base[number], *touched])
+            columns[number, mine] = np.arange(mine.sum())
+        ends = np.cumsum([0, *rig.point_counts.values()])
+        owners = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
+        none = torch.zeros(0, dtype=torch.float64)
+        units = [
+            (none.new_zeros(4 * n * n),) * 2 if pad.inertial else pad.unit_compliance()
+            for n, pad in zip(sizes, pads)
+        ]
+        C, dC = (torch.cat([none, *(unit[k].flatten() for unit in units)]) for k in (0, 1))
+        made = filled(
+            Pads, base=base, node_start=np.cumsum([0, *sizes]),
+            point_start=ends[np.searchsorted(owners, np.arange(len(pads) + 1))],
+            y_start=[slices["pads", name].start for name in rig.pads],
+            v_start=[
+                slices["rates", name].start if pad.inertial else -1
+                for name, pad in rig.pads.items()
+            ],
+            chain_at=chain_at, branches=branches,
+            C_start=np.cumsum([0, *(4 * n * n for n in sizes)]), C=C, dC=dC,
+            reach=[1.5 * unit.abs().max() for unit, _ in units], column=columns,
+            columns=(columns >= 0).sum(1),
         )  # fmt: skip
-        return pads, self._make_inertia(dofs, node_start, material_at)
+        return made, self._make_inertia(made.node_start, made.chain_at + 2 * branches)
 
-    def _make_inertia(
-        self, dofs: list[int], node_start: list[int], material_at: list[int]
-    ) -> Inertia:
-        total = dofs[-1]
-        X, area, D = np.zeros(total), np.zeros(total), np.zeros((total, 2))
+    def _make_inertia(self, node_start: Index, material_at: Index) -> Inertia:
         moving = {i: pad for i, pad in enumerate(self.rig.pads.values()) if pad.inertial}
-        both = {i: [pad.stiffness(modulus) for modulus in range(2)] for i, pad in moving.items()}
+        dofs = np.zeros(len(material_at) + 1, np.int64)
+        for i, pad in moving.items():
+            dofs[i + 1] = 2 * pad.nodes
+        dofs = dofs.cumsum()
+        total = dofs[-1]
+        X, area = np.zeros(total), np.zeros(total)
+        both = {i: [pad.stiffness(1, 0), pad.stiffness(0, 1)] for i, pad in moving.items()}
         patterns = {
             i: sparse.csr_array(abs(K_lambda) + abs(K_mu)) for i, (K_lambda, K_mu) in both.items()
         }
@@ -249,122 +208,105 @@ class Compiled:
         widest = max(
             (pattern.count_nonzero(axis=1).max() for pattern in patterns.values()), default=0
         )
-        surface, column = (
-            np.zeros(2 * node_start[-1], np.int64),
-            np.zeros((total, widest), np.int64),
-        )
-        K = [np.zeros((total, widest)) for _ in range(2)]
+        surface = np.zeros(2 * node_start[-1], np.int64)
+        column, *K = (np.zeros((total, widest)) for _ in range(3))
         for i, pad in moving.items():
             here = slice(dofs[i], dofs[i + 1])
             X[here], area[here] = pad.positions.numpy().ravel(), np.repeat(pad.mesh.nodal_areas, 2)
-            own = 2 * pad.surface.numpy()[:, None] + np.arange(2)
-            surface[2 * node_start[i] : 2 * node_start[i + 1]] = own.ravel()
+            surface[2 * node_start[i] : 2 * node_start[i + 1]] = dofs_of(pad.surface.numpy())
             stiffness, pattern = both[i], patterns[i]
             row = np.repeat(np.arange(here.stop - here.start), np.diff(pattern.indptr))
             at = dofs[i] + row, np.arange(len(row)) - pattern.indptr[row]
             column[at] = pattern.indices
             for k in range(2):
                 K[k][at] = stiffness[k][row, pattern.indices]
-        make: Any = Inertia
-        return make(
-            _ints(dofs), surface, np.zeros((1, total)), np.ones(len(dofs) - 1, np.int64), X, area,
-            column, *K, D, np.zeros((len(dofs) - 1, 2, 2)), _ints(material_at),
+        return filled(
+            Inertia, dof_start=dofs, surface=surface, factor=np.zeros((1, total)),
+            band=np.ones(len(material_at)), X=X, area=area, K_column=column, K_lambda=K[0],
+            K_mu=K[1], D=np.zeros((total, 2)), B=np.zeros((len(material_at), 2, 2)),
+            material_at=material_at,
         )  # fmt: skip
 
     def _make_actuators(self) -> Actuators:
-        rig, rows, starts, setpoints, measured = self.rig, [], [], [], []
+        rig, laws, starts = self.rig, list[Law](), list[int]()
+        numbers = lambda names: [rig.signals.index(name) for name in names]
         for name, actuator in rig.actuators.items():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
-            law = actuator_law(name, actuator, parameters)
+            laws.append(actuator_law(name, actuator, parameters))
             starts.append(self._add_all(parameters))
-            feed = (
-                rig.signals.index(actuator.feed_forward)
-                if actuator.feed_forward is not None
-                else -1
-            )
-            rows.append((law.linearise, law.pullback, rig.coordinate(actuator.pushes), feed))
-            setpoints.append([rig.signals.index(one) for one in actuator.setpoints])
-            measured.append([rig.coordinate(one) for one in actuator.measures])
-        linearise, pullback, pushed, feed_forward = (
-            np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 4).T
+        every = rig.actuators.values()
+        setpoint_start, setpoint = _ragged([numbers(one.setpoints) for one in every])
+        measured_start, measured = _ragged(
+            [[rig.coordinate(name) for name in one.measures] for one in every]
         )
-        make: Any = Actuators
-        return make(
-            linearise,
-            pullback,
-            _ints([*starts, self._count]),
-            pushed,
-            feed_forward,
-            *_ragged(setpoints),
-            *_ragged(measured),
-        )
+        return filled(
+            Actuators, linearise=[law.linearise for law in laws],
+            pullback=[law.pullback for law in laws], p_start=[*starts, self._count],
+            pushed=[rig.coordinate(one.pushes) for one in every],
+            feed_forward=[
+                -1 if one.feed_forward is None else rig.signals.index(one.feed_forward)
+                for one in every
+            ],
+            setpoint_start=setpoint_start, setpoint=setpoint,
+            measured_start=measured_start, measured=measured,
+        )  # fmt: skip
+
+    def _laws(self, name: str, law: SoftContact, shape: Shape) -> LawSet:
+        """The laws of a contact, checked where they are not this package's."""
+        key = id(law), id(shape)
+        if key not in self._known:
+            check_shape(self.rig.contacts[name].body, shape)
+            slip = law.friction
+            own = structure(law) is None or not isinstance(slip, Friction)
+            stiffness = law.R_t.item() + NOMINAL * law.K_t.item()
+            if own:
+                one = torch.ones(()).double()
+                slip_rates(name, slip, one, one, stiffness)
+            self._known[key] = contact_laws(law, shape.prepared())
+            if own and (wrong := check_slip(name, slip, stiffness)):
+                warnings.warn(wrong, stacklevel=2)
+        return self._known[key]
 
     def _make_contacts(self) -> tuple[Contacts, Points]:
-        rig, rows, starts, point_start, sizes, limits = self.rig, [], [], [0], [], []
-        X, weight, node, N = [], [], [], []
-        for name, contact in rig.contacts.items():
-            pad, shape = rig.pads[contact.pad], rig.bodies[contact.body].shape
-            assert shape is not None
-            key = id(contact.law), id(shape)
-            if key not in self._known:
-                check_shape(contact.body, shape)
-                slip = contact.law.friction
-                own = structure(contact.law) is None or not isinstance(slip, Friction)
-                stiffness = contact.law.R_t.item() + NOMINAL * contact.law.K_t.item()
-                if own:
-                    slip_rates(
-                        name, slip, torch.ones(()).double(), torch.ones(()).double(), stiffness
-                    )
-                self._known[key] = contact_laws(contact.law, shape.prepared())
-                if own and (wrong := check_slip(name, slip, stiffness)):
-                    warnings.warn(wrong, stacklevel=2)
-            laws = self._known[key]
-            starts.append(self._add_all(laws.parameters))
-            rows.append(
-                (list(rig.pads).index(contact.pad), 3 * list(rig.bodies).index(contact.body),
-                laws.distance.value,
-                 laws.interface.linearise, laws.interface.pullback, laws.free.value,
-                 laws.free.linearise, laws.free.pullback)
-            )  # fmt: skip
-            first = self._pads.node_start[rows[-1][0]]
-            X.append(pad.point_positions.numpy())
-            weight.append(rig.weight(name).detach().numpy())
-            node.append(first + pad.point_nodes)
-            N.append(pad.point_shares)
-            point_start.append(point_start[-1] + len(pad.point_nodes))
-            sizes.append(shape.size())
+        rig, contacts = self.rig, self.rig.contacts.values()
+        laws, starts, limits = list[LawSet](), list[int](), list[Any]()
+        shapes = [rig.shape_of(name) for name in rig.contacts]
+        for (name, contact), shape in zip(rig.contacts.items(), shapes):
+            laws.append(self._laws(name, contact.law, shape))
+            starts.append(self._add_all(laws[-1].parameters))
+            pad = rig.pads[contact.pad]
             corners = pad.placed(np.stack(np.meshgrid(*pad.mesh.space.T), -1).reshape(-1, 2))
-            box = (
-                *corners[:, 0][[corners[:, 0].argmin(), corners[:, 0].argmax()]],
-                *np.sort(corners[:, 1])[[0, -1]],
-            )
+            box = np.stack((corners.min(0), corners.max(0)), 1).ravel()
             limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
-        columns = [np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 8).T]
-        coordinate = np.stack((columns[1], self._pads.base[columns[0]]), 1)[..., None] + np.arange(
-            3
+        owners = [list(rig.pads).index(contact.pad) for contact in contacts]
+        body = np.array(
+            [3 * list(rig.bodies).index(contact.body) for contact in contacts], np.int64
         )
-        coordinate = np.ascontiguousarray(coordinate.reshape(-1, 6))
-        make: Any = Contacts
-        contacts = make(
-            *columns[:2],
-            self._bodies.free[coordinate],
-            coordinate,
-            *columns[2:],
-            _ints([*starts, self._count]),
-            _ints(point_start),
-            np.array(sizes),
-            np.array(limits).reshape(-1, 4),
-        )
-        start = min(
-            (s.start for (part, _), s in self.layout.slices.items() if part == "stretch"), default=0
-        )
-        points = Points(
-            np.repeat(np.arange(len(rows)), np.diff(point_start)),
-            np.concatenate([*X, np.zeros((0, 2))]), np.concatenate([*weight, np.zeros(0)]),
-            np.concatenate([*node, np.zeros((0, 2), np.int64)]),
-            np.concatenate([*N, np.zeros((0, 2))]), start,
+        both = np.stack((body, self._pads.base[owners]), 1)[..., None] + np.arange(3)
+        coordinate = both.reshape(-1, 6)
+        counts = list(rig.point_counts.values())
+        made = filled(
+            Contacts, pad=owners, body=body, number=self._bodies.free[coordinate],
+            coordinate=coordinate, distance=[one.distance.value for one in laws],
+            linearise=[one.interface.linearise for one in laws],
+            pullback=[one.interface.pullback for one in laws],
+            free=[one.free.value for one in laws],
+            free_linearise=[one.free.linearise for one in laws],
+            free_pullback=[one.free.pullback for one in laws], p_start=[*starts, self._count],
+            point_start=np.cumsum([0, *counts]), size=[shape.size() for shape in shapes],
+            limits=limits,
         )  # fmt: skip
-        return contacts, points
+        pads = [rig.pads[contact.pad] for contact in contacts]
+        joined = lambda parts, *shape: np.concatenate([np.zeros((0, *shape)), *parts])
+        return made, filled(
+            Points, contact=np.repeat(np.arange(len(counts)), counts),
+            X=joined((pad.point_positions for pad in pads), 2),
+            weight=joined(rig.weight(name).detach() for name in rig.contacts),
+            node=joined(
+                (self._pads.node_start[k] + pad.point_nodes for k, pad in zip(owners, pads)), 2
+            ),
+            N=joined((pad.point_shares for pad in pads), 2), y_start=self._start("stretch"),
+        )  # fmt: skip
 
     def system(self, h: float) -> Any:
         """The arrays for steps of h [s]; only inertial pads depend on it."""
@@ -394,14 +336,13 @@ class Compiled:
             lame_lambda, lame_mu, tau, density = p[
                 inertia.material_at[i] : inertia.material_at[i] + 4
             ]
-            K = lame_lambda * pad.stiffness(0) + lame_mu * pad.stiffness(1)
+            K = pad.stiffness(lame_lambda, lame_mu)
             M = density * inertia.area[here]
             A = banded((K * (tau + a)).tocsr())
             A[0] += M / a
             factor = linalg.cholesky_banded(A, lower=True)
             surface = inertia.surface[2 * pads.node_start[i] : 2 * pads.node_start[i + 1]]
-            loads = np.zeros((len(M), len(surface)))
-            loads[surface, np.arange(len(surface))] = 1.0
+            loads = unit_loads(len(M), surface)
             P = linalg.cho_solve_banded((factor, True), loads)[surface]
             pads.C[pads.C_start[i] : pads.C_start[i + 1]] = P.ravel()
             uniform = M[:, None] * np.tile(np.eye(2), (len(M) // 2, 1)) / a
@@ -417,12 +358,25 @@ class Compiled:
         return pads, inertia._replace(factor=factors, band=band, D=D, B=B)
 
 
-def _ragged(lists: list[list[int]]) -> tuple[Index, Index]:
-    """The ends of lists that are put one after the other, and all their numbers."""
-    return _ints([0, *np.cumsum([len(one) for one in lists])]), _ints(
-        [number for one in lists for number in one]
-    )
+def moduli(pad: Pad) -> Tensor:
+    """Numbers of a pad's material as the kernels take them: depth lambda, depth mu, tau, rho depth
+    of an inertial pad, else 1 / (E depth), nu."""
+    material = pad.material
+    if not pad.inertial:
+        return torch.stack((1 / (pad.E * material.depth), material.nu))
+    lame = (material.depth * modulus for modulus in pad.lame())
+    return torch.stack((*lame, pad.chain()[1][0], material.rho * material.depth))
 
 
-def _ints(values: Any) -> Index:
-    return np.array(values, dtype=np.int64)
+def filled(kind: Any, **fields: Any) -> Any:
+    """One of `PARTS` from its fields, as arrays of their declared types."""
+    parts = []
+    for name, dtype, ndim, _ in layout(kind):
+        value = np.ascontiguousarray(fields[name], dtype) if ndim else fields[name]
+        parts.append(value if np.ndim(value) == ndim else value.reshape((0,) * ndim))
+    return kind(*parts)
+
+
+def _ragged(lists: list[list[int]]) -> tuple[Index, list[int]]:
+    """Ends of concatenated lists, and their numbers."""
+    return np.cumsum([0, *map(len, lists)]), [number for one in lists for number in one]

@@ -1,5 +1,5 @@
-"""Data of a rig for step-size control: which errors count together and by what unit, and the
-reference's pieces."""
+"""Data of a rig for step-size control: groups of errors with their units, and the reference's
+pieces."""
 
 import ctypes
 from collections.abc import Callable
@@ -83,14 +83,8 @@ class Followed:
             return
         with torch.no_grad():
             pieces = [one.pieces() for one in chosen]
-            fixed = [
-                body.fixed[axis]
-                for body in rig.bodies.values()
-                for axis in COORDINATES
-                if axis in body.fixed
-            ]
             one = torch.ones(1, dtype=torch.float64)
-            pieces += [(0.0 * one, one, value.reshape(1, 1)) for value in fixed]
+            pieces += [(0.0 * one, one, value.reshape(1, 1)) for value in rig.fixed_values]
             widest = max((c.shape[1] for *_, c in pieces), default=1)
             padded = [torch.nn.functional.pad(c, (0, widest - c.shape[1])) for *_, c in pieces]
             empty = torch.zeros(0, dtype=torch.float64)

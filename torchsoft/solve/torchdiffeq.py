@@ -49,7 +49,7 @@ class TorchdiffeqSolver:
     `odeint_adjoint`.
 
     Takes batches: y0 (..., size); each sample is stepped by itself, with steps of its own, so none
-    depends on its neighbours. rtol and atol mean what they mean in `simulate`; torchdiffeq's own
+    depends on its neighbours. rtol and atol are those of `simulate`; torchdiffeq's own
     defaults (1e-7, 1e-9) are strict for a motion with contact. Options: `step_size` [s] for equal
     steps instead, and the stepper's own, such as Newton's `tolerance` [N]. Raises `TypeError` for
     dynamics that are not a `Rig`'s.

@@ -171,7 +171,14 @@ class Trajectory(Shown):
         return float(self.energy_residual.detach().abs().max() / scale)
 
     def at(self, time: float) -> int:
-        """Index of the sample nearest to `time` [s]."""
+        """Index of the sample nearest to `time` [s]. Raises `ValueError` more than half a sample
+        outside of the run."""
+        first, last = float(self.t[0]), float(self.t[-1])
+        beyond = 0.5 * (last - first) / max(len(self.t) - 1, 1)
+        if not first - beyond <= time <= last + beyond:
+            raise ValueError(
+                f"there is nothing at {time:g} s: the run goes from {first:g} to {last:g} s"
+            )
         return int((self.t - time).abs().argmin())
 
     @cached_property
@@ -280,10 +287,9 @@ def channels(
     out: dict[str, Tensor] = {}
     for name in rig.bodies:
         symbol, pose, velocity = rig.symbols[name], state.pose[name], state.velocity[name]
-        for i, key in enumerate((f"x_{symbol}", f"y_{symbol}", f"theta_{symbol}")):
-            out[key] = pose[..., i]
-        for i, key in enumerate((f"v_x_{symbol}", f"v_y_{symbol}", f"omega_{symbol}")):
-            out[key] = velocity[..., i]
+        keys = [f"{axis}_{symbol}" for axis in COORDINATES]
+        out |= zip(keys, pose.unbind(-1))
+        out |= zip(map(rate_channel, keys), velocity.unbind(-1))
         if rig.bodies[name].freedom["theta"] == "free":
             out[f"L_{symbol}"] = rig.bodies[name].inertia * velocity[..., 2]
     for i, name in enumerate(rig.signals):

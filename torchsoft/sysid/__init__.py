@@ -1,4 +1,4 @@
-"""Identification: which parameters, from which recordings, with what certainty."""
+"""System identification: parameters of a rig from recordings, with their uncertainty."""
 
 from torchsoft.channels import MEASURED
 from torchsoft.sysid.estimate import Estimate

@@ -1,8 +1,8 @@
-"""What an identification takes for granted: numerical constants, numbers called known, laws; and
-how to vary each.
+"""Assumptions of an identification: numerical constants, known parameters, properties of sensors,
+laws; and a variation of each.
 
-A variation makes the recordings, or their parameters, as they would be if one thing were otherwise
-by a stated amount.
+A variation changes the recordings or their parameters as if one assumption were wrong by a stated
+amount.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -25,42 +25,41 @@ from torchsoft.sysid.unknowns import Nuisance, Sensor
 from torchsoft.tables import Number
 
 Kind = Literal["numerical", "known", "sensor", "law"]
-"""A constant of the computation; a number of the rig that is called known; what a sensor is taken
-to be; a law."""
+"""A constant of the computation, a known parameter of the rig, a property of a sensor, or a law."""
 
 PLACE = 20e-6
-"""How far x_C0 is varied [m]: what a careful hand places a disc to."""
+"""Variation of x_C0 [m]: the accuracy with which a careful hand places a disc."""
 
 RADIUS = 1e-3
-"""Relative variation of lengths of the rig that are called known."""
+"""Relative variation of known lengths of the rig."""
 
 KNOWN = 1e-2
-"""Relative variation of the other numbers that are called known."""
+"""Relative variation of the other known parameters."""
 
 FORCE = 0.5
-"""Variation of forces that are fed forward [N]."""
+"""Variation of feed-forward forces [N]."""
 
 CLOCK, SLOWER = 1e-4, 1e-4
-"""Variation of the time at which set-points are given [s], and of the rate of their clock [1]."""
+"""Variation of the time of set-points [s], and of the rate of their clock [1]."""
 
 NEAR, WIDEST = 5.0, 5.0
-"""Amounts by which a known number may be off to first order before a new fit looks for it farther
-away, and how many times as far at the most."""
+"""Number of variation amounts, by the test to first order, within which a new fit searches for a
+known parameter, and the largest factor on that range."""
 
 SMALLER_RAMP = 0.1
-"""Factor by which the depth epsilon of the touch-down ramp is made smaller."""
+"""Factor on the depth epsilon of the touch-down ramp in its variation."""
 
 
 class Fault(NamedTuple):
-    """What a sensor may have and is not known to have: how large it is taken in a variation, in
-    words."""
+    """A possible fault of a sensor that is not among the unknowns: its amount in a variation, the
+    unit of the amount, and its name in a sentence."""
 
     amount: float
     per: str
     verb: str
 
     def size(self, sensor: Sensor, recording: Recording) -> float:
-        """In SI units."""
+        """The amount in SI units."""
         noise = {"noise": sensor.noise, "noise/s": sensor.noise / max(recording.duration, 1e-9)}
         return self.amount * noise.get(self.per, 1.0)
 
@@ -82,12 +81,17 @@ FAULTS: dict[Nuisance, Fault] = {
     "drift": Fault(0.1, "noise/s", "drifted upwards"),
     "clock": Fault(1e-4, "1", "ran too fast"),
 }
-"""Faults of sensors that are looked for where they are not unknown."""
+"""Faults of sensors that are tested where they are not unknowns."""
 
 
 @dataclass(frozen=True)
 class Assumption:
     """An assumption of a fit as the clause `stated`, and its variation as the clause `otherwise`.
+
+    A known parameter, or a property of a sensor, may be wrong by any multiple of `amount` [unit],
+    of either sign unless it is `one_sided`; a law or a constant of the computation holds or does
+    not. `parameter` is the name of the varied parameter: `nominal` is its stated value, and `step`
+    its change in a variation by the amount.
 
     A known number, or a property of a sensor, may differ by any part of the `amount` [unit], to
     either side unless it is `one_sided`; a law or a constant of the computation holds or does not.
@@ -109,9 +113,9 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Variation(Assumption):
-    """An assumption with its variation: `vary` gives another recording, None where that has no
-    meaning for it, and `by` does so by any amount [unit]. An `extension` is a parameter that the
-    rig does not have yet; a `fault` is one of a channel's sensor."""
+    """An assumption with its variation: `vary` gives the varied recording, None where the variation
+    does not apply to it, and `by` does so for any amount [unit]. An `extension` is a parameter that
+    the rig does not have yet; a `fault` belongs to a channel's sensor."""
 
     vary: Callable[[Recording], Recording | None] | None = None
     by: Callable[[Recording, float], Recording | None] | None = None
@@ -119,8 +123,8 @@ class Variation(Assumption):
     fault: tuple[str, Any] | None = None
 
     def of(self, amount: float) -> "Variation":
-        """The variation by another amount, where it can be had; a known number may be off by more
-        then."""
+        """The variation by another amount, if it has one; the range of a known parameter becomes
+        wider for a large amount."""
         by = self.by
         if self.parameter and not self.extension:
             wider = min(max(abs(amount / self.amount) / NEAR, 1.0), WIDEST)
@@ -131,13 +135,13 @@ class Variation(Assumption):
 
     @property
     def label(self) -> str:
-        """Label of the coordinate that it would be, if it were unknown; empty for a law."""
+        """Label of the coordinate for this assumption, if it were an unknown; empty for a law."""
         return f"{self.fault[1]} of {self.fault[0]}" if self.fault is not None else self.parameter
 
 
 def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Variation]:
-    """Everything that the runs of some recordings take for granted and that can be varied;
-    `unknown` are the parameters, and coordinates of starts, that are identified."""
+    """All assumptions of the runs of some recordings that can be varied; `unknown` are the
+    identified parameters and coordinates of starts."""
     first, *others = recordings
     rig = first.rig
     pad = next(iter(rig.pads.values()))
@@ -242,8 +246,8 @@ def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
 
 
 def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
-    """Every pad of more elements, or with more contact points; None where the start is a state of
-    this mesh."""
+    """Refine every pad's mesh by the factor `finer`, with other contact points; None where the
+    start is a state of this mesh."""
     if not isinstance(recording.start, AtRest | Standing):
         return None
 
@@ -256,7 +260,7 @@ def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
 
 
 def shifted(recording: Recording, part: float) -> Recording:
-    """Every pad moved along its face by a part of an element."""
+    """Move every pad's mesh along its face by a fraction of an element."""
 
     def change(rig: Rig) -> None:
         for pad in rig.pads.values():
@@ -268,7 +272,7 @@ def shifted(recording: Recording, part: float) -> Recording:
 
 
 def scaled(recording: Recording, names: Collection[str], factor: float) -> Recording:
-    """Parameters by a factor."""
+    """Multiply parameters by a factor."""
     return with_rig(
         recording,
         lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}),
@@ -276,7 +280,7 @@ def scaled(recording: Recording, names: Collection[str], factor: float) -> Recor
 
 
 def placed(recording: Recording, by: float = PLACE) -> Recording | None:
-    """The disc a little further right [m]."""
+    """Start the disc further right by a distance [m]."""
     start, rig = recording.start, recording.rig
     if not isinstance(start, AtRest) or not isinstance(rig, SoftGrasp):
         return None
@@ -284,7 +288,7 @@ def placed(recording: Recording, by: float = PLACE) -> Recording | None:
 
 
 def moved(recording: Recording, body: str, by: float = PLACE) -> Recording:
-    """A body that stands a little further right [m]."""
+    """Start a body further right by a distance [m]."""
     start = recording.start
     assert isinstance(start, Standing)
     (x, *others), velocity = start.bodies[body]
@@ -293,12 +297,12 @@ def moved(recording: Recording, body: str, by: float = PLACE) -> Recording:
 
 
 def laws(rig: Rig) -> list[SoftContact]:
-    """The contact laws of a rig, each once."""
+    """The distinct contact laws of a rig."""
     return list({id(contact.law): contact.law for contact in rig.contacts.values()}.values())
 
 
 def unramped(recording: Recording) -> Recording:
-    """Sliding taken in at once where a point touches."""
+    """Count sliding in full from touch-down on."""
 
     def change(rig: Rig) -> None:
         for law in laws(rig):
@@ -308,7 +312,7 @@ def unramped(recording: Recording) -> Recording:
 
 
 def coulomb(recording: Recording) -> Recording:
-    """Coulomb's friction with the same coefficients."""
+    """Replace smooth slip by Coulomb friction with the same coefficients."""
 
     def change(rig: Rig) -> None:
         for law in laws(rig):
@@ -320,12 +324,12 @@ def coulomb(recording: Recording) -> Recording:
 
 
 def signals_of(recording: Recording) -> dict[str, nn.Module]:
-    """The signals of a recording's reference by name."""
+    """Signals of a recording's reference by name."""
     return {name.replace(":", "."): one for name, one in recording.rig.reference.signals.items()}
 
 
 def with_reference(recording: Recording, **signals: nn.Module) -> Recording:
-    """The recording with other signals."""
+    """The recording with some signals replaced."""
 
     def change(rig: Rig) -> None:
         rig.reference = Reference(**(signals_of(recording) | signals))
@@ -334,7 +338,7 @@ def with_reference(recording: Recording, **signals: nn.Module) -> Recording:
 
 
 def sparser(recording: Recording) -> Recording:
-    """Every second set-point left out, and a spline through the others."""
+    """Omit every second set-point of the recorded signals."""
     signals = {
         name: Sampled(one.times[::2], one.values[::2])
         for name, one in signals_of(recording).items()
@@ -344,7 +348,8 @@ def sparser(recording: Recording) -> Recording:
 
 
 def retimed(recording: Recording, rate: float, shift: float) -> Recording | None:
-    """Every signal at rate * t + shift [s]; None where a signal is not made of polynomials."""
+    """Evaluate every signal at rate * t + shift [s]; None where a signal is not piecewise
+    polynomial."""
     signals = signals_of(recording)
     known = {name: one for name, one in signals.items() if isinstance(one, Piecewise)}
     if len(known) < len(signals):
@@ -355,7 +360,7 @@ def retimed(recording: Recording, rate: float, shift: float) -> Recording | None
 
 
 def led(recording: Recording, lead: float) -> Recording | None:
-    """Bodies put where they stand another time [s] before the first sample."""
+    """Place bodies in equilibrium at another time [s] before the first sample."""
     start = recording.start
     return (
         replace(recording, start=start._replace(lead=lead)) if isinstance(start, Standing) else None
@@ -363,19 +368,19 @@ def led(recording: Recording, lead: float) -> Recording | None:
 
 
 def delayed(recording: Recording, by: float) -> Recording | None:
-    """Every signal later by a time [s]; None where a signal is not made of polynomials."""
+    """Delay every signal by a time [s]; None where a signal is not piecewise polynomial."""
     return retimed(recording, 1.0, by)
 
 
 def stretched(recording: Recording, part: float) -> Recording | None:
-    """Every signal slower by a part [1], from the first sample on; None where a signal is not made
-    of polynomials."""
+    """Change the rate of every signal by a relative amount from the first sample on; None where a
+    signal is not piecewise polynomial."""
     return retimed(recording, 1 + part, -part * float(recording.times[0]))
 
 
 def raised(recording: Recording, by: float) -> Recording | None:
-    """More force [N] fed forward to every actuator; None where a signal is not made of
-    polynomials."""
+    """Add a feed-forward force [N] to every actuator; None where a signal is not piecewise
+    polynomial."""
     names = {a.feed_forward for a in recording.rig.actuators.values() if a.feed_forward is not None}
     known = {name: recording.rig.reference[name] for name in names}
     if not all(isinstance(one, Piecewise) for one in known.values()):

@@ -1,5 +1,5 @@
-"""Comparison of competing laws: each is fitted to the recordings, and the evidence is judged by the
-rule of `comparison`."""
+"""Comparison of competing laws: fits of each to the recordings, and the evidence for the rule of
+`comparison`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,14 +28,14 @@ from torchsoft.sysid.residual_tests import (
 from torchsoft.sysid.runs import Runner
 
 COLOUR = 3
-"""Largest order of the autoregression by which residuals tell how much their colour moves a
-likelihood ratio."""
+"""Largest order of the autoregression that gives the variance of a likelihood ratio its
+correlation."""
 
 
 class Density(NamedTuple):
-    """What a law says of some recordings: whitened residuals r (m,), s = S^-1 r with S = 1 + J C J'
-    the covariance of the prediction in units of the noise, and the logarithm of the samples'
-    density, in SI units."""
+    """Predictive density of some recordings under a law: whitened residuals r (m,), s = S^-1 r with
+    S = 1 + J C J' the covariance of the prediction in units of the noise, and the logarithm of the
+    samples' density in SI units."""
 
     parts: list[Part]
     r: Array
@@ -44,20 +44,20 @@ class Density(NamedTuple):
 
     @property
     def p(self) -> float:
-        """Of as large a sum of squares."""
+        """p-value of the weighted sum of squared residuals."""
         return float(stats.chi2.sf(self.r @ self.s, self.samples))
 
     @property
     def samples(self) -> int:
-        """Those that saturation has not changed."""
+        """Number of samples that saturation has not changed."""
         return sum(len(part.t) for part in self.parts)
 
 
 def density(
     problem: Problem, which: Sequence[str], r: Array, spread: Array | None = None
 ) -> Density:
-    """Of whitened residuals r (m,), where the estimates are as uncertain as `spread` (m, n) = J
-    C^(1/2) says."""
+    """Density of whitened residuals r (m,), with the uncertainty of the estimates in `spread` (m,
+    n) = J C^(1/2)."""
     mine, s, wider = parts(problem, r, which), r, 0.0
     if spread is not None:
         inner = np.eye(spread.shape[1]) + spread.T @ spread
@@ -74,8 +74,8 @@ def density(
 
 
 class FittedLaw(NamedTuple):
-    """A law, and where its fit ended: coordinates x (n,), which of them were `free` (n,), by which
-    tolerance, and whether it had converged. The problem has the noise that was found."""
+    """A fitted law: final coordinates x (n,), mask `free` (n,) of the fitted ones, tolerance, and
+    convergence. The problem includes the estimated noise."""
 
     name: str
     problem: Problem
@@ -86,11 +86,10 @@ class FittedLaw(NamedTuple):
 
 
 class Evidence:
-    """A fitted law's densities of the recordings `which` it was fitted to and of those that were
-    held out.
+    """A fitted law's densities of the fitted recordings `which` and of the held-out ones.
 
-    They are those of runs with a tenth of the fit's tolerance; `numerical` is what that changes.
-    Raises `ValueError` where one cannot be made.
+    They come from runs with a tenth of the fit's tolerance; `numerical` is the change that this
+    makes. Raises `ValueError` where a run fails.
     """
 
     def __init__(
@@ -117,7 +116,7 @@ class Evidence:
             self.heldout = density(problem, heldout, r[:m], np.asarray(spread, np.float64))
 
     def _at(self, which: Sequence[str], rtol: float, derivatives: bool) -> Residuals:
-        """Residuals, and their Jacobian if wanted."""
+        """Residuals at the estimates, and their Jacobian with `derivatives`."""
         at = self.law.problem.residuals(
             self._runner, self.law.x, which, rtol, self.law.free if derivatives else None
         )
@@ -129,7 +128,7 @@ class Evidence:
 
     @property
     def total(self) -> float:
-        """Logarithm of the density of everything, less Schwarz's penalty."""
+        """Logarithm of the density of all recordings, less Schwarz's penalty."""
         penalty = 0.5 * self.parameters * np.log(len(self.fitted.r))
         return (
             self.fitted.log
@@ -139,8 +138,8 @@ class Evidence:
 
 
 class Ratio(NamedTuple):
-    """The logarithm of a ratio of densities, its variance by the noise as stated, and as the
-    residuals have it."""
+    """Log likelihood ratio, its variance under the stated noise, and its variance with the size and
+    colour of the residuals."""
 
     log: float
     stated: float
@@ -156,12 +155,12 @@ class Ratio(NamedTuple):
 
 
 def ratio(a: Density, b: Density) -> Ratio:
-    """Of two laws, by the noise about the first one.
+    """Likelihood ratio of two laws, with its variance under noise about the prediction of the
+    first.
 
-    The logarithm changes with the samples by the difference of the scores, and its variance is what
-    the noise gives that: as stated, and with the size and the colour that the residuals of the
-    first law have besides, as an autoregression of the order that they choose. The larger one is
-    taken.
+    The logarithm changes with the samples by the difference of the scores. Its variance is computed
+    for the noise as stated, and for noise with the size and the colour of the first law's
+    residuals, modelled as an autoregression of estimated order. The larger variance counts.
     """
     stated = variance = 0.0
     for mine, its in zip(a.parts, b.parts):
@@ -178,8 +177,8 @@ def ratio(a: Density, b: Density) -> Ratio:
 
 
 def coloured(score: Array, noise: Autoregression | None, t: Array) -> Array:
-    """W'^-1 score (m,) for samples at t (m,) [s], W being what whitens noise: its square is the
-    variance of score' noise."""
+    """W'^-1 score (m,) for samples at t (m,) [s], with the whitener W of the noise; its squared
+    norm is the variance of score' noise."""
     if noise is None:
         return score
     return spsolve_triangular(noise.whitener(t).T.tocsr(), score, lower=False)
@@ -189,7 +188,7 @@ def coloured(score: Array, noise: Autoregression | None, t: Array) -> Array:
 
 
 SAME = 1e-6
-"""Part of its range by which a signal of two references may differ."""
+"""Relative difference below which signals of two references are equal."""
 
 CLOSE = 1e-3
 """Relative tolerance of the last fits, on the misfit and on the coordinates."""
@@ -250,7 +249,7 @@ def compare(
 
 
 def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
-    """Raises `ValueError` where the laws were not given the same data."""
+    """Raises `ValueError` where the laws have different data."""
     if len(laws) < 2:
         raise ValueError(f"a comparison needs two laws or more, not {len(laws)}")
     (first, one), *others = laws.items()
@@ -281,7 +280,7 @@ def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
 
 
 def same_reference(one: Recording, other: Recording) -> bool:
-    """Whether what both rigs follow is the same, as far as both have the same signals."""
+    """Whether the signals that both rigs have are equal."""
     t = torch.from_numpy(one.times)
     a, b = (
         dict(zip(r.rig.signals, r.rig.follow(t).detach()[..., 0].unbind(-1))) for r in (one, other)
@@ -296,8 +295,8 @@ def fitted(
     name: str, problem: Problem, runner: Runner, which: Sequence[str], plan: Sequence[Stage] | None,
     rtol: float, starts: int, progress: bool,
 ) -> FittedLaw:  # fmt: skip
-    """A law where the plan ends, and with the noise of its sensors, where they declare a colour.
-    Raises `Unreachable`."""
+    """A law at the end of its plan, with its noise estimated where sensors declare colour. Raises
+    `Unreachable`."""
     if plan is None:
         plan = default_plan(problem, runner, rtol, which, starts)
     if not plan or list(plan[-1].recordings) != list(which):
@@ -324,8 +323,8 @@ def fitted(
 def refitted(
     law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[str]
 ) -> FittedLaw | None:
-    """The law fitted once more, from the values that another one ended with; None where they share
-    none, or it cannot be run there."""
+    """The law fitted once more, from the estimates of another; None where they share no coordinate,
+    or the fit cannot start there."""
     c, x = law.problem.coordinates, law.x.copy()
     known = {
         label: one.to_value(v)
@@ -338,7 +337,7 @@ def refitted(
             x[i] = one.to_x(float(np.clip(known[one.label], one.low, one.high)))
     if (x == law.x).all():
         return None
-    free = tuple(label for label, one in zip(c.labels, law.free) if one)
+    free = tuple(one.label for one in c.within(law.free))
     try:
         stage = Stage("again", tuple(which), free, law.rtol, tolerance=CLOSE)
         fit = run_plan(law.problem, runner, [stage], x).fit
@@ -367,7 +366,7 @@ def versus(best: Evidence, other: Evidence) -> Versus:
 
 
 def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
-    """Every law with its criteria."""
+    """Results of every law, with its information criteria."""
     k = np.array([one.parameters for one in evidence.values()])
     n, deviance = (
         len(next(iter(evidence.values())).fitted.r),

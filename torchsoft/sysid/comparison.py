@@ -43,13 +43,12 @@ Outcome = Literal["law", "cannot tell", "none fits"]
 
 @dataclass(frozen=True)
 class LawFit:
-    """One law at its estimates: the number of its parameters, the log likelihood of the fitted
-    samples in SI units, the sum of squared whitened residuals over the degrees of freedom with its
-    p-value, criteria, Akaike weight (of AICc), and the log density per sample that it predicts for
-    held-out recordings, with the p-value of their sum of squares. `numerical` is how far a tenth of
-    the tolerance changes the log likelihood; `left` has sentences on what is left of the data that
-    is no noise as stated, by the tests of `torchsoft.sysid.residual_tests`, and `patterned` says
-    whether it follows the motion."""
+    """Results of one law: the number of its parameters, the log likelihood of the fitted samples in
+    SI units, the reduced chi-squared with its p-value, information criteria, Akaike weight (of
+    AICc), and the log density per sample of held-out recordings, with the p-value of their sum of
+    squares. `numerical` is the change of the log likelihood by a tenth of the tolerance; `left` has
+    sentences on deviations of the residuals from the stated noise, by the tests of
+    `torchsoft.sysid.residual_tests`, and `patterned` is whether residuals follow the motion."""
 
     name: str
     parameters: int
@@ -70,7 +69,7 @@ class LawFit:
 
     @property
     def misses(self) -> str:
-        """Why it does not explain the data, as the end of a sentence; empty if it does."""
+        """Why the law does not explain the data, as the end of a sentence; empty if it does."""
         if self.p < FITS:
             return f"has chi2 = {self.chi2:.3g} (p = {self.p:.1g})"
         if self.heldout_p is not None and self.heldout_p < FITS:
@@ -79,17 +78,15 @@ class LawFit:
 
     @property
     def fits(self) -> bool:
-        """Whether residuals are as large as the noise, those of held-out recordings too, and do not
-        follow the motion."""
+        """Whether the law explains the fitted and the held-out recordings."""
         return not self.misses
 
 
 @dataclass(frozen=True)
 class Versus:
-    """The best law against another one: logarithms of the likelihood ratios of fitted and of
-    held-out samples, the whitened distance D of the predictions, the inflation c of the variance, E
-    and z of the rule, z of held-out recordings alone, and how far a tenth of the tolerance changes
-    E."""
+    """The best law against another one: log likelihood ratios of fitted and of held-out samples,
+    the whitened distance D of the predictions, the inflation c of the variance, E and z of the
+    rule, z of held-out recordings alone, and the change of E by a tenth of the tolerance."""
 
     best: str
     other: str
@@ -104,7 +101,7 @@ class Versus:
 
     @property
     def doubts(self) -> list[str]:
-        """Why the other law is not refuted, in clauses; empty if it is."""
+        """Clauses on why the other law is not refuted; empty if it is."""
         a, b, out = f"`{self.best}`", f"`{self.other}`", []
         if self.z_heldout is not None and self.z_heldout <= -APART:
             out.append(
@@ -133,10 +130,8 @@ class Versus:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Laws by how well they explain the recordings, the best one first, and the best against every
-    other; `law` is the one that the data name, if they name one, and `verdict` says it in plain
-    words.
-    """
+    """Competing laws, the best first, and the best against every other. `law` is the law named by
+    the data, if any, and `verdict` the conclusion in plain words."""
 
     outcome: Outcome
     law: str | None
@@ -160,7 +155,7 @@ class Comparison:
         write_json(path, asdict(self))
 
     def table(self) -> str:
-        """One line a law, differences to the best."""
+        """A line for each law, with differences from the best."""
         head = ("law", "k", "log L", "chi2", "dAIC", "dAICc", "dBIC", "weight", "held out")
         rows = ["{:20s} {:>3s} {:>11s} {:>7s} {:>9s} {:>9s} {:>9s} {:>7s} {:>9s}".format(*head)]
         least = {key: min(getattr(one, key) for one in self.laws) for key in ("aic", "aicc", "bic")}
@@ -173,7 +168,7 @@ class Comparison:
 
 
 def judged(laws: list[LawFit], against: list[Versus]) -> tuple[Outcome, str | None, str]:
-    """Outcome, the law that is named, and why, by the rule."""
+    """Outcome, named law, and verdict, by the rule."""
     best = laws[0]
     doubts = [doubt for versus in against for doubt in versus.doubts]
     unsure = [

@@ -1,4 +1,4 @@
-"""Criteria of optimal design, and a ranking of recordings that could be made next."""
+"""Criteria of optimal design, and a ranking of candidate recordings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,8 @@ from torchsoft.sysid.runs import Runner
 Optimality = Literal["D", "A", "worst"]
 
 SHARPNESS = 12.0
-"""Of the smooth maximum: it exceeds the largest logarithm by ln(parameters) over this at most."""
+"""Sharpness of the smooth maximum, which exceeds the largest logarithm by ln(parameters) over this
+at most."""
 
 
 def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
@@ -44,9 +45,9 @@ def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
 def chosen(
     problem: Problem, x: Array, names: Sequence[str] | None
 ) -> tuple[tuple[str, ...], Array]:
-    """The parameters `names`, by default every free one that all recordings share, and what their
-    relative errors (s,) are of those of the coordinates x (n,): a matrix (s, n). Raises
-    `ValueError` for others."""
+    """The parameters `names`, by default every free one that all recordings share, and the matrix
+    (s, n) from errors of the coordinates x (n,) to their relative errors (s,). Raises `ValueError`
+    for unknown names."""
     c, one = problem.coordinates, problem.recordings[0]
     values = c.values(x, one.name, one.parameters)
     rows = c.jacobian(x, one.name, values) * c.free / np.array([[values[name]] for name in c.names])
@@ -66,16 +67,16 @@ def chosen(
 
 
 def deviations(names: Sequence[str], T: Array, C: Array) -> dict[str, float]:
-    """Relative standard deviations of parameters, T (s, n) being what they are of coordinates with
-    the covariance C."""
+    """Relative standard deviations of parameters, by the matrix T (s, n) of `chosen` and the
+    covariance C of the coordinates."""
     return dict(zip(names, np.sqrt(np.diag(T @ C @ T.T)).tolist()))
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """A recording that could be made: its duration [s], the relative standard deviations that
-    parameters have without it and would have with it, and the criterion's gain, a logarithm of
-    standard deviations. `lost` says why it cannot be made."""
+    """A candidate recording: its duration [s], the relative standard deviations of parameters
+    without it and with it, and the gain of the criterion, in the logarithm of standard deviations.
+    `lost` is the reason of a failed run."""
 
     name: str
     seconds: float
@@ -90,13 +91,13 @@ def next_recording(
     names: Sequence[str] | None = None, criterion: Optimality = "D", rtol: float = 1e-4,
     workers: int = 1,
 ) -> list[Outlook]:  # fmt: skip
-    """What should be recorded after the recordings of `problem`, whose coordinates are x (n,), say
-    at the end of a fit?
+    """Rank candidates for the next recording, after those of `problem`, at the coordinates x (n,),
+    such as the end of a fit.
 
-    Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The
-    best comes first, by what it takes off the `criterion` ("D", "A" or "worst") of the parameters
-    `names`. A prediction: it holds as far as the model does, and for small errors. Raises
-    `ValueError` for candidates that do not fit the problem.
+    The Fisher matrix of every candidate is added to that of the recordings; only the times of its
+    samples count. The best comes first, by the decrease of the `criterion` ("D", "A" or "worst") of
+    the parameters `names`. The prediction holds as far as the model does, and for small errors.
+    Raises `ValueError` for candidates that do not fit the problem.
     """
     if not candidates:
         raise ValueError("there is no candidate to rank")
@@ -104,18 +105,13 @@ def next_recording(
         [*problem.recordings, *candidates], problem.sensors, problem.unknowns, problem.noise
     )
     known = dict(zip(problem.coordinates.labels, x))
-    c, x = (
-        both.coordinates,
-        np.array(
-            [known.get(a.label, s) for a, s in zip(both.coordinates.all, both.coordinates.start)]
-        ),
-    )
+    c = both.coordinates
+    x = c.begun(known)
     names, T = chosen(both, x, names)
     runner, priors = Runner(both.recordings, workers), len(c.priors)
     have = both.residuals(runner, x, problem.names, rtol, c.free)
     if have.lost:
-        reasons = "; ".join(f"`{name}`: {lost.reason}" for name, lost in have.lost.items())
-        raise ValueError(f"`x` does not reproduce what was recorded: {reasons}")
+        raise ValueError(f"`x` does not reproduce what was recorded: {have.reasons}")
 
     def covariance(J: Array, those: Sequence[str]) -> Array:
         """Of the coordinates that matter to some recordings; zero for the others."""

@@ -1,4 +1,4 @@
-"""Motions designed for parameters of interest: the knots of set-points, moved by gradient."""
+"""Optimal design of motions: the knots of set-points, moved by gradient."""
 
 import time as clock
 from collections.abc import Mapping, Sequence
@@ -20,22 +20,22 @@ from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 
 OUTLIER = 10.0
-"""Slopes beyond so many medians are cut."""
+"""Largest gradient component, in medians; larger ones are clipped."""
 
 MEMORY = 0.85, 0.97
-"""How much of its slopes, and of their squares, Adam remembers from one iteration to the next."""
+"""Adam's decay rates of the first and second moments of the gradient."""
 
 LOOK = 10
 """Iterations between two evaluations at the motion itself, without a random shift."""
 
 FAILURES = 5
-"""Runs lost one after the other until the search goes back to the best motion so far."""
+"""Consecutive failed runs after which the search returns to the best motion."""
 
 
 @dataclass(frozen=True)
 class Visit:
-    """The motion after some iterations: the criterion, and how much of the way to its limit a
-    channel goes."""
+    """The motion after some iterations: the criterion, and the largest fraction of its limit that a
+    channel reaches."""
 
     iteration: int
     value: float
@@ -43,13 +43,13 @@ class Visit:
 
     @property
     def score(self) -> float:
-        """The criterion, and a price of excess."""
+        """The criterion with a penalty on excess."""
         return self.value + PRICE * max(0.0, self.peak - 1.0)
 
 
 class Search:
-    """Adam on the smoothed criterion at coordinates x (n,), projected on what knots may do; keeps
-    the best motion that was looked at. Raises `SimulationFailed` where the motion given is lost."""
+    """Projected Adam on the smoothed criterion at coordinates x (n,). Keeps the best evaluated
+    motion. Raises `SimulationFailed` where the given motion cannot be run."""
 
     def __init__(
         self, planner: Planner, x: Array, rate: float, smoothing: float, seed: int
@@ -66,7 +66,7 @@ class Search:
         return Visit(self.iteration, seen.value, max(seen.peaks.values(), default=0.0))
 
     def look(self) -> None:
-        """Keeps the motion as it is now, if it is the best."""
+        """Evaluate the current motion, and keep it if it is the best."""
         z, seen, visit = self.adam.z, None, Visit(self.iteration, np.inf, np.inf)
         with suppress(SimulationFailed):
             seen = self.planner.evaluate(z, self.x)
@@ -76,7 +76,7 @@ class Search:
             self.best, self.seen, self.z = visit, seen, z
 
     def move(self, iterations: int) -> None:
-        """One step, or none where the motion is lost."""
+        """Take one step, or none where the run fails."""
         moves, z = self.planner.moves, self.adam.z
         try:
             shifted = moves.nearest(z + self.smoothing * self.rng.standard_normal(moves.n))
@@ -104,18 +104,17 @@ RTOL = 1e-3
 """Relative tolerance of the runs: standard deviations are right to some percent."""
 
 BENT = 1.0
-"""Standard deviations that a step of a fit may end from the truth without a word."""
+"""Largest error, in standard deviations, of a fit's Gauss-Newton step that gets no notice."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """A motion and what it is worth.
+    """A designed motion and its information.
 
-    `recording` follows it, and has the samples that the rig would give with the nominal
-    parameters, without noise; so has `given`, the motion that the search began with. `before` and
-    `after` are the relative standard deviations with either, from other recordings and priors too.
-    `history` has the criterion as it went, `limits` names what holds the motion back, `notices`
-    what a reader must know.
+    `recording` follows it, with noiseless samples at the nominal parameters; so does `given`, with
+    the motion at the start of the search. `before` and `after` are the relative standard deviations
+    with either, including the other recordings and priors. `history` has the criterion over the
+    search, `limits` the active constraints, `notices` other facts about the search.
     """
 
     given: Recording
@@ -128,7 +127,7 @@ class Design:
     made_by: dict[str, Any]
 
     def table(self) -> str:
-        """One line a parameter."""
+        """A line for each parameter."""
         rows = [f"{'relative standard deviation':28s} {'before':>9s} {'after':>9s} {'ratio':>7s}"]
         rows += [
             f"{n:28s} {was:9.2%} {self.after[n]:9.2%} {self.after[n] / was:7.2f}"
@@ -144,23 +143,22 @@ def design(
     smoothing: float = 0.02, rtol: float = RTOL, seed: int = 0, workers: int = 1,
     progress: bool = False,
 ) -> Design:  # fmt: skip
-    """Move the knots of the recording `plan` of a problem until the parameters `names` (all, by
-    default) are known best.
+    """Move the knots of the recording `plan` of a problem to minimise the uncertainty of the
+    parameters `names`, by default all.
 
-    Of the plan's samples only the times count; the other recordings and the priors count with what
-    they tell. Sensors' biases and the like are nuisances: what the criterion sees is what is left
-    when they are fitted too; and, beside the covariance, how far finite steps and bent samples
-    would lead a fit astray (`Planner.errors`), at the nominal values. `criterion` is "D" (the
-    volume of the errors), "A" (their mean square) or "worst". `bounds` holds the travel, speed and
-    free knots of signals of the reference, `limits` the ranges (low, high) [unit] of channels of
-    the run, such as forces.
+    Of the plan's samples only the times count; the other recordings and the priors contribute their
+    information. Faults of sensors are nuisances, which the criterion marginalises. Beside the
+    covariance it counts errors of a fit from finite steps and nonlinear samples (`Planner.errors`),
+    at the nominal values. `criterion` is "D" (the volume of the errors), "A" (their mean square) or
+    "worst". `bounds` holds the travel, speed and free knots of signals of the reference, `limits`
+    the ranges (low, high) [unit] of channels of the run, such as forces.
 
     The search begins with the plan's own motion. Each of the `iterations` moves knots by at most
-    about `rate` times what speed allows from one to the next, shifted at random by `smoothing`
+    about `rate` times the distance that speed allows between two, shifted at random by `smoothing`
     times that, and takes a run with sensitivities and 2 n with the adjoint, of relative tolerance
-    `rtol`. A motion that cannot be run is left; with Ctrl-C the best so far is returned, with a
-    notice. Raises `ValueError` for what does not fit together, and where the plan itself cannot be
-    run.
+    `rtol`. A motion that cannot be run is skipped; on Ctrl-C the best so far is returned, with a
+    notice. Raises `ValueError` for arguments that do not fit together, and where the plan itself
+    cannot be run.
     """
     if plan not in problem.names:
         raise ValueError(

@@ -1,4 +1,5 @@
-"""Estimates with intervals, what is identifiable, and what the fit left in the residuals."""
+"""Estimates with intervals, identifiability, residuals by channel, and contributions of
+recordings."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,17 +25,19 @@ IDENTIFIABLE = 0.5
 spans a factor of seven."""
 
 Seen = Annotated[bool, Field(alias="seen")]
-"""Called `seen` in files, since the first version of them."""
+"""Whether the data determine it; called `seen` in files since their first version."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter (or a coordinate of a start, or something wrong with a sensor) in one recording
-    or in all: value, 95 % interval, standard deviation over the value. One that is not identifiable
-    has neither value nor interval, but `last`, where the search happened to end. `kind` is
-    "parameter", "start", or what is wrong with the sensor, `start` where the search began, and
-    `step_bias_sd` what the steps of the simulation shift the estimate by, in standard
-    deviations."""
+    """Estimate of one parameter, coordinate of a start, or fault of a sensor, in one recording or
+    in all: value, 95 % interval, standard deviation over the value.
+
+    One that is not identifiable has neither value nor interval, only `last`, the end of the search.
+    `kind` is "parameter", "start", or the fault of the sensor; `start` is the start of the search,
+    and `step_bias_sd` the shift of the estimate by the simulation's finite steps, in standard
+    deviations.
+    """
 
     name: str
     unit: str
@@ -52,7 +55,7 @@ class Estimate:
 
     @property
     def label(self) -> str:
-        """Its name, with the recording it belongs to."""
+        """Name, with the recording to which it belongs."""
         return self.name + (f" in {self.recording}" if self.recording else "")
 
 
@@ -68,9 +71,8 @@ class Direction:
 
 @dataclass(frozen=True)
 class ChannelResiduals:
-    """Residuals of one channel in one recording, over the noise and whitened, without what
-    saturation has changed: their rms, the first autocorrelation, and the Ljung-Box p-value of their
-    whiteness."""
+    """Whitened residuals of one channel in one recording, without samples changed by saturation:
+    rms, first autocorrelation, and the Ljung-Box p-value of their whiteness."""
 
     recording: str
     channel: str
@@ -81,9 +83,9 @@ class ChannelResiduals:
 
 
 class Quantity(NamedTuple):
-    """Something that is estimated: its value, that at the start, and how it moves with the
-    coordinates (n,): its logarithm, or the value over `size`. `places` are the coordinates that
-    move it."""
+    """An estimated quantity: its value, its value at the start, and the derivative `slope` by the
+    coordinates (n,) of its logarithm, or of the value over `size`. `places` are the coordinates on
+    which it depends."""
 
     name: str
     kind: str
@@ -101,7 +103,7 @@ class Quantity(NamedTuple):
         return self.name + (f" in {self.recording}" if self.recording else "")
 
     def interval(self, sd: float) -> tuple[float, float]:
-        """95 % of it, for a standard deviation of what moves."""
+        """95 % interval for a standard deviation of the logarithm, or of the value over `size`."""
         reach = float(stats.norm.ppf(0.5 + CONFIDENCE / 2)) * sd
         if self.size is not None:
             return self.value - reach * self.size, self.value + reach * self.size
@@ -110,8 +112,7 @@ class Quantity(NamedTuple):
 
 
 def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[Quantity]:
-    """Parameters in physical units, then coordinates of starts, and what is wrong with sensors, at
-    x (n,)."""
+    """Parameters in physical units, then coordinates of starts and faults of sensors, at x (n,)."""
     c = problem.coordinates
     for k, recording in enumerate(problem.recordings):
         values, before = problem.values(x, k), problem.values(c.start, k)
@@ -148,8 +149,8 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
 def estimates(
     problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array
 ) -> list[Estimate]:
-    """Everything that was estimated, in physical units; C (n, n) and shift (n,) are of all
-    coordinates."""
+    """All estimates in physical units; covariance C (n, n) and shift by the steps (n,) are those of
+    all coordinates."""
     edge, out = free & problem.coordinates.at_bound(x), []
     for one in quantities(problem, x, free):
         sd = float(np.sqrt(max(one.slope @ C @ one.slope, 0.0)))
@@ -167,7 +168,7 @@ def estimates(
 
 
 def nuisance_unit(one: Coordinate, problem: Problem) -> str:
-    """Unit of a start's coordinate, or of what is wrong with a sensor."""
+    """Unit of a coordinate of a start, or of a fault of a sensor."""
     if one.kind == "start":
         axis = one.name.split(".")[2]
         return ("rad" if axis.endswith("theta") else "m") + ("/s" if axis.startswith("v_") else "")
@@ -188,8 +189,8 @@ def directions(labels: list[str], values: Array, vectors: Array) -> list[Directi
 
 
 def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, float]]:
-    """RMS residual over the range of what was measured, by recording and channel, without what
-    saturation has changed."""
+    """RMS residual over the measured range, by recording and channel, without samples changed by
+    saturation."""
     out: dict[str, dict[str, float]] = {name: {} for name in which}
     measured = {recording.name: recording.samples for recording in problem.recordings}
     for part in parts(problem.with_noise({}), r, which):
@@ -220,10 +221,9 @@ def residual_channels(
 
 @dataclass(frozen=True)
 class Contribution:
-    """What one recording told about the estimates, or what the priors did (`source` is None then):
-    its share of the weight in each, by label, all sources together being 1, and how many times
-    larger the standard deviation would be without it; none where the others do not determine the
-    estimate."""
+    """Information of one recording, or of the priors (`source` is None then): its share in each
+    estimate by label, where the shares of all sources add up to 1, and the factor on the standard
+    deviation without it, None where the others do not determine the estimate."""
 
     source: str | None
     shares: dict[str, float]
@@ -233,8 +233,8 @@ class Contribution:
 def contributions(
     problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, fitted: Sequence[str]
 ) -> list[Contribution]:
-    """Of the recordings `fitted`, whose rows the whitened Jacobian J (m, n) at x (n,) has, before
-    those of the priors."""
+    """Contributions of the recordings `fitted`, then of the priors, from the whitened Jacobian J
+    (m, n) at x (n,), whose rows are in this order."""
     rows, at = dict[str | None, slice](), 0
     for name in (name for name in problem.names if name in fitted):
         rows[name] = slice(at, at + problem.samples([name]))

@@ -26,21 +26,21 @@ from torchsoft.sysid.result import IdentificationResult
 from torchsoft.tables import plain
 
 SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
-"""Units of pictures, and what one SI unit is in them; others stay as they are."""
+"""Units in figures, by SI unit, with the factor to them; others stay as they are."""
 
 WIDTH = 5.4
-"""Width of a picture [in]: its text stays legible on a phone."""
+"""Width of a figure [in], at which its text is legible on a phone."""
 
 NAME = 24
-"""Characters in a line of a name beside an axis."""
+"""Most characters in a line of a name beside an axis."""
 
 MOST_NAMES = 3
-"""Parts of a direction that its name has room for."""
+"""Most components in the name of a direction."""
 
 
 class Trace(NamedTuple):
-    """One channel of one recording: its unit, times (k,) [s], samples measured and predicted (k,),
-    and residuals over the noise (k,), as they are and whitened."""
+    """One channel of one recording: its unit, times (k,) [s], measured and predicted samples (k,),
+    and residuals over the noise (k,), raw and whitened."""
 
     recording: str
     channel: str
@@ -53,7 +53,7 @@ class Trace(NamedTuple):
 
 
 def direction_name(d: Direction) -> str:
-    """Its largest components, such as `pad.E − 0.24 contact.K_n`."""
+    """Largest components of a direction, such as `pad.E − 0.24 contact.K_n`."""
     parts = list(d.components.items())
     sign = -1 if parts and parts[0][1] < 0 else 1
     parts = [(name, sign * value) for name, value in parts]
@@ -66,14 +66,13 @@ def direction_name(d: Direction) -> str:
 
 
 def literal(text: str, width: int = 200) -> str:
-    """Text as matplotlib must be given it, lest dollars begin a formula, in lines of `width`
-    characters at most."""
+    """Text for matplotlib, with dollars escaped, in lines of at most `width` characters."""
     return fill(plain(text), width).replace("$", r"\$")
 
 
 @rc_context(STYLE)
 def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
-    """Estimates over their starts, with intervals; None where there is nothing on a log scale."""
+    """Estimates over their starts, with intervals; None where none can be on a log scale."""
     rows = [(e, e.start) for e in estimates if e.start is not None and e.start > 0]
     if not rows:
         return None
@@ -175,9 +174,9 @@ def spectrum_figure(result: IdentificationResult) -> Figure:
 def trace_figure(
     trace: Trace, channel: ChannelResiduals | None, noise: Autoregression | None = None
 ) -> Figure:
-    """Measured and predicted, residuals over the noise, and the autocorrelation of those that are
-    to be white, with its band; where the noise is coloured, that before and that of its model
-    too."""
+    """Measured and predicted samples, residuals over the noise, and the autocorrelation of whitened
+    residuals with its band; for coloured noise also that of raw residuals and of the noise
+    model."""
     shown, scale = SHOWN.get(trace.unit, (trace.unit, 1.0))
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     data, residual, correlation = figure.subplots(3, 1, height_ratios=(2.1, 1, 1))
@@ -225,8 +224,7 @@ def trace_figure(
 
 @rc_context(STYLE)
 def design_figure(design: Design) -> Figure:
-    """The signals whose knots moved, above; relative standard deviations and the criterion
-    below."""
+    """Designed signals above; relative standard deviations and the criterion below."""
     names, bounds = tuple(design.made_by["bounds"]), design.made_by["bounds"]
     figure = Figure(figsize=(9.0, 1.8 * len(names) + 3.2), layout="constrained")
     panels: Any = figure.subfigures(2, 1, height_ratios=(1.8 * len(names), 3.2))

@@ -1,9 +1,9 @@
-"""Where a run begins, from the first samples of its recording: these tell it, and then do not
-count.
+"""Initial state of a run from the first samples of its recording, which then do not count in the
+fit.
 
-Coordinates that sensors measure, and their rates, are those of a cubic through the samples, with
-several times its error and with what may be wrong with the sensor. Stretches are anything that
-friction lets stand.
+Measured coordinates and their rates come from a cubic through the samples, with several times its
+error and with the possible faults of the sensor. Stretches of contacts are anything that friction
+can hold.
 """
 
 from collections.abc import Mapping
@@ -37,15 +37,15 @@ from torchsoft.sysid.recording import SAME, Array, Recording
 from torchsoft.sysid.unknowns import Sensor
 
 DEGREE = 3
-"""Of the polynomial in time through the first samples of a channel."""
+"""Degree of the polynomial through the first samples of a channel."""
 
 WIDER = 4.0
-"""How much wider a prior is than the error of that polynomial, whose noise is estimated from a few
-samples."""
+"""Standard deviation of a prior over the error of that polynomial, whose noise is estimated from a
+few samples."""
 
 MIDWAY, FOLLOWED, SPEED = 2e-4, 1e-3, 0.05
-"""Standard deviations of what no sensor measures: of a disc midway between two pads [m], of what
-follows a set-point [m], of a rate that makes the contacts roll [m/s]; those of angles are over the
+"""Standard deviations without a sensor: of a disc midway between two pads [m], of a coordinate that
+follows a set-point [m], of a rate by which the contacts roll [m/s]. Those of angles are over the
 size of the body."""
 
 SHORTEST, LONGEST = 1e-9, 1e-3
@@ -57,13 +57,13 @@ def estimate_initial_state(
     recording: Recording, sensors: Mapping[str, Sensor], *, lead: float = LEAD,
     given: Mapping[str, Normal] | None = None,
 ) -> Recording:  # fmt: skip
-    """The recording, begun in motion at its first sample; the samples of the first `lead` [s] are
-    left out, and tell where.
+    """The recording with a moving start at its first sample; the samples of the first `lead` [s]
+    determine its initial state, and are left out.
 
-    Coordinates that `sensors` do not measure are `given`, mean and standard deviation by the names
-    of `MovingStart.bodies`, or assumed: what an actuator measures follows its set-point, the disc
-    of the paper's rig lies midway between the pads or on the lower one, the angle of a round body
-    is zero, and other rates are those with which the contacts roll.
+    Coordinates that `sensors` do not measure are `given`, by mean and standard deviation under the
+    names of `MovingStart.bodies`, or assumed: a coordinate measured by an actuator follows its
+    set-point, the disc of the paper's rig lies midway between the pads or on the lower one, the
+    angle of a round body is zero, and other rates are those by which the contacts roll.
 
     Raises `ValueError` for fewer than four early samples of a channel or two later ones, a
     coordinate that is neither measured nor given nor can be assumed, a delay that may be longer
@@ -106,8 +106,8 @@ def estimate_initial_state(
 def measured(
     rig: Rig, early: Mapping[str, tuple[Array, Array]], sensors: Mapping[str, Sensor], whose: str
 ) -> dict[str, Normal]:
-    """Coordinates and rates at time zero that the `early` samples tell, each by the channel that
-    tells it best."""
+    """Coordinates and rates at time zero from the `early` samples, each by the most accurate
+    channel."""
     names, channels, found = free_coordinates(rig), measurable(rig), dict[str, Normal]()
     count = len(names) // 2
     for k, (name, channel) in enumerate(zip(names, channels)):
@@ -125,9 +125,9 @@ def measured(
 
 
 def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tuple[Normal, Normal]:
-    """Value and rate at t = 0 of a channel with samples y (k,) at t (k,) [s], by the polynomial
-    through them; `other` is the size of the channel at right angles that a misaligned sensor sees.
-    Raises `ValueError` for too few samples."""
+    """Value and rate at t = 0 of a channel, by a polynomial through the samples y (k,) at t (k,)
+    [s]; `other` is the size of the perpendicular channel that a misaligned sensor sees. Raises
+    `ValueError` for too few samples."""
     inside = ~sensor.saturated(y)
     t, y = t[inside], y[inside]
     if len(t) < DEGREE + 1:
@@ -152,9 +152,8 @@ def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tu
 
 
 def completed(rig: Rig, known: Mapping[str, Normal], at: float, load: float) -> dict[str, Normal]:
-    """All coordinates of the bodies at a time [s], where some are known; loops give way under a
-    `load` [N]. Raises `ValueError` for
-    one that nothing tells."""
+    """All coordinates of the bodies at a time [s], from the known ones; loops deflect under a
+    `load` [N]. Raises `ValueError` for a coordinate that is neither known nor can be assumed."""
     out, names, signals = dict(known), free_coordinates(rig), rig.follow(at).detach()
     pairs = [pair for a in rig.actuators.values() for pair in a.follows]
     followed = {coordinate: rig.signals.index(setpoint) for coordinate, setpoint in pairs}
@@ -196,8 +195,8 @@ def yielding(rig: Rig, coordinate: str) -> float:
 
 
 def reach(rig: Rig, body: str, axis: str) -> float:
-    """What a standard deviation in metres is divided by for a coordinate: the size of the body [m],
-    or half of its longest pad, for an angle, else one."""
+    """Divisor of a standard deviation in metres for a coordinate: the size of the body [m], or of
+    the largest pad without a shape, for an angle; 1 otherwise."""
     shape = rig.bodies[body].shape
     pads = [0.5 * float(pad.mesh.length) for pad in rig.pads.values() if pad.base == body]
     if axis != "theta":
@@ -208,7 +207,7 @@ def reach(rig: Rig, body: str, axis: str) -> float:
 def rolling(
     rig: Rig, known: Mapping[str, Normal], missing: list[str], signals: Tensor
 ) -> dict[str, Normal]:
-    """The `missing` rates with which the points that touch glide least, weighted with their normal
+    """The `missing` rates that minimise gliding at the touching points, weighted with their normal
     forces."""
     if not missing:
         return {}
@@ -217,7 +216,7 @@ def rolling(
     forces = loads(rig, state)
 
     def glide(rates: Array) -> Array:
-        """Weighted velocities of the bodies' points against the pads', linear in the missing
+        """Weighted velocities of the bodies' points relative to the pads', linear in the missing
         rates."""
         values = {
             PREFIX + name: torch.tensor(rate, dtype=torch.float64)
@@ -245,8 +244,8 @@ def rolling(
 
 
 def unstretched(rig: Rig, pose: dict[str, Tensor], velocity: dict[str, Tensor]) -> State:
-    """The state with pads settled around bodies, without stretch. Raises `ValueError` where they do
-    not settle."""
+    """The state with pads settled around the bodies, without stretch. Raises `ValueError` where
+    they do not settle."""
     none = {name: torch.zeros_like(rig.weight(name)) for name in rig.contacts}
     try:
         y = settled(rig, pose, velocity, none).detach()
@@ -256,7 +255,7 @@ def unstretched(rig: Rig, pose: dict[str, Tensor], velocity: dict[str, Tensor]) 
 
 
 def loads(rig: Rig, state: State) -> dict[str, Tensor]:
-    """Normal forces (points,) [N] by contact of bodies that stand there."""
+    """Normal forces (points,) [N] by contact, of bodies at rest there."""
     out = {}
     for name, contact in rig.contacts.items():
         g = rig.penetration(name, state).detach()
@@ -266,8 +265,8 @@ def loads(rig: Rig, state: State) -> dict[str, Tensor]:
 
 
 def stretches(rig: Rig, bodies: Mapping[str, Normal], at: float, time: float) -> dict[str, Stretch]:
-    """What may be stretched when a run begins at a time `at` [s], bodies being where the means say:
-    each contact at the nodes that are loaded and the next ones, by what its friction lets stand for
+    """Possible stretches at the start of a run at the time `at` [s], with bodies at their means: of
+    each contact at the loaded nodes and their neighbours, up to the stretch that friction holds for
     a `time` [s]."""
     out, state = {}, unstretched(rig, *placed(rig, rig.follow(at).detach(), bodies, {}))
     for name, F_N in loads(rig, state).items():
@@ -286,12 +285,12 @@ def stretches(rig: Rig, bodies: Mapping[str, Normal], at: float, time: float) ->
 
 
 def lasting_stretch(contact: Contact, F_N: float, time: float) -> float:
-    """The largest stretch [m] that a contact's friction lets stand for a `time` [s], at a normal
-    force [N] per reference spacing: mu_s F_N / K_t, by Coulomb's law."""
+    """Largest stretch [m] that friction holds for a `time` [s], under a normal force [N] per
+    reference spacing; mu_s F_N / K_t by Coulomb's law."""
     law = contact.law
 
     def slips(s: float) -> float:
-        """How far [m] a stretch s would slip in that time, less what there is of it."""
+        """Slip [m] of a stretch s in that time, less s."""
         N = torch.tensor(F_N, dtype=torch.float64)
         return float(law.friction(law.K_t * s, N, law.R_t)) * time - s
 

@@ -1,4 +1,4 @@
-"""Least squares on frozen steps: Gauss-Newton on exact sensitivities, descent on the adjoint,
+"""Least squares on frozen steps: Gauss-Newton with exact sensitivities, descent with the adjoint,
 covariance and robust losses."""
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from torchsoft.sysid.runs import Runner
 
 def fisher(J: Array) -> tuple[Array, Array, Array]:
     """Covariance (n, n) of the coordinates, eigenvalues (n,) and eigenvectors (n, n) of the Fisher
-    matrix of a whitened Jacobian J (m, n); directions without any information get a very large
+    matrix of a whitened Jacobian J (m, n). Directions without information get a very large
     variance, not an infinite one."""
     values, vectors = np.linalg.eigh(J.T @ J)
     floor = np.maximum(values, 1e-12 * max(values.max(initial=0.0), 1e-300))
@@ -26,37 +26,36 @@ def fisher(J: Array) -> tuple[Array, Array, Array]:
 
 
 def standard_deviations(J: Array) -> Array:
-    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge
-    without information."""
+    """Cramer-Rao bound: standard deviations (n,) of the coordinates for a whitened Jacobian (m, n);
+    huge without information."""
     return np.sqrt(np.diag(fisher(J)[0]))
 
 
 def shift(J: Array, difference: Array) -> Array:
-    """How far coordinates (n,) at a least-squares fit are from those of a finer model: `difference`
-    (m,) is what the residuals of the finer one, at the fit, have more."""
+    """Shift (n,) of the coordinates of a least-squares fit from those of a finer model;
+    `difference` (m,) is the residuals of the finer model at the fit less those of the fit."""
     return np.asarray(np.linalg.lstsq(J, difference, rcond=None)[0], np.float64)
 
 
 CLOSER = 3.0
-"""How many times better than each of its parameters a combination must be known, to be worth a
-sentence."""
+"""Least ratio of each parameter's standard deviation to that of a combination that is reported."""
 
 AS_GOOD = 1.3
-"""How much larger the standard deviation of a combination may become by rounding its exponents."""
+"""Largest growth of a combination's standard deviation by rounding its exponents."""
 
 MINE = 0.7
-"""Correlation of a parameter with a direction above which its uncertainty comes from there."""
+"""Correlation of a parameter with a direction above which it takes part in that direction."""
 
 EXPONENTS = {1.0: 0.1, 0.5: 0.1, 0.1: 0.2, 0.05: 0.2}
-"""What exponents are rounded to multiples of, the roundest first, and the part of its parameters'
-least standard deviation that a combination may then have whatever it had."""
+"""Units to which exponents are rounded, the coarsest first, and the fraction of its parameters'
+least standard deviation that a combination may always have."""
 
 
 @dataclass(frozen=True)
 class Combination:
-    """A product of powers of parameters that data see better than each of its factors: exponents
-    and standard deviations of the parameters by label, and the standard deviation of the product,
-    all relative."""
+    """A product of powers of parameters that the data determine better than each of its factors:
+    exponents and standard deviations of the parameters by label, and the standard deviation of the
+    product, all relative."""
 
     exponents: dict[str, float]
     sds: dict[str, float]
@@ -64,7 +63,7 @@ class Combination:
 
     @property
     def formula(self) -> str:
-        """Such as `contact.K_n / contact.R_n` or `pad.E * contact.K_n^0.4`."""
+        """The product as text, such as `contact.K_n / contact.R_n` or `pad.E * contact.K_n^0.4`."""
         powers = {name: "" if abs(p) == 1 else f"^{abs(p):g}" for name, p in self.exponents.items()}
         above = [name + powers[name] for name, p in self.exponents.items() if p > 0]
         below = [name + powers[name] for name, p in self.exponents.items() if p < 0]
@@ -77,17 +76,18 @@ class Combination:
 
 
 def percent(sd: float) -> str:
-    """A relative standard deviation."""
+    """A relative standard deviation in words."""
     return "not at all" if sd >= 10 else f"{100 * sd:.2g} %"
 
 
 def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combination]:
-    """What is seen of parameters that are not: for every direction in which they are less certain
-    than `blurred` together, the best determined product of powers of the parameters that take part.
+    """Identifiable combinations of parameters that are not identifiable themselves: for every
+    direction with a standard deviation above `blurred`, the best determined product of powers of
+    the participating parameters.
 
-    C (n, n) is the covariance of the logarithms of the parameters `labels`, whatever else was
-    fitted being left out of it. A direction whose product is not `CLOSER` times better known than
-    each of its factors is left out: its parameters are not seen at all.
+    C (n, n) is the covariance of the logarithms of the parameters `labels`, marginal over all else
+    that was fitted. A direction whose product is not `CLOSER` times better determined than each of
+    its factors is left out: its parameters leave no trace in the data.
     """
     values, vectors = np.linalg.eigh(C)
     out: list[Combination] = []
@@ -114,7 +114,7 @@ def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combin
 
 
 def rounded(direction: Array, C: Array) -> Array:
-    """A direction (n,) whose largest component is 1, the others rounded as far as the variance in C
+    """A direction (n,) with largest component 1, and the others rounded as far as the variance in C
     (n, n) allows."""
     exact = direction / direction[np.argmax(np.abs(direction))]
     own, least = float(exact @ C @ exact), float(np.diag(C).min())
@@ -137,10 +137,10 @@ REACH: dict[Loss, float] = {
     "cauchy": 2.385,
     "arctan": 2.571,
 }
-"""c of every loss, such that where the noise is Gaussian it has the `EFFICIENCY`."""
+"""Tuning constant c of every loss, at which it has the `EFFICIENCY` under Gaussian noise."""
 
 EFFICIENCY = 0.95
-"""Variance of the least-squares estimate over the robust one's, with Gaussian noise."""
+"""Variance of the least-squares estimate over that of the robust one, under Gaussian noise."""
 
 
 def rho(loss: Loss, z: Array) -> Array:
@@ -164,8 +164,8 @@ def rho(loss: Loss, z: Array) -> Array:
 
 
 def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
-    """The loss as `least_squares` takes it, linear in the last rows, which are `priors`; its
-    `f_scale` is `REACH[loss]`."""
+    """The loss in the form of `least_squares`, linear in the last `priors` rows; its `f_scale` is
+    `REACH[loss]`."""
 
     def rows(z: Array) -> Array:
         data = len(z) - priors
@@ -177,14 +177,14 @@ def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
 def covariance(
     J: Array, r: Array, loss: Loss, priors: int = 0, exact: NDArray[np.int_] | None = None
 ) -> Array:
-    """Of the coordinates (n, n) where a robust fit has ended: J (m, n) and residuals r (m,) there,
-    the last rows `priors`.
+    """Sandwich covariance (n, n) of the coordinates at the end of a robust fit: J (m, n) and
+    residuals r (m,) there, of which the last `priors` rows are priors.
 
     With psi = rho' r, A = E[psi'] J'J and B = E[psi^2] J'J, both with the priors' own J'J, it is
-    A^-1 B A^-1; expectations are means over the residuals, that of psi^2 over the degrees of
-    freedom; over those `exact` (k,) only, where some samples are saturated. They are not taken
-    below what Gaussian noise as stated gives, 1 over the loss's efficiency. Raises `ValueError`
-    where so many residuals are outliers that nothing holds the estimates.
+    A^-1 B A^-1. Expectations are means over the residuals, that of psi^2 over the degrees of
+    freedom; where some samples are saturated, over the residuals `exact` (k,) only. They are not
+    taken below their values under the stated Gaussian noise, 1 over the loss's efficiency. Raises
+    `ValueError` where most residuals are outliers.
     """
     m, n = len(r) - priors, J.shape[1]
     own = r[:m] if exact is None else r[exact]
@@ -210,12 +210,12 @@ def covariance(
 Notify = Callable[[float], None]
 
 SETTLED = 0.2
-"""Part of a standard deviation by which a coordinate may still move where a fit has ended."""
+"""Largest remaining move of a coordinate, in standard deviations, at which a fit has ended."""
 
 
 class Unreachable(RuntimeError):
-    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has
-    reason and time, `findings` what looked wrong with the recordings themselves."""
+    """The model cannot follow a recording at the start of a fit; `lost` has reason and time by
+    recording, `findings` the doubts about the recordings themselves."""
 
     def __init__(self, lost: dict[str, FailedRun], findings: Sequence[str] = ()) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
@@ -225,8 +225,8 @@ class Unreachable(RuntimeError):
 
 
 class Fit(NamedTuple):
-    """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their
-    number), evaluations, whether it converged, and the residuals there with their Jacobian."""
+    """End of a fit on `steps`: coordinates x (n,), chi2 (mean squared residual), evaluations,
+    convergence, and the residuals there with their Jacobian."""
 
     x: Array
     chi2: float
@@ -290,11 +290,10 @@ def chord(
     free: NDArray[np.bool_], steps: StepsByName, rounds: int = 5,
     notify: Notify = lambda chi2: None,
 ) -> Fit:  # fmt: skip
-    """From a fit on other steps to the one on these: `at` holds the residuals at x on these steps,
-    and the Jacobian on the others, which is kept; until a coordinate would move by less than
-    `SETTLED` standard deviations. A round costs a run, not a Jacobian. It ends where a run fails or
-    the misfit grows.
-    """
+    """Chord iteration from a fit on other steps to the fit on `steps`: `at` holds the residuals at
+    x on these steps, and the Jacobian on the others, which is kept. A round costs a run, not a
+    Jacobian. It ends where every coordinate would move by less than `SETTLED` standard deviations,
+    a run fails, or the misfit grows."""
     count = 0
     while not (converged := settled(problem, x, at, free)) and count < rounds:
         trial = x.copy()
@@ -308,8 +307,9 @@ def chord(
 
 
 def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> Array:
-    """What Gauss-Newton adds to the free coordinates at x: the least squares within their bounds.
-    To clip the free step would not do: what is held at a bound leaves the others where they are."""
+    """Gauss-Newton step of the free coordinates at x: the linear least squares within their bounds.
+    Clipping the free step would not do, since a coordinate at its bound changes the step of the
+    others."""
     low, high = (bound[free] - x[free] for bound in problem.coordinates.bounds)
     step = -shift(at.J[:, free], at.r)
     if ((low <= step) & (step <= high)).all():
@@ -319,7 +319,8 @@ def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool
 
 
 def settled(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> bool:
-    """Whether that is less than `SETTLED` standard deviations for all of them."""
+    """Whether the Gauss-Newton step is below `SETTLED` standard deviations for all free
+    coordinates."""
     return bool(
         (
             np.abs(newton_step(problem, x, at, free))

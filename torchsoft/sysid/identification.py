@@ -4,7 +4,7 @@
 import platform
 import sys
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -65,19 +65,19 @@ from torchsoft.sysid.unknowns import Coordinates
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
-"""Relative tolerance of the last stage: derivatives are then right to some percent, and estimates
-to a fraction of a standard deviation where sensors are as good as `RIG`."""
+"""Relative tolerance of the last stage, at which derivatives are right to some percent, and
+estimates to a fraction of a standard deviation with sensors as good as `RIG`."""
 
 PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
-"""Those whose versions a result names."""
+"""Packages whose versions a result records."""
 
 Assumed = Literal["checked", "explained", "trusted"]
 """Whether assumptions are tested to first order, tested and followed by new fits that look for a
-cause, or believed."""
+cause, or trusted."""
 
 
 class Settings(Table):
-    """How to fit: the arguments of `identify` by the same names."""
+    """Settings of a fit, which are arguments of `identify`."""
 
     rtol: float = Field(RTOL, ge=1e-8, le=1e-2)
     starts: int = Field(1, ge=1, le=2**20)
@@ -102,8 +102,7 @@ class Settings(Table):
 
 
 class How(NamedTuple):
-    """How an identification goes about it, beside its stages; `identify` says what the fields
-    mean."""
+    """Arguments of an identification besides its stages; `identify` documents the fields."""
 
     fitted: list[str]
     heldout: tuple[str, ...]
@@ -116,8 +115,7 @@ class How(NamedTuple):
 
     @property
     def tightenings(self) -> int:
-        """How often the tolerance may become tighter; a robust fit ends on the steps that it
-        has."""
+        """Most times that the tolerance may become tighter; a robust fit keeps its steps."""
         return self.settings.tightenings if self.loss == "linear" else 0
 
 
@@ -125,14 +123,14 @@ def conclude(
     coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How,
     findings: list[str], asked: float, began: float, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
-    """The result, from the fit of the last stage with the noise that was found; `findings` are
-    sentences on the recordings and the plan, `asked` is the tolerance of the whole plan, `began` is
-    on the clock [s]."""
+    """The result, from the fit of the last stage with its estimated noise. `findings` are sentences
+    on the recordings and the plan, `asked` is the tolerance of the whole plan, `began` is on the
+    clock [s]."""
     c = coloured.problem.coordinates
     free, stages = np.isin(c.labels, stage.free), list(stages)
 
     def at_rest() -> Settled:
-        """The fit of the noise that is known, gone on until steps do not matter."""
+        """Continue the fit with its noise until its steps do not matter."""
         start, by = clock.perf_counter(), stage.rtol
         with progress_bar("check of the steps", progress) as notify:
             end = settle(
@@ -179,7 +177,7 @@ def conclude(
         else covariance(J, at.r, how.loss, len(c.priors), exact)
     )
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
-    labels = [label for label, one in zip(c.labels, free) if one]
+    labels = [one.label for one in c.within(free)]
     found = estimates(problem, x, free, C, shift)
     predicted, notices = {}, list(findings)
     if how.heldout:
@@ -193,7 +191,9 @@ def conclude(
             predicted = nrmse(problem, held.r, list(how.heldout))
             notices += guesses(problem, x, how.heldout)
     sd = np.sqrt(np.diag(C_free))
-    notices += notices_on(found, end.at_rest or bool(end.rough), rtol, end.bias is None)
+    notices += notices_on(
+        found, held_by(problem), end.at_rest or bool(end.rough), rtol, end.bias is None
+    )
     notices += rough_notices(c, end.rough)
     notices += assumption_notices(checked) if checked is not None else []
     notices += residual_notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
@@ -246,7 +246,7 @@ def conclude(
 
 
 def noise_entries(coloured: Coloured, stage: Stage, began: float) -> list[dict[str, Any]]:
-    """The result's entries on the fits with the noise that was found."""
+    """The result's entries on the fits with estimated noise."""
     name, out = "with the noise that was found", []
     for one, at in coloured.fits:
         out.append(stage_entry(name, stage, stage.rtol, one, began, at))
@@ -258,9 +258,9 @@ def tested_assumptions(
     coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_],
     doubtful: bool, how: How, progress: bool,
 ) -> Checked:  # fmt: skip
-    """The checks at the end of a fit, on residuals with the colour that was declared and no other:
-    what was found unasked may be the very trace of a wrong assumption. Their columns then get all
-    the noise."""
+    """Tests of the assumptions at the end of a fit, on residuals whitened by declared colour only:
+    undeclared colour may be the trace of a wrong assumption. The columns in the result are whitened
+    by all of the noise."""
     problem, which = coloured.problem, stage.recordings
     declared = {
         channel: noise
@@ -282,8 +282,8 @@ def tested_assumptions(
 
 
 def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
-    """Sentences on recordings that were predicted with values of their own, which no recording that
-    was fitted tells."""
+    """Sentences on held-out recordings that were predicted with parameters of their own, which no
+    fitted recording determines."""
     out = []
     for k in (k for k, name in enumerate(problem.names) if name in heldout):
         mine = [
@@ -298,8 +298,27 @@ def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
     return out
 
 
-def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) -> list[str]:
-    """Sentences on what a reader must know before using the numbers."""
+NEXT_TO = 1e-2
+"""Relative distance of an estimate at a bound from the known number that is the bound."""
+
+
+def held_by(problem: Problem) -> dict[str, tuple[str, float]]:
+    """Known numbers that unknown ones may not pass, such as mu_k of mu_s: name and value by the
+    name of the unknown."""
+    out, unknown = dict[str, tuple[str, float]](), problem.coordinates.names
+    for recording in problem.recordings:
+        for pair in recording.rig.ordered.items():
+            for mine, other in (pair, pair[::-1]):
+                if mine in unknown and other not in unknown:
+                    out[mine] = other, recording.parameters[other]
+    return out
+
+
+def notices_on(
+    found: list[Any], held: Mapping[str, tuple[str, float]], converged: bool, rtol: float,
+    unchecked: bool,
+) -> list[str]:  # fmt: skip
+    """Sentences on unidentifiable estimates, active bounds, tolerance and convergence."""
     out = []
     for e in found:
         if not e.identifiable:
@@ -312,9 +331,11 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
                 f"{e.label} is not identifiable from these data: {change} would not show in them"
             )
         if e.at_bound and e.identifiable:
-            out.append(
-                f"{e.label} ended at a bound ({e.last:.4g}): widen the bound or question the model"
-            )
+            other, value = held.get(e.name, ("", np.nan))
+            remedy = "widen the bound or question the model"
+            if np.isclose(e.last, value, rtol=NEXT_TO):
+                remedy = f"{other} = {value:.4g}, which is known, holds it there; is that right?"
+            out.append(f"{e.label} ended at a bound ({e.last:.4g}): {remedy}")
     worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
     if unchecked:
         out.append(
@@ -333,7 +354,8 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
 
 
 def rough_notices(c: Coordinates, rough: Sequence[str]) -> list[str]:
-    """That samples are not smooth in some coordinates where a fit has ended, and the remedy."""
+    """A sentence on coordinates in which samples are not smooth at the end of the fit, with the
+    remedy."""
     if not rough:
         return []
     remedy = "judge the intervals by profile likelihoods (torchsoft.sysid.profile)"
@@ -455,8 +477,8 @@ def with_its_noise(
     method: Method,
     notify: Notify,
 ) -> Coloured:
-    """The fit of the last stage, gone on with whatever noise it leaves: by new Jacobians, then by
-    the last one."""
+    """The fit of the last stage, continued with the noise estimated from its residuals: with a new
+    Jacobian first, then with the last one."""
     free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
 
     def refit(one: Problem, last: Fit, number: int) -> Fit:

@@ -7,8 +7,9 @@ differentiable in both.
 """
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -22,7 +23,7 @@ from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, settled, standing
+from torchsoft.physics.statics import NoEquilibrium, resting, settled, standing
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.tangent import directions
 
@@ -119,24 +120,33 @@ class AtRest(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """Bodies are at known places, `lead` [s] before the first sample, and pads have settled around
-    them.
+    """Bodies stand at known places, `lead` [s] before the first sample, and pads have settled
+    around them.
 
-    `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s], `position_sd`
-    how well coordinates such as "disc.x" are known [m, rad]: these are coordinates of the start.
-    The displacements of the pads are those at the nominal parameters, whatever the others are.
+    `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s]; `rests` by body
+    the numbers of the coordinates that are in balance instead, no actuator pushing; `position_sd`
+    the standard deviations of coordinates such as "disc.x" [m, rad], which are coordinates of the
+    start. Rest and pads are those of the present parameters, not of the nominal ones.
     """
 
     bodies: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
     lead: float = SETTLE
-    position_sd: Mapping[str, float] = {}
+    rests: Mapping[str, Sequence[int]] = MappingProxyType({})
+    position_sd: Mapping[str, float] = MappingProxyType({})
 
     @classmethod
-    def of(cls, rig: Rig, y0: Tensor, lead: float = SETTLE) -> "Standing":
+    def of(
+        cls, rig: Rig, y0: Tensor, lead: float = SETTLE,
+        rests: Mapping[str, Sequence[int]] = MappingProxyType({}),
+    ) -> "Standing":  # fmt: skip
         """The places of the state y0 (size,)."""
         state = rig.unpack(y0.detach())
         pairs = zip(state.pose.items(), state.velocity.values())
-        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead)
+        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead, rests)
+
+    def __repr__(self) -> str:
+        rests, sd = dict(self.rests), dict(self.position_sd)
+        return f"Standing({dict(self.bodies)}, {self.lead}, {rests}, {sd})"
 
     def __str__(self) -> str:
         return f"{self.lead:g} s early, bodies at known places, pads settled around them"
@@ -163,29 +173,30 @@ class Standing(NamedTuple):
         return self.bodies[body][0][COORDINATES.index(axis)]
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
-        own, moving = (
-            deepcopy(rig).requires_grad_(False),
-            [k for k, sd in self.position_sd.items() if sd > 0],
+        at = min(float(t[0]) for t, _ in samples.values()) - self.lead
+        given, velocity = (
+            {name: torch.tensor(one[k], dtype=torch.float64) for name, one in self.bodies.items()}
+            for k in range(2)
         )
+        still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
 
         def state(values: Mapping[str, Tensor]) -> Tensor:
-            pose = {k: torch.tensor(q, dtype=torch.float64) for k, (q, _) in self.bodies.items()}
-            for name in moving:
-                body, axis = name.split(".")
-                place = torch.tensor(self.place(name), dtype=torch.float64)
-                by = values.get(f"{PREFIX}{name}", place) - place
-                pose[body] = pose[body] + by * torch.eye(3).double()[COORDINATES.index(axis)]
-            found = own.unpack(standing(own, pose))
-            rates = {
-                k: torch.tensor(self.bodies[k][1], dtype=torch.float64) for k in found.velocity
-            }
-            return own.pack(found._replace(velocity=rates))
+            pose = dict(given)
+            for name in self.position_sd:
+                if (place := values.get(f"{PREFIX}{name}")) is not None:
+                    body, axis = name.split(".")
+                    row = torch.eye(3, dtype=torch.float64)[COORDINATES.index(axis)]
+                    pose[body] = pose[body] + (place - self.place(name)) * row
+            try:
+                if self.rests:
+                    pose = resting(rig, pose, self.rests, signals=still, actuators=())
+                found = rig.unpack(standing(rig, pose))
+            except NoEquilibrium as error:
+                raise SimulationFailed(f"the run cannot begin there: {error}", at) from None
+            moving = {name: velocity[name] for name in found.velocity}
+            return rig.pack(found._replace(velocity=moving))
 
-        if moving:
-            return HeldPads(rig, rig, state)
-        with torch.no_grad():
-            y0 = state({})
-        return HeldPads(rig, rig, lambda values: y0)
+        return state
 
 
 class Known(NamedTuple):

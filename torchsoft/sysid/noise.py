@@ -1,13 +1,13 @@
-"""Noise as it is: coloured, as an autoregression whose order the data choose.
+"""Coloured noise, as an autoregression of estimated order.
 
 Residuals (m,) of one channel are in units of the noise that its sensor states. An autoregression of
 order p is
 
     u_k = phi_1 u_(k-1) + ... + phi_p u_(k-p) + scale e_k,   e_k independent, normal, of variance 1,
 
-on a regular grid, of which samples may be missing. Its whitener W has W' W = K^-1, K the covariance
-of the samples that are there, so |W r|^2 + log det K is -2 log likelihood, but for a constant, and
-W J is the Jacobian that belongs to W r.
+on a regular grid with possible gaps. Its whitener W has W' W = K^-1, with K the covariance of the
+samples, so |W r|^2 + log det K is -2 log likelihood up to a constant, and W J is the Jacobian of W
+r.
 """
 
 from collections.abc import Sequence
@@ -21,30 +21,29 @@ from scipy import linalg, optimize, signal, sparse
 from torchsoft.sysid.recording import Array
 
 JITTER = 0.05
-"""Part of the spacing by which samples may be off their grid."""
+"""Largest deviation of samples from their grid, over its spacing."""
 
 MEMORY = 200
-"""Most samples of the past that a whitened one looks back at. Fewer do exactly, as soon as p of
-them follow each other."""
+"""Most past samples in the prediction of one; p consecutive samples are enough for an exact one."""
 
 ORDERS = 12
-"""Largest order that a fit of the noise tries."""
+"""Largest order in a fit of noise."""
 
 SAMPLES_AN_ORDER = 10
-"""Fewest samples that a coefficient is found from."""
+"""Fewest samples for each coefficient."""
 
 
 def spacing(t: Array) -> float:
-    """Of the grid that sample times t (m,) [s] lie on, some of whose points may be empty: the mean
-    of what lies between neighbours."""
+    """Spacing [s] of the grid of sample times t (m,) [s], which may have gaps: the mean distance of
+    neighbours."""
     apart = np.diff(t)
     near = apart[apart < 1.5 * np.quantile(apart, 0.1)]
     return float(near.mean())
 
 
 def positions(t: Array, h: float) -> tuple[Array, bool]:
-    """Sample times t (m,) [s] over the spacing h [s], from 0, and whether they are whole numbers,
-    but for `JITTER`; then rounded."""
+    """Sample times t (m,) [s] over the spacing h [s], from 0, and whether they are whole numbers up
+    to `JITTER`, to which they are then rounded."""
     apart = np.diff(t) / h
     whole = np.round(apart)
     regular = bool((np.abs(apart - whole) <= JITTER).all() and (whole >= 1).all())
@@ -52,7 +51,8 @@ def positions(t: Array, h: float) -> tuple[Array, bool]:
 
 
 def coefficients(reflections: Sequence[float] | Array) -> Array:
-    """phi (p,) from the p reflection coefficients, by the recursion of Levinson and Durbin."""
+    """Coefficients phi (p,) from the p reflection coefficients, by the Levinson-Durbin
+    recursion."""
     phi = np.zeros(0)
     for kappa in reflections:
         phi = np.append(phi - kappa * phi[::-1], kappa)
@@ -60,7 +60,8 @@ def coefficients(reflections: Sequence[float] | Array) -> Array:
 
 
 def reflections(phi: Sequence[float]) -> Array:
-    """The recursion backwards; the process is stationary where all are between -1 and 1."""
+    """Reflection coefficients, by the inverse recursion; the process is stationary where all are
+    between -1 and 1."""
     a, out = np.array(phi, float), []
     while len(a):
         out.append(kappa := a[-1])
@@ -73,8 +74,8 @@ def reflections(phi: Sequence[float]) -> Array:
 @dataclass(frozen=True)
 class Autoregression:
     """Coloured noise of one channel: coefficients `phi` (p,), the standard deviation `scale` of the
-    innovations, in units of the noise that the sensor states, and the `spacing` [s] of the samples
-    that they belong to; white without coefficients.
+    innovations, in units of the sensor's stated noise, and the `spacing` [s] of the samples; white
+    without coefficients.
 
     Raises `ValueError` where it is not stationary.
     """
@@ -96,7 +97,7 @@ class Autoregression:
 
     @classmethod
     def stated(cls, phi: Sequence[float], spacing: float) -> "Autoregression":
-        """Noise of this colour whose standard deviation is what the sensor states."""
+        """Noise of this colour with the standard deviation that the sensor states."""
         one = cls(tuple(phi), 1.0, spacing)
         return cls(one.phi, one.autocovariance(1)[0] ** -0.5, spacing)
 
@@ -106,11 +107,11 @@ class Autoregression:
 
     @property
     def sd(self) -> float:
-        """Standard deviation of the noise, over the one that the sensor states."""
+        """Standard deviation of the noise, over that stated for the sensor."""
         return float(self.autocovariance(1)[0] ** 0.5)
 
     def autocovariance(self, n: int) -> Array:
-        """At lags 0 to n - 1 (n,)."""
+        """Autocovariance at lags 0 to n - 1 (n,)."""
         p = self.order
         a = np.concatenate(([1.0], -np.array(self.phi)))
         lag = np.abs(
@@ -127,7 +128,7 @@ class Autoregression:
         return np.concatenate((first, rest))
 
     def effective(self, n: int) -> float:
-        """How many independent samples tell the variance as exactly as n of this noise."""
+        """Number of independent samples that determine the variance as well as n of this noise."""
         rho = self.autocovariance(n) / self.autocovariance(1)[0]
         return n / (1 + 2 * float((1 - np.arange(1, n) / n) @ rho[1:] ** 2))
 
@@ -183,8 +184,8 @@ class Autoregression:
 
 
 def pasts(grid: NDArray[np.int_], p: int) -> NDArray[np.int_]:
-    """For samples at the points `grid` (m,): the first one that has to be known to predict each
-    from its past (m,). What came before p in a row does not matter."""
+    """For samples at grid points `grid` (m,), index (m,) of the first one needed to predict each
+    from its past. Samples before p consecutive ones do not matter."""
     i = np.arange(len(grid))
     begins = np.concatenate(([True], np.diff(grid) != 1))
     run = i - np.maximum.accumulate(np.where(begins, i, 0)) + 1  # samples in a row, up to this one
@@ -193,13 +194,14 @@ def pasts(grid: NDArray[np.int_], p: int) -> NDArray[np.int_]:
 
 
 def log_det(W: sparse.csr_array) -> float:
-    """log det K of the noise that W whitens."""
+    """log det K of the noise with the whitener W."""
     return -2 * float(np.log(W.diagonal()).sum())
 
 
 @dataclass(frozen=True)
 class Score:
-    """One order that was tried: -2 log likelihood of all samples, and the criterion of Bayes."""
+    """One order of a fit: -2 log likelihood of all samples, and the Bayesian information
+    criterion."""
 
     order: int
     deviance: float
@@ -207,7 +209,7 @@ class Score:
 
 
 class NoiseFit(NamedTuple):
-    """The noise that was found, and every order that was tried."""
+    """The selected noise, and the scores of all orders."""
 
     noise: Autoregression
     scores: tuple[Score, ...]
@@ -219,10 +221,11 @@ def fit_noise(
     """Noise of one channel from its residuals: times (m,) [s] and residuals (m,) of each recording.
 
     Every order up to `most`, as far as the samples go, is fitted by Burg's method for segments (de
-    Waele and Broersen, 2000), which gives stationary noise only, and the one with the least
-    Bayesian criterion is taken; its likelihood is exact, with gaps, and where a recording is
-    sampled at a whole part of the highest rate. `parameters` is how many unknowns these residuals
-    have been fitted with. Without such a grid the orders are 0 and 1, by maximum likelihood.
+    Waele and Broersen, 2000), whose noise is always stationary, and the order with the least
+    Bayesian information criterion is selected. The likelihood is exact, with gaps, and where a
+    recording is sampled at a whole fraction of the highest rate. `parameters` is the number of
+    unknowns fitted to these residuals. Without such a grid the orders are 0 and 1, by maximum
+    likelihood.
     """
     h, m = min(spacing(t) for t, _ in series), sum(len(t) for t, _ in series)
     if all(positions(t, h)[1] for t, _ in series):
@@ -252,14 +255,14 @@ def fit_noise(
 
 
 def segments(t: Array, r: Array, h: float) -> list[Array]:
-    """The residuals (m,) in pieces without gaps."""
+    """Residuals (m,), split at gaps."""
     k, _ = positions(t, h)
     return np.split(r, np.flatnonzero(np.diff(k) > 1.5) + 1)
 
 
 def burg(parts: Sequence[Array], most: int) -> Array:
-    """Reflection coefficients (most,) that forward and backward prediction errors within the
-    pieces, together, make smallest; fewer where the pieces are too short."""
+    """Reflection coefficients (most,) that minimise the forward and backward prediction errors
+    within all segments; fewer where the segments are too short."""
     forward, backward, out = [p.copy() for p in parts], [p.copy() for p in parts], []
     for _ in range(most):
         pairs = [(f[1:], b[:-1]) for f, b in zip(forward, backward) if len(f) > 1]
@@ -273,7 +276,7 @@ def burg(parts: Sequence[Array], most: int) -> Array:
 
 
 def by_time(series: Sequence[tuple[Array, Array]], h: float) -> float:
-    """The most likely correlation over h [s] of noise that decays with time."""
+    """Maximum-likelihood correlation over h [s] of noise that decays exponentially with time."""
     m = sum(len(t) for t, _ in series)
 
     def deviance(z: float) -> float:

@@ -1,8 +1,8 @@
-"""NUTS on the exact gradients: draws of the posterior where it is not Gaussian, too.
+"""Posterior draws by NUTS with exact gradients, also for a posterior that is not Gaussian.
 
-A coordinate x between its bounds becomes y = logit((x - low) / (high - low)), whose density has
-dx/dy as a factor more, and y is whitened by the curvature at the optimum, so that the sampler sees
-something like a standard normal distribution.
+A coordinate x between its bounds becomes y = logit((x - low) / (high - low)), whose density has the
+additional factor dx/dy. y is whitened by the curvature at the optimum, so that the sampler sees
+approximately a standard normal distribution.
 """
 
 import importlib
@@ -29,16 +29,15 @@ from torchsoft.sysid.recording import Array
 from torchsoft.threads import single_threaded
 
 EDGE = 1e-3
-"""Nearest to a bound, as part of the way between the two, that the middle of the whitened
-coordinates may lie."""
+"""Least distance of the whitened coordinates' origin from a bound, over the width of the bounds."""
 
 R_HAT, EFFECTIVE = 1.01, 100
-"""Largest R-hat of chains that have mixed (Vehtari et al. 2021), and the fewest independent draws
-that give an interval."""
+"""Largest R-hat of mixed chains (Vehtari et al. 2021), and fewest effective draws for an
+interval."""
 
 
 class Failed(RuntimeError):
-    """A run that failed: the sampler takes it for a wall."""
+    """A failed run, which the sampler treats as a wall."""
 
     is_recoverable = True
 
@@ -67,8 +66,7 @@ class Whitened(NamedTuple):
         return self.low + self.width * expit(self.middle + self.A @ z)
 
     def density(self, o: Optimum, z: Array) -> tuple[float, Array]:
-        """Logarithm of the posterior density of z, but for a constant, and its gradient (n,).
-        Raises `Failed`."""
+        """Log posterior density of z, up to a constant, and its gradient (n,). Raises `Failed`."""
         y = self.middle + self.A @ z
         x, u = o.place(self.low + self.width * expit(y)), expit(y)
         value, gradient, reason = o.misfit(x)
@@ -82,8 +80,7 @@ class Whitened(NamedTuple):
 def sampler() -> Any:
     """nutpie. Raises `ImportError` with the remedy where it is missing."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # arviz announces its next edition
+        with warnings.catch_warnings(action="ignore"):  # arviz announces its next edition
             importlib.import_module("nutpie.compiled_pyfunc")
             return importlib.import_module("nutpie")
     except ImportError as missing:
@@ -94,13 +91,13 @@ def nuts(
     o: Optimum, *, chains: int = 4, draws: int = 250, tune: int = 100, accept: float = 0.8,
     seed: int = 0, progress: bool = False,
 ) -> Posterior:  # fmt: skip
-    """Draws by the No-U-Turn sampler of nutpie, in `chains` that run side by side in the optimum's
-    threads; `tune` more draws of each, before, are for its step and scales. More shares `accept` of
-    proposals that are taken need shorter steps.
+    """Posterior draws by the No-U-Turn sampler of nutpie, in `chains` that run side by side in the
+    optimum's threads, after `tune` draws of each for step size and scales. A larger target
+    acceptance rate `accept` makes steps shorter.
 
-    A run that fails counts as a wall. Ctrl-C ends it with the draws so far, if there are any. The
-    same seed gives the same draws. Raises `ImportError` without nutpie, and `RuntimeError` where no
-    start near the optimum can be simulated.
+    A run that fails counts as a wall. Ctrl-C ends the sampling with the draws so far, if there are
+    any. The same seed gives the same draws. Raises `ImportError` without nutpie, and `RuntimeError`
+    where no start near the optimum can be simulated.
     """
     if chains < 1 or draws < 4 or tune < 20:
         raise ValueError(
@@ -138,8 +135,7 @@ def nuts(
         ["x"],
         make_initial_point_fn=start,
     )
-    with single_threaded(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with single_threaded(), warnings.catch_warnings(action="ignore"):
         trace = package.sample(
             model, chains=chains, cores=min(chains, o.workers), draws=draws, tune=tune,
             target_accept=accept, seed=seed, progress_bar=progress,
@@ -174,9 +170,9 @@ def nuts(
 
 
 def complete(trace: Any, draws: int) -> tuple[Array, dict[str, Array]]:
-    """Free coordinates (chains, draws, n) and the sampler's own numbers (chains, draws): those
-    chains, cut to one length, that leave most draws. Raises `KeyboardInterrupt` where an
-    interruption left none."""
+    """Free coordinates (chains, draws, n) and sampler statistics (chains, draws), of the chains,
+    cut to equal length, that retain most draws. Raises `KeyboardInterrupt` where an interruption
+    left none."""
     z = trace.posterior["x"].values[:, :draws]
     length = np.isfinite(z).all(-1).sum(-1)
     order = np.argsort(-length, kind="stable")

@@ -1,10 +1,10 @@
-"""Stages: which data, which unknowns, which ties, in which order.
+"""Stages of a fit: recordings, free coordinates, ties and tolerances, in order.
 
 A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be
-simulated. So: first the slowest recording, for what it can identify; then all of them, with ratios
-(kinetic over static friction) tied at their upper bound, because friction that does not fall with
-slip always has a solution; then a scan over each ratio, and everything free. Tolerances are loose
-in the beginning, and the last stage takes the full one.
+simulated. So the first stage fits the slowest recording, for its identifiable coordinates; the next
+fits all recordings, with ratios (kinetic over static friction) tied at their upper bound, because
+friction that does not fall with slip always has a solution; then each ratio is scanned and
+everything is free. Tolerances are loose at first, and full in the last stage.
 """
 
 import time as clock
@@ -39,27 +39,28 @@ from torchsoft.sysid.runs import Runner
 from torchsoft.tables import plain
 
 FIRST_LOOK = 0.1
-"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this:
-one that is barely identifiable would run off to make up for what is still wrong elsewhere."""
+"""Largest predicted standard deviation [1] of a coordinate in the first stage: one that is barely
+identifiable would compensate for errors elsewhere."""
 
 LOOSE, USUAL = 1e-3, 1e-4
-"""Relative tolerances of the stages with ratios tied, and of those before the last one."""
+"""Relative tolerances of the stages with tied ratios, and of those between them and the last
+one."""
 
 FIRST, ALL, FREE, LAST = 8, 15, 30, 20
-"""Evaluations that each of the stages may take."""
+"""Most evaluations of each stage."""
 
 SCANNED = (1.0, 0.85, 0.7, 0.55)
-"""Parts of its upper bound at which a ratio is tried before it is set free."""
+"""Fractions of its upper bound at which a ratio is tried before it is free."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """One fit: recordings, free coordinates by label, the relative tolerance that chooses its
-    steps, how long, and what is set or scanned before it.
+    steps, limits of its iteration, and coordinates to set or scan before it.
 
-    `tied` sets coordinates to values; `scanned` tries each value, by `LOOSE`, the others held, and
-    keeps the best. With `starts` above one, that many Sobol points within a factor `spread` of the
-    start are fitted, and the best end goes on.
+    `tied` sets coordinates to values; `scanned` tries each value with the relative tolerance
+    `LOOSE`, the others held, and keeps the best. With `starts` above one, that many Sobol points
+    within a factor `spread` of the start are fitted, and the best end is kept.
     """
 
     name: str
@@ -84,8 +85,8 @@ def tie_ratios(problem: Problem, x: Array) -> Array:
 
 
 def visible(J: Array, candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The largest set, found greedily, whose members are all known to better than `FIRST_LOOK` when
-    the rest is held."""
+    """The largest set, found greedily, whose members all have standard deviations below
+    `FIRST_LOOK` with the rest held."""
     out = candidates.copy()
     while out.any():
         sd = standard_deviations(J[:, out])
@@ -115,8 +116,8 @@ def informative(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
 def default_plan(
     problem: Problem, runner: Runner, rtol: float, which: Sequence[str], starts: int = 1
 ) -> list[Stage]:
-    """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes
-    identifiable.
+    """Stages for some recordings; the first fits the slowest one, with the coordinates that its
+    Fisher matrix at the start makes identifiable.
 
     Raises `Unreachable` where that recording cannot be simulated from the start.
     """
@@ -165,7 +166,7 @@ Method = Literal["gauss_newton", "lbfgs", "adam"]
 def stage_entry(
     name: str, stage: Stage, rtol: float, fit: Fit, began: float, ended: float
 ) -> dict[str, Any]:
-    """The result's entry on a stage that began and ended so on the clock [s]."""
+    """The result's entry on a stage, with its begin and end on the clock [s]."""
     return {
         "name": name, "recordings": list(stage.recordings), "free": list(stage.free), "rtol": rtol,
         "evaluations": fit.evaluations, "chi2": fit.chi2, "converged": fit.converged,
@@ -175,7 +176,7 @@ def stage_entry(
 
 @contextmanager
 def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
-    """Shows the progress of one stage: call it with chi2 after every evaluation."""
+    """A progress bar of one stage. Yields a function to call with chi2 after every evaluation."""
     with tqdm(desc=plain(label), unit=" evaluations", disable=not shown) as bar:
 
         def notify(chi2: float) -> None:
@@ -187,7 +188,7 @@ def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
 
 class PlanEnd(NamedTuple):
     """End of a plan: the fit of the last stage that could begin, that stage, the result's entries
-    on all stages, and why the stage after it could not begin."""
+    on all stages, and the error of the stage after it."""
 
     fit: Fit
     stage: Stage
@@ -249,8 +250,8 @@ def run_stage(
     seed: int,
     notify: Any,
 ) -> Fit:
-    """One stage from x: ties, scans, Sobol starts, fit on the steps of each start; the best fit.
-    Raises `Unreachable` where no start can be simulated."""
+    """One stage from x: ties, scans, and fits from Sobol starts, each on the steps of its start;
+    returns the best. Raises `Unreachable` where no start can be simulated."""
     c = problem.coordinates
     for label in (*stage.free, *(label for label, _ in (*stage.tied, *stage.scanned))):
         if label not in c.labels:
@@ -287,8 +288,8 @@ def on_steps(
     problem: Problem, runner: Runner, stage: Stage, x: Array, steps: StepsByName, loss: Loss,
     method: Method, notify: Notify, first: Residuals | None = None,
 ) -> Fit:  # fmt: skip
-    """The fit of a stage from x on steps that are frozen; `first` holds residuals and Jacobian
-    there, if they are known."""
+    """The fit of a stage from x on frozen steps; `first` holds residuals and Jacobian at x, if
+    known."""
     common: dict[str, Any] = {
         "which": stage.recordings, "free": np.isin(problem.coordinates.labels, stage.free),
         "steps": steps, "notify": notify,
@@ -310,8 +311,8 @@ def scan(
     values: Sequence[float],
     notify: Notify,
 ) -> Array:
-    """x with the one of the values for coordinate number i that fits best, the others held; all are
-    run side by side."""
+    """x with the best of some values for coordinate i, the others held; all are run side by
+    side."""
     rtol = max(LOOSE, stage.rtol)
     trials = [x.copy() for _ in values]
     for trial, value in zip(trials, values):
@@ -330,8 +331,8 @@ def scan(
 def sobol(
     problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, seed: int
 ) -> list[Array]:
-    """`stage.starts` - 1 more points within the stage's spread of x, in the free coordinates and
-    within the bounds."""
+    """`stage.starts` - 1 further points within the stage's spread of x, in the free coordinates and
+    within their bounds."""
     if stage.starts == 1:
         return []
     low, high = problem.coordinates.bounds
@@ -355,29 +356,32 @@ def sobol(
 
 
 STEP_BIAS = 0.5
-"""Shift of an estimate by the finite steps, over its standard deviation, above which the tolerance
-is called too coarse."""
+"""Largest shift of an estimate by finite steps, in standard deviations, before the tolerance counts
+as too coarse."""
 
 FINER = 0.1
-"""The tolerance of the check over the one that is checked."""
+"""Tolerance of the check, over the tolerance under check."""
 
 REFITS, EXACT = 15, 1e-6
-"""Evaluations with Jacobians of their own that such a fit may take, and its relative tolerance."""
+"""Most evaluations with new Jacobians in the final fit, and its relative tolerance."""
 
 ROUNDS = 3
-"""How often a fit goes on with steps chosen anew at its end."""
+"""Most fits that continue with steps chosen anew at their end."""
 
 
 class Settled(NamedTuple):
-    """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with
-    the last Jacobian; how far the steps have moved every coordinate (n,), None where that could not
-    be checked; the fits on other steps since, with their tolerances and when on the clock [s] they
-    ended; the residuals by a tenth of the tolerance, those of `at` where these could not be had;
-    and whether the fit is `at_rest`: with steps chosen anew no coordinate would move by more than
-    `SETTLED` standard deviations (where steps are only checked: whether the fit has converged).
-    `rough` names the coordinates that would move although steps do not matter, the farthest first:
-    samples are not smooth in them. `steps` are those of `at` where steps chosen anew
-    have no run."""
+    """End of a fit whose steps were checked: coordinates x (n,), residuals there on steps that
+    `rtol` chooses at x, with the last Jacobian.
+
+    `bias` is the shift of every coordinate (n,) by finite steps, None where it could not be
+    checked; `fits` are the fits on other steps since, with their tolerances and their end on the
+    clock [s]; `finer` are the residuals with a tenth of the tolerance, or those of `at` where such
+    runs fail. `at_rest` is whether with steps chosen anew no coordinate would move by more than
+    `SETTLED` standard deviations (where steps are only checked, whether the fit has converged).
+    `rough` names the coordinates that would move although steps do not matter, the largest move
+    first: samples are not smooth in them. `steps` are those of `at` where runs with steps chosen
+    anew fail.
+    """
 
     x: Array
     at: Residuals
@@ -399,17 +403,17 @@ def settle(
     tightenings: int,
     notify: Notify,
 ) -> Settled:
-    """Go on from a fit, by its Jacobian and a few runs: with steps chosen anew until they do not
-    matter, and with a tighter tolerance, at most so many times, where a tenth of it shifts an
-    estimate by more than `STEP_BIAS`, or steps are what keeps the fit from its rest. With none the
-    steps are kept, and only checked."""
+    """Continue a fit with its Jacobian and a few runs: on steps chosen anew until they do not
+    matter, and with a tighter tolerance, at most `tightenings` times, where a tenth of it shifts an
+    estimate by more than `STEP_BIAS`, or where steps keep the fit from settling. With no
+    tightenings the steps are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
     at = fit.at
     rounds = ROUNDS if tightenings else 0
 
     def along(start: Residuals, steps: StepsByName) -> bool:
-        """A fit on other steps from residuals on them, by new Jacobians where the last one does not
-        lead to its end; whether it came any further."""
+        """Fit on other steps from residuals on them, with new Jacobians where the last one does not
+        suffice; returns whether the coordinates changed."""
         nonlocal x, at
         common: dict[str, Any] = {"which": which, "free": free, "steps": steps, "notify": notify}
         end = chord(problem, runner, x, start._replace(J=at.J), **common)

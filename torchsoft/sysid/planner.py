@@ -1,19 +1,19 @@
-"""The criterion of a motion that could be made, and its slopes by the knots: exact, by 2 n runs of
-the adjoint.
+"""Design criterion of a candidate motion, and its exact gradient by the knots, from 2 n runs of the
+adjoint.
 
 With the whitened Jacobian J (m, n) of the samples by the coordinates x, the covariance is C =
 (J'J)^-1; for a criterion phi and G = d phi / d(J'J), its derivative by a knot k is
 
     d phi / dk = sum_j W_j . d/dx_j (dr/dk),        W = 2 J G held fixed,
 
-the difference along each x_j of what the discrete adjoint gives by the knots for the weights W_j: 2
-n runs, however many knots there are.
+the difference along each x_j of the discrete adjoint by the knots with the weights W_j: 2 n runs
+for any number of knots.
 
-A covariance is what a fit ends with if samples are linear in the parameters, as far as the
-intervals reach, and runs exact. Both fail where a motion is chaotic, whose sensitivities are large
-and no use. So phi is that of C + mean(e e'), e being a part of the errors of one Gauss-Newton step
-that begins a standard deviation away; its derivative leaves e as it is. Where chaos is such that a
-small change of a parameter changes samples altogether, a motion is refused (`check_predictable`).
+The covariance describes the end of a fit if samples are linear in the parameters over the
+intervals, and runs exact. Both fail where a motion is chaotic, with large sensitivities that no fit
+can use. So phi is that of C + mean(e e'), with e a fraction of the errors of one Gauss-Newton step
+from a standard deviation away; its derivative ignores that of e. A motion is refused where a small
+change of a parameter changes samples completely (`check_predictable`).
 """
 
 from collections import Counter
@@ -40,37 +40,36 @@ from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map, single_threaded
 
 Range = tuple[float, float]
-"""Least and largest value of a channel [its unit]."""
+"""Lower and upper bound of a channel [its unit]."""
 
 DIFFERENCE = 1e-2
-"""Step of the difference along a coordinate [1]: wide, since slopes are rough where points touch,
-leave and slip."""
+"""Step of the difference along a coordinate [1]: wide, since gradients are rough where points
+touch, leave and slip."""
 
 MARGIN = 0.97
-"""Part of the way to a limit from which on it costs, since peaks lie between samples."""
+"""Fraction of a limit from which the penalty begins, since peaks lie between samples."""
 
 PREDICTABLE = 10.0
-"""Change of a sample with the logarithm of a parameter, over the largest of its channel, above
-which a motion is no use."""
+"""Largest derivative of a sample by the logarithm of a parameter, over the largest sample of its
+channel, of an acceptable motion."""
 
 FARTHEST = 0.1
-"""Relative error of a parameter, at most, with which a fit is tried."""
+"""Largest relative error of a parameter at which a Gauss-Newton step is tried."""
 
 TRIED = 2
-"""Points that are tried, each with signs of its own."""
+"""Number of starting points for Gauss-Newton steps, each with its own signs."""
 
 LEFT = 0.3
-"""Part of the errors there that the criterion counts: fits take finer steps than a search for
-motions."""
+"""Fraction of these errors in the criterion: fits take finer steps than a search for motions."""
 
 PRICE = 5.0
-"""What a sample at twice the way to a limit costs, in units of the criterion."""
+"""Penalty of a sample at twice its limit, in units of the criterion."""
 
 
 class DesignEvaluation(NamedTuple):
-    """One motion at one x: the criterion, what excess costs, how much of the way to their limits
-    channels go, the covariance C (n, n), the `errors` (k, s) of the parameters that the samples'
-    not being linear makes, the criterion's derivative G (n, n) by the Fisher matrix, the rows J (m,
+    """One motion at one x: the criterion, the penalty `cost` of excess, the largest fraction of
+    their limits that channels reach, the covariance C (n, n), the `errors` (k, s) of the parameters
+    by nonlinear samples, the criterion's derivative G (n, n) by the Fisher matrix, the rows J (m,
     n) of the samples, the steps, and the signals of the run."""
 
     value: float
@@ -85,7 +84,7 @@ class DesignEvaluation(NamedTuple):
 
 
 class Planner:
-    """The criterion of motions of one recording of a problem, and its slopes by their knots."""
+    """The criterion of motions of one recording of a problem, and its gradient by their knots."""
 
     def __init__(
         self, problem: Problem, plan: str, moves: Moves, limits: Mapping[str, Range],
@@ -119,8 +118,8 @@ class Planner:
         self.cost = Counter({"runs": 0, "gradients": 0})
 
     def recorded(self, x: Array) -> Array:
-        """A root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError` where
-        they are lost."""
+        """A square root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError`
+        where they cannot be run."""
         if x.tobytes() not in self._known:
             p, which = (
                 self.problem,
@@ -130,11 +129,9 @@ class Planner:
             if which:
                 at = p.residuals(self._others, x, which, self.rtol, p.coordinates.free)
                 if at.lost:
-                    reasons = "; ".join(
-                        f"`{name}`: {lost.reason}" for name, lost in at.lost.items()
-                    )
                     raise ValueError(
-                        f"a draw of the parameters does not reproduce what was recorded: {reasons}"
+                        f"a draw of the parameters does not reproduce what was recorded: "
+                        f"{at.reasons}"
                     )
                 J = at.J[: len(at.J) - len(p.coordinates.priors)]
             self._known[x.tobytes()] = np.linalg.qr(J)[1]
@@ -142,7 +139,7 @@ class Planner:
 
     @contextmanager
     def _begun(self) -> Iterator[RunContext]:
-        """The recording's rig, ready to run; not used again where a run fails."""
+        """A copy of the recording's rig, ready to run, which is discarded if a run fails."""
         begun = self._idle.pop() if self._idle else self.recording.begin()
         yield begun
         self._idle.append(begun)
@@ -150,7 +147,7 @@ class Planner:
     def run(
         self, z: Array, x: Array, steps: Steps, free: NDArray[np.bool_] | None
     ) -> tuple[Residuals, Prediction]:
-        """Residuals of the motion z at x, the last of them those of the priors, and the run. Raises
+        """Residuals of the motion z at x, those of the priors last, and the run. Raises
         `SimulationFailed`."""
         p = self.problem
         by_name = {self.recording.name: steps} if isinstance(steps, Frozen) else steps
@@ -162,7 +159,7 @@ class Planner:
         return p.gather(x, [job], [run]), run
 
     def evaluate(self, z: Array, x: Array, steps: Steps | None = None) -> DesignEvaluation:
-        """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given
+        """Evaluate the motion z at x, with the planner's tolerance or with `steps`; on frozen steps
         without the errors. Raises `SimulationFailed`."""
         c, given = self.problem.coordinates, self.rtol if steps is None else steps
         at, run = self.run(z, x, given, c.free)
@@ -191,8 +188,8 @@ class Planner:
         )
 
     def check_predictable(self, x: Array, J: Array, signals: Signals) -> None:
-        """Raises `SimulationFailed` where a parameter that hardly changes would change the samples
-        altogether: then their information is that of chaos, which no fit can use."""
+        """Raises `SimulationFailed` where a small change of a parameter would change the samples
+        completely: their information is then that of chaos, which no fit can use."""
         c, at = self.problem.coordinates, 0
         rig = [one.of_the_rig and one.scale == "log" for one in c.all]
         for channel, one in self.problem.readouts(x, self.k).items():
@@ -208,10 +205,10 @@ class Planner:
             at += len(t)
 
     def errors(self, z: Array, x: Array, rtol: float, at: Residuals, C: Array, T: Array) -> Array:
-        """How far (k, s) relative to the parameters a Gauss-Newton step without noise ends from the
-        truth, that begins a standard deviation from it at points of different signs, on steps of
-        their own: nothing where samples are linear over an interval, and steps fine enough; much
-        where the motion is chaotic. Raises `SimulationFailed`."""
+        """Relative errors (k, s) of the parameters after one noiseless Gauss-Newton step from a
+        standard deviation away, at points of different signs, each on its own steps: zero where
+        samples are linear over an interval and steps fine enough, large where the motion is
+        chaotic. Raises `SimulationFailed`."""
         out, (low, high) = [], self.problem.coordinates.bounds
         sd = np.minimum(np.sqrt(np.diag(T @ C @ T.T)), FARTHEST)
         for k in range(TRIED):
@@ -222,16 +219,16 @@ class Planner:
         return np.array(out)
 
     def reached(self, signals: Signals) -> dict[str, Array]:
-        """Where limited channels are (G,) between the middle of their range, 0, and its ends, -1
-        and 1."""
+        """Position of limited channels (G,) within their ranges: 0 in the middle, -1 and 1 at the
+        ends."""
         return {
             name: (2 * signals.values[:, signals.names.index(name)] - low - high) / (high - low)
             for name, (low, high) in self.limits.items()
         }
 
     def slopes(self, z: Array, x: Array, at: DesignEvaluation) -> Array:
-        """Derivative by z of the criterion and of what excess costs, on the steps of the look.
-        Raises `SimulationFailed`."""
+        """Gradient by z of the criterion and of the penalty, on the steps of the evaluation. Raises
+        `SimulationFailed`."""
         c, W = self.problem.coordinates, 2 * at.J @ at.G
         low, high = c.bounds
         tasks, beside = (
@@ -259,8 +256,8 @@ class Planner:
             )
 
     def adjoint(self, z: Array, x: Array, steps: Steps, weights: Array) -> Array:
-        """Slopes by z of weights (G, channels) on the signals of the run at x. Raises
-        `SimulationFailed`."""
+        """Gradient by z of the signals of the run at x, weighted with `weights` (G, channels).
+        Raises `SimulationFailed`."""
         variables = torch.tensor(z, requires_grad=True)
         reference = self.moves.reference(variables)
         with self._begun() as begun:
@@ -279,7 +276,7 @@ class Planner:
         return slopes.numpy()
 
     def pulled(self, x: Array, signals: Signals, w: Array) -> Array:
-        """What weights w (m,) on the residuals are on the signals (G, channels)."""
+        """Weights (G, channels) on the signals, from weights w (m,) on the residuals."""
         out, at = np.zeros(signals.values.shape), 0
         for one, W in zip(self.problem.readouts(x, self.k).values(), self._pulls):
             t, measured = self.recording.samples[one.channel]
@@ -292,7 +289,7 @@ class Planner:
         return out
 
     def overload(self, signals: Signals) -> Array:
-        """Derivative of what excess costs by the signals (G, channels)."""
+        """Derivative of the penalty by the signals (G, channels)."""
         out = np.zeros(signals.values.shape)
         for name, part in self.reached(signals).items():
             low, high = self.limits[name]
@@ -306,15 +303,14 @@ class Planner:
         return deviations(names, T, at.C)
 
     def bent(self, x: Array, at: DesignEvaluation) -> dict[str, Array]:
-        """The errors (k,) by parameter, over its standard deviation."""
+        """Errors (k,) by parameter, over its standard deviation."""
         return {
             name: error / sd
             for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)
         }
 
     def made(self, z: Array, x: Array, at: DesignEvaluation) -> Recording:
-        """The recording that follows a motion, with the samples that its sensors would give without
-        noise."""
+        """The recording of a motion, with the noiseless samples of its sensors."""
         rig = deepcopy(self.recording.rig)
         with torch.no_grad():
             rig.reference = self.moves.reference(torch.from_numpy(z))

@@ -1,8 +1,7 @@
-"""Posterior draws: by Laplace's approximation, checked and corrected by importance, and by NUTS on
-the exact gradients.
+"""Posterior draws: by Laplace's approximation with importance weights here, by NUTS in `nuts`.
 
-The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r, within the bounds.
-A coordinate without a prior is uniform between its bounds.
+The density is that of the coordinates: exp(-|r|^2 / 2), with priors as rows of r, within the
+bounds. A coordinate without a prior is uniform between its bounds.
 """
 
 import time as clock
@@ -21,30 +20,28 @@ from torchsoft.sysid.recording import Array
 from torchsoft.threads import parallel_map, single_threaded
 
 WITHIN = 1e-3
-"""Least share of Gaussian draws that must lie within the bounds."""
+"""Least fraction of Gaussian draws within the bounds."""
 
 K_HAT = 0.7
-"""Shape of the tail of the importance weights above which they cannot be trusted (Vehtari et al.
-2024)."""
+"""Largest shape of the tail of reliable importance weights (Vehtari et al. 2024)."""
 
 EFFICIENT = 0.5
-"""Effective over all draws, by their weights, below which Laplace's approximation is said to be
-rough."""
+"""Fraction of effective draws below which Laplace's approximation counts as rough."""
 
 SAME = 1e-6
-"""Difference of logarithms of weights below which they are all the same."""
+"""Range of log weights below which they count as equal."""
 
 ALIKE = 0.9
-"""The same, above which weights are so much alike that the shape of their tail tells nothing."""
+"""Fraction of effective draws above which the tail of the weights carries no information."""
 
 LEAST = -700.0
-"""Logarithm of a weight over the largest that is as good as zero."""
+"""Log weight, relative to the largest, that counts as zero."""
 
 FEWEST = 100
-"""Draws that can tell the tail of their weights."""
+"""Fewest draws that determine the tail of their weights."""
 
 CHECKED = 8
-"""Draws that are simulated once more, with steps chosen anew."""
+"""Number of draws simulated once more, with steps chosen anew."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +59,10 @@ class MarginalSummary:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws (chains, draws, n) of the free coordinates `labels` in physical units, and their
-    normalised `weights` (chains, draws); what was checked, what a reader must know, what it cost,
-    how it was made.
+    """Draws (chains, draws, n) of the free coordinates `labels` in physical units, with normalised
+    `weights` (chains, draws), results of checks, notices, cost and provenance.
 
-    A run that was interrupted has fewer draws than were asked for.
+    An interrupted run has fewer draws than requested.
     """
 
     method: Literal["laplace", "nuts"]
@@ -108,25 +104,25 @@ class Posterior:
 
 
 def halves(chains: Array) -> Array:
-    """Draws (chains, draws); those of a single chain as two."""
+    """Draws (chains, draws), with a single chain split in two."""
     return chains if len(chains) > 1 else chains[:, : chains.size // 2 * 2].reshape(2, -1)
 
 
 def diagnostics() -> Any:
-    """ArviZ's functions of arrays; their import takes a second. Raises `ModuleNotFoundError` with
-    the remedy where they are missing."""
+    """ArviZ's array functions, imported here since the import takes a second. Raises
+    `ModuleNotFoundError` with the remedy where they are missing."""
     return needed("arviz_stats.base", "posterior").array_stats
 
 
 def quantile(values: Array, weights: Array, part: float) -> float:
-    """Of weighted draws (draws,)."""
+    """Quantile of weighted draws (draws,)."""
     order = np.argsort(values)
     return float(np.interp(part, np.cumsum(weights[order]) - weights[order] / 2, values[order]))
 
 
 def measure(o: Optimum, x: Array) -> tuple[float, Array]:
-    """What a density of values has more, as one of coordinates x (n,), and its gradient by the free
-    ones: the logarithm of d value / d x where a prior is normal on a logarithmic scale, or
+    """Log Jacobian factor between densities of values and of coordinates x (n,), and its gradient
+    by the free coordinates: d value / d x where a prior is normal on a logarithmic scale, or
     log-normal on a linear one."""
     total, gradient = 0.0, np.zeros(len(x))
     for i, prior in o.problem.coordinates.priors:
@@ -143,10 +139,10 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
     """Draws of the Gaussian at the optimum, with the covariance of the Fisher matrix, within the
     bounds.
 
-    The exact density at every draw, a run each, gives them importance weights, Pareto-smoothed:
-    they correct the Gaussian where it is roughly right, and their k-hat says where it is not.
-    Raises `ValueError` where hardly a draw is within the bounds: the data do not determine all
-    coordinates; and for fewer draws than `FEWEST`.
+    The exact density at every draw, a run each, gives importance weights with Pareto smoothing.
+    They correct a Gaussian that is roughly right, and their k-hat shows where it is not. Raises
+    `ValueError` for fewer draws than `FEWEST`, and where hardly a draw is within the bounds,
+    because the data do not determine all coordinates.
     """
     if draws < FEWEST:
         raise ValueError(
@@ -162,7 +158,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
         x = o.place(z[k])
         at = o.residuals(x)
         if at.lost:
-            return -np.inf, next(iter(at.lost.values())).reason
+            return -np.inf, at.reason
         return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
 
     with single_threaded(), tqdm(desc="Laplace", total=draws, disable=not progress) as bar:
@@ -203,8 +199,8 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
 
 
 def importance(log_weights: Array) -> tuple[Array, float]:
-    """Normalised weights (draws,), Pareto-smoothed, and the shape k of their tail, infinite where a
-    few draws have all the weight. Draws without density have none."""
+    """Normalised importance weights (draws,) with Pareto smoothing, and the shape k of their tail,
+    infinite where a few draws have all the weight. Draws without density have zero weight."""
     known = np.isfinite(log_weights)
     log_w, k_hat = log_weights[known] - log_weights[known].max(), -np.inf
     if np.ptp(log_w) > SAME:
@@ -221,8 +217,8 @@ def importance(log_weights: Array) -> tuple[Array, float]:
 def inside(
     rng: np.random.Generator, mean: Array, C: Array, low: Array, high: Array, count: int
 ) -> tuple[Array, Array]:
-    """Normal draws (count, n) with covariance C (n, n) that lie between bounds, and the standard
-    normal ones behind them."""
+    """Normal draws (count, n) with covariance C (n, n) within bounds, and the standard normal draws
+    behind them."""
     L, kept, tried = np.linalg.cholesky(C).T, np.zeros((0, len(mean))), 0
     while len(kept) < count and tried < count / WITHIN:
         noise = rng.standard_normal((4 * count, len(mean)))
@@ -241,7 +237,7 @@ def inside(
 
 
 def steps_off(o: Optimum, z: Array) -> float:
-    """Largest change of |r|^2 at free coordinates z (k, free coordinates) by steps chosen anew;
+    """Largest change of |r|^2 by steps chosen anew, at free coordinates z (k, free coordinates);
     infinite where a run fails."""
     off = [o.off(o.place(one)) for one in z]
     return float(np.max(np.where(np.isnan(off), np.inf, np.abs(off))))
@@ -257,7 +253,7 @@ def notices_on_steps(o: Optimum, off: float) -> list[str]:
 
 
 def notices_on_runs(o: Optimum, lost: Sequence[str], runs: int) -> list[str]:
-    """Sentences on runs that failed, and on residuals that are too large for the noise."""
+    """Sentences on failed runs, and on residuals larger than the noise."""
     m = o.problem.samples(o.which)
     chi2, out = o.square / m, []
     if lost:

@@ -1,10 +1,9 @@
-"""Comparison of recordings with their rig, before any fit: set-points, control loops, signs and
+"""Checks of recordings against their rig before any fit: set-points, control loops, signs and
 units.
 
-Channels are held against a run with the parameters of the start, which tells signs and units. Whose
-set-points are those of a loop is told by the body that follows them. The law of an actuator is
-known, so the mean of its recorded force is held against what it makes of the coordinates that it
-measures.
+Signs and units of channels are compared with a run at the start's parameters. The measured
+coordinate of a loop is recognised by the body that follows the set-point. The mean recorded force
+of an actuator is compared with its known law at the measured coordinates.
 """
 
 import math
@@ -30,7 +29,7 @@ from torchsoft.tables import shown
 
 
 def together(every: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """One diagnostic of every code: the first, with the names of the other recordings."""
+    """One diagnostic for each code: the first, with the names of the other recordings."""
     out: list[Diagnostic] = []
     for code in dict.fromkeys(one.code for one in every):
         first, *others = sorted(
@@ -48,8 +47,8 @@ def together(every: Sequence[Diagnostic]) -> list[Diagnostic]:
 
 
 def accepted(every: Sequence[Diagnostic], acknowledged: Sequence[str]) -> list[str]:
-    """Messages of warnings, and of errors that are acknowledged. Raises `ValueError` for other
-    errors, and for a code that was acknowledged and not found."""
+    """Messages of warnings, and of acknowledged errors. Raises `ValueError` for other errors, and
+    for an acknowledged code without a finding."""
     codes = dict.fromkeys(one.code for one in every)
     if strange := [code for code in acknowledged if code not in codes]:
         there = f"what was found is {', '.join(codes)}" if codes else "nothing looks wrong"
@@ -75,26 +74,26 @@ MISTAKEN = {
     },
     "N": {1e3: ("millinewtons", "newtons"), 1 / 9.81: ("kilograms", "newtons")},
 }
-"""What makes values of a dimension too large by a factor when it is taken for the other."""
+"""Factors between units that are commonly confused, by SI unit."""
 
 
 def confusions(unit: str) -> list[tuple[float, str]]:
-    """Factors by which a channel in `unit` may be too large, with the units that were confused."""
+    """Factors by which a channel in `unit` may be too large, with the confused units."""
     known = MISTAKEN.get(unit.removesuffix("/s"), {})
     over = [(factor, f"{a} taken for {b}") for factor, (a, b) in known.items()]
     return over + [(1 / factor, f"{b} taken for {a}") for factor, (a, b) in known.items()]
 
 
 FEWEST = 8
-"""Samples without which nothing is said of a controller."""
+"""Fewest samples for a judgement of a controller."""
 
 ROUGH = 0.03
-"""Part of the force by which it may differ from what the controller gives besides the noise: drives
-are not exact."""
+"""Relative difference, besides the noise, between a force and its controller's law that counts as
+normal: drives are not exact."""
 
 
 def comparable(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> bool:
-    """Whether a channel has samples of a sensor that sees nothing else and is never saturated."""
+    """Whether a channel has samples of a sensor without inertia, misalignment or saturation."""
     if name not in recording.samples or name not in sensors:
         return False
     one, y = sensors[name], recording.samples[name][1]
@@ -104,9 +103,9 @@ def comparable(recording: Recording, sensors: Mapping[str, Sensor], name: str) -
 def controller_findings(
     recording: Recording, sensors: Mapping[str, Sensor], unknown: Collection[str] = ()
 ) -> Iterator[Diagnostic]:
-    """Diagnostics on forces that their controller does not give on the average, where they and its
-    coordinates were measured by sensors of which no fault is to be estimated, and its gains are not
-    among the parameters that are `unknown`."""
+    """Diagnostics on forces whose mean differs from their controller's, where no sensor of the
+    force or of its coordinates has a fault to be estimated, and no gain is among the `unknown`
+    parameters."""
     rig = recording.rig
     tensors = {id(rig.parameter(name)) for name in unknown}
     for name, actuator in rig.actuators.items():
@@ -153,36 +152,36 @@ def controller_findings(
 
 
 MOVES = 5.0
-"""Times its noise that a channel moves, where its motion says something."""
+"""Least motion of a channel, over its noise, for a judgement."""
 
 OPPOSITE = -0.5
-"""Correlation with the run below which a sign is called opposite: wrong parameters do not do
-that."""
+"""Correlation with the run below which a sign counts as opposite, beyond the effect of wrong
+parameters."""
 
 LARGER = 8.0
-"""Factor between the sizes of motions from which parameters, off by three, do not explain it."""
+"""Factor between the sizes of motions above which wrong parameters, off by three, are no
+explanation."""
 
 NEAR = math.log(4.0)
-"""How near such a factor must be to one of mistaken units, in its logarithm."""
+"""Largest difference of the logarithm of such a factor from that of confused units."""
 
 SAME, APART = 0.1, 0.3
-"""Part of its motion by which a coordinate that follows a set-point may differ from it, and by
-which another one differs."""
+"""Largest relative difference of a coordinate that follows a set-point, and least one of a
+coordinate that does not."""
 
 Expected = Mapping[str, tuple[Readout, Signals]]
-"""The sensors of a run, with its signals."""
+"""Readouts of a run, with its signals, by channel."""
 
 
 def precheck(
     problem: Problem, runner: Runner, which: Sequence[str] | None = None
 ) -> list[Diagnostic]:
-    """Diagnostics on some recordings of a problem, or on all: one of every code."""
+    """Diagnostics on some recordings of a problem, by default all: one for each code."""
     every, x = list[Diagnostic](), problem.coordinates.start
     which = problem.names if which is None else which
     unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
     jobs = problem.jobs(x, which, LOOSE, None)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of motions that a mistake makes violent
+    with warnings.catch_warnings(action="ignore"):  # of motions that a mistake makes violent
         runs = runner.run(jobs)
     for job, got in zip(jobs, runs):
         recording, expected = problem.recordings[job.recording], {}
@@ -201,9 +200,11 @@ def findings(
     expected: Expected,
     unknown: Collection[str] = (),
 ) -> list[Diagnostic]:
-    """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the
-    names of unknown parameters. A recording with an error is not held against the run."""
-    every = [*setpoint_findings(recording, sensors), *rounded(recording, sensors)]
+    """Diagnostics on one recording, compared with the readouts `expected` of a run from the start,
+    if there is one; `unknown` are the names of unknown parameters. A recording with an error is not
+    compared with the run."""
+    every = [*setpoint_findings(recording, sensors), *noisy(recording, sensors)]
+    every += rounded(recording, sensors)
     every += another_body(recording, sensors, expected)
     for more in (
         against_run(recording, sensors, expected),
@@ -215,11 +216,29 @@ def findings(
 
 
 COARSE = 1.2
-"""Steps of a sensor over its noise from which they widen the noise by 6 % and more."""
+"""Least ratio of a sensor's quantisation to its noise for a warning; it widens the noise by 6 % and
+more."""
+
+
+ENOUGH, WIDTH = 10, 0.5
+"""Samples of a channel whose range, over their noise, is not smaller than that by chance."""
+
+
+def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
+    """Noise that is stated so large that samples could not be as near to each other as they are."""
+    for name, sensor in sensors.items():
+        y = recording.samples[name][1] if name in recording.samples else np.zeros(0)
+        if len(y) >= ENOUGH and 0 < np.ptp(y) < WIDTH * sensor.noise:
+            unit = recording.units[name]
+            text = (
+                f"the noise of {name} is stated as {sensor.noise:.3g} {unit}, but all of its "
+                f"samples are within {np.ptp(y):.3g} {unit}: is it in the right unit?"
+            )
+            yield found(f"noise of {name}", recording, text, grave=True)
 
 
 def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
-    """Readings in steps that the stated noise and resolution leave out."""
+    """Warnings on quantised readings whose steps the stated noise and resolution omit."""
     for name, sensor in sensors.items():
         if name not in recording.samples:
             continue
@@ -238,7 +257,7 @@ def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Dia
 def unsaturated(
     recording: Recording, sensors: Mapping[str, Sensor], name: str
 ) -> tuple[Array, Array]:
-    """Times and values of a channel, without those that are saturated."""
+    """Times and values of a channel's unsaturated samples."""
     t, y = recording.samples[name]
     inside = ~sensors[name].saturated(y)
     return t[inside], y[inside]
@@ -247,7 +266,7 @@ def unsaturated(
 def against_run(
     recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
 ) -> Iterator[Diagnostic]:
-    """Signs and units of channels that cannot be those of the run."""
+    """Diagnostics on channels whose sign or unit contradicts the run."""
     for name, (one, signals) in expected.items():
         (t, y), noise = unsaturated(recording, sensors, name), sensors[name].sd
         if len(t) < 2 * MOVES:
@@ -288,8 +307,8 @@ def against_run(
 def another_body(
     recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
 ) -> Iterator[Diagnostic]:
-    """A set-point that another body follows than the one whose coordinate the loop is taken to
-    measure; or that this one does not follow, as it does in the run."""
+    """Diagnostics on set-points that another body follows than the measured one, or that the
+    measured body follows in the run only."""
     rig = recording.rig
     movable = {
         f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes
@@ -332,8 +351,8 @@ def apart(
     name: str,
     expected: Expected | None,
 ) -> float | None:
-    """Distance of a channel, as it is measured or expected, from a set-point, over the motion of
-    that; None without samples, or where it hardly moves."""
+    """RMS difference of a channel, measured or expected, from a set-point, over the motion of the
+    set-point; None without samples, or where the set-point hardly moves."""
     if name not in (recording.samples.keys() & sensors.keys() if expected is None else expected):
         return None
     t, y = unsaturated(recording, sensors, name)

@@ -1,4 +1,4 @@
-"""Predicted signals of a recording, and the readings of sensors that see them."""
+"""Predicted signals of a recording, and the readings of its sensors."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
 
 class Signals(NamedTuple):
     """Channels of a run on a grid: t (G,) [s], values (G, channels) in the order of `names`, and
-    their derivatives (G, channels, n), if there are any."""
+    their derivatives (G, channels, n), if any."""
 
     t: Array
     names: tuple[str, ...]
@@ -32,8 +32,8 @@ class Signals(NamedTuple):
 
 
 class Term(NamedTuple):
-    """A part of a reading: `factor` times the `order`-th rate of a channel, and the derivative of
-    the factor by a nuisance."""
+    """A term of a reading: `factor` times the derivative of some `order` of a channel, and the
+    derivative of the factor by a nuisance."""
 
     channel: str
     order: int
@@ -43,8 +43,8 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True)
 class Readout:
-    """One channel as its sensor gives it, for given values of what is wrong with the sensor; its
-    `repr` says all of it."""
+    """One channel as read by its sensor, for given values of the sensor's nuisances. Its `repr` is
+    complete."""
 
     channel: str
     noise: float
@@ -61,8 +61,8 @@ class Readout:
     def expected(
         self, signals: Signals, times: Array
     ) -> tuple[Array, Array | None, dict[Nuisance, Array]]:
-        """The reading (k,) at `times` without noise, its derivatives (k, n) by what the run was
-        differentiated by, and by the nuisances."""
+        """Noiseless reading (k,) at `times`, its derivatives (k, n) by the parameters of the run's
+        sensitivities, and those by the nuisances."""
         y, rate, slopes = np.zeros(len(times)), np.zeros(len(times)), None
         by: dict[Nuisance, Array] = {}
         for term in self.terms:
@@ -89,10 +89,11 @@ class Readout:
         return y, None if slopes is None else self.gain * slopes, by
 
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
-        """Expected less measured over the noise (k,), and its derivative by the expected.
+        """Expected less measured values over the noise (k,), and the derivative by the expected
+        values.
 
-        Of a saturated sample half the square is the negative logarithm of the probability that
-        value and noise are together beyond the limit (Tobin, 1958).
+        For a saturated sample, half the squared residual is the negative log probability that value
+        plus noise exceeds the limit (Tobin, 1958).
         """
         r, weight = (y - measured) / self.noise, np.full(len(y), 1 / self.noise)
         for limit, sign in ((self.high, 1.0), (self.low, -1.0)):
@@ -103,7 +104,7 @@ class Readout:
         return r, weight
 
     def pulled_back(self, signals: Signals, times: Array, v: Array) -> Array:
-        """What weights v (k,) on the expected reading are on the channels (G, channels)."""
+        """Weights (G, channels) on the channels, from weights v (k,) on the expected reading."""
         out, spline = np.zeros(signals.values.shape), CubicSpline(signals.t, np.eye(len(signals.t)))
         for term in self.terms:
             if term.factor != 0.0:
@@ -114,14 +115,14 @@ class Readout:
         return out
 
     def own_times(self, times: Array) -> Array:
-        """Times (k,) [s] at which the sensor reads what it notes at `times`."""
+        """Times (k,) [s] of the readings that the sensor stamps with `times`."""
         return times - self.delay - self.clock * (times - self.middle)
 
 
 def censored(z: Array) -> tuple[Array, Array]:
-    """-sqrt(-2 ln Phi(z)) (k,), where values are expected z standard deviations beyond a limit, and
-    its derivative; Phi is the normal distribution function. It is z far short of the limit, and
-    nothing far beyond."""
+    """-sqrt(-2 ln Phi(z)) (k,) for values expected z standard deviations beyond a limit, and its
+    derivative; Phi is the normal distribution function. It tends to z far short of the limit, and
+    to zero far beyond."""
     log = log_ndtr(z)
     r = -np.sqrt(-2 * log)
     density = np.exp(-0.5 * z**2 - log) / np.sqrt(2 * np.pi)
@@ -129,8 +130,8 @@ def censored(z: Array) -> tuple[Array, Array]:
 
 
 def partner(rig: Rig, channel: str) -> tuple[str, float]:
-    """The channel at right angles, and the sign with which it enters when the sensor is turned.
-    Raises `ValueError`."""
+    """The perpendicular channel, and the sign with which a rotated sensor sees it. Raises
+    `ValueError`."""
     names = {rig.renamed.get(key, key): key for key in every_key(rig)}
     key = names.get(channel, channel)
     for a, b, sign in (
@@ -156,7 +157,7 @@ def partner(rig: Rig, channel: str) -> tuple[str, float]:
 
 
 def every_key(rig: Rig) -> list[str]:
-    """Keys of the free coordinates and their rates, before the rig renames any."""
+    """Keys of the free coordinates and their rates, before renaming."""
     poses = [
         f"{['x', 'y', 'theta'][i]}_{rig.symbols[b]}"
         for b, axes in rig.layout.free.items()
@@ -166,8 +167,8 @@ def every_key(rig: Rig) -> list[str]:
 
 
 def pushed(rig: Rig, channel: str) -> str:
-    """The channel of the rate of what an effort's actuator pushes. Raises `ValueError` for what is
-    not an effort."""
+    """Channel of the rate of the coordinate that an actuator pushes, by the channel of its effort.
+    Raises `ValueError` for other channels."""
     for name, actuator in rig.actuators.items():
         if channel == rig.renamed.get(f"F_{name}", f"F_{name}"):
             body, axis = actuator.pushes.split(".")
@@ -212,13 +213,13 @@ def readout(
 
 
 TOLERANCE = 1e-8
-"""Newton tolerance [N] of the runs that fits are made of: far below any sensor, above rounding with
-the largest dashpots."""
+"""Newton tolerance [N] of the runs in fits: far below any sensor, above rounding errors with the
+largest dashpots."""
 
 
 class Frozen:
-    """The steps of a run, to be taken again: their ends `knots` (steps + 1,) [s]. Its `repr` names
-    them to the bit."""
+    """Frozen steps of a run: their ends `knots` (steps + 1,) [s]. Its `repr` identifies them to the
+    bit."""
 
     def __init__(self, knots: Array) -> None:
         self.knots, self._name = knots, sha256(knots.tobytes()).hexdigest()
@@ -228,12 +229,12 @@ class Frozen:
 
 
 Steps = float | Frozen
-"""The steps of a run: a relative tolerance that chooses them, or those of another run."""
+"""Steps of a run: a relative tolerance that chooses them, or frozen ones."""
 
 
 class Prediction(NamedTuple):
     """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], their derivatives (G,
-    channels, n), if there are any, and the steps' ends `knots` [s] where a tolerance chose them."""
+    channels, n), if any, and the ends `knots` [s] of steps chosen by a tolerance."""
 
     t: Array
     signals: Array
@@ -242,8 +243,8 @@ class Prediction(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """Half the sum of squared residuals of one recording, its derivatives by the run's parameters
-    (n,), and by every channel's nuisances (channels, nuisances)."""
+    """Half the sum of squared residuals of one recording, and its derivatives by the run's
+    parameters (n,) and by every channel's nuisances (channels, nuisances)."""
 
     loss: float
     parameters: Array
@@ -251,27 +252,27 @@ class Misfit(NamedTuple):
 
 
 class FailedRun(NamedTuple):
-    """A run that could not be finished: why, and when [s]."""
+    """A failed run: reason and time [s]."""
 
     reason: str
     time: float
 
 
 Judge = Callable[[Signals], tuple[float, Array, Array]]
-"""Half the sum of squared residuals of a run's signals, its derivatives by them (G, channels), and
-by the nuisances."""
+"""Half the sum of squared residuals of a run's signals, and its derivatives by the signals (G,
+channels) and by the nuisances."""
 
 
 @torch.no_grad()
 def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
-    """Give the rig other parameters, by the names that `Rig.parameter` knows."""
+    """Set parameters of the rig, by the names of `Rig.parameter`."""
     for name, value in values.items():
         rig.parameter(name).fill_(value)
 
 
 class Run(NamedTuple):
-    """What a run begins with: the state y0 (size,), and the tensors by which it is differentiated,
-    those of parameters before those of the start."""
+    """Begin of a run: the state y0 (size,), and the tensors for differentiation, those of
+    parameters before those of the start."""
 
     y0: Tensor
     parameters: tuple[str, ...]
@@ -279,8 +280,7 @@ class Run(NamedTuple):
 
 
 def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str]) -> Run:
-    """Gives the rig its parameters, and makes the state where it begins, with its derivatives by
-    `names`."""
+    """Set the rig's parameters, and make its initial state, differentiable by `names`."""
     set_parameters(
         begun.rig, {name: value for name, value in values.items() if not name.startswith(PREFIX)}
     )
@@ -296,9 +296,9 @@ def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str
 
 
 def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
-    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: of
-    touch those of the run, of others along the motion of the bodies, and of the controllers' own
-    parameters."""
+    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start. Those
+    of touch come from the run; others follow from the sensitivities of the bodies' motion, and from
+    the controllers' own parameters."""
     assert run.sensitivities is not None
     bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
     along = [
@@ -319,7 +319,7 @@ def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
 
 
 def choice(steps: Steps) -> dict[str, Any]:
-    """The arguments of `simulate` that say which steps to take, and how exactly."""
+    """Arguments of `simulate` for its steps and tolerance."""
     chosen = (
         {"knots": torch.from_numpy(steps.knots)} if isinstance(steps, Frozen) else {"rtol": steps}
     )
@@ -329,8 +329,7 @@ def choice(steps: Steps) -> dict[str, Any]:
 def predict(
     begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps
 ) -> Prediction:
-    """Signals on the grid, and their derivatives by `names`, if there are any. Raises
-    `SimulationFailed`."""
+    """Signals on the grid, and their derivatives by `names`, if any. Raises `SimulationFailed`."""
     rig, run, keys = begun.rig, prepared(begun, values, names), begun.channels
     touch = [key for key in keys if key not in measurable(rig)] if names else ()
     dy0 = torch.from_numpy(directions(run.y0, run.wanted)) if names else None
@@ -357,7 +356,7 @@ def misfit(
     steps: Steps,
     judge: Judge,
 ) -> Misfit:
-    """The misfit that `judge` finds, with its gradient by `names`, by the discrete adjoint. Raises
+    """The misfit by `judge`, with its gradient by `names`, by the discrete adjoint. Raises
     `SimulationFailed`."""
     rig, run = begun.rig, prepared(begun, values, names)
     out = simulate(rig, grid.t, y0=run.y0, gradient="discrete", **choice(steps))

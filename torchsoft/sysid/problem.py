@@ -1,5 +1,4 @@
-"""The least-squares problem: recordings, sensors and unknowns; residuals in units of the sensors'
-noise."""
+"""The least-squares problem: recordings, sensors and unknowns; whitened residuals."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,26 +29,35 @@ from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, U
 from torchsoft.tables import line
 
 StepsByName = float | Mapping[str, Frozen]
-"""The steps of runs: a relative tolerance that chooses them, or frozen ones by recording."""
+"""Steps of runs: a relative tolerance that chooses them, or frozen ones by recording."""
 
 
 class Residuals(NamedTuple):
     """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of
-    the priors; their Jacobian J (m, n) by the coordinates (zero where not free), and what was lost:
-    recordings that could not be simulated, with the reason. With a loss r and J are infinite. |r|^2
-    / 2 is the negative logarithm of the posterior density, but for a constant.
-    """
+    the priors; their Jacobian J (m, n) by the coordinates (zero where not free); and failed runs by
+    recording. With a failed run, r and J are infinite. |r|^2 / 2 is the negative log posterior
+    density up to a constant."""
 
     r: Array
     J: Array
     lost: dict[str, FailedRun]
 
+    @property
+    def reason(self) -> str:
+        """Reason of the first failed run, empty if there is none."""
+        return next((one.reason for one in self.lost.values()), "")
+
+    @property
+    def reasons(self) -> str:
+        """Every failed run with its reason."""
+        return "; ".join(f"`{name}`: {one.reason}" for name, one in self.lost.items())
+
 
 def with_extensions(
     recordings: Sequence[Recording], unknowns: dict[str, Unknown]
 ) -> tuple[Sequence[Recording], dict[str, Unknown]]:
-    """Recordings whose rigs have the parameters that are unknown, and the unknowns, those that are
-    extensions with the bounds of their search where none are given."""
+    """Recordings whose rigs are extended by the unknown parameters, and the unknowns, with default
+    bounds for extensions."""
     added, out = [], dict(unknowns)
     for recording in recordings:
         known = extensions(recording.rig)
@@ -64,8 +72,8 @@ def with_extensions(
 
 
 def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
-    """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit
-    between the pads, say."""
+    """Raises `ValueError` where a bound of an unknown makes the rig impossible, such as a disc that
+    does not fit between the pads."""
     for c in coordinates.all:
         if c.kind != "parameter" or c.ratio_to:
             continue
@@ -82,9 +90,9 @@ def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> Non
 
 
 def check_value(recording: Recording, name: str, value: float) -> None:
-    """Raises `ValueError` for a rig that cannot be."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a steep friction law, which a search may pass through
+    """Raises `ValueError` for a parameter value that makes the rig impossible."""
+    # of a steep friction law, through which a search may pass
+    with warnings.catch_warnings(action="ignore"):
         if isinstance(recording.rig, SoftGrasp) and name in NAMES:
             recording.rig.settings.override({name: value})
         else:
@@ -94,9 +102,9 @@ def check_value(recording: Recording, name: str, value: float) -> None:
 
 
 class Reading(NamedTuple):
-    """One channel of a run as its sensor reads it: times (k,) [s], samples, expected readings with
-    their derivatives (k, n) by what the run was differentiated by, and by nuisances; residuals r
-    (k,) over the noise, not whitened, and their derivative by the expected readings."""
+    """One channel of a run as read by its sensor: times (k,) [s], samples, expected readings with
+    their derivatives (k, n) by the run's parameters and by nuisances; residuals r (k,) over the
+    noise, not whitened, and their derivative by the expected readings."""
 
     channel: str
     t: Array
@@ -109,11 +117,11 @@ class Reading(NamedTuple):
 
 
 class Problem:
-    """Which parameters explain these recordings?
+    """The problem of finding the parameters that explain some recordings.
 
-    `recordings` have names of their own; `sensors` are the channels that count, with their noise;
-    `unknowns` the parameters, `extensions` of the rigs among them; `noise` the colour of a
-    channel's noise, white where there is none. Raises `ValueError` where these do not fit together.
+    `recordings` have distinct names; `sensors` are the channels that count, with their noise;
+    `unknowns` are the parameters, `extensions` of the rigs included; `noise` is the colour of a
+    channel's noise, white by default. Raises `ValueError` where these do not fit together.
     """
 
     def __init__(
@@ -161,8 +169,8 @@ class Problem:
         self.check_saturated()
 
     def check_saturated(self) -> None:
-        """Raises `ValueError` where noise is coloured and samples are saturated: of such neighbours
-        no likelihood is known that can be computed."""
+        """Raises `ValueError` for saturated samples with coloured noise, whose likelihood is
+        intractable."""
         for recording in self.recordings:
             for channel, sensor in self.sensors.items():
                 coloured = sensor.colour == "ar" or channel in self.noise
@@ -179,11 +187,11 @@ class Problem:
                     )
 
     def with_noise(self, noise: Mapping[str, Autoregression]) -> "Problem":
-        """The same problem with noise of these colours, by channel."""
+        """The same problem with other noise, by channel."""
         return Problem(self.recordings, self.sensors, self.unknowns, noise)
 
     def whitened(self, recording: Recording, channel: str, rows: Array) -> Array:
-        """Rows (k,) or (k, n) of a channel's samples, made independent of each other."""
+        """Rows (k,) or (k, n) of a channel's samples, whitened."""
         if channel not in self.noise:
             return rows
         key = recording.name, channel
@@ -196,7 +204,7 @@ class Problem:
         return tuple(recording.name for recording in self.recordings)
 
     def samples(self, which: Sequence[str] | None = None) -> int:
-        """Number of samples that count, in some recordings or in all."""
+        """Number of samples that count in some recordings, by default all."""
         return sum(
             len(t)
             for recording in self.recordings
@@ -205,17 +213,13 @@ class Problem:
             if channel in self.sensors
         )
 
-    @property
-    def data_seconds(self) -> float:
-        return sum(recording.duration for recording in self.recordings)
-
     def values(self, x: Array, k: int) -> dict[str, float]:
-        """Values of what is unknown of the rig and of the start in recording number k."""
+        """Values of the unknowns of the rig and of the start in recording k."""
         recording = self.recordings[k]
         return self.coordinates.values(x, recording.name, recording.parameters)
 
     def readouts(self, x: Array, k: int) -> dict[str, Readout]:
-        """The sensors that recording number k has samples of, at x (n,)."""
+        """Readouts of the sensors with samples in recording k, at x (n,)."""
         recording, out = self.recordings[k], {}
         for channel, sensor in self.sensors.items():
             if channel in recording.samples:
@@ -237,8 +241,8 @@ class Problem:
         free: NDArray[np.bool_] | None,
         adjoint: bool = False,
     ) -> list[Job]:
-        """One run a recording; with `free` they are differentiated by the parameters that free
-        coordinates (n,) move."""
+        """One run for each recording; with `free`, differentiated by the parameters that depend on
+        free coordinates (n,)."""
         c, out = self.coordinates, []
         for k, recording in enumerate(self.recordings):
             if recording.name not in which:
@@ -264,8 +268,8 @@ class Problem:
         steps: StepsByName,
         free: NDArray[np.bool_] | None = None,
     ) -> Residuals:
-        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates. On
-        frozen steps they are smooth in x."""
+        """Residuals of some recordings at x (n,), with the Jacobian's columns of `free`
+        coordinates. On frozen steps they are smooth in x."""
         jobs = self.jobs(x, which, steps, free)
         return self.gather(x, jobs, runner.run(jobs))
 
@@ -277,8 +281,8 @@ class Problem:
         rtol: float,
         free: NDArray[np.bool_] | None = None,
     ) -> tuple[Residuals, dict[str, Frozen]]:
-        """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; none where
-        one is lost."""
+        """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; no steps
+        where a run fails."""
         jobs = self.jobs(x, which, rtol, free)
         runs = runner.run(jobs)
         at = self.gather(x, jobs, runs)
@@ -286,7 +290,7 @@ class Problem:
         return at, {} if at.lost else {name: Frozen(run.knots) for name, run in zip(names, runs)}
 
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
-        """Residuals at x (n,) from the results of its jobs."""
+        """Residuals at x (n,) from the results of jobs."""
         lost = {
             self.recordings[job.recording].name: got
             for job, got in zip(jobs, results)
@@ -329,7 +333,7 @@ class Problem:
         return np.concatenate(rs), np.concatenate(Js)
 
     def readings(self, x: Array, job: Job, run: Prediction) -> Iterator[Reading]:
-        """The sensors of the recording of a job at x (n,), beside its samples."""
+        """Readings of the sensors in a job's recording at x (n,)."""
         recording = self.recordings[job.recording]
         signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
         for channel, one in self.readouts(x, job.recording).items():
@@ -346,7 +350,7 @@ class Problem:
         free: NDArray[np.bool_],
     ) -> tuple[float, Array, dict[str, FailedRun]]:
         """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a
-        run is lost."""
+        run fails."""
         c, jobs = self.coordinates, self.jobs(x, which, steps, free, adjoint=True)
         total, gradient, lost = 0.0, np.zeros(len(x)), {}
         for job, got in zip(jobs, runner.run(jobs)):

@@ -1,4 +1,4 @@
-"""Profile likelihoods: the misfit where one coordinate is held and all others are fitted again."""
+"""Profile likelihoods: the misfit with one coordinate held and all others fitted again."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from torchsoft.sysid.result import IdentificationResult
 
 CHOSEN_ANEW = 1.0
-"""Change of |r|^2 by steps that are chosen anew, in place of those of the optimum, above which
-these are too far off."""
+"""Largest acceptable change of |r|^2 by steps that are chosen anew, in place of those of the
+optimum."""
 
 
 class Optimum:
-    """Coordinates x (n,) where a fit of the recordings `which` (all by default) ended, with the
-    steps that `rtol` chooses there. `free` (n,) are the coordinates that were fitted. `variance` is
-    what the noise's is larger than it was stated, and widens profiles. `workers` threads may look
-    at it side by side.
+    """End x (n,) of a fit of the recordings `which` (by default all), with the steps that `rtol`
+    chooses there. `free` (n,) is the mask of fitted coordinates. `variance` is the factor of the
+    noise's variance over the stated one, which widens profiles. `workers` threads may evaluate it
+    side by side.
 
     Raises `Unreachable` where x cannot be simulated.
     """
@@ -56,9 +56,8 @@ class Optimum:
 
     @classmethod
     def of(cls, problem: Problem, answer: "IdentificationResult", workers: int = 1) -> Self:
-        """Where the identification of `problem` ended, with the noise that it found. Raises
-        `ValueError` for another problem's answer, or one of a robust loss, which says nothing of a
-        likelihood."""
+        """The end of the identification of `problem`, with its estimated noise. Raises `ValueError`
+        for another problem's answer, or one of a robust loss, which is no likelihood."""
         last, labels = answer.stages[-1], problem.coordinates.labels
         if [one.label for one in answer.coordinates] != list(labels):
             raise ValueError(
@@ -78,10 +77,8 @@ class Optimum:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the free coordinates."""
-        return tuple(
-            label for label, free in zip(self.problem.coordinates.labels, self.free) if free
-        )
+        """Labels of the free coordinates."""
+        return tuple(one.label for one in self.problem.coordinates.within(self.free))
 
     @property
     def J(self) -> Array:
@@ -90,17 +87,17 @@ class Optimum:
 
     @property
     def covariance(self) -> Array:
-        """Of the free coordinates, by the Fisher matrix at x."""
+        """Covariance of the free coordinates, by the Fisher matrix at x."""
         return fisher(self.J)[0]
 
     def sd(self, i: int) -> float:
-        """Of coordinate number i, as widened as its profile."""
+        """Standard deviation of coordinate i, widened like its profile."""
         inner = int(np.flatnonzero(np.flatnonzero(self.free) == i)[0])
         return float(np.sqrt(self.covariance[inner, inner] * self.variance))
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Of the free coordinates."""
+        """Bounds of the free coordinates."""
         low, high = self.problem.coordinates.bounds
         return low[self.free], high[self.free]
 
@@ -112,7 +109,7 @@ class Optimum:
 
     def values(self, z: Array) -> Array:
         """Free coordinates z (..., free coordinates) in physical units."""
-        mine = [c for c, free in zip(self.problem.coordinates.all, self.free) if free]
+        mine = self.problem.coordinates.within(self.free)
         return np.stack(
             [np.vectorize(c.to_value, [float])(z[..., i]) for i, c in enumerate(mine)], -1
         )
@@ -124,16 +121,16 @@ class Optimum:
         )
 
     def misfit(self, x: Array) -> tuple[float, Array, str]:
-        """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; where a
-        run is lost, infinite, with the reason."""
+        """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; infinite,
+        with the reason, where a run fails."""
         value, gradient, lost = self.problem.misfit(
             self.runner, x, self.which, self.steps, self.free
         )
         return value, gradient[self.free], next((one.reason for one in lost.values()), "")
 
     def off(self, x: Array) -> float:
-        """How much larger |r|^2 at x (n,) is by steps that the tolerance chooses there than by
-        those of the optimum; NaN where one of the two fails."""
+        """Change of |r|^2 at x (n,) by steps chosen there, in place of the optimum's; NaN where a
+        run fails."""
         frozen = self.residuals(x)
         fresh, _ = self.problem.freeze(self.runner, x, self.which, self.rtol)
         return (
@@ -147,45 +144,43 @@ class Optimum:
 
 
 RISE = float(stats.chi2.ppf(0.95, 1))
-"""2 Delta(-log posterior) where a 95 % interval ends."""
+"""2 Delta(-log posterior) at the ends of a 95 % interval."""
 
 STRIDE = 0.5
-"""Change of the square root of the rise from one point of a profile to the next; its end is at
-1.96."""
+"""Change of the square root of the rise between two points of a profile, whose end is at 1.96."""
 
 POINTS = 12
-"""Most points to either side."""
+"""Most points on either side."""
 
 EVALUATIONS = 10
-"""Most evaluations of Gauss-Newton to a point."""
+"""Most evaluations of Gauss-Newton for a point."""
 
 BEYOND = (RISE**0.5 + STRIDE) ** 2
-"""Rise above which a point lies too far beyond the end of the interval to tell where that is."""
+"""Rise above which a point is too far beyond the end of the interval to locate it."""
 
 SHORTER = 6
-"""How often, to either side, a stride is made shorter because a run fails or the rise goes too
-far."""
+"""Most reductions of the stride on either side, after a failed run or a rise that goes too far."""
 
 FITTED = 2e-3
-"""Change of |r|^2 with which the fit of the others is done."""
+"""Change of |r|^2 at which the fit of the others ends."""
 
 LOWER = 0.1
-"""Fall of |r|^2 below the optimum's from which the fit was not at its optimum."""
+"""Fall of |r|^2 below the optimum's that shows that the fit was not at its optimum."""
 
 DIFFERENT = 0.2
-"""Difference of an end of the two intervals, over the half width of Wald's, above which they are
-called different."""
+"""Difference between the ends of both intervals, over the half width of Wald's, that gets a
+notice."""
 
 
 @dataclass(frozen=True)
 class Profile:
     """The profile of one coordinate: its values in physical units, ascending, and the `rises` of 2
-    (-log posterior) there.
+    (-log posterior) at them.
 
-    `others` holds, by label, where the other coordinates went, in physical units. `ci95` has None
-    for an end that was not found, and `notices` says why; `wald95` is what the covariance says.
-    `variance` is what the rises were divided by: above one where residuals are larger than the
-    noise that was given.
+    `others` holds the values of the other coordinates by label, in physical units. `ci95` has None
+    for an end that was not found, and `notices` the reason; `wald95` is the interval by the
+    covariance. `variance` is the divisor of the rises, above one where residuals are larger than
+    the stated noise.
     """
 
     label: str
@@ -200,7 +195,7 @@ class Profile:
 
 
 class Point(NamedTuple):
-    """Coordinates (n,) of a profile, the rise there, and the residuals with their Jacobian."""
+    """Coordinates (n,) of a point of a profile, its rise, and the residuals with their Jacobian."""
 
     x: Array
     rise: float
@@ -208,8 +203,7 @@ class Point(NamedTuple):
 
 
 class Side(NamedTuple):
-    """The points to one side of the optimum, outwards, why it ended before the interval did, and
-    what else there is to say."""
+    """The points on one side of the optimum, outwards, the reason of an early end, and notices."""
 
     points: list[Point]
     ended: str
@@ -219,8 +213,8 @@ class Side(NamedTuple):
 def profiles(
     optimum: Optimum, labels: Sequence[str] | None = None, *, progress: bool = False
 ) -> list[Profile]:
-    """Profiles of some coordinates, or of all free ones, both sides of each side by side in the
-    optimum's threads.
+    """Profiles of some coordinates, by default all free ones; all sides are computed side by side
+    in the optimum's threads.
 
     Raises `ValueError` for a label that is not a free coordinate's.
     """
@@ -246,7 +240,7 @@ def profiles(
 
 
 def walk(o: Optimum, i: int, sign: int) -> Side:
-    """From the optimum outwards in coordinate number i, until the interval has ended."""
+    """One side of the profile of coordinate i, from the optimum to the end of the interval."""
     label, (low, high) = (
         o.problem.coordinates.labels[i],
         (float(b[i]) for b in o.problem.coordinates.bounds),
@@ -289,8 +283,8 @@ def walk(o: Optimum, i: int, sign: int) -> Side:
 
 
 def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
-    """The others' optimum with coordinate number i at `aim`, begun along the tangent of the
-    profile; or why there is none."""
+    """The optimum of the others with coordinate i at `aim`, started along the tangent of the
+    profile; or None with the reason of failure."""
     others, (low, high) = o.free.copy(), o.problem.coordinates.bounds
     others[i] = False
     x = here.x.copy()
@@ -310,12 +304,12 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
             x, at = fit.x, fit.at
             x[i] = aim
     if at.lost:
-        return None, next(iter(at.lost.values())).reason
+        return None, at.reason
     return Point(x, (float(at.r @ at.r) - o.square) / o.variance, at), ""
 
 
 def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
-    """The curve of both sides, its interval, and what is to be said of it."""
+    """The profile of both sides, with its interval and notices."""
     c = o.problem.coordinates
     one, points = c.all[i], [*below.points[::-1], Point(o.x, 0.0, o.at), *above.points]
     x = np.array([point.x[i] for point in points])

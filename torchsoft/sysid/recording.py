@@ -1,5 +1,5 @@
-"""A recording: the rig that was there, where its run began, and the samples of the sensors, which
-may have gaps."""
+"""A recording: the rig, the start of its run, and the samples of the sensors, which may have
+gaps."""
 
 import inspect
 from collections.abc import Collection
@@ -27,19 +27,19 @@ from torchsoft.sysid.initial_state import AtRest, Begin, Start, StartCoordinate
 Array = NDArray[np.float64]
 
 BETWEEN = 1e-3
-"""Spacing [s] of the regular grid that is simulated where samples are needed between (an unknown
-delay), or are denser than it; a cubic spline lies between its points."""
+"""Spacing [s] of the simulated regular grid where samples are interpolated (an unknown delay) or
+denser than it, with a cubic spline between its points."""
 
 REACH = 0.1
-"""Largest delay [s] of a sensor: for so long before the first sample and after the last one runs
-are known."""
+"""Largest delay [s] of a sensor, and time before the first and after the last sample that runs
+cover."""
 
 SAME = 1e-9
-"""Times [s] closer than this are one time."""
+"""Difference [s] below which two times are equal."""
 
 
 class RunContext(NamedTuple):
-    """A rig of a run's own, where the run begins, and the channels that are looked at."""
+    """Context of a run: its own copy of the rig, the initial state, and the recorded channels."""
 
     rig: Rig
     y0: Begin
@@ -47,7 +47,7 @@ class RunContext(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Times t (G,) [s] to simulate, and how many of them come before what is looked at."""
+    """Times t (G,) [s] to simulate; the first `early` of them are not part of the signals."""
 
     t: Tensor
     early: int
@@ -58,13 +58,13 @@ REST = AtRest()
 
 @dataclass(frozen=True)
 class Recording:
-    """One run of a rig, seen by sensors.
+    """One run of a rig, measured by sensors.
 
-    `rig` has the known numbers and the nominal ones of what is unknown, the laws, and the reference
-    that the run followed; runs are made of copies of it. `samples` holds times (k,) [s] and values
-    (k,) by channel, each with times of its own; channels are those of the rig's trajectories that
-    `measurable` names, and those of touch. `start` says where the run begins. `dataclasses.replace`
-    makes variants, with another law, say.
+    `rig` has the known parameters, nominal values of the unknown ones, the laws, and the reference
+    that the run followed; runs use copies of it. `samples` holds times (k,) [s] and values (k,) by
+    channel, each with its own times; channels are those of `measurable`, and those of touch.
+    `start` is the start of the run. `dataclasses.replace` makes variants, such as one with another
+    law.
     """
 
     name: str
@@ -94,8 +94,8 @@ class Recording:
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
-        """What runs are looked at for: what any sensor of this rig can measure of the motion, and
-        the channels of touch that were sampled."""
+        """Recorded channels of runs: all measurable channels of the motion, and the sampled
+        channels of touch."""
         motion = measurable(self.rig)
         return (*motion, *(channel for channel in self.samples if channel not in motion))
 
@@ -107,19 +107,19 @@ class Recording:
 
     @cached_property
     def times(self) -> Array:
-        """Every time at which something was measured (m,) [s]."""
+        """All times of samples (m,) [s]."""
         every = np.unique(np.concatenate([t for t, _ in self.samples.values()]))
         return every[np.append(True, np.diff(every) > SAME)]
 
     @property
     def duration(self) -> float:
-        """From the first to the last sample [s]."""
+        """Time from the first to the last sample [s]."""
         return float(self.times[-1] - self.times[0])
 
     @cached_property
     def speed(self) -> float:
-        """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow
-        recordings are the easy ones."""
+        """Root mean square speed of the horizontal set-points and drives [m/s]; slow recordings are
+        easy to fit."""
         pairs = [pair for a in self.rig.actuators.values() for pair in a.follows]
         names = [setpoint for coordinate, setpoint in pairs if coordinate.endswith(".x")]
         names += [name for name in self.rig.signals if name.endswith(".x")]
@@ -130,13 +130,13 @@ class Recording:
 
     @cached_property
     def start_coordinates(self) -> tuple[StartCoordinate, ...]:
-        """What is unknown of where the run begins."""
+        """Unknown coordinates of the start."""
         return self.start.coordinates(self.rig, self.samples)
 
     @cached_property
     def parameters(self) -> dict[str, float]:
-        """Every number that can be identified: the rig's scalar parameters, by their aliases where
-        they have one, and the start's coordinates."""
+        """Values that can be identified, by name: the rig's scalar parameters, under their aliases
+        where they have one, and the start's coordinates."""
         names = {own: name for name, own in self.rig.names.items()}
         mine = [
             (own, value)
@@ -148,21 +148,21 @@ class Recording:
         return numbers | {c.name: c.mean for c in self.start_coordinates}
 
     def begin(self) -> RunContext:
-        """A copy of the rig, and where its runs begin."""
+        """A copy of the rig, and the start of its runs."""
         rig = deepcopy(self.rig)
         for name, value in rig.named_parameters():
             value.requires_grad_(not name.startswith("reference."))
         return RunContext(rig, self.start.begin(rig, self.samples), self.channels)
 
     def on_a_grid(self, interpolated: bool) -> bool:
-        """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times:
-        where they are denser, or values between them are needed (`interpolated`)."""
+        """Whether to simulate a regular grid, every `BETWEEN`, in place of the samples' own times:
+        where these are denser, or `interpolated`."""
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
     def grid(self, interpolated: bool) -> Grid:
-        """The times to simulate: the beginning, where that is before the samples, then the samples'
-        own times, or a regular grid from `REACH` before the first, but not from before the
-        beginning, to `REACH` after the last."""
+        """Times to simulate: the begin, where it is before the samples, then the samples' own
+        times, or a regular grid from `REACH` before the first, but not before the begin, to `REACH`
+        after the last."""
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
@@ -172,7 +172,7 @@ class Recording:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Names everything that decides a run or a residual of this recording."""
+        """Checksum of everything that determines a run or a residual of this recording."""
         t = torch.from_numpy(np.linspace(self.times[0] - self.start.lead, self.times[-1], 2000))
         signals = self.rig.follow(t).detach().numpy().tobytes()
         measured = b"".join(
@@ -184,16 +184,16 @@ class Recording:
 
 
 def extended(recording: Recording, names: Collection[str]) -> Recording:
-    """The recording of a rig with more parameters, at their neutral values. Raises `ValueError` for
-    a name that the rig has no extension of."""
+    """The recording with more parameters of its rig, at their neutral values. Raises `ValueError`
+    for a name that is not an extension of the rig."""
     rig = deepcopy(recording.rig)
     extend(rig, names)
     return replace(recording, rig=rig)
 
 
 def identity(rig: Rig) -> bytes:
-    """What a rig is made of: its parts' numbers and plain attributes, but for the reference, and
-    the files with the code of parts that are the user's own."""
+    """Identity of a rig without its reference: numbers and plain attributes of its parts, and the
+    source of user-defined parts."""
     parts = [
         (name, part) for name, part in rig.named_modules() if name.split(".")[0] != "reference"
     ]
@@ -213,12 +213,12 @@ def identity(rig: Rig) -> bytes:
 
 ARRAYS = np.ndarray, Tensor
 VALUES = int, float, str, np.generic, tuple, list, dict, FunctionType, partial, type(None)
-"""Attributes that name a part."""
+"""Types of attributes that identify a part."""
 
 
 def plain(part: nn.Module) -> str:
     """A part's own parameters and buffers, and its attributes that are numbers, text, arrays,
-    functions or tuples of them."""
+    functions or tuples of them, as text."""
     tensors = {
         **dict(part.named_parameters(recurse=False)),
         **dict(part.named_buffers(recurse=False)),
@@ -233,8 +233,8 @@ def plain(part: nn.Module) -> str:
 
 
 def stated(value: Any) -> Any:
-    """A value as its `repr` says all of it: an array by its checksum, a function by its name and
-    the values that it holds."""
+    """A value in a form with a complete `repr`: an array as its checksum, a function as its name
+    and the values that it holds."""
     if isinstance(value, ARRAYS):
         array = value.detach().numpy() if isinstance(value, Tensor) else value
         return array.shape, sha256(array.tobytes()).hexdigest()
@@ -249,7 +249,7 @@ def stated(value: Any) -> Any:
 
 
 def source(code: Any) -> bytes:
-    """The file that a class or a function stands in; empty where it was typed in."""
+    """Content of the file that defines a class or a function; empty for one typed in."""
     try:
         return Path(inspect.getfile(code)).read_bytes()
     except (OSError, TypeError):

@@ -1,4 +1,4 @@
-"""Problems with one assumption otherwise: its effect on residuals, and fits repeated with it."""
+"""Variations of a problem by one wrong assumption: effects on the residuals, and repeated fits."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,25 +17,25 @@ from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Unknown
 
 REFITS, ROUGH = 20, 1e-3
-"""Evaluations that a fit under another assumption may take, and its relative tolerance: it has to
-find out whether the misfit goes away, not where exactly."""
+"""Most evaluations of a repeated fit, and its relative tolerance: enough to see whether the misfit
+vanishes."""
 
 
 FAR = 2.0
-"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins
-where the first one began, too."""
+"""Misfit per sample above which tests to first order at the end of the fit are void, and repeated
+fits also start where the first fit did."""
 
 AMOUNTS = 10.0
-"""How many amounts of a variation a number of the rig may be off where a fit is repeated."""
+"""Range of a parameter in a repeated fit, in amounts of its variation."""
 
 HALVINGS = 10
-"""How often that is halved where there is no such rig."""
+"""Most halvings of that range where the rig is impossible at its end."""
 
 
 class End(NamedTuple):
-    """A fit in whose place another is held: coordinates x (n,), residuals there, the free
-    coordinates (n,), the recordings that were fitted, residuals and steps of runs by the tolerance
-    `rtol`, the maker of runs, and the tolerance of the fit itself, `finest`."""
+    """End of a fit: coordinates x (n,), residuals there, mask `free` (n,), fitted recordings,
+    residuals and steps of runs by the tolerance `rtol` of variations, the runner, and the tolerance
+    `finest` of the fit itself."""
 
     x: Array
     at: Residuals
@@ -49,8 +49,7 @@ class End(NamedTuple):
 
     @property
     def far(self) -> bool:
-        """Whether the fit left so much that what is so to first order where it ended says
-        nothing."""
+        """Whether the misfit is so large that tests to first order at this end are void."""
         return float(np.mean(self.base.r**2)) > FAR
 
 
@@ -58,9 +57,9 @@ def ended(
     problem: Problem, runner: Runner, x: Array, at: Residuals, free: NDArray[np.bool_],
     which: Sequence[str], rtol: float, own: Mapping[str, Frozen] | None = None,
 ) -> End:  # fmt: skip
-    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the
-    variations: `USUAL`, or that of the fit, if runs are lost with it; or with `at`, by its `own`
-    steps, where no others have a run."""
+    """The end of a fit with the tolerance `rtol`, with a run for each recording by the tolerance of
+    the variations: `USUAL`, or that of the fit, if such runs fail; or `at` on its `own` steps,
+    where these are given."""
     if own is not None:
         return End(x, at, free, tuple(which), at, own, rtol, runner, rtol)
     usual = max(rtol, USUAL)
@@ -72,16 +71,15 @@ def ended(
 
 
 EARLY = 2e-3
-"""Steps [s] before those of the fit, where a run begins earlier in a variation."""
+"""Steps [s] before those of the fit, where the run of a variation begins earlier."""
 
 WRONG = {"bias": 1e4, "delay": 0.02, "gain": 0.5, "drift": 1e4, "clock": 0.05}
-"""How far a fault of a sensor is looked for: bias and drift [/s] over the noise, delay [s], gain
-[1], clock [1]."""
+"""Range of a sensor's fault: bias and drift [/s] over the noise, delay [s], gain [1], clock [1]."""
 
 
 def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | str:
-    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A
-    parameter that is called known, or a fault of a sensor, becomes one more unknown."""
+    """The problem with one assumption varied in the recordings `which`, or the reason why there is
+    none. A known parameter, or a fault of a sensor, becomes another unknown."""
     made, unknowns, sensors = [], dict(problem.unknowns), dict(problem.sensors)
     for recording in problem.recordings:
         other = (
@@ -112,9 +110,8 @@ def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | 
 
 
 def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
-    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on
-    until there is such a rig: a smaller disc may leave the pads apart. Raises `ValueError` where
-    there is none."""
+    """A parameter changed by a relative `part`, halved until the rig is possible: a smaller disc
+    may leave the pads apart. Raises `ValueError` where it never is."""
     for _ in range(HALVINGS):
         with suppress(ValueError):
             for recording in recordings:
@@ -125,8 +122,7 @@ def farthest(recordings: Sequence[Recording], name: str, value: float, part: flo
 
 
 def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
-    """What a variation adds to the residuals (m,), on the same steps, or None and why that is not
-    known."""
+    """Change of the residuals (m,) by a variation, on the same steps, or None and the reason."""
     if end.base.lost:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
     other = varied(problem, end.which, one)
@@ -137,12 +133,12 @@ def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None
              for r in other.recordings if r.name in end.steps}  # fmt: skip
     got = other.residuals(runner, end.x, end.which, steps)
     if got.lost:
-        return None, f"a run failed: {next(iter(got.lost.values())).reason}"
+        return None, f"a run failed: {got.reason}"
     return got.r - end.base.r, ""
 
 
 def since(steps: Frozen, begin: float) -> Frozen:
-    """The same steps of a run that begins at another time [s]."""
+    """The same steps for a run that begins at another time [s]."""
     knots = steps.knots
     if begin == knots[0]:
         return steps
@@ -151,9 +147,9 @@ def since(steps: Frozen, begin: float) -> Frozen:
 
 
 class Joint(NamedTuple):
-    """A fit with many suspects unknown at once: coordinates by label, the sum of squares that it
-    leaves, and how much each suspect alone takes, to first order there, of the misfit that is left
-    with all of them as stated, as a part of it by name."""
+    """A fit with many suspects as unknowns: coordinates by label, the final sum of squares, and the
+    fraction of the misfit, with all of them as stated, that each suspect alone explains to first
+    order there, by name."""
 
     at: Mapping[str, float]
     left: float
@@ -164,13 +160,13 @@ def joint_fit(
     problem: Problem, end: End, suspects: Sequence[Variation], enough: float, loss: Loss,
     notify: Notify,
 ) -> Joint | None:  # fmt: skip
-    """The fit with every suspect unknown that is a number or a fault of a sensor; None where there
-    is none. It begins where the first fit ended and, if a sum of squares above `enough` is left,
-    where that began, too.
+    """The fit with all suspects that are parameters or faults of sensors as unknowns; None where
+    there are none. It starts at the end of the first fit and, if the sum of squares stays above
+    `enough`, also at the start of that fit.
 
-    A fit that lacks something may end far from the truth, where tests to first order rank suspects
-    wrongly. The joint fit ends near it, and there they rank them rightly. Where it does not explain
-    the data, none of its suspects does alone.
+    A fit with a wrong assumption may end far from the truth, where tests to first order rank
+    suspects wrongly. The joint fit ends near it, where they rank them rightly. If the joint fit
+    does not explain the data, none of its suspects does alone.
     """
     other, tried = problem, list[Variation]()
     for one in suspects:
@@ -180,14 +176,14 @@ def joint_fit(
     if not tried:
         return None
     c, free = other.coordinates, freed(problem, other, end)
-    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
+    labels = tuple(one.label for one in c.within(free))
     plan = [
         Stage(f"joint by rtol = {rtol:g}", end.which, labels, rtol, ALL, ROUGH)
         for rtol in (LOOSE, end.rtol)
     ]
     at, fits = dict(zip(problem.coordinates.labels, end.x)), list[Fit]()
     runner = end.runner.of(other.recordings)
-    for x in (np.array([at.get(one, own) for one, own in zip(c.labels, c.start)]), c.start):
+    for x in (c.begun(at), c.start):
         with suppress(Unreachable):
             fits.append(run_plan(other, runner, plan, x, loss=loss, notify=notify).fit)
             if float(fits[-1].at.r @ fits[-1].at.r) <= enough:
@@ -199,7 +195,7 @@ def joint_fit(
     Q, _ = np.linalg.qr(J[:, np.isin(c.labels, problem.coordinates.labels) & free])
 
     def across(d: Array) -> Array:
-        """What no coordinate of the first fit can do (m,)."""
+        """Component (m,) orthogonal to the Jacobian of the first fit's coordinates."""
         return d - Q @ (Q.T @ d)
 
     stated = across(fit.at.r - J[:, columns] @ (fit.x - c.start)[columns])
@@ -212,20 +208,20 @@ def joint_fit(
 
 
 def freed(problem: Problem, other: Problem, end: End) -> NDArray[np.bool_]:
-    """Mask of coordinates of a varied problem that are free: those of the fit, and its own."""
+    """Mask of the free coordinates of a varied problem: those of the fit, and its own."""
     fitted = dict(zip(problem.coordinates.labels, end.free))
     return np.array([bool(fitted.get(label, True)) for label in other.coordinates.labels])
 
 
 class Refit(NamedTuple):
-    """A fit that was repeated: the problem, its end, and which of its coordinates were free."""
+    """A repeated fit: the problem, its end, and the mask of free coordinates."""
 
     problem: Problem
     fit: Fit
     free: NDArray[np.bool_]
 
     def of(self, label: str) -> float:
-        """A coordinate at the end."""
+        """Final value of a coordinate."""
         return float(self.fit.x[self.problem.coordinates.labels.index(label)])
 
 
@@ -233,12 +229,12 @@ def refit(
     problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify,
     joint: Joint | None = None,
 ) -> Refit | None:  # fmt: skip
-    """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where
-    it cannot begin.
+    """The fit with one assumption varied, or with all as stated, on its own steps; None where it
+    cannot begin.
 
-    It begins where the fit ended, or where a joint fit did; ratios that ended at a bound are looked
-    for again over all of their range. Without a joint fit, with anything but a sensor otherwise,
-    and a misfit above `FAR`, it begins where the first fit began, too, and the better end counts.
+    It starts at the end of the fit, or of a joint fit; ratios at a bound are scanned again over
+    their whole range. Without a joint fit, and with a misfit above `FAR`, variations other than of
+    a sensor also start where the first fit did, and the better end counts.
     """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):
@@ -246,15 +242,15 @@ def refit(
     c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
     if joint is not None:
         at |= {label: joint.at[label] for label in c.labels if label in joint.at}
-    x = np.array([at.get(label, own) for label, own in zip(c.labels, c.start)])
+    x = c.begun(at)
     free = freed(problem, other, end)
-    stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
+    stuck = [one for one in c.within(free & c.at_bound(x)) if one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
+    labels = tuple(one.label for one in c.within(free))
     runner = end.runner.of(other.recordings)
 
     def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
-        """The fit of the last stage, if none is lost."""
+        """The fit of the last stage, nothing where one fails."""
         with suppress(Unreachable):
             yield run_plan(other, runner, plan, x, loss=loss, notify=notify).fit
 

@@ -1,5 +1,5 @@
-"""Rehearsal of an experiment: its recordings are simulated, with the sensors' noise, before anyone
-builds it, and what would be identified from them shows what the experiment is good for."""
+"""Rehearsal of an experiment: simulated recordings with the sensors' noise, whose identification
+shows the information of the experiment before it is built."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from torchsoft import csvfile
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.sysid.configuration import Beginning, Config, Entry, Rest
@@ -20,28 +19,29 @@ from torchsoft.sysid.synthetic import record
 from torchsoft.sysid.unknowns import Unknown
 
 FINER = 0.1
-"""Tolerance of the simulated experiment, in parts of the fit's."""
+"""Tolerance of the simulated experiment, over the fit's."""
 
 
 def planned(
-    stated: Config, built: BuiltRig[Any], name: str, rtol: float, start: Beginning | None = None,
+    stated: Config, file: RigFile, name: str, rtol: float, start: Beginning | None = None,
     **how: Any,
 ) -> Recording:  # fmt: skip
-    """A recording of a rig as a configuration has it planned, from the run that `rtol` makes; `how`
-    is what else `record` takes. Raises `ValueError`, and `SimulationFailed`."""
-    plan, start = stated.rehearsal, start or stated.start
+    """A planned recording of a file's rig by a configuration, from a run with the tolerance `rtol`;
+    `how` are further arguments of `record`. Raises `ValueError`, and `SimulationFailed`."""
+    plan, start, built = stated.rehearsal, start or stated.start, file.build()
     if plan.duration is not None:
         built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
-    at_rest = Standing.of(built.rig, built.y0, start.lead if isinstance(start, Rest) else 0.0)
+    lead = start.lead if isinstance(start, Rest) else 0.0
+    at_rest = Standing.of(built.rig, built.y0, lead, file.rests())
     return record(name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **how)
 
 
 def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Path]]:
-    """Simulate the recordings of a configuration, of the rig as its file has it, and write them to
-    `out` as CSV files, the templates of those to record.
+    """Simulate the recordings of a configuration, with the parameters of its rig file, and write
+    them to `out` as CSV files, which are templates of those to record.
 
     Returns the configuration of their identification, whose search begins away from the truth, and
-    the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot do.
+    the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot follow.
     """
     file, plan = RigFile.from_toml(config.parent / stated.rig), stated.rehearsal
     entries = stated.recordings or (Entry(name="rehearsal"),)
@@ -50,12 +50,12 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
         name = entry.name or Path(entry.paths[0]).stem
         with at_field("settings"):
             mine = file.override(**stated.settings).override(**entry.settings)
-        built = mine.build()
-        known, rig = vocabulary(built.rig, stated.columns), built.rig
+        known = vocabulary(mine.build().rig, stated.columns)
         try:
-            made = planned(stated, built, name, FINER * stated.fit.rtol, entry.start, seed=random)
+            made = planned(stated, mine, name, FINER * stated.fit.rtol, entry.start, seed=random)
         except ValueError as error:
             raise ValueError(f"{config}: {error}") from None
+        rig = made.rig
         followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
         columns = {"t": made.times} | dict(zip(rig.signals, followed))
         columns |= {channel: y for channel, (_, y) in made.samples.items()}
@@ -74,8 +74,8 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
 def away(
     unknowns: dict[str, Unknown], file: RigFile, factor: float
 ) -> Iterator[tuple[str, Unknown]]:
-    """The unknowns, those whose start is not stated off by a factor, up and down in turns. Numbers
-    that bound each other stay."""
+    """The unknowns, with unstated starts moved by a factor, up and down in turns. Parameters that
+    bound each other stay."""
     rig = file.assemble()
     bound = {name for pair in rig.ordered.items() for name in pair}
     for k, (name, one) in enumerate(unknowns.items()):

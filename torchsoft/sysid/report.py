@@ -1,5 +1,5 @@
-"""Report of an identification: one HTML file with its pictures inside, that any browser opens
-without a network. `report.html` has its words, this module what they are said of."""
+"""HTML report of an identification, self-contained for any browser. `report.html` holds the text,
+this module the data."""
 
 import base64
 import io
@@ -37,22 +37,22 @@ PAGES = Environment(
     undefined=StrictUndefined,
     finalize=lambda value: value if isinstance(value, Markup) else plain(str(value)),
 )
-"""Templates, which escape what they are given, without control characters."""
+"""Templates that escape their values and remove control characters."""
 
 Cell = str | tuple[str, str]
 """Text, or a class with text."""
 
 
 def png(figure: Figure) -> Markup:
-    """The picture, as an address of data has it."""
+    """The figure as base 64 of a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=160)
     return Markup(base64.b64encode(buffer.getvalue()).decode())
 
 
 def kept(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> list[tuple[int, str]]:
-    """The columns of a table that have anything in them, and their class: "n", numbers to the
-    right, but for the first."""
+    """Columns of a table that are not empty, with their class: "n" for right-aligned numbers,
+    except in the first."""
     out = []
     for i in range(len(head)):
         kinds = [kind for kind, text in (cell(row[i]) for row in rows) if text]
@@ -62,7 +62,7 @@ def kept(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> list[tuple[int,
 
 
 def cell(one: Cell, column: str = "n") -> tuple[str, str]:
-    """Class and text of a cell in a column; "n" for what begins like a number, or like an
+    """Class and text of a cell; the class is "n" for text that begins like a number, or like an
     interval."""
     if isinstance(one, tuple):
         return one
@@ -70,7 +70,7 @@ def cell(one: Cell, column: str = "n") -> tuple[str, str]:
 
 
 def grouped(value: float, digits: int = 5) -> str:
-    """So many digits, thousands set apart, such as 159 090, and a true minus."""
+    """A number with significant digits, grouped thousands such as 159 090, and a true minus."""
     text = f"{value:.{digits}g}"
     if 10.0**digits / 10 <= abs(value) < 1e9:
         text = f"{float(text):,.0f}".replace(",", "\u202f")
@@ -78,7 +78,7 @@ def grouped(value: float, digits: int = 5) -> str:
 
 
 def signed(value: float) -> str:
-    """With its sign."""
+    """A number with its sign."""
     return ("+" if value > 0 else "") + grouped(value, 2)
 
 
@@ -86,7 +86,8 @@ def signed(value: float) -> str:
 
 
 def estimates(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
-    """Rows by caption: parameters, those of single recordings, starts and sensors."""
+    """Rows by caption: shared parameters, parameters of single recordings, starts, and faults of
+    sensors."""
     groups: dict[str, list[Estimate]] = {
         "": [],
         "Parameters of which each recording has its own": [],
@@ -115,7 +116,7 @@ def estimates(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
 
 
 def prior(e: Estimate) -> Cell:
-    """What was known before."""
+    """Median and standard deviation of the prior."""
     if e.prior is None:
         return ""
     sd = f"×/÷ {np.exp(e.prior.sd):.3g}" if e.prior.kind == "log-normal" else f"± {e.prior.sd:.2g}"
@@ -123,7 +124,8 @@ def prior(e: Estimate) -> Cell:
 
 
 def contributions(result: IdentificationResult) -> list[list[str]]:
-    """The weight of each recording in each parameter, and what it takes off the deviation."""
+    """Share of each recording in each parameter, and the factor on the standard deviation without
+    it."""
     rows = []
     for e in (e for e in result.estimates if e.identifiable and e.kind == "parameter"):
         cells = [e.label]
@@ -136,7 +138,7 @@ def contributions(result: IdentificationResult) -> list[list[str]]:
 
 
 def correlations(result: IdentificationResult) -> str:
-    """The strong ones, in words."""
+    """Strong correlations in words."""
     C, labels = result.correlation, result.labels
     strong = [
         f"{labels[i]} and {labels[j]} {grouped(C[i][j], 2)}"
@@ -148,7 +150,8 @@ def correlations(result: IdentificationResult) -> str:
 
 
 def assumptions(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
-    """Rows on what estimates hang on and what the data say of it, the harmless ones apart."""
+    """Rows on the tests of assumptions, with those apart that matter neither to the estimates nor
+    to the data."""
     moving, harmless = list[list[Cell]](), list[list[Cell]]()
     for one in sorted(result.assumptions, key=lambda one: -abs(one.most_moved[1])):
         label, move = one.most_moved
@@ -168,7 +171,7 @@ def assumptions(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
 
 
 def noise_of(model: Autoregression | None) -> str:
-    """Order and size of coloured noise."""
+    """Order and standard deviation of the noise in words."""
     return "white" if model is None else f"order {model.order}, {model.sd:.2g} × as stated"
 
 
@@ -198,8 +201,8 @@ def report(
 def traces(
     result: IdentificationResult, problem: Problem, journal: Path | None
 ) -> tuple[list[Trace], dict[str, str]]:
-    """Measured and predicted samples of every recording at the result, and why others could not be
-    simulated."""
+    """Measured and predicted samples of every recording at the result, and the reasons of failed
+    runs."""
     if result.noise:
         problem = problem.with_noise({one.channel: one.model for one in result.noise})
     x, out, lost = np.array(result.x), list[Trace](), dict[str, str]()
@@ -223,7 +226,7 @@ def traces(
 
 
 def page(result: IdentificationResult, drawn: list[Trace], lost: dict[str, str]) -> str:
-    """The whole HTML text."""
+    """The HTML text."""
     within = {(one.recording, one.channel): one for one in result.residuals}
     noise = {one.channel: one.model for one in result.noise}
     units, by = {one.channel: one.unit for one in drawn}, result.made_by

@@ -1,8 +1,8 @@
-"""Tests of the residuals of a fit, each with a p-value that counts the independent samples.
+"""Tests of the residuals of a fit, each with a p-value for the number of independent samples.
 
 The residuals r (m,) are whitened with the assumed noise, J (m, n) is their Jacobian. With the right
-model and noise they are independent, normal, of variance one, but for the n directions that the fit
-took out. Every test is of one channel in one recording where it can be:
+model and noise they are independent and normal with variance one, but for the n fitted directions.
+Tests are of one channel in one recording where possible:
 
     level     the sum of squares is chi-squared: residuals are as large as the stated noise
     white     Ljung and Box: no correlation is left from sample to sample
@@ -11,10 +11,9 @@ took out. Every test is of one channel in one recording where it can be:
     outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
     priors    normal: estimates are where their priors expect them
 
-p-values are adjusted by Holm's method: with a right model one of them or more falls below `LEVEL`
-in as many of all identifications. Declared colour is not tested again; colour that was found
-without a declaration is a finding, although intervals allow for it: a sensor may have made it, or a
-wrong model.
+p-values are adjusted by Holm's method: with a right model, the probability that any falls below
+`LEVEL` is at most `LEVEL`. Declared colour is not tested again. Undeclared colour is a finding,
+although intervals allow for it: it may come from a sensor, or from a wrong model.
 """
 
 import time as clock
@@ -37,20 +36,19 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.unknowns import Sensor
 
 CLEAR = 4.0
-"""Standard deviations of the noise that a prediction must be within the range of a sensor that is
-saturated, so that its residual has a normal distribution; and from the prediction, beyond which a
-sample counts wherever it is."""
+"""Distance of a prediction from the end of a saturated sensor's range, in standard deviations of
+the noise, at which its residual is normally distributed; a sample farther than this from its
+prediction always counts."""
 
 FEWEST = 4
-"""Samples that are left of a sensor that is saturated, below which nothing is said of it."""
+"""Fewest remaining samples of a saturated sensor for a test."""
 
 
 class Part(NamedTuple):
-    """One channel of one recording at the fit, without what saturation has changed: times t (m,)
-    [s], the rows (m,) of r and J that are its own, the residuals `raw` (m,) over the noise that the
-    sensor states, the `reading` (m,) that the model predicts [unit], the noise that was found of
-    such residuals (white as stated, if None), what whitens (m,) or (m, k), and how many samples
-    were `saturated`."""
+    """Residuals of one channel in one recording, without samples changed by saturation: times t
+    (m,) [s], their rows (m,) in r and J, the residuals `raw` (m,) over the stated noise, the
+    predicted `reading` (m,) [unit], the estimated noise (None for white noise as stated), the
+    whitening of (m,) or (m, k), and the number of `saturated` samples."""
 
     recording: str
     channel: str
@@ -64,7 +62,7 @@ class Part(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As sentences name it."""
+        """Name in sentences."""
         return f"{self.channel} of `{self.recording}`"
 
     def verdict(self, test: "Test", p: float, size: float, words: str) -> "Verdict":
@@ -73,11 +71,11 @@ class Part(NamedTuple):
 
 def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
     """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise; none of a
-    channel that is saturated but for less than `FEWEST` samples.
+    channel with fewer than `FEWEST` samples left by saturation.
 
-    Of a sensor that is saturated samples are left out where the prediction is near the end of its
-    range or beyond, whether they are saturated or not: the noise of those that are not is not
-    normal. What is far from the prediction stays.
+    For a saturated sensor, samples are left out where the prediction is near the end of its range
+    or beyond, saturated or not: the noise of the unsaturated ones there is not normal. Samples far
+    from the prediction stay.
     """
     out, at = [], 0
     for recording in problem.recordings:
@@ -116,8 +114,8 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
 
 
 def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
-    """Readings without noise (m,), from samples and residuals over the noise: infinite where a
-    saturated one leaves nothing."""
+    """Noiseless readings (m,), from samples and residuals over the noise; infinite where a
+    saturated sample has no residual."""
     y = measured + sensor.sd * raw
     for limit, sign in ((sensor.high, 1.0), (sensor.low, -1.0)):
         if limit is not None:
@@ -130,34 +128,32 @@ def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
 
 
 LEVEL = 0.01
-"""Part of all identifications with a right model and right noise in which a test gives a false
-alarm."""
+"""Probability of a false alarm in an identification with the right model and noise."""
 
 LAGS = 20
-"""Autocorrelations that are shown, at most, and at most a quarter of the samples."""
+"""Most autocorrelations in figures, and at most a quarter of the samples."""
 
 TESTED = 10
-"""Autocorrelations that are tested, at most, and at most one in twenty samples: the sum of more is
-not yet chi-squared in its tail, where alarms are."""
+"""Most autocorrelations in a test, and at most one in twenty samples: the sum of more is not yet
+chi-squared in its tail, where alarms are."""
 
 FAINT = 0.5
-"""Residuals over the noise below which their pattern is not judged: the noise is overstated, and
-that is said."""
+"""Residuals over the noise below which their pattern is not tested, since the noise is
+overstated."""
 
 MOST = 3
-"""Channels that a sentence names; it counts the others."""
+"""Most channels that a sentence names; it counts the others."""
 
 MEDIAN = 0.37
-"""How many residuals tell the level as exactly, by their squares, as one residual does by the
-median of all."""
+"""Efficiency of the level by the median residual, relative to the mean square."""
 
 Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One test of one channel in one recording (of all, where they are None): its p-value, the one
-    that is adjusted for all tests together, the size of what it looks at, and that in words."""
+    """Result of one test of one channel in one recording (None for all): its p-value, the p-value
+    adjusted for all tests, the size of the effect, and the effect in words."""
 
     test: Test
     recording: str | None
@@ -175,8 +171,8 @@ class Verdict:
 def judge_residuals(
     parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
 ) -> list[Verdict]:
-    """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are
-    named, with their Jacobian J (m, n) by what was free.
+    """All tests of a fit's whitened residuals r (m,), with the Jacobian J (m, n) by the free
+    coordinates; the last rows are those of the named `priors`.
 
     With a `robust` loss outliers are expected: the level is that of the median residual, and tails
     are not tested.
@@ -210,7 +206,7 @@ def judge_residuals(
 
 
 def holm(verdicts: Sequence[Verdict]) -> list[Verdict]:
-    """With p-values adjusted for as many tests as there are, in the order given."""
+    """Verdicts with p-values adjusted by Holm's method, in the same order."""
     p, n = np.array([f.p for f in verdicts]), len(verdicts)
     order = np.argsort(p)
     adjusted = np.empty(n)
@@ -219,16 +215,16 @@ def holm(verdicts: Sequence[Verdict]) -> list[Verdict]:
 
 
 def two_sided(square: float, dof: float) -> float:
-    """p-value of a chi-squared sum that should be neither too large nor too small."""
+    """Two-sided p-value of a chi-squared sum."""
     return float(min(1.0, 2 * min(stats.chi2.sf(square, dof), stats.chi2.cdf(square, dof))))
 
 
 def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float, float]:
-    """Is the sum of squares that of the noise as stated? With it that sum, and how many independent
-    samples it is worth.
+    """Test of the sum of squares against the stated noise; returns also that sum and its degrees of
+    freedom.
 
-    Where the noise's level was found from these residuals, so that whitened ones tell nothing, the
-    raw ones have it, which are worth `Autoregression.effective` samples (Satterthwaite).
+    Where the noise's level was estimated from these residuals, the raw ones are tested, which are
+    worth `Autoregression.effective` samples (Satterthwaite).
     """
     rows = r[part.rows] if part.noise is None else part.raw
     n = len(rows)
@@ -248,7 +244,8 @@ def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float,
 
 
 def autocorrelation(r: Array) -> Array:
-    """Of residuals r (m,) at lags 1, 2, ..., at most `LAGS` and a quarter of the samples."""
+    """Autocorrelation of residuals r (m,) at lags 1, 2, ..., up to `LAGS` and a quarter of the
+    samples."""
     c = r - r.mean()
     lags, power = min(LAGS, len(r) // 4), float(c @ c)
     return (
@@ -259,8 +256,8 @@ def autocorrelation(r: Array) -> Array:
 
 
 def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
-    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,), after so many
-    coefficients were fitted."""
+    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,), after a fit of
+    `coefficients`."""
     rho, m = autocorrelation(r), len(r)
     lags = min(max(TESTED, coefficients + 3), m // 20)
     if not rho.any() or lags <= coefficients:
@@ -270,15 +267,15 @@ def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
 
 
 def white(part: Part, r: Array) -> Verdict:
-    """Is what was whitened white?"""
+    """Test of whiteness of the whitened residuals."""
     rho, p = whiteness(r[part.rows], part.noise.order if part.noise is not None else 0)
     return part.verdict("white", p, rho, f"(neighbouring samples correlate by {rho:.2f})")
 
 
 def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, Array]:
-    """What residuals have in common with Z (m, k), signals at the samples of a part: the F test's
-    p-value of fitting them besides the unknowns, against the variance of the part itself, the share
-    of that which they take, and what each alone would take, signed (k,)."""
+    """F test of residuals against Z (m, k), signals at the samples of a part: the p-value of
+    fitting them besides the unknowns, relative to the variance of the part, the share of that
+    variance that they explain, and the signed effect of each alone (k,)."""
     size = np.linalg.norm(Z, axis=0)
     columns = np.zeros((len(r), Z.shape[1]))
     columns[part.rows] = part.whitened(Z / np.where(size > 0, size, 1.0))
@@ -300,8 +297,8 @@ def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, A
 
 
 def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
-    """Do residuals line up with the reading that the model predicts, as a wrong sensor would make
-    them, or with those of the other channels and their rates, as a wrong law would?"""
+    """Tests of correlation with the predicted reading, as a wrong sensor would cause it, and with
+    other channels and their rates, as a wrong law would."""
     out, t = [], part.t
     y = CubicSpline(t, part.reading)
     own = {
@@ -330,8 +327,7 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
 
 
 def outliers(part: Part, r: Array) -> Verdict:
-    """Is the largest residual larger than it may be (Grubbs), or are the tails too heavy (Anscombe
-    and Glynn)?"""
+    """Tests of the largest residual (Grubbs), and of heavy tails (Anscombe and Glynn)."""
     rows = r[part.rows]
     m, at = len(rows), int(np.argmax(np.abs(rows)))
     sd = float(rows.std(ddof=1)) if m > 2 else 0.0
@@ -348,8 +344,7 @@ def outliers(part: Part, r: Array) -> Verdict:
 
 
 def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
-    """Do residuals of different channels, where they are sampled at the same times, have something
-    in common (Bartlett)?"""
+    """Test of correlation between channels sampled at the same times (Bartlett)."""
     longest = max((p.t for p in parts), key=len)
     alike = [
         p for p in parts if np.array_equal(p.t, longest) and float(np.mean(p.raw**2)) >= FAINT**2
@@ -372,7 +367,7 @@ def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[
 
 
 def contradicted(name: str, r: float, q: Array) -> Verdict:
-    """Is the residual r of a prior, whose row of Q is q (n,), as small as it should be?"""
+    """Test of the residual r of a prior, whose row of Q is q (n,)."""
     free = max(1.0 - float(q @ q), 0.0)
     z = float(r) / free**0.5 if free > 1e-9 else 0.0  # without data it is where the prior is
     return Verdict(
@@ -403,7 +398,7 @@ SENTENCES: dict[str, str] = {
 
 def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:
     """A sentence for each kind of alarm, naming recordings and channels, the clearest first;
-    intervals are `widened` [1] for residuals that are too large."""
+    `widened` [1] is the factor on intervals for residuals that are too large."""
     kinds: dict[str, list[Verdict]] = {kind: [] for kind in SENTENCES}
     for verdict in sorted(
         (f for f in verdicts if f.alarming), key=lambda f: (f.recording is None, f.p)
@@ -422,7 +417,7 @@ def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[
 
 
 def named(words: Sequence[str]) -> str:
-    """The first of them, and how many more there are."""
+    """The first `MOST` words, and the number of others."""
     more = len(words) - MOST
     return ", ".join(words[:MOST]) + (f" and {more} more" if more > 0 else "")
 
@@ -431,12 +426,13 @@ def named(words: Sequence[str]) -> str:
 
 
 ROUNDS = 2
-"""How often noise is found: in what the fit leaves, and in what the fit with that noise leaves."""
+"""Most estimates of the noise: from the residuals of the fit, and from those of the fit with that
+noise."""
 
 
 class Coloured(NamedTuple):
-    """A problem with the noise that was found, its fit, the noise by channel with every order that
-    was tried, and the fits on the way with when on the clock [s] they ended."""
+    """A problem with estimated noise, its fit, the noise by channel with the scores of every order,
+    and the fits on the way with their ends on the clock [s]."""
 
     problem: Problem
     fit: Fit
@@ -452,11 +448,11 @@ def allow_for_colour(
     refit: Callable[[Problem, Fit, int], Fit],
     undeclared: bool = True,
 ) -> Coloured:
-    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by
-    `refit(problem, fit, round)`, from there, while coordinates that are `free` (n,) move.
+    """Estimate the noise from a fit's residuals in the recordings `which`, and continue the fit
+    with it by `refit(problem, fit, round)`, while coordinates that are `free` (n,) move.
 
-    Where all noise is white nothing is changed. Unless `undeclared` colour is looked for, that of
-    other channels stays as the problem has it.
+    Nothing changes where all noise is white. Without `undeclared`, only declared colour is
+    estimated, and that of other channels stays as it is in the problem.
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
     given = {} if undeclared else problem.noise
@@ -479,7 +475,8 @@ def allow_for_colour(
 
 
 def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residuals:
-    """Residuals and their Jacobian with the noise of the problem in place of that of the parts."""
+    """Residuals and their Jacobian, whitened with the noise of the problem in place of that of the
+    parts."""
     r, J = at.r.copy(), at.J.copy()
     recordings = {recording.name: recording for recording in problem.recordings}
     for part in now:
@@ -494,13 +491,13 @@ def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residual
 
 
 def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> dict[str, NoiseFit]:
-    """The noise of channels whose residuals, all recordings together, are not white, by channel; J
-    (m, n) is the Jacobian.
+    """Coloured noise by channel, of channels whose residuals, all recordings together, are not
+    white; J (m, n) is the Jacobian.
 
-    White noise is refused by the ratio of likelihoods, at `LEVEL` for all channels and orders
-    together; that of `declared` channels by the Bayesian criterion alone. Noise is never taken to
-    be less than the sensor states. That of channels with saturated samples stays white: what their
-    residuals have of colour is a verdict, with its sentence.
+    White noise is rejected by a likelihood-ratio test, at `LEVEL` for all channels and orders
+    together; for `declared` channels by the Bayesian information criterion alone. The noise is at
+    least as large as stated. That of channels with saturated samples stays white: colour of their
+    residuals is a verdict, with its sentence.
     """
     Q, out = np.linalg.qr(J)[0], {}
     channels = list(dict.fromkeys(part.channel for part in parts))
@@ -523,7 +520,7 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
 
 
 def colour_notices(found: Mapping[str, NoiseFit], declared: Sequence[str] = ()) -> list[str]:
-    """Sentences on colour that intervals allow for although nobody has declared it."""
+    """Sentences on undeclared colour, which intervals allow for."""
     names = [
         f"{channel} (order {fit.noise.order}, neighbouring samples correlate by "
         f"{correlation(fit.noise):.2f})"
@@ -539,6 +536,6 @@ def colour_notices(found: Mapping[str, NoiseFit], declared: Sequence[str] = ()) 
 
 
 def correlation(noise: Autoregression) -> float:
-    """Of neighbouring samples."""
+    """Correlation of neighbouring samples."""
     gamma = noise.autocovariance(2)
     return float(gamma[1] / gamma[0])

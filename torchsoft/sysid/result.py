@@ -44,12 +44,12 @@ from torchsoft.tables import Number, line, refusing, shown
 
 @dataclass(frozen=True)
 class RecordedRig:
-    """A recording and its rig: what tells it from others, its length [s], where it began, the rig's
-    class, its numbers and laws before the fit (`description`), and the values that were
-    `identified` of it, with those of where it `began`.
+    """A recording and its rig: fingerprint, length [s], start, the rig's class, its parameters and
+    laws before the fit (`description`), the `identified` parameters, and the values `began` of the
+    start's coordinates.
 
-    `settings` are those from which `SoftGrasp` makes the very same rig; none where another rig, or
-    laws of the user's own, are needed.
+    `settings` are those from which `SoftGrasp` makes the same rig; None for another rig, or for
+    user-defined laws.
     """
 
     name: str
@@ -66,12 +66,12 @@ class RecordedRig:
 
     @property
     def known(self) -> dict[str, Any]:
-        """Numbers and laws that were not identified, without those of a scenario."""
+        """Parameters and laws that were not identified, without those of a scenario."""
         return known(self.description, self.identified)
 
     def rebuilt(self) -> Rig:
-        """The rig before the fit, whose reference holds still. Raises `ValueError` where only its
-        maker has its laws."""
+        """The rig before the fit, with a constant reference. Raises `ValueError` for user-defined
+        laws, which a file cannot hold."""
         if self.settings is None:
             raise ValueError(
                 f"the rig of recording `{self.name}` is a {self.rig} with parts of its own, which "
@@ -82,7 +82,7 @@ class RecordedRig:
 
 
 def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str, Any]:
-    """A rig's description as one table, without what is identified and without the scenario."""
+    """A rig's description as one table, without the identified parameters and the scenario."""
     parameters = {
         name: value for name, value in description["parameters"].items() if name not in identified
     }
@@ -95,7 +95,7 @@ def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str
 
 
 def undetermined(values: Mapping[str, float]) -> str:
-    """What is said of values that the data do not tell."""
+    """A clause on values that the data do not determine."""
     said = ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
     return f"not identifiable from the data, and so only where the search ended: {said}"
 
@@ -106,8 +106,7 @@ def rebuildable(rig: Rig) -> bool:
         return False
     settings = rig.settings
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a steep friction law
+        with warnings.catch_warnings(action="ignore"):  # of a steep friction law
             Parameters.model_validate(settings.model_dump())
     except ValueError:
         return False
@@ -115,7 +114,7 @@ def rebuildable(rig: Rig) -> bool:
 
 
 def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[RecordedRig]:
-    """Of every recording, with its values at x (n,)."""
+    """Every recording with its rig, at x (n,)."""
     out, seen = list[RecordedRig](), dict[bytes, bool]()
     for k, recording in enumerate(problem.recordings):
         values, rig, key = problem.values(x, k), recording.rig, identity(recording.rig)
@@ -138,21 +137,21 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
 
 
 SCHEMA = "torchsoft-answer-5"
-"""Name and version of the file's form."""
+"""Name and version of the file format."""
 
 
 LARGEST = 1e9
-"""Size [B] of a file of an answer at the most."""
+"""Largest size [B] of an answer's file."""
 
 UNEXPLAINED = 1.25
-"""RMS residual of a channel over its stated noise from which a report begins by saying that the
-model does not explain it."""
+"""RMS residual of a channel, over its stated noise, above which the headline says that the model
+does not explain the data."""
 
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """Coloured noise of one channel: the model that residuals were whitened by, and the orders that
-    were tried."""
+    """Coloured noise of one channel: the model that whitened its residuals, and the scores of all
+    orders."""
 
     channel: str
     model: Autoregression
@@ -161,11 +160,11 @@ class ChannelNoise:
 
 @dataclass(frozen=True, repr=False)
 class IdentificationResult(Shown):
-    """Estimates, correlations, directions, residuals, predictions, and how they were made.
+    """Estimates, correlations, directions, residuals, predictions, and their provenance.
 
-    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that
-    were free (`labels`). `rigs` are those of the recordings, with their laws and the references
-    that they followed; a file does not hold them.
+    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in the free ones
+    (`labels`). `rigs` are those of the recordings, with their laws and references; a file does not
+    hold them.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
@@ -229,8 +228,8 @@ class IdentificationResult(Shown):
 
     @property
     def headline(self) -> str:
-        """First line of a report: that the model does not explain the data, or how many parameters
-        are identifiable."""
+        """First line of a report: the model does not explain the data, or the number of
+        identifiable parameters."""
         mine = [e for e in self.estimates if e.kind == "parameter"]
         worst = max(self.residuals, key=lambda one: one.stated, default=None)
         text = (
@@ -248,8 +247,8 @@ class IdentificationResult(Shown):
         )
 
     def recorded(self, recording: str | None = None) -> RecordedRig:
-        """A recording and its rig, the first one by default. Raises `ValueError` for one that is
-        not there, and, without a name, where rigs differ from recording to recording."""
+        """A recording and its rig, by default the first. Raises `ValueError` for an unknown one,
+        and, without a name, where rigs differ between recordings."""
         known = ", ".join(f"`{one.name}`" for one in self.recordings)
         if recording is None and self.recordings:
             first = self.recordings[0]
@@ -307,11 +306,11 @@ class IdentificationResult(Shown):
     def draws(
         self, count: int, recording: str | None = None, seed: int = 0
     ) -> dict[str, NDArray[np.float64]]:
-        """What the fit leaves unknown: values (1 + count,) [unit] of the parameters by name, first
-        the estimates, then draws from the normal distribution of the coordinates within their
-        bounds. `torchsoft.plan` takes them as `over`.
+        """Draws (1 + count,) [unit] of the uncertain parameters by name, first the estimates, then
+        draws from the normal distribution of the coordinates within their bounds. `torchsoft.plan`
+        takes them as `over`.
 
-        Warns of parameters that are not identifiable, which stay where the search ended. Raises
+        Warns of parameters that are not identifiable, which stay at the end of the search. Raises
         `ValueError` for no count, and where no parameter is identifiable.
         """
         whole("count", count, 1)
@@ -336,8 +335,8 @@ class IdentificationResult(Shown):
         return values
 
     def _told(self, one: RecordedRig) -> set[str]:
-        """Names of parameters that are identifiable. Warns of the others, those of a held-out
-        recording too."""
+        """Names of the identifiable parameters. Warns of the others, including those of a held-out
+        recording."""
         mine = [
             e for e in self.estimates if e.kind == "parameter" and e.recording in (None, one.name)
         ]
@@ -352,7 +351,7 @@ class IdentificationResult(Shown):
         return told
 
     def to_json(self) -> str:
-        """The content of the file."""
+        """Content of the file."""
         content = finite(adapter().dump_python(self, mode="json", by_alias=True))
         return json.dumps(
             {"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False
@@ -364,7 +363,7 @@ class IdentificationResult(Shown):
             partial.write_text(self.to_json(), encoding="utf-8")
 
     def table(self) -> str:
-        """The headline, and one line an estimate."""
+        """The headline, and a line for each estimate."""
         rows = [self.headline, f"{'parameter':34s} {'estimate':>12s}   95 % interval"]
         for e in self.estimates:
             if e.value is None or e.ci95 is None:
@@ -385,7 +384,8 @@ def adapter() -> TypeAdapter[IdentificationResult]:
 
 
 def checksum(content: Any) -> str:
-    """Of JSON content, in which 1 is 1.0 and the order of names does not matter."""
+    """Checksum of JSON content, independent of the order of names and of whether 1 is written as
+    1.0."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
@@ -421,7 +421,7 @@ def schema() -> dict[str, Any]:
 
 
 def load_answer(path: str | Path) -> IdentificationResult:
-    """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no
+    """The answer in a file. Raises `ValueError` naming the file for one that is damaged or not an
     answer, and `OSError`."""
     check_file(path, LARGEST)
     try:
@@ -446,18 +446,18 @@ def load_answer(path: str | Path) -> IdentificationResult:
             f"{path} is damaged: its content is not what was saved; restore it from a copy, or "
             "identify again"
         )
-    with refusing(content, str(path)), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a steep friction law, which was fitted nevertheless
+    # of a steep friction law, which was fitted nevertheless
+    with refusing(content, str(path)), warnings.catch_warnings(action="ignore"):
         return adapter().validate_json(json.dumps(content))
 
 
 BLURRED = 0.1
-"""Relative standard deviation of a combination of parameters from which it is looked for what the
-data see in its place."""
+"""Relative standard deviation of a combination of parameters above which identifiable products are
+reported in its place."""
 
 
 def seen_together(problem: Problem, free: NDArray[np.bool_], C: Array) -> list[Combination]:
-    """Products of powers of parameters that the data see better than each of them."""
+    """Products of powers of parameters that the data determine better than each of them."""
     mine = [
         i
         for i, one in enumerate(problem.coordinates.all)

@@ -1,5 +1,5 @@
-"""Motions of a rig file for an identification: candidates ranked, and the knots of the best moved
-by gradient, both by one criterion."""
+"""Design of a rig file's motion for an identification: a ranking of candidates, and the best one's
+knots moved by gradient, by one criterion."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -21,14 +21,14 @@ from torchsoft.sysid.rehearsal import planned
 from torchsoft.tables import line
 
 AS_STATED = "as stated"
-"""The name of the motion of the rig file itself, which is a candidate too."""
+"""Name of the candidate that is the motion of the rig file itself."""
 
 
 @dataclass(frozen=True)
 class Rated:
-    """A candidate: the criterion, a logarithm of standard deviations, the smaller the better; the
-    relative standard deviations of the parameters, and how much of the way to their limits channels
-    go. `lost` says why it cannot be made."""
+    """A rated candidate: the criterion, a logarithm of standard deviations, the smaller the better;
+    the relative standard deviations of the parameters, and the largest fraction of their limits
+    that channels reach. `lost` is the reason of a failed run."""
 
     name: str
     value: float
@@ -44,15 +44,15 @@ class Rated:
 
 
 class Chosen(NamedTuple):
-    """The candidates, the best first; the rig file with the best motion, and how its knots were
-    moved, if any might."""
+    """The candidates, the best first; the rig file with the best motion, and its design if knots
+    were moved."""
 
     rated: list[Rated]
     file: RigFile
     found: Design | None
 
     def table(self) -> str:
-        """One line a candidate."""
+        """A line for each candidate."""
         names = list(next((one.deviations for one in self.rated if not one.lost), {}))
         width = max([len(one.name) for one in self.rated] + [9])
         rows = [f"{'candidate':{width}s} criterion  {'  '.join(names)}"]
@@ -64,7 +64,7 @@ class Chosen(NamedTuple):
         return "\n".join(rows)
 
     def summary(self) -> dict[str, Any]:
-        """What is written as JSON."""
+        """Content of `design.json`."""
         out: dict[str, Any] = {"candidates": [asdict(one) for one in self.rated]}
         if self.found is not None:
             one = self.found
@@ -80,12 +80,11 @@ def choose(
     config: Path, stated: Config, recorded: Sequence[Recording] = (), *, workers: int = 1,
     progress: bool = False,
 ) -> Chosen:  # fmt: skip
-    """Rank the motions that a configuration has as candidates by what identifies its unknowns
-    best, beside what has been `recorded`, and move the knots of the best of those that `bounds`
-    name.
+    """Rank a configuration's candidates for the motion by the uncertainty of its unknowns, together
+    with the recordings in `recorded`, and move the knots of the best one that `bounds` name.
 
-    The rig is as its file has it. Raises `ValueError` for what does not fit together, or where no
-    candidate can be made.
+    The rig is that of its file. Raises `ValueError` for parts that do not fit together, and where
+    no candidate can be run.
     """
     plan = stated.design
     with at_field("settings"):
@@ -97,9 +96,9 @@ def choose(
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
         with at_field(f"design.candidates.{name}"):
             files[name] = file.override(**settings)
-            built = files[name].build()
+            files[name].build()
         try:
-            made = planned(stated, built, name, plan.rtol, noise=0.0)
+            made = planned(stated, files[name], name, plan.rtol, noise=0.0)
             problem = Problem([*recorded, made], stated.sensors, stated.unknowns)
             planner = Planner(
                 problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, plan.criterion,

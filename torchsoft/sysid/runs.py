@@ -1,8 +1,8 @@
 """Runs of the model in threads, and their results on disk.
 
-A fit is a deterministic function of its runs: started again it reads the results that it has, to
-the bit, and goes on from there. Results are data with checksums in a marked folder of their own; a
-damaged file, or that of another run, is made again.
+A fit is a deterministic function of its runs: started again, it reads the stored results, to the
+bit, and continues. Results are data with checksums in a marked folder; a damaged file, or one of
+another run, is made again.
 """
 
 import io
@@ -42,20 +42,20 @@ MEANING = (
 )
 
 RUN = re.compile(r"[0-9a-f]{64}\.run")
-"""Names of the results."""
+"""Names of files with results."""
 
 KINDS = {kind.__name__: kind for kind in (Prediction, Misfit, FailedRun)}
-"""What can be the result of a run."""
+"""Types of results of a run."""
 
 PROGRAM = (
     digest(Path(__file__).parents[1]),
     *(version(name) for name in ("torchsoft", "torch", "numpy", "scipy", "llvmlite")),
 )
-"""Everything but the data that decides a run."""
+"""Digest of the source, and versions of the packages, that determine a run besides its data."""
 
 
 def encoded(result: Any) -> bytes:
-    """A result as numpy's archive of its fields, without those that are None."""
+    """A result as numpy's archive of its fields, without None."""
     fields = {
         name: np.asarray(value) for name, value in result._asdict().items() if value is not None
     }
@@ -66,7 +66,7 @@ def encoded(result: Any) -> bytes:
 
 
 def decoded(content: bytes) -> Any:
-    """The result that `encoded` was given, to the bit."""
+    """The result from its archive, to the bit."""
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         fields = {
             name: archive[name] if archive[name].ndim else archive[name].item()
@@ -77,8 +77,8 @@ def decoded(content: bytes) -> Any:
 
 
 class Journal:
-    """The results of runs of some recordings in a folder, by the run, which is any object whose
-    `repr` says all of it.
+    """Results of runs of some recordings in a folder, by run; a run is any object with a complete
+    `repr`.
 
     Raises `ValueError` for a folder that holds anything else.
     """
@@ -89,7 +89,7 @@ class Journal:
         self._open()
 
     def _open(self) -> None:
-        """Make the folder, and mark it unless it is someone else's."""
+        """Make the folder, and mark it as a journal."""
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(
                 f"the checkpoint {self.folder} is a file; give a new or an empty folder"
@@ -103,12 +103,12 @@ class Journal:
             (self.folder / CHECKPOINT).write_text(MEANING, encoding="utf-8")
 
     def _place(self, run: object) -> tuple[bytes, Path]:
-        """What the checksum of a run's file begins with, and the file."""
+        """Prefix of the checksum of a run's file, and the file."""
         name = sha256((self._own + repr(run)).encode())
         return name.digest(), self.folder / f"{name.hexdigest()}.run"
 
     def recall(self, run: object) -> Any:
-        """The result of a run; None where it is not there, or damaged."""
+        """The result of a run; None where it is missing or damaged."""
         name, path = self._place(run)
         if not path.is_file():
             return None
@@ -127,7 +127,7 @@ class Journal:
         return None
 
     def keep(self, run: object, result: Any) -> None:
-        """Write the result of a run, so that it lasts."""
+        """Write the result of a run."""
         name, path = self._place(run)
         content = encoded(result)
         if not (
@@ -139,8 +139,8 @@ class Journal:
 
 
 def forget(folder: Path) -> None:
-    """Remove a journal's own files, and the folder unless it holds anything else; other folders are
-    left alone."""
+    """Remove a journal's own files, and the folder if it holds nothing else; other folders are left
+    alone."""
     if not (folder / CHECKPOINT).is_file():
         return
     for path in folder.iterdir():
@@ -156,11 +156,11 @@ def forget(folder: Path) -> None:
 
 
 class Job(NamedTuple):
-    """One run: which recording, the values of what is unknown, the names to differentiate by, and
-    the steps.
+    """One run: index of the recording, values of the unknowns, names to differentiate by, and
+    steps.
 
-    `interpolated` asks for a grid between the samples; `judged` asks for the misfit and its
-    gradient in place of the signals: by every sensor's readout and the colour of its noise.
+    `interpolated` requests a grid between the samples; `judged` requests the misfit and its
+    gradient in place of the signals, and holds every sensor's readout and the colour of its noise.
     """
 
     recording: int
@@ -172,8 +172,8 @@ class Job(NamedTuple):
 
 
 class Runner:
-    """Runs jobs in `workers` threads (in this one, if it is one), and remembers their results in
-    the folder `journal`."""
+    """Runs jobs in `workers` threads (in this one, if it is one), and stores their results in the
+    folder `journal`."""
 
     def __init__(
         self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None
@@ -188,7 +188,7 @@ class Runner:
         ]  # models that no thread is using
 
     def of(self, recordings: Sequence[Recording]) -> "Runner":
-        """One of other recordings, in as many threads and the same folder."""
+        """A runner for other recordings, with the same number of threads and the same folder."""
         return Runner(recordings, self.workers, self.folder)
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
@@ -206,8 +206,7 @@ class Runner:
         return out
 
     def _made(self, job: Job) -> Any:
-        """The result of a run that is made now, and kept even if an interruption is waiting for its
-        end."""
+        """Run a job and store its result, even if an interruption is pending."""
         idle = self._idle[job.recording]
         try:
             begun = idle.pop()
@@ -220,7 +219,7 @@ class Runner:
         return result
 
     def _length(self, job: Job) -> float:
-        """Steps of a run [1], by experience where they are not chosen yet."""
+        """Steps of a run [1], estimated where a tolerance chooses them."""
         if isinstance(job.steps, Frozen):
             return len(job.steps.knots) - 1
         return steps_per_second(job.steps) * self.recordings[job.recording].duration
@@ -236,7 +235,7 @@ class Runner:
 
 
 def simulated(recording: Recording, begun: RunContext, job: Job) -> Any:
-    """A `Prediction`, a `Misfit`, or a `FailedRun`, by a rig that nobody else is using."""
+    """A `Prediction`, a `Misfit`, or a `FailedRun`, with a rig that no other thread uses."""
     run = begun, job.values, recording.grid(job.interpolated), job.names, job.steps
     try:
         if job.judged is None:

@@ -1,16 +1,15 @@
-"""Do the data agree with what was taken for granted, and how far would estimates move if it were
-otherwise?
+"""Tests of an identification's assumptions: agreement with the data, and effect on the estimates.
 
-One run a recording and variation, at the estimates, on the same steps: the difference d (m,) that
-it makes to the residuals is one more column beside the Jacobian J. Its projection on J says how far
-estimates would move; the rest of it, along the residuals, how much of it the data favour. A
-constant of the computation is not known to be right: it enters the intervals as a coordinate more,
-with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
+A variation takes one run for each recording, at the estimates, on the same steps: its change d (m,)
+of the residuals is another column beside the Jacobian J. The projection of d on J gives the shift
+of the estimates; its orthogonal part, along the residuals, the amplitude that the data favour. A
+constant of the computation is not known to be right: it enters the intervals as another coordinate,
+with a standard normal prior on its amplitude, so that intervals become wider where the data cannot
+determine it.
 """
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
@@ -23,39 +22,40 @@ from tqdm import tqdm
 
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
-from torchsoft.sysid.fit import Loss, Notify, fisher, shift, standard_deviations
+from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, extended
-from torchsoft.sysid.refits import End, Joint, Refit, difference, joint_fit, refit
+from torchsoft.sysid.refits import End, Refit, difference, joint_fit, refit
 from torchsoft.sysid.residual_tests import LEVEL, parts
 from torchsoft.tables import Number, plain
 
 EVIDENT = 20.0
-"""Fall of chi2, over the misfit that is left per sample, from which the data favour a variation:
-four and a half standard deviations, for some twenty variations are looked at."""
+"""Fall of chi2, over the remaining misfit per sample, above which the data favour a variation: four
+and a half standard deviations, since some twenty variations are tested."""
 
 PATTERN = 0.5
-"""Part of the residuals' autocorrelation that a variation may leave and yet count as what the data
-favour: a cause takes the pattern away with it, while coloured noise lines up with anything slow."""
+"""Largest fraction of the residuals' autocorrelation that a favoured variation leaves: a cause
+removes the pattern, while coloured noise correlates with anything slow."""
 
 LAGS = 10
-"""Autocorrelations that are looked at."""
+"""Number of autocorrelations in this test."""
 
 BY_CHANCE = 2.0
-"""What the statistic of Box and Pierce may be by chance, over its expectation."""
+"""Largest statistic of Box and Pierce, over its expectation, that counts as chance."""
 
 MOST = 24
-"""Suspects with which a fit is repeated."""
+"""Most suspects with which a fit is repeated, besides laws and constants of the computation."""
 
 RIVAL = 0.3
-"""Part of the gain to first order of what explains a misfit from which a suspect is its rival."""
+"""Fraction of the best suspect's gain to first order above which another one is its rival."""
 
 NEARLY = 0.99
-"""Part of a misfit above the noise that a suspect takes away where few others need to be tried."""
+"""Fraction of the misfit above the noise that a suspect must explain to make most other fits
+needless."""
 
 BESIDES = 3
-"""Things that are looked for besides the likeliest suspect."""
+"""Most effects that are looked for besides the likeliest suspect."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,13 @@ class AssumptionTest(Assumption):
     """Test of one assumption: the effect of its variation by `amount` [unit].
 
     `moves` is the shift of each estimate in its standard deviations, by label; `gain` the fall of
-    the sum of squares, to `left`, by the amplitude that the data favour: `favoured` [unit] with the
-    standard deviation `favoured_sd`. `significance` is the gain over the misfit per sample that
-    would be left, `pattern` the part of the residuals' autocorrelation that would be left, 0 where
-    there is none. With `refitted` that is the result of a new fit, else it is to first order.
-    `unchecked` is the reason why there is no test. `value` is the favoured value of the
-    `parameter`, `under` are the estimates with the favoured amplitude, by label. `suspected`: the
-    data favour the variation, and `odds` are its part of the evidence among all suspects.
+    the sum of squares, to `left`, at the amplitude that the data favour: `favoured` [unit] with the
+    standard deviation `favoured_sd`. `significance` is the gain over the remaining misfit per
+    sample, `pattern` the remaining fraction of the residuals' autocorrelation, 0 where there is
+    none. With `refitted` the result is that of a new fit, else it is to first order. `unchecked` is
+    the reason of a missing test. `value` is the favoured value of the `parameter`, `under` are the
+    estimates at the favoured amplitude, by label. `suspected` is whether the data favour the
+    variation, and `odds` its share of the evidence among all suspects.
     """
 
     moves: dict[str, Number] = field(default_factory=dict)
@@ -98,8 +98,8 @@ class AssumptionTest(Assumption):
 
     @property
     def absurd(self) -> bool:
-        """Whether a number of the rig would have to vanish or to double: a test to first order says
-        nothing then."""
+        """Whether a parameter of the rig would have to vanish or to double, so that a test to first
+        order is void."""
         return (
             self.kind == "known"
             and self.unit == "%"
@@ -109,7 +109,7 @@ class AssumptionTest(Assumption):
 
     @property
     def falls(self) -> str:
-        """What it does to the sum of squares, as a sentence has it."""
+        """The fall of the sum of squares, as the end of a sentence."""
         return (
             f"falls by {self.gain:.0f} in a new fit"
             if self.refitted
@@ -118,7 +118,7 @@ class AssumptionTest(Assumption):
 
     @property
     def found(self) -> str:
-        """What explains the data best, as the end of a sentence."""
+        """The variation that fits best, as the end of a sentence."""
         amount = f"{self.favoured:+.3g} {self.unit}".rstrip()
         if self.parameter and self.unit == "%":
             return (
@@ -133,7 +133,7 @@ class AssumptionTest(Assumption):
 
     @property
     def most_moved(self) -> tuple[str, float]:
-        """The label of the coordinate that would move most, and by how many standard deviations."""
+        """Label of the coordinate with the largest shift, and the shift in standard deviations."""
         return max(self.moves.items(), key=lambda item: abs(item[1]), default=("", 0.0))
 
 
@@ -145,33 +145,34 @@ def assumption_test(one: Assumption, **outcome: Any) -> AssumptionTest:
 
 
 class Checked(NamedTuple):
-    """All checks; columns (m, k) of the constants of the computation, and those of the free
-    coordinates' Jacobian (m, n)."""
+    """All tests; columns (m, k) of the constants of the computation, and the Jacobian (m, n) of the
+    free coordinates."""
 
     checks: list[AssumptionTest]
     columns: Array
     J: Array
     untried: tuple[str, ...] = ()
-    """What an interrupt left out."""
+    """Tests left out by an interruption."""
     candidates: tuple[str, ...] = ()
-    """Suspects that only new fits can tell: whether one explains a misfit that none explains to
-    first order, or which of several that do."""
+    """Suspects that only new fits can judge: none explains the misfit to first order, or several
+    do."""
     besides: tuple[AssumptionTest, ...] = ()
-    """What the data favour to first order besides the likeliest suspect, one after the other."""
+    """Effects that the data favour to first order besides the likeliest suspect, each beside those
+    before it."""
     left: Mapping[str, float] = MappingProxyType({})
-    """RMS residual of every channel, over its noise, with the likeliest suspect and what is
+    """RMS residual of every channel, over its noise, with the likeliest suspect and the effects
     besides."""
 
     def covariance(self) -> Array:
-        """Covariance (n, n) of the free coordinates, which the constants of the computation
-        enlarge."""
+        """Covariance (n, n) of the free coordinates, widened by the constants of the
+        computation."""
         k, n = self.columns.shape[1], self.J.shape[1]
         rows = np.block([[self.J, self.columns], [np.zeros((k, n)), np.eye(k)]])
         _, R = np.linalg.qr(rows[:, [*range(n, n + k), *range(n)]])
         return fisher(R[k:, k:])[0]
 
     def widening(self) -> Array:
-        """What that is more than without them (n, n)."""
+        """Part (n, n) of that covariance due to the constants of the computation."""
         return self.covariance() - fisher(self.J)[0]
 
 
@@ -190,7 +191,8 @@ def check_assumptions(
     judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
     untried = [one.name for one in taken if one.vary is not None]
     try:
-        with quiet():
+        # such as of pads that creep longer than the lead of a run
+        with warnings.catch_warnings(action="ignore"):
             first = columns_of(problem, end, taken)
         judge.columns = {one.name: d for one, d in first if d.any()}
         checks |= {one.name: judge.column(one, d) for one, d in first if d.any()}
@@ -227,19 +229,30 @@ def new_fits(
     problem: Problem, end: End, candidates: Sequence[Variation], loss: Loss, judge: "Judge",
     checks: dict[str, AssumptionTest], progress: bool,
 ) -> Iterator[Variation]:  # fmt: skip
-    """Repeats the fit with one suspect after the other, whose `checks` it replaces. Once one
-    explains the misfit, or `NEARLY` all of it, those that are worth much less are left out."""
-    gains, joint = {one.name: checks[one.name].gain for one in candidates}, None
+    """Repeat the fit with one suspect after the other, and replace its test in `checks`.
+
+    Once one explains the misfit, or `NEARLY` all of it, those with much smaller gains are left
+    out; numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that all
+    numbers together leave.
+    """
+    gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     count = len(candidates)
-    with quiet(), tqdm(total=count + 1, unit="fit", disable=not progress) as bar:
+    bar = tqdm(total=count + 1, unit="fit", disable=not progress)
+    with warnings.catch_warnings(action="ignore"), bar:
 
         def notify(chi2: float) -> None:
             bar.set_postfix_str(f"chi2 = {chi2:.4g}")
 
         if end.far:
             bar.set_description("new fit with all suspects unknown at once")
-            gains, joint = ranked(problem, end, candidates, gains, loss, judge, notify)
-        blind = end.far and joint is None  # gains to first order say little
+            joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
+        explains = joint is not None and joint.left <= judge.little
+        bounded = dict[str, float]()
+        if joint is not None:  # where it leaves much, no number of it explains the data alone
+            gains |= {name: explains * judge.square * part for name, part in joint.parts.items()}
+            if not explains:
+                bounded = dict.fromkeys(joint.parts, RIVAL * judge.misfit(joint.left))
+        blind = end.far and not explains  # gains to first order say little
         order = sorted(candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name]))
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, None, loss, notify)
@@ -248,44 +261,25 @@ def new_fits(
         for number, one in enumerate(order if as_stated is not None else (), 1):
             if gains[one.name] < enough:
                 return
+            if one.name in bounded and least < bounded[one.name]:
+                continue
             bar.set_description(plain(f"new fit with another {one.name} ({number} of {count})"))
             tried = one.of(checks[one.name].favoured)
-            other = refit(problem, end, tried, loss, notify, joint)
+            other = refit(problem, end, tried, loss, notify, joint if explains else None)
             if other is not None and as_stated is not None:
                 found = judge.fit(tried, other, as_stated, checks[one.name])
                 checks[one.name] = replace(found, amount=one.amount, step=one.step)
+                least = min(least, judge.misfit(found.left)) if found.refitted else least
             bar.update()
             yield one
             if judge.nearly(checks[one.name]):
                 enough = max(enough, RIVAL * gains[one.name])
 
 
-def ranked(
-    problem: Problem, end: End, candidates: Sequence[Variation], gains: dict[str, float],
-    loss: Loss, judge: "Judge", notify: Notify,
-) -> tuple[dict[str, float], Joint | None]:  # fmt: skip
-    """Gains of suspects by a joint fit of all of them, and that fit; those to first order, without
-    a joint fit, where there is none. Where it leaves much, no number of it explains the data
-    alone, and gains nothing."""
-    joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
-    if joint is None:
-        return gains, None
-    if joint.left > judge.little:
-        return gains | dict.fromkeys(joint.parts, 0.0), None
-    return gains | {name: part * judge.square for name, part in joint.parts.items()}, joint
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """No warnings: of pads that creep longer than a run begins before its samples, for one."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
-    """Suspects with which a fit is repeated, those that would explain most first: `MOST` of them,
-    and every law, with which there may be a run elsewhere though none where the fit ended."""
+    """Suspects for repeated fits, in order of their gain: the first `MOST`, and every law and
+    constant of the computation, which may have a run elsewhere though none at the end of the
+    fit."""
     tested = [one for one in suspects if one.name in checks]
     known = [one for one in tested if one.kind == "law" or not checks[one.name].unchecked]
     known.sort(key=lambda one: -checks[one.name].gain)
@@ -302,8 +296,8 @@ def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) 
 
 
 def compared(checked: Checked, judge: "Judge") -> Checked:
-    """Tests with their odds: parts of the evidence, by Schwarz's criterion, of those that the data
-    favour; a new fit with a law that holds or does not has no amplitude."""
+    """Tests with odds: shares of the evidence, by Schwarz's criterion, of the suspected ones. A new
+    fit with a law that holds or does not has no amplitude."""
     out = list(checked.checks)
     favoured = [one for one in out if one.suspected]
     if not favoured:
@@ -320,27 +314,29 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
 
 
 class Judge:
-    """What variations are worth at the end of a fit."""
+    """Tests of variations at the end of a fit."""
 
     def __init__(self, problem: Problem, end: End) -> None:
         self.end, self.r, self.J = end, end.at.r, end.at.J[:, end.free]
         self.Q, _ = np.linalg.qr(self.J)
         self.sd = standard_deviations(self.J)
-        self.coordinates = [
-            one for one, is_free in zip(problem.coordinates.all, end.free) if is_free
-        ]
+        self.coordinates = problem.coordinates.within(end.free)
         self.labels = [one.label for one in self.coordinates]
         self.columns, self.ends = dict[str, Array](), dict[str, tuple[Array, Array]]()
         self.parts = parts(problem, self.r, end.which)
         self.places = [part.rows for part in self.parts]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
-        misfit = self.square - self.dof
+        misfit = self.misfit(self.square)
         self.little = self.square - NEARLY * misfit if misfit > 0.0 else 0.0
-        """Sum of squares that is next to nothing above the noise."""
+        """Sum of squares below which next to nothing is left above the noise."""
+
+    def misfit(self, left: float) -> float:
+        """Part of a sum of squares that is above the noise."""
+        return left - self.dof
 
     def explained(self, checks: Iterable[AssumptionTest]) -> bool:
-        """Whether the data favour something with which residuals are no larger than the noise."""
+        """Whether with a suspected variation residuals are no larger than the noise."""
         left = min((one.left for one in checks if one.suspected), default=np.inf)
         return float(stats.chi2.sf(left, self.dof)) > LEVEL
 
@@ -352,8 +348,8 @@ class Judge:
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
         favoured_sd: float, rest: float, after: Array, before: Array, refitted: bool = False,
     ) -> AssumptionTest:  # fmt: skip
-        """Of a variation that leaves residuals `after` (m,) of those `before`, with a sum of
-        squares `left`, a misfit `rest` per sample."""
+        """The test of a variation that turns residuals `before` (m,) into `after`, with a sum of
+        squares `left`, and a misfit `rest` per sample."""
         by_label = dict(zip(self.labels, moves.tolist()))
         x = self.end.x[self.end.free] + moves * self.sd * (
             1.0 if refitted else favoured / one.amount
@@ -380,8 +376,9 @@ class Judge:
     def column(
         self, one: Assumption, d: Array, Q: Array | None = None, r: Array | None = None
     ) -> AssumptionTest:
-        """Of what a variation adds to the residuals (m,), to first order in its amplitude; beside
-        other columns, whose orthonormal basis is Q (m, n), on what they leave, r (m,)."""
+        """Test, to first order in its amplitude, of a variation that adds the column d (m,) to the
+        residuals; on residuals r (m,) beside columns with the orthonormal basis Q (m, n), by
+        default those of the fit."""
         Q, r = self.Q if Q is None else Q, self.r if r is None else r
         across = d - Q @ (Q.T @ d)
         size, along, square = float(across @ across), float(across @ r), float(r @ r)
@@ -400,8 +397,8 @@ class Judge:
     def fit(
         self, one: Variation, again: Refit, as_stated: Refit, linear: AssumptionTest
     ) -> AssumptionTest:
-        """Of a fit that was repeated with it, beside one that was repeated without; or to first
-        order, where the new fit did not come as far."""
+        """Test by a repeated fit with the variation, compared with a repeated fit as stated; the
+        test to first order, where the new fit gains less and has not converged."""
         at, before = again.fit.at, as_stated.fit.at
         gain = float(before.r @ before.r - at.r @ at.r)
         if gain <= linear.gain and not again.fit.converged:
@@ -425,8 +422,8 @@ class Judge:
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]
     ) -> tuple[tuple[AssumptionTest, ...], Array]:
-        """Tests to first order of what the data favour besides one suspect, `BESIDES` at the most,
-        each with those before it; and the residuals (m,) that all of them leave."""
+        """Tests to first order of effects besides one suspect, at most `BESIDES`, each beside those
+        before it; and the residuals (m,) that all of them leave."""
         out: list[AssumptionTest] = []
         r, J = self.r, self.J
         if best.refitted:
@@ -451,12 +448,12 @@ class Judge:
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
-    """What is left of the autocovariances of residuals r beyond those of white noise, by the root
-    of the sum of their squares; 0 where r has none beyond chance."""
+    """Fraction of the autocovariances of residuals r, beyond those of white noise, that residuals
+    `left` retain, by the root of the sum of squares; 0 where r has none beyond chance."""
 
     def statistic(r: Array) -> tuple[float, float]:
-        """That of Box and Pierce, over the stated noise in place of the residuals' own, and its
-        mean for white residuals."""
+        """Statistic of Box and Pierce, relative to the stated noise instead of the residuals' own,
+        and its mean for white residuals."""
         total = white = 0.0
         for rows in places:
             own, n = r[rows], len(r[rows])
@@ -474,9 +471,9 @@ def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> flo
 def columns_of(
     problem: Problem, end: End, taken: Sequence[Variation]
 ) -> list[tuple[Variation, Array]]:
-    """Effects on the residuals of other values of known parameters, of extensions of the rigs, and
-    of faults of sensors that are not unknown, to first order: of a run a recording with its
-    derivatives, and one more for extensions that exclude each other. Nothing where a run fails."""
+    """Columns of the residuals, to first order, for known parameters, extensions of the rigs, and
+    faults of sensors that are not unknowns: from one run for each recording with its derivatives,
+    and another for extensions that exclude each other. Empty where a run fails."""
     if end.base.lost:
         return []
     out: list[tuple[Variation, Array]] = []
@@ -510,7 +507,8 @@ def columns_of(
 
 
 def batches(problem: Problem, known: Sequence[Variation]) -> Iterator[list[Variation]]:
-    """Parameters that one rig can have, those that it has already in the first batch."""
+    """Parameters grouped into sets that one rig can have, with those that it already has in the
+    first."""
     left = list(known)
     while left:
         rig, mine = deepcopy(problem.recordings[0].rig), list[Variation]()
@@ -525,7 +523,7 @@ def batches(problem: Problem, known: Sequence[Variation]) -> Iterator[list[Varia
 
 
 def faults_of(problem: Problem) -> list[Variation]:
-    """Faults of sensors that are not unknown."""
+    """Faults of sensors that are not unknowns."""
     have = {(one.name, one.kind) for one in problem.coordinates.all}
     first = problem.recordings[0]
     return [

@@ -1,9 +1,9 @@
-"""Are recorded set-points close enough together for their motion, and are their rates theirs?
+"""Checks of recorded set-points: their spacing in time, and the agreement of rates with values.
 
-A recorded signal is known at its rows only; a cubic stands between them. Its error is estimated
-from the rows: without every second one, and without three in four, the cubic has more of it, by an
-order that is observed. It is stated by its effect: the error of the set-point, against the noise of
-the sensor of that coordinate, and that of the effort, against the noise of the force.
+A recorded signal is known at its rows only, with a cubic between them. The error of the cubic is
+estimated from cubics through every second and every fourth row, whose larger errors show its order.
+It is stated by its effect: the error of the set-point over the noise of that coordinate's sensor,
+and that of the effort over the noise of the force.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,7 +22,7 @@ from torchsoft.sysid.unknowns import Sensor
 
 
 def found(code: str, recording: Recording, message: str, grave: bool = False) -> Diagnostic:
-    """A diagnostic on one recording; a `grave` one makes a fit worthless."""
+    """A diagnostic on one recording, an error if it is `grave`."""
     return Diagnostic(
         "error" if grave else "warning",
         recording.name,
@@ -32,34 +32,33 @@ def found(code: str, recording: Recording, message: str, grave: bool = False) ->
 
 
 def channel(rig: Rig, name: str) -> str:
-    """The channel of a coordinate such as "disc.x", or of the force of an actuator such as "x"."""
+    """Channel of a coordinate such as "disc.x", or of the effort of an actuator such as "x"."""
     body, _, axis = name.partition(".")
     own = f"{axis}_{rig.symbols[body]}" if axis else f"F_{body}"
     return rig.renamed.get(own, own)
 
 
 NOTICED = 0.2
-"""Part of a sensor's noise from which what happens between rows is said: residuals would be off by
-it everywhere."""
+"""Error between rows, over a sensor's noise, above which a warning is given: residuals would be off
+by it everywhere."""
 
 HOPELESS, ORDERLESS = 100.0, 1.0
-"""Times a sensor's noise by which the unknown between rows makes a fit worthless, if it does not
-even fall by this order where rows are closer."""
+"""Error between rows, over a sensor's noise, that makes a fit worthless, if its order of
+convergence is at most the second number."""
 
 ORDERS = (0.5, 4.0)
-"""Least and largest order that is believed; a cubic through exact values has the largest."""
+"""Least and largest credible order of convergence; a cubic through exact values has the largest."""
 
 PARTS = (0.0, 0.25, 0.5, 0.75)
-"""Where between rows signals are compared."""
+"""Positions between rows at which signals are compared."""
 
 OTHER_RATE = 0.25
-"""Part of a rate by which it may differ from that of the spline through the values, which must be
-sure to half of it."""
+"""Largest relative difference of a rate from that of the spline through the values, which must be
+known to half of it."""
 
 
 class Gap(NamedTuple):
-    """What happens between rows: an error [SI], rms, in units of the noise of a channel, and the
-    order with which it falls."""
+    """Error between rows: rms [SI], over the noise of a channel, and its order of convergence."""
 
     channel: str
     error: float
@@ -68,28 +67,28 @@ class Gap(NamedTuple):
 
 
 def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
-    """The signal by one in so many rows; rates that were `derived` from all rows are derived from
+    """The signal at every so-many-th row; rates that were `derived` from all rows are derived from
     these."""
     rates = None if derived else signal.rates.detach()[::every]
     return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
 
 
 def is_derived(signal: Sampled) -> bool:
-    """Whether its rates are those of the spline through its values."""
+    """Whether the rates are those of the spline through the values."""
     own = spline_rates(signal.times, signal.values)
     return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
 
 
 def extrapolated(by: Mapping[int, Tensor]) -> tuple[float, float]:
-    """RMS error of a quantity at every row, from those by every row, every second and every fourth;
-    and the observed order."""
+    """RMS error of a quantity with every row, by Richardson extrapolation from every second and
+    fourth row, and the observed order."""
     half, quarter = (float((by[2 * k] - by[k]).square().mean().sqrt()) for k in (1, 2))
     order = float(np.clip(np.log2(max(quarter, 1e-300) / max(half, 1e-300)), *ORDERS))
     return half / (2**order - 1), order
 
 
 def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
-    """What the rows of an actuator's set-point leave open, in the channels that have sensors."""
+    """Errors between rows of an actuator's set-point, in the channels with sensors."""
     rig, out = recording.rig, []
     actuator = rig.actuators[name]
     signal = rig.reference[actuator.setpoint]
@@ -122,16 +121,15 @@ def demanded(
     x: Tensor,
     v: Tensor,
 ) -> Tensor:
-    """What the controller makes (n,) of a set-point while its coordinate is at x and moves at v."""
+    """Effort (n,) of the controller for a set-point, with its coordinate at x and its rate at v."""
     known = cubic(feed, every, is_derived(feed)) if isinstance(feed, Sampled) else feed
     more = torch.zeros_like(x) if known is None else known(t)[0]
     return actuator(torch.stack((place, rate, more, x, v), -1))
 
 
 def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
-    """What looks wrong with the set-points of a recording. Of laws of several coordinates only
-    rates are judged here: that they are too sparse shows when every second one is left out
-    (`checks`)."""
+    """Diagnostics on the set-points of a recording. For controllers of several coordinates only
+    rates are tested here."""
     rig = recording.rig
     recorded = {
         n
@@ -151,7 +149,7 @@ def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> It
 def sparse_finding(
     recording: Recording, sensors: Mapping[str, Sensor], name: str
 ) -> Diagnostic | None:
-    """The words on set-points that are too far apart."""
+    """Diagnostic on set-points that are too far apart in time."""
     gap_list = gaps(recording, sensors, name)
     if not gap_list or (worst := max(gap_list, key=lambda gap: gap.noises)).noises <= NOTICED:
         return None
@@ -186,7 +184,7 @@ def sparse_finding(
 
 
 def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
-    """The words on rates that are not those of the values."""
+    """Diagnostic on rates unlike those of the values."""
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
     times, values = signal.times, signal.values.detach()

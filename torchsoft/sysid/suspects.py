@@ -1,27 +1,27 @@
-"""Sentences on what the data say of assumptions: the likeliest suspects, what else they favour, the
-misfit that stays, and the constants of the computation that estimates hang on."""
+"""Sentences on the tests of assumptions: the likeliest suspects, further effects, the remaining
+misfit, and constants of the computation that affect the estimates."""
 
 from collections.abc import Sequence
 
 from torchsoft.sysid.sensitivity import AssumptionTest, Checked
 
 LIKELY = 0.01
-"""Odds from which a suspect is named."""
+"""Least odds of a suspect that is named."""
 
 UNEXPLAINED = 1.15
-"""RMS residual of a channel over its noise that is said to be left."""
+"""Least RMS residual of a channel, over its noise, that is reported as unexplained."""
 
 UNDER = 8
-"""Estimates that a sentence states under an alternative."""
+"""Most estimates that a sentence states under an alternative."""
 
 MOVED = 0.5
-"""Standard deviations by which a constant of the computation may move an estimate without a
-word."""
+"""Largest shift of an estimate by a constant of the computation, in standard deviations, that gets
+no notice."""
 
 
 def assumption_notices(checked: Checked) -> list[str]:
-    """Sentences on what the data favour, the strongest first, and on constants of the computation
-    that estimates hang on."""
+    """Sentences on suspected assumptions, the strongest first, and on constants of the computation
+    that affect the estimates."""
     out, checks = [], checked.checks
     favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
     if checked.candidates and not favoured:
@@ -72,7 +72,7 @@ def assumption_notices(checked: Checked) -> list[str]:
 def contradictions(
     favoured: Sequence[AssumptionTest], candidates: Sequence[AssumptionTest]
 ) -> list[str]:
-    """Sentence on the suspect of the best odds, and on those that the data, or tests to first
+    """A sentence on the suspect with the best odds, and on those that the data, or tests to first
     order, cannot tell from it."""
     best = favoured[0]
     label, move = best.most_moved

@@ -1,9 +1,8 @@
-"""Recordings made by the simulator itself: a known truth to identify."""
+"""Synthetic recordings by the simulator, with a known truth."""
 
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -27,9 +26,7 @@ RIG = {
 """Sensors of a good rig: poses to 10 um and 0.5 mrad, forces to 0.1 N."""
 
 RTOL = 1e-6
-"""Relative tolerance of the runs that recordings are made of: a tenth of what a fit takes."""
-
-AS_STATED: Mapping[str, float] = MappingProxyType({})
+"""Relative tolerance of the runs behind synthetic recordings, a tenth of a fit's."""
 
 
 def record(
@@ -37,15 +34,15 @@ def record(
     sensors: Mapping[str, Sensor], *, start: Start | None = None, rate: float = 200.0,
     rtol: float = RTOL, noise: float = 1.0, seed: int | np.random.Generator = 0,
 ) -> Recording:  # fmt: skip
-    """What sensors see of a rig that follows the motion `planned`, while its numbers are those of
-    the `truth`.
+    """A synthetic recording of a rig with the parameters of the `truth`, which follows the motion
+    `planned`.
 
-    `planned` is what `RigFile.build` or, of the paper's rig, `excitation.begin` gives; `truth` are
-    numbers that differ, by the names that `Rig.parameter` knows, or a rig of other laws with the
-    same pads. The run begins as `start` says, by default at rest: in the paper's rig `AtRest`, in
-    another one where it is planned to. Sampled at `rate` [Hz] from a run whose steps `rtol`
-    chooses, with Gaussian noise of `noise` times each sensor's own. The recording holds nothing of
-    the truth but the samples. Raises `ValueError` for a name or channel that is not there, and
+    `planned` is the result of `RigFile.build` or, for the paper's rig, `excitation.begin`; `truth`
+    holds parameters that differ, by the names of `Rig.parameter`, or is a rig with other laws and
+    the same pads. The run begins at `start`, by default at rest: `AtRest` in the paper's rig, the
+    planned state in another one. Samples are taken at `rate` [Hz] from a run with the tolerance
+    `rtol`, with Gaussian noise of `noise` times each sensor's own. The recording holds nothing of
+    the truth but the samples. Raises `ValueError` for an unknown name or channel, and
     `SimulationFailed`.
     """
     rig, y0, t = planned
@@ -55,10 +52,12 @@ def record(
     made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)
     begun, early = made.begin(), int(begins.lead > 0)
     if isinstance(truth, Rig):
-        begun, truth = begun._replace(rig=deepcopy(truth)), AS_STATED
-        if isinstance(begun.y0, HeldPads):
-            begun.y0.rig = begun.rig
-        begun.rig.reference = rig.reference
+        own, truth = deepcopy(truth), {}
+        own.reference = rig.reference
+        y0 = begins.begin(own, made.samples)
+        if isinstance(begun.y0, HeldPads):  # displacements at the nominal parameters
+            y0, begun.y0.rig = begun.y0, own
+        begun = begun._replace(rig=own, y0=y0)
     grid = Grid(torch.from_numpy(np.append([at[0] - begins.lead] * early, at)), early)
     exact, rng = predict(begun, truth, grid, (), rtol).signals, np.random.default_rng(seed)
     samples = {}

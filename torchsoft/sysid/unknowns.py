@@ -1,8 +1,8 @@
-"""What is unknown: parameters with bounds and scales, and the vector of coordinates that the fits
-move in.
+"""Unknowns: parameters with bounds and scales, faults of sensors, and the vector of coordinates in
+which fits move.
 
-A coordinate is the logarithm of a value, or the value over the width of its bounds; so a
-coordinate's standard deviation is a relative one either way.
+A coordinate is the logarithm of a value, or the value over the width of its bounds; so its standard
+deviation is a relative one either way.
 """
 
 import math
@@ -22,17 +22,16 @@ from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown
 
 SPREAD = 10.0
-"""Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by
-this."""
+"""Default bounds of a logarithmic parameter: its nominal value divided and multiplied by this."""
 
 
 Per = Literal["all", "recording"]
-"""Whether one value belongs to all recordings, or each has its own."""
+"""Whether one value holds for all recordings, or each has its own."""
 
 
 class Prior(Table):
-    """What is known of a value beforehand: a normal distribution with standard deviation `sd` about
-    the `median`, or ("log-normal") one of the logarithm, `sd` being that of ln."""
+    """Prior distribution of a value: normal with standard deviation `sd` about the `median`, or
+    "log-normal", where `sd` is that of the natural logarithm."""
 
     median: float
     sd: float = Field(gt=0, le=1e12)
@@ -52,20 +51,20 @@ class Prior(Table):
         return (value - self.median) / self.sd, 1 / self.sd
 
     def draw(self, rng: np.random.Generator) -> float:
-        """A value from the distribution."""
+        """A random value."""
         z = self.sd * float(rng.standard_normal())
         return self.median * math.exp(z) if self.kind == "log-normal" else self.median + z
 
 
 class Unknown(Table):
-    """One parameter to be identified: of the rig, a user's law included, by its name there, or by
-    its alias in `Parameters`.
+    """One parameter to identify, by its name in the rig, user-defined laws included, or by its
+    alias in `Parameters`.
 
-    `nominal` is where the search starts, by default the value of the recordings' own rigs; with
-    `ratio_to` the value, nominal, bounds and prior are those of the ratio to that other parameter,
-    and `fixed` besides ties the two. Bounds end where the parameter's own do (`Rig.quantity`):
-    wider ones are errors. With `per` = "recording" every recording has a value of its own. A
-    `prior` counts as one more measurement.
+    `nominal` is the start of the search, by default the value of the recordings' own rigs; with
+    `ratio_to`, value, nominal, bounds and prior are those of the ratio to that other parameter, and
+    `fixed` besides ties the two. Bounds must lie within the parameter's own (`Rig.quantity`). With
+    `per` = "recording" every recording has a value of its own. A `prior` counts as one more
+    measurement.
     """
 
     nominal: float | None = None
@@ -94,23 +93,23 @@ class Unknown(Table):
 
 Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia", "clock"]
 NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
-"""What may be wrong with a sensor, in the order of a problem's coordinates."""
+"""Faults of a sensor, in the order of a problem's coordinates."""
 
 
 class Sensor(Table):
-    """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong
-    with it, and where it ends.
+    """A measured channel: standard deviation of its noise [the channel's unit], largest size of its
+    faults, and its range.
 
-    How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift`
+    Faults are a constant `bias` [unit], a `delay` [s], an error of its `gain` [1], a `drift`
     [unit/s] from the middle of the recording on, its `misalignment` [rad] about the axis out of the
-    plane; the `inertia` [kg] between a force sensor and what it pushes, whose acceleration it does
-    not feel; the `clock` [1] that runs too fast, counted from the middle of the recording. Zero
-    leaves them out, otherwise they are identified too, one for all recordings or one
-    for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that
-    value and noise together are there or beyond (Tobin's likelihood), and that noise must be white.
-    Readings in steps of a `resolution` [unit] have its variance, a twelfth of its square, besides.
-    `colour` says whether the noise is known to be independent ("white"), or may be an
-    autoregression ("ar"), whose order and coefficients are then found.
+    plane; the `inertia` [kg] between a force sensor and the body that it pushes, whose acceleration
+    it does not feel; the `clock` [1] that runs too fast, counted from the middle of the recording.
+    Zero leaves a fault out; others are identified, one for all recordings or one for each (`per`).
+    Samples at `low` or `high` [unit] or beyond are saturated: they only say that value plus noise
+    is there or beyond (Tobin's likelihood), and the noise must be white. Readings in steps of a
+    `resolution` [unit] have the additional variance of a twelfth of its square. `colour` is "white"
+    for independent noise, or "ar" for an autoregression, whose order and coefficients are then
+    estimated.
     """
 
     noise: float = Field(ge=1e-15, le=1e6)
@@ -135,11 +134,11 @@ class Sensor(Table):
 
     @property
     def sd(self) -> float:
-        """Standard deviation [unit] of noise and rounding together."""
+        """Standard deviation [unit] of noise and quantisation together."""
         return math.hypot(self.noise, self.resolution / math.sqrt(12))
 
     def saturated(self, y: Array) -> NDArray[np.bool_]:
-        """Which samples y (k,) [unit] are at the end of its range, or beyond."""
+        """Mask of samples y (k,) [unit] at an end of the range or beyond."""
         low, high = (
             -math.inf if self.low is None else self.low,
             math.inf if self.high is None else self.high,
@@ -148,7 +147,7 @@ class Sensor(Table):
 
     @property
     def nuisances(self) -> dict[Nuisance, tuple[float, float, float]]:
-        """Least, nominal and largest value of what is to be identified of it."""
+        """Least, nominal and largest value of each fault to identify."""
         out: dict[Nuisance, tuple[float, float, float]] = {}
         for kind in NUISANCES:
             nominal, reach = float(kind == "gain"), float(getattr(self, kind))
@@ -160,9 +159,9 @@ class Sensor(Table):
 def by_channel(
     rigs: Iterable[Rig], sensors: Mapping[str, Sensor], sampled: Collection[str] | None = None
 ) -> dict[str, Sensor]:
-    """Sensors by channel: one that is called by an array of touch of the rigs, such as
-    "skin.normal", is one of each of its channels (of those `sampled`, if that is given) that has
-    none of its own."""
+    """Sensors by channel. A sensor named after an array of touch of the rigs, such as
+    "skin.normal", stands for each of its channels (of those `sampled`, if given) without a sensor
+    of its own."""
     arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
     shared, own = dict[str, Sensor](), dict[str, Sensor]()
     for name, sensor in sensors.items():
@@ -175,8 +174,8 @@ def by_channel(
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One entry of the vector: what it belongs to, its bounds and start in physical units, its
-    scale, and its prior."""
+    """One entry of the vector of coordinates: name and kind, its bounds and start in physical
+    units, its scale, and its prior."""
 
     name: str
     kind: Literal["parameter", "start"] | Nuisance
@@ -191,7 +190,7 @@ class Coordinate:
 
     @property
     def of_the_rig(self) -> bool:
-        """Whether a run depends on it, not only what sensors make of the run."""
+        """Whether a run depends on it; otherwise only a sensor's reading of the run does."""
         return self.kind in ("parameter", "start")
 
     @property
@@ -213,8 +212,8 @@ class Coordinate:
 
 
 def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> tuple[float, float]:
-    """Bounds of an unknown, or of its ratio, whatever the others are: those that its part's
-    constructor declares."""
+    """Bounds of an unknown, or of its ratio, from the declaration of its part's constructor and
+    from fixed parameters."""
     given, ordered, ratio_to = recording.parameters, recording.rig.ordered, unknowns[name].ratio_to
     if ratio_to is not None:
         return (0.0, 1.0) if ordered.get(name) == ratio_to else (-math.inf, math.inf)
@@ -236,8 +235,8 @@ def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> 
 
 
 def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
-    """Of an unknown, or its ratio, in the rigs of all recordings. Raises `ValueError` where they do
-    not have the same."""
+    """Value of an unknown, or of its ratio, in the rigs of all recordings. Raises `ValueError`
+    where they differ."""
     own = [
         r.parameters[name] / (r.parameters[u.ratio_to] if u.ratio_to else 1.0) for r in recordings
     ]
@@ -251,15 +250,16 @@ def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
 
 
 AT_BOUND = 1e-4
-"""Part of the way between its bounds within which a coordinate counts as being at one."""
+"""Distance from a bound, over the width of the bounds, below which a coordinate counts as being at
+it."""
 
 
 class Coordinates:
-    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to
-    parameters of the rig, of where runs begin, and of the sensors.
+    """All coordinates of a problem, in a fixed order, and the map from their vector x (n,) to
+    parameters of the rig, starts of runs, and faults of sensors.
 
-    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is
-    not there, or a nominal value or the median of a prior out of bounds.
+    Raises `ValueError` for unknowns that some recording's rig lacks, a ratio to an unknown
+    parameter, or a nominal value or median of a prior out of bounds.
     """
 
     def __init__(
@@ -364,8 +364,8 @@ class Coordinates:
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 
     def _check_order(self, *names: str) -> None:
-        """Raises `ValueError` where a search could take the first of two parameters above the
-        second."""
+        """Raises `ValueError` where a search could move the first of two ordered parameters above
+        the second."""
         lower, upper = ({c.name: c for c in self.all if not c.fixed}.get(name) for name in names)
         if lower and upper and not lower.ratio_to and lower.high > upper.low:
             raise ValueError(
@@ -383,7 +383,7 @@ class Coordinates:
 
     @property
     def start(self) -> Array:
-        """x of the nominal values (n,)."""
+        """Vector x of the nominal values (n,)."""
         return np.array([c.to_x(c.nominal) for c in self.all])
 
     @property
@@ -392,9 +392,16 @@ class Coordinates:
             [c.to_x(c.high) for c in self.all]
         )
 
+    def begun(self, known: Mapping[str, float]) -> Array:
+        """Vector x (n,) with the `known` entries by label, and the nominal values elsewhere."""
+        return np.array([known.get(label, own) for label, own in zip(self.labels, self.start)])
+
+    def within(self, mask: NDArray[np.bool_]) -> list[Coordinate]:
+        """The coordinates of a mask (n,)."""
+        return [one for one, is_in in zip(self.all, mask) if is_in]
+
     def at_bound(self, x: Array) -> NDArray[np.bool_]:
-        """Which coordinates (n,) are as close to a bound as `AT_BOUND` of the way to the other
-        one."""
+        """Mask of coordinates (n,) within `AT_BOUND` of a bound."""
         low, high = self.bounds
         return np.minimum(x - low, high - x) < AT_BOUND * (high - low)
 
@@ -435,7 +442,7 @@ class Coordinates:
     def nuisances(
         self, x: Array, channel: str, recording: str
     ) -> dict[Nuisance, tuple[float, int]]:
-        """Values of what is wrong with a sensor [SI] in one recording, and their places in x."""
+        """Values [SI] of a sensor's faults in one recording, and their indices in x."""
         return {
             c.kind: (c.to_value(x[i]), i)
             for i, c in enumerate(self.all)
@@ -444,5 +451,5 @@ class Coordinates:
 
     @property
     def priors(self) -> list[tuple[int, Prior]]:
-        """Places of coordinates that have a prior and are free, and the priors."""
+        """Indices of free coordinates with a prior, and the priors."""
         return [(i, c.prior) for i, c in enumerate(self.all) if c.prior is not None and not c.fixed]

@@ -1,4 +1,5 @@
-"""Datasets in the form of other projects. A folder of them appears whole or not at all."""
+"""Export of datasets to the formats of other projects. The exported folder appears whole or not at
+all."""
 
 import importlib
 import shutil
@@ -17,9 +18,9 @@ WRITERS = {"the-well": "the_well", "lerobot": "lerobot", "mcap": "mcap"}
 
 
 def export(url: str, to: str, out: Path) -> str:
-    """Write the sound trajectories of a finished dataset to a new folder; a sentence on what is in
-    it. Raises `StoreError` for a dataset that is damaged or unfinished, and `ValueError` for one
-    that this form cannot hold, and for a folder that is not empty."""
+    """Write the sound trajectories of a finished dataset to a new folder; returns a summary
+    sentence. Raises `StoreError` for a dataset that is damaged or unfinished, and `ValueError` for
+    one that the format cannot hold, and for a folder that is not empty."""
     data, config = Vouched(url).data(chunks=None), Config.model_validate(Manifest.read(url).config)
     sound = np.flatnonzero(data.failed.values == 0)
     if not len(sound):

@@ -1,7 +1,7 @@
-"""LeRobot's dataset v3: an episode a trajectory, a frame a sample.
+"""LeRobot's dataset v3, with a trajectory as an episode and a sample as a frame.
 
-Set-points are the action, or where none is kept the efforts of the actuators; other channels are
-the state, and forces at the contact points observations of their own. Numbers that were drawn are
+Set-points are the action, or efforts of the actuators where no set-point is kept. Other channels
+are the state, and forces at the contact points observations of their own. Drawn parameters are
 columns of the episodes.
 """
 
@@ -20,7 +20,7 @@ from torchsoft.files import write_json
 
 VERSION = "v3.0"
 CHUNK, SIZE = 1000, 100
-"""Files of a folder, and size of a file [MB], at the most."""
+"""Most files in a folder, and largest size of a file [MB]."""
 
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 SEEN = "observation."
@@ -28,8 +28,8 @@ INDICES = ("frame_index", "episode_index", "index", "task_index")
 
 
 def write(source: Source, out: Path) -> str:
-    """Data, episodes, tasks and statistics. Raises `ValueError` for a rate of samples that is no
-    whole number."""
+    """Write data, episodes, tasks and statistics. Raises `ValueError` for a sample rate that is not
+    a whole number."""
     arrow, parquet = needed("pyarrow", "export"), needed("pyarrow.parquet", "export")
     rate = 1.0 / source.config.sample_interval
     if abs(rate - round(rate)) > 1e-6 * rate:
@@ -96,8 +96,7 @@ def write(source: Source, out: Path) -> str:
 
 
 def of_frames(source: Source) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every feature by its name. Raises `ValueError` where nothing is kept that could be an
-    action."""
+    """Every feature by its name. Raises `ValueError` where no channel can be an action."""
     action = source.motions or [name for name in source.channels if name.startswith("F_")]
     state = [name for name in source.channels if name not in action]
     if not action or not state:
@@ -119,7 +118,7 @@ def of_frames(source: Source) -> Iterator[tuple[str, dict[str, Any]]]:
 def values(
     run: xr.Dataset, named: dict[str, list[str]], features: dict[str, Any]
 ) -> dict[str, NDArray]:
-    """Vectors (samples, n) of a trajectory."""
+    """Vectors (samples, n) of the features of a trajectory."""
     out = dict[str, NDArray]()
     for key in features:
         if key in named:
@@ -130,21 +129,21 @@ def values(
 
 
 def column(arrow: Any, values: NDArray) -> Any:
-    """A column of vectors, or of numbers, as which LeRobot takes vectors of one."""
+    """A column of vectors; of numbers for vectors of length one, as LeRobot requires."""
     if values.size == len(values):
         return arrow.array(values.ravel())
     return arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), values.shape[1])
 
 
 def statistics(values: NDArray) -> dict[str, Any]:
-    """What LeRobot keeps of an episode's feature."""
+    """LeRobot's statistics of one feature in one episode."""
     x = values.reshape(len(values), -1).astype(float)
     found = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
     return {key: one.tolist() for key, one in found.items()} | {"count": [len(x)]}
 
 
 def together(episodes: list[dict[str, Any]], features: dict[str, Any]) -> dict[str, Any]:
-    """The same of all episodes, which are of equal length."""
+    """LeRobot's statistics over all episodes, which are of equal length."""
     out = dict[str, Any]()
     for key in features:
         of = {what: np.array([one[f"stats/{key}/{what}"] for one in episodes])

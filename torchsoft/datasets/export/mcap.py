@@ -1,4 +1,4 @@
-"""One MCAP log a trajectory."""
+"""One MCAP log for each trajectory."""
 
 from pathlib import Path
 
@@ -7,7 +7,8 @@ from torchsoft.solve.mcap import write_log
 
 
 def write(source: Source, out: Path) -> str:
-    """Channels of every trajectory; what was drawn for it is the log's metadata."""
+    """Write the channels of every trajectory to a log; its drawn parameters are the log's
+    metadata."""
     told = (*source.drawn, "split")
     for run in source.runs(source.sound.tolist(), (*source.channels, *told)):
         about = {name: str(run[name].item()) for name in (*told, "trajectory")}

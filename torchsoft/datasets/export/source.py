@@ -1,4 +1,4 @@
-"""The sound trajectories of a dataset as exporters take them."""
+"""The sound trajectories of a dataset, as exporters read them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from torchsoft.datasets.subject import SPLITS
 
 
 class Source(NamedTuple):
-    """A dataset, and the numbers of its `sound` trajectories."""
+    """A dataset, and the indices of its `sound` trajectories."""
 
     config: Config
     data: xr.Dataset
@@ -21,7 +21,7 @@ class Source(NamedTuple):
 
     @property
     def splits(self) -> dict[str, list[int]]:
-        """Sound trajectories of every split that has any."""
+        """Indices of the sound trajectories of every split that has any."""
         split = self.data.split.values[self.sound]
         found = {name: self.sound[split == name].tolist() for name in SPLITS}
         return {name: some for name, some in found.items() if some}
@@ -33,17 +33,18 @@ class Source(NamedTuple):
 
     @property
     def motions(self) -> list[str]:
-        """Channels that say what the rig is asked for."""
+        """Channels that are set-points of the rig, or their rates."""
         of = self.config.subject.template.signals
         return [name for name in self.channels if name.removesuffix("_dot") in of]
 
     @property
     def drawn(self) -> list[str]:
-        """Numbers of a trajectory that are drawn."""
+        """Names of the drawn parameters."""
         return list(self.config.subject.labels)
 
     def runs(self, rows: Sequence[int], names: Iterable[str]) -> Iterator[xr.Dataset]:
-        """Some arrays of some trajectories, one after the other, in memory."""
+        """The arrays `names` of each trajectory in `rows`, one trajectory after the other, in
+        memory."""
         some = self.data[[*names]]
         for index in tqdm(rows, unit=" trajectories", leave=False, disable=None):
             yield some.isel(trajectory=index).load()

@@ -1,8 +1,8 @@
-"""The Well's HDF5: what happens on the surface of each pad, as fields on the line of its contact
-points.
+"""The Well's HDF5: fields on the surface of each pad, along the line of its contact points.
 
-A dataset a pad, since all fields of one share their grid. Displacements are two scalar fields: a
-vector field of The Well has as many components as its grid has dimensions, here one.
+Each pad has a dataset of its own, since all fields of one share their grid. Displacements are two
+scalar fields: a vector field of The Well has as many components as its grid has dimensions, here
+one.
 """
 
 from pathlib import Path
@@ -17,11 +17,12 @@ from torchsoft.datasets.export.source import Source
 NAMES = {"train": "train", "validation": "valid", "test": "test"}
 
 FLOAT = np.float32
-"""Precision of everything, as in The Well."""
+"""Precision of all numbers, as in The Well."""
 
 
 def write(source: Source, out: Path) -> str:
-    """A folder a pad with its splits. Raises `ValueError` for a dataset without contact points."""
+    """Write a folder for each pad, with its splits. Raises `ValueError` for a dataset without
+    contact points."""
     if not (surfaces := list(source.config.subject.surfaces)) or not source.config.nodal:
         raise ValueError(
             "The Well is for fields, and this dataset has none (nodal = false); export it to "
@@ -54,8 +55,8 @@ def write(source: Source, out: Path) -> str:
 
 
 def lay_out(file: h5py.File, source: Source, surface: str, count: int) -> list[str]:
-    """Groups and attributes of a file of `count` trajectories; the names of its fields, the
-    displacements last."""
+    """Create groups and attributes of a file of `count` trajectories; returns the names of its
+    fields, the displacements last."""
     config, data, point = source.config, source.data, f"{surface}_point"
     names = [str(name) for name in data if data[name].dims == ("trajectory", "time", point)]
     names += ["displacement_x", "displacement_y"]
@@ -96,19 +97,20 @@ def lay_out(file: h5py.File, source: Source, surface: str, count: int) -> list[s
 
 
 class Statistics:
-    """Mean, deviation and root mean square of fields, and of their changes between samples."""
+    """Mean, standard deviation and root mean square of fields, and of their changes between
+    samples."""
 
     def __init__(self) -> None:
         self.of: dict[str, NDArray] = {}
 
     def add(self, name: str, values: NDArray) -> None:
-        """Take one more trajectory (times, points) in."""
+        """Add one more trajectory (times, points)."""
         values = values.astype(float)
         sums = [(x.size, x.sum(), (x * x).sum()) for x in (values, np.diff(values, axis=0))]
         self.of[name] = self.of.get(name, 0.0) + np.array(sums)
 
     def yaml(self) -> str:
-        """The file that The Well's normalisations read."""
+        """Content of the file that The Well's normalisations read."""
         out = dict[str, dict[str, float]]()
         for name, sums in self.of.items():
             for (n, total, squares), suffix in zip(sums, ("", "_delta")):

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.physics.arguments import names, number, positive, whole
-from torchsoft.physics.mesh.mesh import Array, FreeMesh, Index, Mesh, element_matrices, in_band
+from torchsoft.physics.mesh.mesh import (
+    Array,
+    FreeMesh,
+    Index,
+    Mesh,
+    element_matrices,
+    in_band,
+    quads,
+)
 from torchsoft.quantity import Length, Quantity
 
 SIDES = ("base", "left", "right")
@@ -48,10 +56,15 @@ class PadMesh(Mesh):
 
     @cached_property
     def nodes(self) -> Array:
-        """Reference positions [m], shape (N, 2)."""
+        """Reference positions [m], shape (N, 2): columns are vertical, layers share the height."""
         x = np.linspace(0, self.length, self.elements_x + 1)
-        y = np.linspace(0, self.height, self.elements_y + 1)
-        return np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+        part = np.linspace(0, 1, self.elements_y + 1)
+        y = part * self.profile(x)[:, None]
+        return np.stack((np.broadcast_to(x[:, None], y.shape), y), -1).reshape(-1, 2)
+
+    def profile(self, x: Array) -> Array:
+        """Height of the face [m] at x [m]."""
+        return np.full_like(x, self.height)
 
     @property
     def grid(self) -> Index:
@@ -63,9 +76,7 @@ class PadMesh(Mesh):
     @cached_property
     def elements(self) -> Index:
         """Node numbers of each element, anticlockwise, shape (elements, 4)."""
-        number = self.grid
-        corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
-        return np.stack(corners, -1).reshape(-1, 4)
+        return quads(self.grid)
 
     def edge(self, name: str) -> Index:
         """Numbers of the nodes on an edge of the block."""
@@ -97,8 +108,7 @@ class PadMesh(Mesh):
     @cached_property
     def matrices(self) -> tuple[Array, Array, Array]:
         """Element matrices K_lambda, K_mu, M (8, 8): all elements are alike."""
-        K_lambda, K_mu, M = element_matrices(self.nodes[self.elements[0]])
-        return K_lambda, K_mu, M
+        return element_matrices(self.nodes[self.elements[0]])
 
     @property
     def space(self) -> Array:
@@ -149,19 +159,10 @@ class CurvedPadMesh(PadMesh):
         return self.bonded_edges
 
     def profile(self, x: Array) -> Array:
-        """Height of the face [m] at x [m]."""
         if self.radius in (inf, -inf):
-            return np.full_like(x, self.height)
+            return super().profile(x)
         R, off = abs(self.radius), x - 0.5 * self.length
         return self.height - np.sign(self.radius) * off**2 / (R + np.sqrt(R**2 - off**2))
-
-    @cached_property
-    def nodes(self) -> Array:
-        """Reference positions [m], shape (N, 2): columns are vertical, layers share the height."""
-        x = np.linspace(0, self.length, self.elements_x + 1)
-        part = np.linspace(0, 1, self.elements_y + 1)
-        y = part * self.profile(x)[:, None]
-        return np.stack((np.broadcast_to(x[:, None], y.shape), y), -1).reshape(-1, 2)
 
     @cached_property
     def matrices(self) -> tuple[Array, Array, Array]:
@@ -234,11 +235,7 @@ class FingertipMesh(FreeMesh):
         rows = np.concatenate(
             (inner[None], len(core) + np.arange(layers * (4 * k + 1)).reshape(layers, -1))
         )
-        squares = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
-        sectors = rows[:-1, :-1], rows[:-1, 1:], rows[1:, 1:], rows[1:, :-1]
-        elements = np.concatenate(
-            [np.stack(corners, -1).reshape(-1, 4) for corners in (squares, sectors)]
-        )
+        elements = np.concatenate((quads(number), quads(rows)[:, [0, 3, 2, 1]]))
         nodes = np.concatenate((core, ring.reshape(-1, 2))) + [R, 0.0]
         order = in_band(nodes, elements)
         place = np.argsort(order)

@@ -7,7 +7,7 @@ import torch
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from torchsoft.physics.mesh.mesh import Array, Mesh, lame_moduli
+from torchsoft.physics.mesh.mesh import Array, Index, Mesh, dofs_of, lame_moduli
 
 
 def banded(matrix: sparse.csr_array) -> Array:
@@ -60,21 +60,21 @@ def solved(matrix: sparse.csr_array, loads: Array) -> Array:
     return out
 
 
+def unit_loads(size: int, dofs: Index) -> Array:
+    """One load (size, dofs) on each of some dofs."""
+    loads = np.zeros((size, len(dofs)))
+    loads[dofs, np.arange(len(dofs))] = 1.0
+    return loads
+
+
 @lru_cache(maxsize=16)
 def unit_compliance(mesh: Mesh, nu: float) -> tuple[Array, Array]:
     """Displacements of the surface per force on it, (K^-1)_ss for E depth = 1, and their derivative
     by nu, -K^-1 (dK/dnu) K^-1, both (2 surface, 2 surface)."""
-    surface = (2 * mesh.surface[:, None] + np.arange(2)).ravel()
-    loads = np.zeros((2 * len(mesh.free), len(surface)))
-    loads[surface, np.arange(len(surface))] = 1.0
-    K_lambda, K_mu, _ = mesh.matrices
-    lame_lambda, lame_mu = lame_moduli(1.0, nu)
-    X = solved(mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu), loads)
+    surface = dofs_of(mesh.surface)
+    X = solved(mesh.stiffness(*lame_moduli(1.0, nu)), unit_loads(2 * len(mesh.free), surface))
     with torch.inference_mode(False), torch.enable_grad():
         nu_ = torch.tensor(nu, dtype=torch.float64, requires_grad=True)
         moduli = lame_moduli(torch.ones_like(nu_), nu_)
-    d_lambda, d_mu = (
-        torch.autograd.grad(modulus, nu_, retain_graph=True)[0].item() for modulus in moduli
-    )
-    dK = mesh.assemble(d_lambda * K_lambda + d_mu * K_mu)
-    return X[surface], -(X.T @ (dK @ X))
+    slopes = (torch.autograd.grad(x, nu_, retain_graph=True)[0].item() for x in moduli)
+    return X[surface], -(X.T @ (mesh.stiffness(*slopes) @ X))

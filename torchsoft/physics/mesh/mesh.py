@@ -28,6 +28,17 @@ def lame_moduli(E: Modulus, nu: Modulus) -> tuple[Modulus, Modulus]:
     return E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
 
 
+def dofs_of(nodes: Index) -> Index:
+    """Degrees of freedom (2 n,) of nodes (n,): x and y of each."""
+    return (2 * nodes[:, None] + np.arange(2)).ravel()
+
+
+def quads(number: Index) -> Index:
+    """Elements (n, 4) of a grid of nodes, anticlockwise, by the nodes' numbers (columns, rows)."""
+    corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    return np.stack(corners, -1).reshape(-1, 4)
+
+
 def gradients(corners: Array, xi: float, zeta: float) -> tuple[Array, Array, Array]:
     """Shape functions (4,) at a place of the square, their gradients (..., 4, 2) [1/m] in elements
     of `corners` (..., 4, 2) [m], and the determinant of the map (...) [m2]."""
@@ -137,13 +148,18 @@ class Mesh:
     def assemble(self, element: Array, all_nodes: bool = False) -> sparse.csr_array:
         """Global matrix of element matrices (8, 8) or (elements, 8, 8), on the dofs of the free
         nodes or of all of them."""
-        dofs = (2 * self.elements[:, :, None] + np.arange(2)).reshape(-1, 8)
+        dofs = dofs_of(self.elements.ravel()).reshape(-1, 8)
         rows, cols = np.repeat(dofs, 8, 1).ravel(), np.tile(dofs, (1, 8)).ravel()
         entries = np.broadcast_to(element, (len(dofs), 8, 8)).ravel()
         size = 2 * len(self.nodes)
         full = sparse.csr_array((entries, (rows, cols)), shape=(size, size))
-        keep = (2 * self.free[:, None] + np.arange(2)).ravel()
+        keep = dofs_of(self.free)
         return full if all_nodes else full[keep][:, keep]
+
+    def stiffness(self, lame_lambda: float, lame_mu: float) -> sparse.csr_array:
+        """Global stiffness per depth, on the dofs of the free nodes."""
+        K_lambda, K_mu, _ = self.matrices
+        return self.assemble(lame_lambda * K_lambda + lame_mu * K_mu)
 
     @cached_property
     def nodal_areas(self) -> Array:

@@ -25,6 +25,7 @@ from torchsoft.physics.mesh.mesh import (
     edges,
     gradients,
     in_band,
+    quads,
 )
 
 IGNORED = {"line", "vertex"}
@@ -188,7 +189,7 @@ class QuadMesh(FreeMesh):
                 )
             return number
 
-        n, quads = range(finer + 1), list[list[int]]()
+        n, divided = range(finer + 1), list[Index]()
         for quad in self.quads:
             number = np.array(
                 [
@@ -202,8 +203,7 @@ class QuadMesh(FreeMesh):
                     for i in n
                 ]
             )
-            corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
-            quads += np.stack(corners, -1).reshape(-1, 4).tolist()
+            divided.append(quads(number))
         sides = [
             [
                 [at(side, (finer * (finer - k - i), finer * (k + i))) for i in (0, 1)]
@@ -212,7 +212,7 @@ class QuadMesh(FreeMesh):
             ]
             for old in (self.face_sides, self.bonded_sides)
         ]
-        return QuadMesh.of(np.array(points), quads, *sides)
+        return QuadMesh.of(np.array(points), np.concatenate(divided), *sides)
 
 
 def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Index]]:
@@ -226,9 +226,7 @@ def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Ind
 
     if unit not in LENGTHS:
         raise ValueError(f"`unit` must be one of {', '.join(LENGTHS)}, but is {unit!r}")
-    with check_file(path, LARGEST).open(
-        "rb"
-    ):  # what is not there, or not to be read, is an OSError
+    with check_file(path, LARGEST).open("rb"):  # a missing or unreadable file is an OSError
         pass
     try:
         with (

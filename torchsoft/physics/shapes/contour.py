@@ -41,7 +41,7 @@ SHARPEST = 1e-2
 """How far from a contour, over its size, the nearest point must at least be the only one."""
 
 JUDGED = 1024
-"""About how many points of a contour are looked at to judge it."""
+"""Number of points, about, at which a contour is judged."""
 
 EXACT = 1e-9
 """How exact distances [m] and normals [1] must be found up to half as far as the nearest point is

@@ -69,8 +69,8 @@ class Superellipse(Shape):
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         a, b, n = self.a, self.b, self.n
-        left, below = x[..., 0].detach() < 0, x[..., 1].detach() < 0
-        X, Y = torch.where(left, -x[..., 0], x[..., 0]), torch.where(below, -x[..., 1], x[..., 1])
+        mirrored = x.detach() < 0
+        X, Y = torch.where(mirrored, -x, x).unbind(-1)
         corner = 0.5 ** (
             1 / n.detach()
         )  # u and v where the halves of the quarter meet, on whose normal both begin
@@ -86,8 +86,9 @@ class Superellipse(Shape):
         size = torch.sqrt(along * along + across * across)
         along, across = along / size, across / size
         phi = (X - A * u) * along + (Y - B * v) * across
-        nx, ny = torch.where(over, along, across), torch.where(over, across, along)
-        return phi, torch.stack((torch.where(left, -nx, nx), torch.where(below, -ny, ny)), -1)
+        pair = torch.where(over, along, across), torch.where(over, across, along)
+        normal = torch.stack(pair, -1)
+        return phi, torch.where(mirrored, -normal, normal)
 
     @staticmethod
     def stationarity(

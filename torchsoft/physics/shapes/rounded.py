@@ -62,7 +62,7 @@ class Rounded(Outlined):
         bulge = torch.where(cross >= 0, 1.0, -1.0).double()
         trim = (
             self.radius * bulge * cross / (1 + dot)
-        )  # r tan(|turn| / 2): what an arc takes of both of its sides
+        )  # r tan(|turn| / 2): length that an arc takes from both of its sides
         normal, start = torch.stack((t[:, 1], -t[:, 0]), -1), v + trim[:, None] * t
         centre = start - (bulge * self.radius)[:, None] * normal
         return Sides(
@@ -132,16 +132,18 @@ class RoundedBox(Rounded):
         )
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        left, below = x[..., 0].detach() < 0, x[..., 1].detach() < 0
-        qx = torch.where(left, -x[..., 0], x[..., 0]) - (self.half_width - self.radius)
-        qy = torch.where(below, -x[..., 1], x[..., 1]) - (self.half_height - self.radius)
+        mirrored = x.detach() < 0
+        qx, qy = torch.where(mirrored, -x, x).unbind(-1)
+        qx = qx - (self.half_width - self.radius)
+        qy = qy - (self.half_height - self.radius)
         corner, side = (qx >= 0) & (qy >= 0) & (qx + qy > 0), qx > qy
         far = torch.sqrt(torch.where(corner, qx * qx + qy * qy, 1.0))
         one, zero = torch.ones_like(far), torch.zeros_like(far)
         nx = torch.where(corner, qx / far, torch.where(side, one, zero))
         ny = torch.where(corner, qy / far, torch.where(side, zero, one))
         phi = torch.where(corner, far, torch.where(side, qx, qy)) - self.radius
-        return phi, torch.stack((torch.where(left, -nx, nx), torch.where(below, -ny, ny)), -1)
+        n = torch.stack((nx, ny), -1)
+        return phi, torch.where(mirrored, -n, n)
 
     outline = Shape.outline
 

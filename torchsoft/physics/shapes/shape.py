@@ -27,7 +27,8 @@ log = logging.getLogger("torchsoft")
 Array = NDArray[np.float64]
 
 NOTED = 1e-9
-"""Distance [m] from the origin of given coordinates from which on a centre of mass is told."""
+"""Distance [m] between the origin of given coordinates and the centre of mass from which on a note
+is written."""
 
 
 class Shape(nn.Module):

@@ -12,10 +12,17 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import FELT, GAMMA, INSTANT, MIX, STEPPED
-from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
+from torchsoft.solve.kernel.inertia import (
+    base_velocity,
+    pull_stiffness,
+    solve,
+    stiffness_force,
+    to_base,
+    to_world,
+)
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, branch_rate, restore, softness
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel.linear import add, dot, put, row_of, solve_dense
+from torchsoft.solve.kernel.linear import add, bounds, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance
 from torchsoft.solve.kernel.step import TINY, dense_states
 from torchsoft.solve.kernel.table import Array
@@ -67,7 +74,6 @@ def nodal_cotangent(
             for r in range(2):
                 own[s.inertia_surface[2 * w.touched[first + i] + r]] += b[2 * i + r]
         base = s.pad_base[pad]
-        cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
         x_bar = y_axis = 0.0
         for i in range(i1 - i0):
             x_bar -= s.inertia_D[i0 + i, 0] * own[i]
@@ -76,10 +82,10 @@ def nodal_cotangent(
                 x_bar += v_bar[i]
             else:
                 y_axis += v_bar[i]
-        if free[base] >= 0:
-            V_bar[free[base]] += cos * x_bar - sin * y_axis
-        if free[base + 1] >= 0:
-            V_bar[free[base + 1]] += sin * x_bar + cos * y_axis
+        push = to_world(s, w, pad, x_bar, y_axis)
+        for axis in range(2):
+            if free[base + axis] >= 0:
+                V_bar[free[base + axis]] += push[axis]
         rates = z.dofs[0, i0:i1]
         put(own, rates)
         solve(s, pad, rates)
@@ -116,21 +122,13 @@ def pad_state(
 ) -> None:
     """Cotangents of a massless pad's state at the stage's start, and of its material, from those of
     its nodal rates and displacements (nodes, 2)."""
-    p, first, last, start = (
-        s.p,
-        s.pad_node_start[pad],
-        s.pad_node_start[pad + 1],
-        s.pad_y_start[pad],
-    )
-    size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    p, first, start = s.p, s.pad_node_start[pad], s.pad_y_start[pad]
+    size = 2 * (s.pad_node_start[pad + 1] - first)
+    chain, branches = s.pad_chain_at[pad], s.pad_branches[pad]
     start_C, material = s.pad_C_start[pad], chain + 2 * branches
     soft = softness(s, pad)
-    by_rate, by_u, zeta, z_dot = (
-        scratch.surface[0],
-        scratch.surface[1],
-        scratch.surface[2],
-        scratch.surface[3],
-    )
+    by_rate, by_u = scratch.surface[0], scratch.surface[1]
+    zeta, z_dot = scratch.surface[2], scratch.surface[3]
     scratch.surface[:, :size] = 0.0
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
@@ -175,7 +173,6 @@ def inertial_state(
     free, at = s.body_free, s.inertia_material_at[pad]
     i0, i1, base = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_base[pad]
     U, W, mass = s.pad_y_start[pad], s.pad_v_start[pad], s.p[s.inertia_material_at[pad] + 3]
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     nx = nu[free[base], 0] if free[base] >= 0 else 0.0
     ny = nu[free[base + 1], 0] if free[base + 1] >= 0 else 0.0
     own, strain, force, back = (
@@ -185,7 +182,7 @@ def inertial_state(
         z.dofs[3, i0:i1],
     )  # own: of u'
     reaction, local = z.pair[0], z.pair[1]
-    reaction[0], reaction[1] = -(cos * nx + sin * ny), -(cos * ny - sin * nx)
+    reaction[0], reaction[1] = to_base(s, w, pad, -nx, -ny)
     for i in range(i1 - i0):
         own[i] = (
             a * y_bar[U + i] + y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * reaction[i % 2]
@@ -194,7 +191,7 @@ def inertial_state(
         for r in range(2):
             own[s.inertia_surface[2 * node + r]] += rate_bar[node, r]
     solve(s, pad, own)  # now the multiplier of the pad's equation
-    vx, vy = base_velocity(s, pad, w.V, w.q)
+    vx, vy = base_velocity(s, w, pad)
     here = rate[i0:i1]
     stiffness_force(s, pad, here, force)
     stiffness_force(s, pad, own, back)
@@ -204,12 +201,8 @@ def inertial_state(
         change = here[i] + v - y[W + i]
         p_bar[at + 2] -= own[i] * force[i]
         p_bar[at + 3] += M * change * (reaction[i % 2] - own[i])
-        strain[i] = y[U + i] + (s.p[at + 2] + a) * here[i]
-    for k in range(i1 - i0):
-        for j in range(s.inertia_K_column.shape[1]):
-            product = own[k] * strain[s.inertia_K_column[i0 + k, j]]
-            p_bar[at] -= s.inertia_K_lambda[i0 + k, j] * product
-            p_bar[at + 1] -= s.inertia_K_mu[i0 + k, j] * product
+        strain[i] = -y[U + i] - (s.p[at + 2] + a) * here[i]
+    pull_stiffness(s, pad, strain, own, p_bar)
     local[:] = 0.0
     for i in range(i1 - i0):
         local[i % 2] += y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * (
@@ -217,8 +210,9 @@ def inertial_state(
         )
         y_bar[U + i] -= back[i]
         y_bar[W + i] = mass * s.inertia_area[i0 + i] / a * (own[i] - reaction[i % 2])
-    V_bar[base] += cos * local[0] - sin * local[1]
-    V_bar[base + 1] += sin * local[0] + cos * local[1]
+    push = to_world(s, w, pad, local[0], local[1])
+    V_bar[base] += push[0]
+    V_bar[base + 1] += push[1]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
             y_bar[U + s.inertia_surface[2 * node + r]] += u_bar[node, r]
@@ -275,12 +269,11 @@ def elastic_adjoint(
     """Adjoint of the force and the moment in an inertial pad, sums of K (u + tau u')."""
     i0, i1, at = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.inertia_material_at[pad]
     base, tau, wrench, V_bar = s.pad_base[pad], s.p[at + 2], z.wrenches[pad], z.pair[0]
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-    x, y_axis = z.load[base], z.load[base + 1]
-    bar, back = z.dofs[0, i0:i1], z.dofs[1, i0:i1]
+    x, y_axis = to_base(s, w, pad, z.load[base], z.load[base + 1])
+    bar, back, strain = z.dofs[0, i0:i1], z.dofs[1, i0:i1], z.dofs[2, i0:i1]
     for i in range(0, i1 - i0, 2):
-        bar[i] = wrench[0] + cos * x + sin * y_axis - s.inertia_X[i0 + i + 1] * wrench[2]
-        bar[i + 1] = wrench[1] + cos * y_axis - sin * x + s.inertia_X[i0 + i] * wrench[2]
+        bar[i] = wrench[0] + x - s.inertia_X[i0 + i + 1] * wrench[2]
+        bar[i + 1] = wrench[1] + y_axis + s.inertia_X[i0 + i] * wrench[2]
     stiffness_force(s, pad, bar, back)
     V_bar[:] = 0.0
     for i in range(i1 - i0):
@@ -288,17 +281,14 @@ def elastic_adjoint(
         y_bar[s.pad_v_start[pad] + i] += tau * back[i]
         V_bar[i % 2] -= tau * back[i]
         p_bar[at + 2] += back[i] * rate[i0 + i]
-        for j in range(s.inertia_K_column.shape[1]):
-            column = s.inertia_K_column[i0 + i, j]
-            strain = bar[i] * (y[s.pad_y_start[pad] + column] + tau * rate[i0 + column])
-            p_bar[at] += s.inertia_K_lambda[i0 + i, j] * strain
-            p_bar[at + 1] += s.inertia_K_mu[i0 + i, j] * strain
+        strain[i] = y[s.pad_y_start[pad] + i] + tau * rate[i0 + i]
+    pull_stiffness(s, pad, strain, bar, p_bar)
+    push = to_world(s, w, pad, V_bar[0], V_bar[1])
     for axis in range(2):
-        own = cos * V_bar[0] - sin * V_bar[1] if axis == 0 else sin * V_bar[0] + cos * V_bar[1]
         if s.body_free[base + axis] >= 0:
-            y_bar[s.body_V_start + s.body_free[base + axis]] += own
+            y_bar[s.body_V_start + s.body_free[base + axis]] += push[axis]
         elif s.body_signal[base + axis] >= 0:
-            signals_bar[s.body_signal[base + axis], 1] += own
+            signals_bar[s.body_signal[base + axis], 1] += push[axis]
 
 
 @compiled
@@ -366,13 +356,7 @@ def stage_adjoint(
             for j in range(free):
                 if column[j] >= 0:
                     X[i, 0] += X[i, 1 + column[j]] * nu[j, 0]
-        for node in range(w.low[pad], w.high[pad]):
-            rate_bar[node, 0], rate_bar[node, 1], u_bar[node, 0], u_bar[node, 1] = (
-                0.0,
-                0.0,
-                0.0,
-                0.0,
-            )
+        rate_bar[w.low[pad] : w.high[pad]], u_bar[w.low[pad] : w.high[pad]] = 0.0, 0.0
         for i in range(w.actives[pad]):
             k = w.active[at + i]
             c = s.point_contact[k]
@@ -389,7 +373,7 @@ def stage_adjoint(
                     weights[r] += G[row_, r] * by[row_]
             for row_ in range(6):
                 by[row_] += load_cotangent(s, z, c, row_)
-            own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+            own = bounds(s.contact_p_start, c)
             call_pullback(s.contact_pullback[c], w.x[k], p[own], weights, p_bar[own])
             for m in range(8):
                 position = velocity = 0.0
@@ -426,7 +410,7 @@ def stage_adjoint(
         if number < 0:
             continue
         actuate(s, i, w.q, w.V, signals, x, out, J)
-        own, push = slice(s.act_p_start[i], s.act_p_start[i + 1]), nu[number]
+        own, push = bounds(s.act_p_start, i), nu[number]
         call_pullback(s.act_pullback[i], x, p[own], push, p_bar[own])
         n = 0
         for k in range(s.act_setpoint_start[i], s.act_setpoint_start[i + 1]):
@@ -465,7 +449,7 @@ def free_stretches(
             i += 1
         elif y_bar[j] != 0.0:
             c = s.point_contact[k]
-            own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+            own = bounds(s.contact_p_start, c)
             x[0], x[1], x[2] = y[j], s.point_weight[k], a
             call_linearise(s.contact_free_linearise[c], x, s.p[own], out, J)
             weight[0] = a * y_bar[j]

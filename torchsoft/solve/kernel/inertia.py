@@ -15,17 +15,35 @@ from torchsoft.solve.kernel.table import Array
 
 
 @compiled
-def stiffness_force(s: Any, pad: int, u: Array, out: Array) -> None:
-    """K u, (dofs,) both."""
-    at, first, p = s.inertia_material_at[pad], s.inertia_dof_start[pad], s.p
+def add_stiffness(s: Any, pad: int, lame: Array, u: Array, out: Array) -> None:
+    """Add (lambda K_lambda + mu K_mu) u to out, (dofs,) both, of depth times the Lame moduli."""
+    first = s.inertia_dof_start[pad]
     for i in range(u.size):
         total = 0.0
         for k in range(s.inertia_K_column.shape[1]):
             stiffness = (
-                p[at] * s.inertia_K_lambda[first + i, k] + p[at + 1] * s.inertia_K_mu[first + i, k]
+                lame[0] * s.inertia_K_lambda[first + i, k] + lame[1] * s.inertia_K_mu[first + i, k]
             )
             total += stiffness * u[s.inertia_K_column[first + i, k]]
-        out[i] = total
+        out[i] += total
+
+
+@compiled
+def stiffness_force(s: Any, pad: int, u: Array, out: Array) -> None:
+    """K u, (dofs,) both."""
+    out[:] = 0.0
+    add_stiffness(s, pad, s.p[s.inertia_material_at[pad] :], u, out)
+
+
+@compiled
+def pull_stiffness(s: Any, pad: int, u: Array, out_bar: Array, p_bar: Array) -> None:
+    """Add to p_bar the cotangents of a pad's moduli in K u, from out_bar, (dofs,) both."""
+    at, first = s.inertia_material_at[pad], s.inertia_dof_start[pad]
+    for i in range(u.size):
+        for k in range(s.inertia_K_column.shape[1]):
+            product = out_bar[i] * u[s.inertia_K_column[first + i, k]]
+            p_bar[at] += s.inertia_K_lambda[first + i, k] * product
+            p_bar[at + 1] += s.inertia_K_mu[first + i, k] * product
 
 
 @compiled
@@ -68,23 +86,36 @@ def free_rates(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 
 
 @compiled
-def base_velocity(s: Any, pad: int, V: Array, q: Array) -> Any:
-    """The base's velocity (x, y) in its own axes."""
-    B = s.pad_base[pad]
-    cos, sin = np.cos(q[B + 2]), np.sin(q[B + 2])
-    return cos * V[B] + sin * V[B + 1], cos * V[B + 1] - sin * V[B]
+def to_base(s: Any, w: Any, pad: int, x: float, y: float) -> tuple[float, float]:
+    """A vector of the world in the axes of a pad's base."""
+    angle = w.q[s.pad_base[pad] + 2]
+    cos, sin = np.cos(angle), np.sin(angle)
+    return cos * x + sin * y, cos * y - sin * x
+
+
+@compiled
+def to_world(s: Any, w: Any, pad: int, x: float, y: float) -> tuple[float, float]:
+    """A vector in the axes of a pad's base in the world's."""
+    angle = w.q[s.pad_base[pad] + 2]
+    cos, sin = np.cos(angle), np.sin(angle)
+    return cos * x - sin * y, sin * x + cos * y
+
+
+@compiled
+def base_velocity(s: Any, w: Any, pad: int) -> tuple[float, float]:
+    """The base's velocity in its own axes."""
+    return to_base(s, w, pad, w.V[s.pad_base[pad]], w.V[s.pad_base[pad] + 1])
 
 
 @compiled
 def couple_point(s: Any, w: Any, pad: int, k: int, c: int, K: Array, H: Array, Rv: Array) -> None:
     """Contribution of the base's velocity to the rate of point k, in Hc and Rv."""
-    cos, sin, base, free = w.frame[c, 0], w.frame[c, 1], s.pad_base[pad], s.body_free
     for axis in range(2):
-        towards = free[base + axis]
+        towards = s.body_free[s.pad_base[pad] + axis]
         if towards < 0:
             continue
         column = s.pad_column[pad, towards]
-        ex, ey = (cos, -sin) if axis == 0 else (sin, cos)  # the world's axis in the base's frame
+        ex, ey = to_base(s, w, pad, 1.0 - axis, axis)
         Dx, Dy = 0.0, 0.0
         for j in range(2):
             dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * s.point_node[k, j]]
@@ -105,13 +136,12 @@ def couple_point(s: Any, w: Any, pad: int, k: int, c: int, K: Array, H: Array, R
 @compiled
 def couple_base(s: Any, w: Any, pad: int, n: int, Rv: Array) -> None:
     """The base's reaction to nodal forces and to its own velocity, in Rf and Rv."""
-    base, free, first = s.pad_base[pad], s.body_free, s.pad_node_start[pad]
-    cos, sin, B = np.cos(w.q[base + 2]), np.sin(w.q[base + 2]), s.inertia_B[pad]
+    base, free, first, B = s.pad_base[pad], s.body_free, s.pad_node_start[pad], s.inertia_B[pad]
     for axis in range(2):
         number = free[base + axis]
         if number < 0:
             continue
-        ex, ey = (cos, -sin) if axis == 0 else (sin, cos)
+        ex, ey = to_base(s, w, pad, 1.0 - axis, axis)
         for m in range(2 * n):
             dof = (
                 s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + m // 2] + m % 2]
@@ -122,7 +152,7 @@ def couple_base(s: Any, w: Any, pad: int, n: int, Rv: Array) -> None:
         for other in range(2):
             towards = free[base + other]
             if towards >= 0:
-                ox, oy = (cos, -sin) if other == 0 else (sin, cos)
+                ox, oy = to_base(s, w, pad, 1.0 - other, other)
                 Rv[number, towards] -= ex * (B[0, 0] * ox + B[0, 1] * oy) + ey * (
                     B[1, 0] * ox + B[1, 1] * oy
                 )
@@ -139,7 +169,7 @@ def inertia_force(
         s.pad_v_start[pad],
         s.p[s.inertia_material_at[pad] + 3],
     )
-    vx, vy = base_velocity(s, pad, w.V, w.q)
+    vx, vy = base_velocity(s, w, pad)
     x, z = 0.0, 0.0
     for i in range(0, rates.size, 2):
         x += mass * s.inertia_area[first + i] / a * (rates[i] + vx - y[v_start + i])

@@ -22,7 +22,7 @@ import numpy as np
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.inertia import couple_base, couple_point, free_rates
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
-from torchsoft.solve.kernel.linear import add, dot, put, row_of
+from torchsoft.solve.kernel.linear import add, bounds, dot, put, row_of
 from torchsoft.solve.kernel.table import Array
 
 NEGLIGIBLE = 1e-14
@@ -71,13 +71,8 @@ def apply_law(s: Any, w: Any, k: int, stretch: float, a: float) -> None:
     w.F."""
     c, x = s.point_contact[k], w.x[k]
     x[6], x[7], x[8] = stretch, s.point_weight[k], a
-    call_linearise(
-        s.contact_linearise[c],
-        x,
-        s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]],
-        w.out[k],
-        w.J[k],
-    )
+    own = s.p[bounds(s.contact_p_start, c)]
+    call_linearise(s.contact_linearise[c], x, own, w.out[k], w.J[k])
     for j in range(2):
         for r in range(2):
             w.F[s.point_node[k, j], r] += s.point_N[k, j] * w.out[k, r]
@@ -176,9 +171,7 @@ def scan(s: Any, w: Any, y: Array, margin: float) -> None:
             c, n0, n1 = s.point_contact[k], s.point_node[k, 0], s.point_node[k, 1]
             ux, uy = at_point(s, k, w.u)
             kinematics(s, w, k, ux, uy, 0.0, 0.0, x)
-            call_value(
-                s.contact_distance[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi
-            )
+            call_value(s.contact_distance[c], x, s.p[bounds(s.contact_p_start, c)], phi)
             if not phi[0] > margin:
                 w.window[at + count] = k
                 count += 1
@@ -208,9 +201,7 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
         ux, uy = at_point(s, k, w.u)
         vx, vy = at_point(s, k, w.u_dot)
         kinematics(s, w, k, ux + a * vx, uy + a * vy, vx, vy, w.x[k])
-        call_value(
-            s.contact_distance[c], w.x[k], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi
-        )
+        call_value(s.contact_distance[c], w.x[k], s.p[bounds(s.contact_p_start, c)], phi)
         if phi[0] >= 0.0:
             continue
         apply_law(s, w, k, y[s.point_y_start + k], a)

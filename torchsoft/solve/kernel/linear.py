@@ -67,6 +67,12 @@ def row_of(matrices: Array, start: int, i: int, size: int) -> Array:
 
 
 @compiled
+def bounds(start: Array, i: int) -> slice:
+    """Entries of part i among parts that lie one after the other."""
+    return slice(start[i], start[i + 1])
+
+
+@compiled
 def solve_banded(factor: Array, b: Array) -> None:
     """Solve L L^T x = b in place, L in scipy's lower banded storage."""
     band, n = factor.shape

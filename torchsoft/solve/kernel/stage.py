@@ -10,7 +10,14 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import STEPPED
-from torchsoft.solve.kernel.inertia import base_velocity, inertia_force, solve, stiffness_force
+from torchsoft.solve.kernel.inertia import (
+    base_velocity,
+    inertia_force,
+    solve,
+    stiffness_force,
+    to_base,
+    to_world,
+)
 from torchsoft.solve.kernel.interface import (
     assemble,
     branch_rate,
@@ -24,7 +31,7 @@ from torchsoft.solve.kernel.interface import (
     softness,
 )
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
-from torchsoft.solve.kernel.linear import add, dot, put, row_of, solve_dense
+from torchsoft.solve.kernel.linear import add, bounds, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.table import Array
 
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
@@ -62,7 +69,7 @@ def actuate(
     for k in range(s.act_measured_start[i], s.act_measured_start[i + 1]):
         x[n + 1], x[n + 2] = q[s.act_measured[k]], V[s.act_measured[k]]
         n += 2
-    call_linearise(s.act_linearise[i], x, s.p[s.act_p_start[i] : s.act_p_start[i + 1]], out, J)
+    call_linearise(s.act_linearise[i], x, s.p[bounds(s.act_p_start, i)], out, J)
     return out[0]
 
 
@@ -114,7 +121,7 @@ def residual(s: Any, w: Any, pad: int, y: Array, a: float, n: int, r: Array) -> 
     inertial = s.pad_v_start[pad] >= 0
     b = w.X[2 * first : 2 * (first + n)]
     b[:, 0] = 0.0
-    vx, vy = base_velocity(s, pad, w.V, w.q)
+    vx, vy = base_velocity(s, w, pad)
     for i in range(w.actives[pad]):
         k = w.active[at + i]
         c = s.point_contact[k]
@@ -144,18 +151,18 @@ def residual(s: Any, w: Any, pad: int, y: Array, a: float, n: int, r: Array) -> 
         B, base = s.inertia_B[pad], s.pad_base[pad]
         mx, my = reaction_without_contact(s, w, pad, y, a)
         mx, my = mx + B[0, 0] * vx + B[0, 1] * vy, my + B[1, 0] * vx + B[1, 1] * vy
-        cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+        X, Y = to_world(s, w, pad, mx, my)
         if free[base] >= 0:
-            r[free[base], 0] -= cos * mx - sin * my
+            r[free[base], 0] -= X
         if free[base + 1] >= 0:
-            r[free[base + 1], 0] -= sin * mx + cos * my
+            r[free[base + 1], 0] -= Y
 
 
 @compiled
 def reaction_without_contact(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float]:
     """Sum of M (free - v*)/(a h) of an inertial pad, in the base's axes."""
     first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
-    vx, vy = base_velocity(s, pad, w.V, w.q)
+    vx, vy = base_velocity(s, w, pad)
     x, z = inertia_force(s, w, pad, y, a, w.full[first:last])
     mass = s.p[s.inertia_material_at[pad] + 3] / a
     for i in range(first, last, 2):
@@ -193,10 +200,9 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
             add(f, row[low - 2 * first :], rates)
     if s.pad_v_start[pad] >= 0:
         base, free = s.pad_base[pad], s.body_free
-        cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
         Vx = w.V[base] + (dV[free[base]] if free[base] >= 0 else 0.0)
         Vy = w.V[base + 1] + (dV[free[base + 1]] if free[base + 1] >= 0 else 0.0)
-        vx, vy = cos * Vx + sin * Vy, cos * Vy - sin * Vx
+        vx, vy = to_base(s, w, pad, Vx, Vy)
         for m in range(low, high):
             dof = s.inertia_dof_start[pad] + s.inertia_surface[m]
             rates[m - low] -= s.inertia_D[dof, 0] * vx + s.inertia_D[dof, 1] * vy
@@ -347,12 +353,7 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, wrenches: Array) -
             elif y[j] != 0.0:  # away from contact the stretch decays through the slip element
                 c = s.point_contact[n]
                 w.x[n, 6], w.x[n, 7], w.x[n, 8] = y[j], s.point_weight[n], a
-                call_value(
-                    s.contact_free[c],
-                    w.x[n, 6:],
-                    p[s.contact_p_start[c] : s.contact_p_start[c + 1]],
-                    out,
-                )
+                call_value(s.contact_free[c], w.x[n, 6:], p[bounds(s.contact_p_start, c)], out)
                 k[j] = out[0]
                 powers[count] += out[1]
                 powers[count + 1] += out[2]
@@ -400,7 +401,7 @@ def finish_inertial(
     p = s.p
     first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
     base, at = s.pad_base[pad], s.inertia_material_at[pad]
-    vx, vy = base_velocity(s, pad, w.V, w.q)
+    vx, vy = base_velocity(s, w, pad)
     extra, effort, forces, stiffness = (
         w.inertial[0, first:last], w.inertial[1, first:last], w.inertial[2, first:last],
         w.inertial[3, first:last]
@@ -429,7 +430,7 @@ def finish_inertial(
     for i in range(last - first):
         wrenches[pad, i % 2] += effort[i]
     mx, my = inertia_force(s, w, pad, y, a, rates)
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-    w.load[base] -= cos * mx - sin * my
-    w.load[base + 1] -= sin * mx + cos * my
+    X, Y = to_world(s, w, pad, mx, my)
+    w.load[base] -= X
+    w.load[base + 1] -= Y
     return fastest * 1.5

@@ -22,7 +22,7 @@ from torchsoft.solve.kernel.arrays import (
     OFF_THE_PAD,
     TAPE_FULL,
 )
-from torchsoft.solve.kernel.inertia import elastic_wrench
+from torchsoft.solve.kernel.inertia import elastic_wrench, to_world
 from torchsoft.solve.kernel.interface import at_point
 from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
@@ -127,10 +127,10 @@ def record(s: Any, w: Any, y: Array, wrenches: Array, out: Array) -> None:
         put(wrenches[pad], wrench)
         if s.pad_v_start[pad] >= 0:
             elastic_wrench(s, w, pad, y, wrench)
-            x, y_axis = wrench[0] - wrenches[pad, 0], wrench[1] - wrenches[pad, 1]
-            cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-            loads[base] += cos * x - sin * y_axis
-            loads[base + 1] += sin * x + cos * y_axis
+            change = wrench[0] - wrenches[pad, 0], wrench[1] - wrenches[pad, 1]
+            X, Y = to_world(s, w, pad, change[0], change[1])
+            loads[base] += X
+            loads[base + 1] += Y
 
 
 @compiled

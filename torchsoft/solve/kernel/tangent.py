@@ -6,11 +6,16 @@ One factorisation of Newton's system a stage, as many right-hand sides as there 
 
 from typing import Any
 
-import numpy as np
-
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import FELT, GAMMA, INSTANT, MIX, STEPPED
-from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
+from torchsoft.solve.kernel.inertia import (
+    add_stiffness,
+    base_velocity,
+    solve,
+    stiffness_force,
+    to_base,
+    to_world,
+)
 from torchsoft.solve.kernel.interface import (
     NEGLIGIBLE,
     assemble,
@@ -20,7 +25,7 @@ from torchsoft.solve.kernel.interface import (
     softness,
 )
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel.linear import add, dot, put, row_of, solve_dense
+from torchsoft.solve.kernel.linear import add, bounds, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance, coordinates_at, eliminate
 from torchsoft.solve.kernel.step import dense_states
 from torchsoft.solve.kernel.table import Array
@@ -140,16 +145,10 @@ def inertial_part(
     """The same for an inertial pad; z.free (dofs, m) receives dv of all its dofs, and r the base's
     reaction."""
     at = s.inertia_material_at[pad]
-    i0, i1, U, W, base = (
-        s.inertia_dof_start[pad],
-        s.inertia_dof_start[pad + 1],
-        s.pad_y_start[pad],
-        s.pad_v_start[pad],
-        s.pad_base[pad],
-    )
+    i0, i1 = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
+    U, W, base = s.pad_y_start[pad], s.pad_v_start[pad], s.pad_base[pad]
     n, mass, tau = i1 - i0, s.p[at + 3], s.p[at + 2]
-    vx, vy = base_velocity(s, pad, w.V, w.q)
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+    vx, vy = base_velocity(s, w, pad)
     own, force, column, strain = (
         w.inertial[0, i0:i1],
         w.inertial[1, i0:i1],
@@ -164,17 +163,12 @@ def inertial_part(
         for i in range(n):
             column[i] = dy[U + i, k]
         stiffness_force(s, pad, column, own)
+        add_stiffness(s, pad, dp[at:, k], strain, own)
         for i in range(n):
-            total = -own[i] - force[i] * dp[at + 2, k]
-            for j in range(s.inertia_K_column.shape[1]):
-                change = (
-                    s.inertia_K_lambda[i0 + i, j] * dp[at, k]
-                    + s.inertia_K_mu[i0 + i, j] * dp[at + 1, k]
-                )
-                total -= change * strain[s.inertia_K_column[i0 + i, j]]
             M = s.inertia_area[i0 + i] / a
             v_dot = here[i] + (vx if i % 2 == 0 else vy) - y[W + i]
-            column[i] = total + M * (mass * dy[W + i, k] - dp[at + 3, k] * v_dot)
+            column[i] = M * (mass * dy[W + i, k] - dp[at + 3, k] * v_dot)
+            column[i] -= own[i] + force[i] * dp[at + 2, k]
         solve(s, pad, column)
         along = across = 0.0
         for i in range(n):
@@ -186,12 +180,11 @@ def inertial_part(
                 along += change
             else:
                 across += change
+        push = to_world(s, w, pad, along, across)
         for axis in range(2):
             number = s.body_free[base + axis]
             if number >= 0:
-                r[number, k] -= (
-                    cos * along - sin * across if axis == 0 else sin * along + cos * across
-                )
+                r[number, k] -= push[axis]
         for i in range(w.counts[pad]):
             node = w.touched[s.pad_node_start[pad] + i]
             for axis in range(2):
@@ -227,7 +220,7 @@ def stage_tangent(
         if number < 0:
             continue
         actuate(s, i, w.q, w.V, signals, x, out, J)
-        own = slice(s.act_p_start[i], s.act_p_start[i + 1])
+        own = bounds(s.act_p_start, i)
         law_derivatives(z, s.act_pullback[i], x, p[own], dp[own], 1, change)
         add(1.0, change[0], r[number])
         n = coordinates_at(s, i)
@@ -252,7 +245,7 @@ def stage_tangent(
         for i in range(w.actives[pad]):
             k = w.active[at + i]
             c = s.point_contact[k]
-            own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+            own = bounds(s.contact_p_start, c)
             law_derivatives(z, s.contact_pullback[c], w.x[k], p[own], dp[own], outputs, e[k])
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
             moved[:], v[:] = 0.0, 0.0
@@ -320,13 +313,13 @@ def nodal_rates(s: Any, w: Any, z: Any, pad: int, a: float, m: int) -> None:
             for i in range(2 * n):
                 add(X[i, m + column[number]], dV[number], X[i, :m])
     own_rate[:n], base_rate[:] = 0.0, 0.0
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     if inertial:
         for axis in range(2):
             number = s.body_free[base + axis]
             if number >= 0:
-                add(cos if axis == 0 else sin, dV[number], base_rate[0])
-                add(-sin if axis == 0 else cos, dV[number], base_rate[1])
+                e = to_base(s, w, pad, 1.0 - axis, axis)
+                add(e[0], dV[number], base_rate[0])
+                add(e[1], dV[number], base_rate[1])
     for i in range(n):
         for o in range(2):
             row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (w.touched[first + i] - first) + o, size)
@@ -398,36 +391,27 @@ def feel_inertial(
         s.pad_v_start[pad],
     )
     i0, i1, tau = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.p[at + 2]
-    wrench, load = (
-        2 * s.point_contact.size + 3 * pad,
-        2 * s.point_contact.size + 3 * (s.pad_base.size),
-    )
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-    strain, force, into = w.inertial[0, i0:i1], w.inertial[1, i0:i1], z.recorded
+    wrench = 2 * s.point_contact.size + 3 * pad
+    load = wrench + 3 * (s.pad_base.size - pad)
+    strain, force, held = w.inertial[0, i0:i1], w.inertial[1, i0:i1], w.inertial[2, i0:i1]
+    into = z.recorded
+    for i in range(i1 - i0):
+        held[i] = y[U + i] + tau * rate[i0 + i]
     for k in range(dy.shape[1]):
         for i in range(i1 - i0):
             change = tau * (dy[W + i, k] - z.base_rate[i % 2, k]) + dp[at + 2, k] * rate[i0 + i]
             strain[i] = dy[U + i, k] + change
         stiffness_force(s, pad, strain, force)
+        add_stiffness(s, pad, dp[at:, k], held, force)
         x = y_axis = moment = 0.0
-        for i in range(i1 - i0):
-            change = force[i]
-            for j in range(s.inertia_K_column.shape[1]):
-                column = s.inertia_K_column[i0 + i, j]
-                stiffness = (
-                    s.inertia_K_lambda[i0 + i, j] * dp[at, k]
-                    + s.inertia_K_mu[i0 + i, j] * dp[at + 1, k]
-                )
-                change += stiffness * (y[U + column] + tau * rate[i0 + column])
-            if i % 2 == 0:
-                x += change
-                moment -= s.inertia_X[i0 + i + 1] * change
-            else:
-                y_axis += change
-                moment += s.inertia_X[i0 + i - 1] * change
+        for i in range(0, i1 - i0, 2):
+            x += force[i]
+            y_axis += force[i + 1]
+            moment += s.inertia_X[i0 + i] * force[i + 1] - s.inertia_X[i0 + i + 1] * force[i]
         into[wrench, k], into[wrench + 1, k], into[wrench + 2, k] = x, y_axis, moment
-        into[load + base, k] += cos * x - sin * y_axis
-        into[load + base + 1, k] += sin * x + cos * y_axis
+        X, Y = to_world(s, w, pad, x, y_axis)
+        into[load + base, k] += X
+        into[load + base + 1, k] += Y
 
 
 @compiled
@@ -440,7 +424,7 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
     i, x, out, J, change = 0, z.decay_x, w.decay, z.decay_J, z.change
     for k in range(at, s.pad_point_start[pad + 1]):
         j, c = s.point_y_start + k, s.point_contact[k]
-        own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+        own = bounds(s.contact_p_start, c)
         if i < w.actives[pad] and w.active[at + i] == k:
             add(a, z.e[k, 2], dy[j])
             add_output(s, w, z, k, w.H[at + i, 2], a, dy[j])
