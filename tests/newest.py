@@ -71,15 +71,16 @@ def main(python: str) -> None:
         wheel = next(folder.glob("torchsoft*.whl"))
         run(bin / "pip", "install", "--quiet", wheel, where=folder)
         run(bin / "python", "-c", VERSIONS, where=work)
-        shutil.copytree(ROOT / "examples" / "identify", work / "identify")
+        shutil.copytree(ROOT / "examples" / "identify", work / "examples" / "identify")
+        shutil.copytree(ROOT / "rigs", work / "rigs")
         run(bin / "torchsoft", "init", "mine", where=work)
         run(bin / "torchsoft", "check", "mine.toml", where=work)
         run(bin / "torchsoft", "run", "mine.toml", "--out", "out", where=work)
         run(
             bin / "torchsoft",
             "identify",
-            "identify/rolling.csv",
-            "identify/rolling.toml",
+            "examples/identify/rolling.csv",
+            "examples/identify/rolling.toml",
             "--out",
             "fit",
             where=work,

@@ -154,7 +154,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "another column": (put(1, X_C, "Ventil"),
         r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
     "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
-    "no sensor": (put(1, X_C, "y_C [mm]"),
+    "no sensor": (put(1, X_C, "v_x [um/s]"),
         r"rig\.toml: sensors: no recording has samples of `x_C`"),
     "semicolons": (
         lambda table: table.__setitem__(slice(None), [[";".join(cells)] for cells in table]),
@@ -190,7 +190,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "turned already": (scale(THETA, 1.0, 500.0),
         r"row 2, column `theta`: it begins at 0.48\d* rad, but the rig file at 0 rad"),
     "another ground": (scale(Y_BR, 1.0, 3.0),
-        r"row 2, column `y_Br`: it begins at .*, but the rig file at 0.0501"),
+        r"row 2, column `y_Br`: it begins at .*, but the rig file at 0\.04999"),
     "moving": (
         lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i,
         cells in enumerate(table[1:])],
@@ -209,7 +209,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "in the grasp": (
         lambda table: [scale(k, 1.0, -0.6)(table) for k in (Y_D, Y_BR)],
-        r"row 2, column `y_d`: it begins at 0.0495 m, but the rig file at 0.0501",
+        r"row 2, column `y_d`: it begins at 0.0495 m, but the rig file at 0\.04999",
     ),
     "one sample": (
         lambda table: [cells.__setitem__(X_C, "") for cells in table[2:]],
@@ -222,7 +222,7 @@ BAD_CONFIG = {
     "no rig": (CONFIG.replace("rig =", "title ="),
         r'rig\.toml: rig is missing: say rig = "FILE.toml".*; rigs/paper.toml is'),
     "the paper's settings": (CONFIG.replace("actuators.x.measures", "control.senses"),
-        r"rig\.toml, recording `data`: settings.*control is not known here.*controllers"),
+        r"rig\.toml, recording `data`: settings: `control` is not known .* mean `controllers`"),
     "the paper's pads": (CONFIG + '[pads]\nkind = "kelvin_voigt"\n',
         r"pads is not known: .* material of the rig file: say \[settings\.materials\.NAME\]"),
     "a law's pads": (CONFIG + '[compare.solid.pads]\nkind = "kelvin_voigt"\n',
@@ -243,12 +243,12 @@ BAD_CONFIG = {
     "the paper's unknown": (CONFIG.replace("laws.steel_on_rubber.K_n", "contact.K_n"),
         r"rig\.toml: unknowns: `contact.K_n` cannot be identified.*laws\.steel_on_rubber\.K_n"),
     "unknown setting": (CONFIG.replace("friction.v_s", "friction.vs"),
-        r"recording `data`: settings.*vs is not known here"),
+        r"recording `data`: settings: .*friction: `vs` is not known here; did you mean `v_s`"),
     "not a table": (
         re.sub(r"bodies\..*\n", "", CONFIG).replace("actuators", "bodies = 3\nactuators"),
         r"`data`: settings.*bodies should be a table, not 3"),
     "other pads": (CONFIG.replace("bodies.disc", "pads.L.height = 3e-3\nbodies.disc", 1),
-        r"column `y_d`: it begins at 0.0501\d* m, but the rig file at 0.0485"),
+        r"column `y_d`: it begins at 0.0501\d* m, but the rig file at 0\.0484"),
     "nothing to fit": ('heldout = ["data"]\n' + CONFIG, r"heldout: it names every recording"),
     "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n",
     r"sensors\.theta\.delay should be less than"),

@@ -49,14 +49,16 @@ fixed."motion.x_d" = {{ kind = "chirp", since = 0.1, amplitude = 1e-3, first = 2
 parameters."motion.x_d.amplitude" = {{ low = 2e-4, high = 4e-4 }}
 """
 
-IDENTIFICATION = """
+IDENTIFICATION = f"""
+rig = {json.dumps(str(ROOT / "rigs" / "paper.toml"))}
 [settings]
-contact.v_s = 0.05
-control.senses = "bracket"
-scenario.x_C0 = 60.3e-3
-[unknowns."contact.K_n"]
+laws.steel_on_rubber.friction.v_s = 0.05
+actuators.x.measures = "bracket.x"
+bodies.disc.start.x = 60.3e-3
+bodies.bracket.start.x = 60.3e-3
+[unknowns."laws.steel_on_rubber.K_n"]
 nominal = 1e5
-[unknowns."pad.E"]
+[unknowns."materials.rubber.E"]
 nominal = 0.7e6
 [sensors]
 x_C.noise = 10e-6

@@ -30,6 +30,8 @@ from torchsoft.tables import from_toml
 
 pytestmark = pytest.mark.slow
 
+PAPER = ROOT / "rigs" / "paper.toml"
+
 SMALL = 1e-3
 """Meshes whose stiffness takes more memory than this [GiB] are not built here."""
 
@@ -204,21 +206,24 @@ STATED = """
 heldout = ["second"]
 ignore = ["Temp"]
 acknowledged = ["sign of F_x"]
-missing = { F_ff = -1.0 }
-start = { kind = "rest", position_sd = 1e-5 }
+start = { kind = "rest", position_sd = { "disc.x" = 1e-5 } }
 [settings]
-contact = { v_s = 0.05, mu_k = 0.5 }
-control = { senses = "bracket" }
-scenario = { x_C0 = 60.3e-3 }
-pad = { elements_x = 20, elements_y = 1, height = 4.59e-3, nu = 0.45 }
-disc = { radius = 19.37e-3 }
+laws.steel_on_rubber.friction = { v_s = 0.05, mu_k = 0.5 }
+actuators.x.measures = "bracket.x"
+materials.rubber.nu = 0.45
+[settings.bodies]
+disc = { shape = { radius = 19.37e-3 }, start = { x = 60.3e-3 } }
+bracket = { start = { x = 60.3e-3 } }
+[settings.pads]
+L = { elements_x = 20, elements_y = 1 }
+U = { elements_x = 20, elements_y = 1 }
 [unknowns]
-"contact.K_n" = { nominal = 8e4 }
-"pad.E" = { nominal = 0.45e6 }
-"pad.tau" = { nominal = 20e-3 }
-"contact.mu_s" = { nominal = 0.9, low = 0.5, high = 2.0 }
-"pad.nu" = { scale = "linear", low = 0.3, high = 0.49 }
-[unknowns."contact.R_t"]
+"laws.steel_on_rubber.K_n" = { nominal = 8e4 }
+"materials.rubber.E" = { nominal = 0.45e6 }
+"materials.rubber.tau" = { nominal = 20e-3 }
+"laws.steel_on_rubber.friction.mu_s" = { nominal = 0.9, low = 0.5, high = 2.0 }
+"materials.rubber.nu" = { scale = "linear", low = 0.3, high = 0.49 }
+[unknowns."laws.steel_on_rubber.R_t"]
 nominal = 400.0
 low = 100.0
 high = 1e3
@@ -249,8 +254,7 @@ seed = 0
 [[recordings]]
 files = ["second.csv", "force.csv"]
 name = "second"
-settings = { "contact.v_s" = 0.06 }
-missing = { F_ff = 0.0 }
+settings = { laws = { steel_on_rubber = { friction = { v_s = 0.06 } } } }
 """
 SLOW = """
 [[recordings]]
@@ -260,20 +264,24 @@ name = "third"
 kind = "moving"
 lead = 40e-3
 given = { "disc.y" = { mean = 23.5e-3, sd = 1e-4 } }
-[pads]
-kind = "kelvin_voigt"
+[compare.coulomb.settings.laws.steel_on_rubber]
+friction = { kind = "coulomb", mu_s = 0.8, mu_k = 0.5 }
 [compare.coulomb]
-settings = { "contact.friction" = "coulomb" }
-without = ["contact.R_t"]
-[compare.solid]
-pads = { kind = "standard_linear_solid", E_instant = 2e6, tau_instant = 1e-4 }
+without = ["laws.steel_on_rubber.R_t"]
+[compare.solid.settings.materials.rubber]
+kind = "standard_linear_solid"
+E = 0.75e6
+E_instant = 2e6
+nu = 0.45
+tau = 10e-3
+depth = 44e-3
 """
 """What a file may state; and what takes longer, a recording that begins in motion and competing
 laws."""
 
 
 def identification(slow: bool) -> dict[str, Any]:
-    return tomllib.loads(STATED + SLOW if slow else STATED)
+    return {"rig": str(PAPER)} | tomllib.loads(STATED + SLOW if slow else STATED)
 
 
 def run_once(case: measured.Case) -> None:
@@ -282,7 +290,7 @@ def run_once(case: measured.Case) -> None:
     problem, fit = case.problem, case.config.fit
     expected = cost(problem, fit.rtol, fit.starts, fit.workers, case.config.heldout)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
-    memory = max(r.rig.settings.pad.memory for r in problem.recordings)
+    memory = max(pad.mesh.memory for r in problem.recordings for pad in r.rig.pads.values())
     if memory > SMALL or cost(problem, RTOL, 1, 1).steps > 1e5:
         return
     start, free = problem.coordinates.start, problem.coordinates.free

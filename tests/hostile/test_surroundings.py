@@ -302,5 +302,5 @@ def test_terminals_that_know_ascii_only(tally, tmp_path):
     expect(line, *command, err=".*", **LOCALES[-1])
     written = json.loads((out / "answer.json").read_text(encoding="utf-8"))
     line.held("größe µ" in str(written), "the name is lost")
-    config.write_text("[unknowns.'pad.µ']\n" + IDENTIFICATION, encoding="utf-8")
+    config.write_text(IDENTIFICATION + "[unknowns.'pad.µ']\n", encoding="utf-8")
     expect(line, *command, status=2, out=".*", err="[^\n]*\n", **LOCALES[-1])

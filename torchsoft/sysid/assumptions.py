@@ -202,10 +202,9 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
                 f"it began {1e6 * PLACE:g} um further right",
                                   1e6 * PLACE, "um", vary=placed,
                                   by=lambda r, amount: placed(r, 1e-6 * amount)))  # fmt: skip
-        if isinstance(rig.contacts["L"].law.friction, SmoothSlip):
-            out.append(Variation("Coulomb friction", "law",
-            "slip is smooth (contact.friction = \"smooth\")",
-                                  "it were Coulomb's", vary=coulomb))  # fmt: skip
+    if any(isinstance(law.friction, SmoothSlip) for law in laws(rig)):
+        out.append(Variation("Coulomb friction", "law", "slip is smooth (friction \"smooth\")",
+                              "it were Coulomb's", vary=coulomb))  # fmt: skip
     pushed = {one.pushes for one in rig.actuators.values()}
     for name, axes in rig.layout.free.items() if isinstance(first.start, Standing) else ():
         if 0 in axes and f"{name}.x" not in pushed and f"start.{name}.x" not in unknown:

@@ -81,23 +81,25 @@ def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> Non
             if c.name in {*recording.rig.ordered, *recording.rig.ordered.values()}:
                 continue
             for field, value in (("low", c.low), ("high", c.high)):
+                ratios = {d.name: d.nominal for d in coordinates.all if d.ratio_to == c.name}
+                along = {name: value * ratio for name, ratio in ratios.items()}
                 try:
-                    check_value(recording, c.name, value)
+                    check_possible(recording, {c.name: value} | along)
                 except ValueError as error:
                     raise ValueError(
                         f"unknowns.{c.name}.{field} = {value:g} is impossible: {error}"
                     ) from None
 
 
-def check_value(recording: Recording, name: str, value: float) -> None:
-    """Raises `ValueError` for a parameter value that makes the rig impossible."""
+def check_possible(recording: Recording, values: Mapping[str, float]) -> None:
+    """Raises `ValueError` for parameter values that make the rig impossible."""
     # of a steep friction law, through which a search may pass
     with warnings.catch_warnings(action="ignore"):
-        if isinstance(recording.rig, SoftGrasp) and name in NAMES:
-            recording.rig.settings.override({name: value})
+        if isinstance(recording.rig, SoftGrasp) and values.keys() <= NAMES.keys():
+            recording.rig.settings.override(dict(values))
         else:
             rig = deepcopy(recording.rig)
-            set_parameters(rig, {name: value})
+            set_parameters(rig, values)
             check_values(rig)
 
 

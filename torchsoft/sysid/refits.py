@@ -11,7 +11,7 @@ from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
 from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, Stage, default_plan, run_plan
 from torchsoft.sysid.prediction import Frozen
-from torchsoft.sysid.problem import Problem, Residuals, check_value
+from torchsoft.sysid.problem import Problem, Residuals, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Unknown
@@ -115,7 +115,7 @@ def farthest(recordings: Sequence[Recording], name: str, value: float, part: flo
     for _ in range(HALVINGS):
         with suppress(ValueError):
             for recording in recordings:
-                check_value(recording, name, value * (1 + part))
+                check_possible(recording, {name: value * (1 + part)})
             return value * (1 + part)
         part /= 2
     raise ValueError(f"{name} = {value:g} can hardly be varied")
