@@ -150,12 +150,12 @@ def test_an_error_is_one_line_and_ends_with_2(folder, name, capsys):
 
 
 def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder):
-    (folder / "µ.toml").write_text(CONFIG.replace("contact.K_n", "contact.µ"), encoding="utf-8")
+    (folder / "µ.toml").write_text(CONFIG.replace("rubber.K_n", "rubber.µ"), encoding="utf-8")
     command = [sys.executable, "-m", "torchsoft", "identify", "data.csv", "µ.toml"]
     environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     ended = subprocess.run(command, capture_output=True, check=False, timeout=120, env=environment)
     assert ended.returncode == 2
-    assert b"`contact.\\xb5` cannot be identified" in ended.stderr
+    assert b"`laws.steel_on_rubber.\\xb5` cannot be identified" in ended.stderr
     assert ended.stderr.count(b"\n") == 1
 
 
@@ -218,7 +218,7 @@ def test_it_writes_answer_and_page(answered):
     assert sorted(path.name for path in out.iterdir()) == ["answer.json", "report.html"]
     answer = json.loads((out / "answer.json").read_text())
     found = {e["name"]: e for e in answer["estimates"]}
-    assert set(found) == {"contact.K_n", "pad.E"}
+    assert set(found) == {"laws.steel_on_rubber.K_n", "materials.rubber.E"}
     assert answer["converged"]
     command = shlex.join(
         ["torchsoft", "identify", *answered[1], "--out", str(out), "--no-progress"]
@@ -256,7 +256,7 @@ def test_options_come_before_the_configuration(answered, capsys):
     assert not kept.exists()  # a checkpoint is removed once the answer is there
     text, err = capsys.readouterr()
     assert str(out / "answer.json") in text
-    assert "contact.K_n" in text
+    assert "laws.steel_on_rubber.K_n" in text
     assert err == ""
 
 
@@ -275,7 +275,8 @@ def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder, capsys)
 
 @pytest.mark.slow
 def test_competing_laws_are_compared(folder, capsys):
-    laws = '[compare.coulomb]\nsettings.contact.friction = "coulomb"\n'
+    law = '{kind = "coulomb", mu_s = 0.8, mu_k = 0.7}'
+    laws = f"[compare.coulomb]\nsettings.laws.steel_on_rubber.friction = {law}\n"
     (folder / "rig.toml").write_text(f"{CONFIG}{laws}")
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 0
     text, _ = capsys.readouterr()

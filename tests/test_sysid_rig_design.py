@@ -112,7 +112,7 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda text: text.replace(text.splitlines()[1], ""), "a design is of the rig of a file"),
+        (lambda text: text.replace(text.splitlines()[1], ""), "rig is missing: say rig"),
         (replaced("x_upper = ", "x_uper = "), "limits.x_uper = .* did you mean `x_upper`\\?"),
         (replaced("twist.motion", "twist.motions"), "design.candidates.twist: `motions` is not"),
         (replaced("theta_d = {low", "theta = {low"), "no Profile called `theta`"),

@@ -154,15 +154,15 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
     "paper's pads": (
         TOML,
         lambda text: text + '[pads]\nkind = "kelvin_voigt"\n',
-        "pads are of the paper's rig; say it in the rig file",
+        r"pads is not known: .* say \[settings\.materials\.NAME\]",
     ),
     "no file": (TOML, replaced('"rig.toml"', '"none.toml"'), "rig: none.toml: No such file"),
     "bad file": ("rig.toml", replaced("mass = 0.25", "mas = 0.25"), "rig: .*`mas` is not known"),
     "settings": (TOML, replaced("table.elements_x", "table.elements"), "settings.*`elements`"),
     "known place": (
         TOML,
-        replaced("lead = 0.0", "position_sd = 1e-3"),
-        "position_sd is of the paper's rig",
+        replaced("lead = 0.0", 'position_sd = {"disk.x" = 1e-3}'),
+        "`position_sd` of the start speaks of `disk.x`; did you mean `disc.x`",
     ),
     "unit": (CSV, replaced("camera (mm)", "camera (kg)"), "column `camera` cannot be in 'kg'"),
     "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: did you mean `y_disc`"),
@@ -232,7 +232,7 @@ def test_a_rehearsal_says_what_an_experiment_would_identify(folder):
 @pytest.mark.parametrize(
     ("change", "more", "words"),
     [
-        (replaced('rig = "rig.toml"', ""), (), "a rehearsal simulates the rig of a file"),
+        (replaced('rig = "rig.toml"', ""), (), "rig is missing: say rig"),
         (
             lambda text: text,
             ("run.csv",),

@@ -271,7 +271,7 @@ without = ["laws.steel_on_rubber.R_t"]
 [compare.solid.settings.materials.rubber]
 kind = "standard_linear_solid"
 E = 0.75e6
-E_instant = 2e6
+E_instant = 8e6
 nu = 0.45
 tau = 10e-3
 depth = 44e-3

@@ -196,12 +196,10 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         stated = f"bodies were put where they stand {lead:g} s before the first sample (lead)"
         out.append(Variation("lead", "law", stated, f"it were {other:g} s",
                              vary=partial(led, lead=other)))  # fmt: skip
-    if isinstance(rig, SoftGrasp):  # what the paper's rig takes for granted besides
-        if isinstance(first.start, AtRest) and "start.disc.x" not in unknown:
-            out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0",
-                f"it began {1e6 * PLACE:g} um further right",
-                                  1e6 * PLACE, "um", vary=placed,
-                                  by=lambda r, amount: placed(r, 1e-6 * amount)))  # fmt: skip
+    if isinstance(first.start, AtRest) and "start.disc.x" not in unknown:
+        out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0",
+            f"it began {1e6 * PLACE:g} um further right", 1e6 * PLACE, "um", vary=placed,
+                              by=lambda r, amount: placed(r, 1e-6 * amount)))  # fmt: skip
     if any(isinstance(law.friction, SmoothSlip) for law in laws(rig)):
         out.append(Variation("Coulomb friction", "law", "slip is smooth (friction \"smooth\")",
                               "it were Coulomb's", vary=coulomb))  # fmt: skip
