@@ -182,15 +182,15 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder, 
     write(
         folder / "data.csv", [cells[:2] + cells[3:] for cells in table]
     )  # without the rate of x_d
-    config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3")
+    config = CONFIG.replace('"bracket.x"', '"disc.x"').replace("60.3e-3", "60e-3")
     (folder / "rig.toml").write_text(
-        config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1)
+        config.replace("[unknowns", "actuators.x.Kp = 1e6\nactuators.x.Kd = 0.0\n[unknowns", 1)
     )
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
     message = capsys.readouterr().err
     where = r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: "
     found = re.search(
-        where + r"the disc was lost at t = (\S+) s: the closed loop is unstable", message
+        where + r"at t = (\S+) s the body was lost: it left the space over a pad", message
     )
     assert found, message
     row, t, inside = int(found[1]), float(found[2]), float(found[3])
