@@ -160,7 +160,7 @@ def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
         "steps": steps,
     }
     newton = gauss_newton(problem, runner, problem.coordinates.start, **common)
-    descent = descend(problem, runner, problem.coordinates.start, evaluations=40, **common)
+    descent = descend(problem, runner, problem.coordinates.start, evaluations=20, **common)
     adam = descend(problem, runner, newton.x, method="adam", evaluations=2, **common)
     free = problem.coordinates.free
     np.testing.assert_allclose(descent.x[free], newton.x[free], atol=2e-3)
