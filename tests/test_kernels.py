@@ -6,13 +6,13 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 import numpy as np
 import pytest
+from hostile.damage import BYTES, Victim, damage
 
 from torchsoft.solve.kernel import objects, table
 from torchsoft.solve.kernel.table import Array, IndexMatrix
@@ -42,22 +42,9 @@ def test_an_object_is_found_again(folder, capsys):
     assert capsys.readouterr().err == ""
 
 
-def flipped(content: bytes) -> bytes:
-    middle = len(content) // 2
-    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-
-
-DAMAGES: dict[str, Callable[[bytes], bytes]] = {
-    "empty": lambda content: b"",
-    "cut": lambda content: content[:-100],
-    "one bit": flipped,
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_object_is_not_used(folder, damage, capsys):
-    path = kept()
-    path.write_bytes(DAMAGES[damage](path.read_bytes()))
+@pytest.mark.parametrize("kind", BYTES)
+def test_a_damaged_object_is_not_used(folder, kind, capsys):
+    damage(BYTES[kind], Victim(kept(), np.random.default_rng(0)))
     assert objects.found("run") is None
     said = capsys.readouterr().err
     assert said == f"torchsoft: note: {folder} holds damaged kernels, which are not used\n"

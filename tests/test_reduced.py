@@ -100,7 +100,7 @@ def test_saturating_friction_is_recovered():
     """tanh(s' / v) with v known: amplitude to 5 %, and the linear terms beside it."""
     upper = friction(R, 1e-3)["v_C"][1]
     model = truth({"v_C": [(upper, 3.0)]})
-    records = [motion(model, seed) for seed in range(3)]
+    records = [motion(model, seed) for seed in range(2)]
     recipe = replace(RECIPE, threshold=0.02)
     found = fit(
         assemble(records, joined(mechanics(R), {"v_C": [upper]}), recipe), recipe

@@ -35,7 +35,7 @@ from torchsoft.solve.trajectory import load
 READY = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))
 
 
-ELSEWHERE = "fingertips", "two_fingers", "ellipse"
+ELSEWHERE = "fingertips", "two_fingers", "ellipse", "rounded_box"
 """Ready rigs whose parts other tests run."""
 
 

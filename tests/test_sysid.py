@@ -24,7 +24,9 @@ from torchsoft.sysid import (
     Unreachable,
     identify,
     record,
+    sensitivity,
 )
+from torchsoft.sysid.assumptions import assumptions
 from torchsoft.sysid.fit import (
     descend,
     gauss_newton,
@@ -158,7 +160,7 @@ def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
         "steps": steps,
     }
     newton = gauss_newton(problem, runner, problem.coordinates.start, **common)
-    descent = descend(problem, runner, problem.coordinates.start, evaluations=40, **common)
+    descent = descend(problem, runner, problem.coordinates.start, evaluations=20, **common)
     adam = descend(problem, runner, newton.x, method="adam", evaluations=2, **common)
     free = problem.coordinates.free
     np.testing.assert_allclose(descent.x[free], newton.x[free], atol=2e-3)
@@ -376,6 +378,9 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
         return at._replace(lost=lost), steps
 
     monkeypatch.setattr(Problem, "freeze", failing)
+    few = lambda *given: [one for one in assumptions(*given) if one.name in tried]
+    tried = "mesh", "clock of the set-points", "disc.mass"
+    monkeypatch.setattr(sensitivity, "assumptions", few)
     data = record("strokes", begin(SHORT, BASE), {"pad.E": TRUTH["pad.E"]}, SENSORS, noise=0.0)
     problem = Problem([data], SENSORS, {"pad.E": Unknown(nominal=0.8e6)})
     plan = [Stage(f"by {rtol}", ("strokes",), ("pad.E",), rtol) for rtol in (1e-3, 1e-4)]
@@ -388,7 +393,7 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
     tested = {one.name: one.unchecked for one in answer.assumptions}
     assert not tested["mesh"]
     assert not tested["clock of the set-points"]
-    assert "disc.mass" in tested
+    assert tested.keys() >= {*tried}
     other = [plan[0], replace(plan[1], free=())]
     first = iter([True])
     with pytest.raises(Unreachable, match=r"recording `strokes`: at t = 0.5 s: no"):

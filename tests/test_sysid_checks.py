@@ -2,6 +2,7 @@
 what they cannot tell."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -67,6 +68,11 @@ def recorded(truth: dict[str, float] | None = None, excitation: Excitation = STR
     )
 
 
+@cache
+def brief() -> Recording:
+    return recorded(excitation=BRIEF)
+
+
 def checked(
     data: Recording,
     doubtful: bool = False,
@@ -86,7 +92,7 @@ def checked(
 @pytest.fixture(scope="module")
 def same():
     """Of data that the same model made."""
-    return checked(recorded(excitation=BRIEF))
+    return checked(brief())
 
 
 def test_nothing_is_said_of_what_is_right(same):
@@ -130,7 +136,7 @@ def late(data: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("made", "name", "favoured", "says"),
     [
-        (lambda: delayed(recorded(excitation=BRIEF), -3e-4), "clock of the set-points", 0.3,
+        (lambda: delayed(brief(), -3e-4), "clock of the set-points", 0.3,
          "set-points and sensors"),
         *(pytest.param(*row, marks=pytest.mark.slow) for row in (
             (lambda: sampled(x_C0=STROKES.x_C0 + 1.5 * PLACE), "x_C0", 30.0,
@@ -375,7 +381,7 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same):
 
 def test_two_causes_are_both_named():
     """An offset of one sensor and the gain of another: the second one besides the first."""
-    data = turned(recorded(excitation=BRIEF))
+    data = turned(brief())
     t, force = data.samples["F_y"]
     found = checked(replace(data, samples=data.samples | {"F_y": (t, 1.03 * force)}), explain=False)
     first, *_ = sorted(found.checks, key=lambda one: -one.odds)
@@ -398,7 +404,7 @@ def test_extensions_are_suspects():
 
 
 def test_every_pad_is_meshed_anew_where_it_was():
-    data = recorded(excitation=BRIEF)
+    data = brief()
     other = remeshed(data, 2, 3)
     for name, pad in data.rig.pads.items():
         new = other.rig.pads[name]
@@ -411,7 +417,7 @@ def test_every_pad_is_meshed_anew_where_it_was():
 
 
 def test_what_is_unknown_is_not_taken_for_granted():
-    data = recorded(excitation=BRIEF)
+    data = brief()
     names = {one.name for one in assumptions([data], set())}
     left = {
         one.name for one in assumptions([data], {"disc.radius", "contact.epsilon", "start.disc.x"})
@@ -422,7 +428,7 @@ def test_what_is_unknown_is_not_taken_for_granted():
 def test_a_variation_that_cannot_be_run_is_said(monkeypatch):
     one = Variation("mesh", "numerical", "the pads have few elements", "", vary=lambda r: None)
     monkeypatch.setattr("torchsoft.sysid.sensitivity.assumptions", lambda *_: [one])
-    (said,) = assumption_notices(checked(recorded(excitation=BRIEF)))
+    (said,) = assumption_notices(checked(brief()))
     assert said.startswith("it could not be checked what it does that the pads have few elements")
 
 
@@ -452,7 +458,7 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
         return difference(*args)
 
     monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
-    problem = Problem([recorded(excitation=BRIEF)], SENSORS, {name: Unknown() for name in TRUTH})
+    problem = Problem([brief()], SENSORS, {name: Unknown() for name in TRUTH})
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.01)
     assert any("interrupted, so these were not tried: " in text for text in answer.notices)

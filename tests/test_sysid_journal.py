@@ -1,17 +1,16 @@
 """The journal of an identification: data with checksums, to the bit, in a folder of its own."""
 
-import pickle
 import struct
 import threading
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from hostile.damage import Trap, archive, forged, objects
+from hostile.damage import BYTES, PLANTED, Trap, Victim, archive, damage, forged
 
 from torchsoft.sysid import runs
 from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction
@@ -67,30 +66,21 @@ def test_a_result_is_read_as_it_was_written(tmp_path, name):
     assert journal(tmp_path, "b").recall(RUN) is None
 
 
-DAMAGES: dict[str, Callable[[bytes, bytes, Trap], bytes]] = {
-    "empty": lambda name, content, trap: b"",
-    "cut": lambda name, content, trap: content[:-1],
-    "one bit": lambda name, content, trap: content[:99] + bytes([content[99] ^ 4]) + content[100:],
-    "a pickle": lambda name, content, trap: pickle.dumps(trap),
-    "a pickle with a checksum": lambda name, content, trap: forged(name, pickle.dumps(trap)),
-    "an object array with a checksum": lambda name, content, trap: forged(name, objects(trap)),
-    "another archive with a checksum": lambda name, content, trap: forged(
-        name, archive(kind=np.asarray("Path"))
-    ),
-    "a kind that is no name": lambda name, content, trap: forged(name, archive(kind=np.ones(3))),
-    "no fields": lambda name, content, trap: forged(name, archive(kind=np.asarray("Prediction"))),
-    "unknown fields": lambda name, content, trap: forged(
-        name, archive(kind=np.asarray("Prediction"), path=np.ones(2))
-    ),
+SEALED = {
+    "a kind that is no name": archive(kind=np.ones(3)),
+    "no fields": archive(kind=np.asarray("Prediction")),
+    "unknown fields": archive(kind=np.asarray("Prediction"), path=np.ones(2)),
 }
+KINDS = BYTES | PLANTED | {name: lambda v, one=one: v.seal(one) for name, one in SEALED.items()}
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_or_planted_file_is_noticed_and_never_executed(tmp_path, damage):
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_or_planted_file_is_noticed_and_never_executed(tmp_path, kind):
     folder, trap = tmp_path / "runs", Trap(tmp_path / "executed")
     journal(folder).keep(RUN, PREDICTION)
     (path,) = files(folder)
-    path.write_bytes(DAMAGES[damage](bytes.fromhex(path.stem), path.read_bytes(), trap))
+    seal = partial(forged, bytes.fromhex(path.stem))
+    damage(KINDS[kind], Victim(path, np.random.default_rng(0), path, trap, seal))
     again = journal(folder)
     with pytest.warns(UserWarning, match="runs holds damaged results, whose runs are made again$"):
         assert again.recall(RUN) is None
