@@ -30,6 +30,7 @@ from torchsoft.datasets.simulation import simulate_task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid.columns import read_table
+from torchsoft.sysid.rig_recordings import vocabulary
 
 
 @pytest.fixture(scope="module")
@@ -292,9 +293,10 @@ def test_a_run_is_logged_and_read_as_its_file_is(tmp_path):
     run.save(tmp_path / "run.nc")
     assert main(["plot", str(tmp_path / "run.nc"), "--mcap"]) == 0
     Trajectory.load(tmp_path / "run.nc").to_mcap(tmp_path / "again.mcap")
-    one = read_table(tmp_path / "run.nc")
+    known = vocabulary(model, {})
+    one = read_table(tmp_path / "run.nc", (), known)
     for name in ("run.mcap", "again.mcap"):
-        other = read_table(tmp_path / name)
+        other = read_table(tmp_path / name, (), known)
         assert {*one.values} == {*other.values}
         for column, values in one.values.items():
             np.testing.assert_array_equal(values, other.values[column])
