@@ -42,6 +42,7 @@ from torchsoft.rigs import RigFile
 from torchsoft.sysid import RIG, Problem, Sensor, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
+from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.measured import load
 from torchsoft.sysid.runs import Runner
 from torchsoft.tables import toml_row
@@ -233,7 +234,9 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "fit.toml").write_text(stated(lab, settings, truth), encoding="utf-8")
     sensors = {channel: Sensor(noise=sd) for channel, sd in lab.noise.items()}
-    exact = record("measured", file.build(), truth, sensors, rate=RATE, rtol=EXACT, noise=0.0)
+    built = file.build()
+    start = Standing.of(built.rig, built.y0, rests=file.rests())  # at rest with the true numbers
+    exact = record("measured", built, truth, sensors, start=start, rate=RATE, rtol=EXACT, noise=0.0)
 
     def repetition(seed: int) -> Repetition:
         rng, path = np.random.default_rng(seed), folder / f"{seed}.csv"
