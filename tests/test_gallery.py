@@ -8,6 +8,12 @@ from typing import Any
 
 import pytest
 
+IDENTIFIED = {
+    "materials.rubber.E": 9e5, "materials.rubber.tau": 0.012,
+    "laws.steel_on_rubber.friction.mu_s": 0.6,
+}  # fmt: skip
+"""The truth of what is identified from a file."""
+
 ROOT = Path(__file__).parents[1]
 PROGRAMS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
 LONGEST = 60
@@ -36,7 +42,7 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "which_motion": lambda n: n["table"][3, 4] < n["table"][:3, 4].min(),  # mu_k by shaking
     "identify": lambda n: all(
         n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
-        for name, truth in {"pad.E": 9e5, "pad.tau": 0.012, "contact.mu_s": 0.6}.items()
+        for name, truth in IDENTIFIED.items()
     ),
     "identify_friction": lambda n: all(
         n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]

@@ -1,5 +1,5 @@
-"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, measured by noisy
-sensors. Takes some seconds.
+"""Make the recordings of this folder: the paper's rig, its parameters `TRUTH` by the names of
+`Parameters`, measured by noisy sensors. Takes some seconds.
 
 python examples/identify/make.py
 """
