@@ -313,7 +313,7 @@ def another_body(
     movable = {
         f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes
     }
-    for actuator in rig.loops.values():
+    for loop, actuator in rig.loops.items():
         body, _, axis = actuator.measured.partition(".")
         own, setpoint = channel(rig, actuator.measured), actuator.setpoint
         mine, run = (apart(recording, sensors, setpoint, own, by) for by in (None, expected))
@@ -335,7 +335,8 @@ def another_body(
             else:
                 continue
             paper = isinstance(rig, SoftGrasp) and axis == "x"
-            remedy = f' (say control.senses = "{other}")' if paper else ""
+            senses = f'control.senses = "{other}"' if paper else f'measures = "{other}.{axis}"'
+            remedy = f" (say {senses})" if paper else f" (say {senses} of the actuator {loop})"
             code = "control.senses" if paper else f"what {setpoint} is of"
             text = (
                 f"{setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
