@@ -72,7 +72,7 @@ def test_candidates_are_ranked_by_what_they_tell(out):
     stated = read_config(out / "fit.toml")
     file = RigFile.from_toml(RIG).override(**stated.settings)
     twisted = file.override(**stated.design.candidates["twist"])
-    made = planned(stated, twisted, "twist", stated.design.rtol, noise=0.0)
+    made = planned(stated, twisted, twisted.build(), "twist", stated.design.rtol, noise=0.0)
     problem = Problem([made], stated.sensors, stated.unknowns)
     x, free = problem.coordinates.start, problem.coordinates.free
     J = problem.residuals(Runner([made]), x, ["twist"], stated.design.rtol, free).J

@@ -99,6 +99,7 @@ def make(options: argparse.Namespace) -> int:
     from torchsoft.datasets.check import failures
     from torchsoft.datasets.config import Config
     from torchsoft.datasets.files import listed
+    from torchsoft.datasets.reader import open_dataset
     from torchsoft.threads import cores
 
     workers = CLUSTER if options.scheduler else options.workers
@@ -135,7 +136,7 @@ def make(options: argparse.Namespace) -> int:
         + (f"{bad} failed, each with its reason" if bad else "none failed")
     )
     if bad:
-        say(failures(options.out)[1])
+        say(failures(open_dataset(options.out, unfinished=True))[1])
     if left:
         say(f"of the whole set {len(left)} of {config.shards} shards are left: {listed(left)}")
     return 0

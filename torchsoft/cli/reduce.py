@@ -57,12 +57,11 @@ def reduce(options: argparse.Namespace) -> int:
     if options.radius is not None and not options.radius > 0:
         raise ValueError(f"--radius must be positive [m]; it is {options.radius:g}")
     names: dict[str, Any] = {"disc": options.disc, "bracket": options.bracket}
-    records = [
-        record(Trajectory.load(file), begin=options.begin, **names) for file in (*fitted, last)
-    ]
+    runs = [Trajectory.load(file) for file in (*fitted, last)]
+    records = [record(run, begin=options.begin, **names) for run in runs]
     try_folder(options.out, options.force)
     radius = options.radius or rolling_radius(records[:1])
-    size = Trajectory.load(fitted[0]).setup.bodies[options.disc].size
+    size = runs[0].setup.bodies[options.disc].size
     if not radius < LARGEST * size:
         raise ValueError(
             f"a rolling radius of {radius:g} m is not that of `{options.disc}`, which reaches "

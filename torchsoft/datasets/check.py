@@ -77,21 +77,19 @@ def findings(url: str) -> Iterator[str]:
     design = points(config)
     for shard in sorted(store.finished):
         yield from check_shard(data, config, shard, design)
-    share, sentence = failures(url)
+    finished = [i for shard in sorted(store.finished) for i in config.rows(shard)]
+    share, sentence = failures(data.isel(trajectory=finished))
     if share > MANY:
         yield sentence
 
 
-def failures(url: str) -> tuple[float, str]:
-    """Share of the finished trajectories that failed, and a sentence with the commonest reason."""
-    store = Vouched(url, unfinished=True)
-    config, data = Config.model_validate(Manifest.read(url).config), store.data(chunks=None)
-    rows = [i for shard in sorted(store.finished) for i in config.rows(shard)]
-    failed = data.failed.values[rows].astype(bool)
+def failures(data: xr.Dataset) -> tuple[float, str]:
+    """Share of finished trajectories that failed, and a sentence with the commonest reason."""
+    failed = data.failed.values.astype(bool)
     if not failed.any():
         return 0.0, "none failed"
-    reason, _ = Counter(data.reason.values[rows][failed].tolist()).most_common(1)[0]
-    said = f"{failed.sum()} of {len(rows)} trajectories failed, most often: {line(reason, 200)}"
+    reason, _ = Counter(data.reason.values[failed].tolist()).most_common(1)[0]
+    said = f"{failed.sum()} of {len(failed)} trajectories failed, most often: {line(reason, 200)}"
     return float(failed.mean()), said
 
 

@@ -135,14 +135,11 @@ class Standing(NamedTuple):
     position_sd: Mapping[str, float] = MappingProxyType({})
 
     @classmethod
-    def of(
-        cls, rig: Rig, y0: Tensor, lead: float = SETTLE,
-        rests: Mapping[str, Sequence[int]] = MappingProxyType({}),
-    ) -> "Standing":  # fmt: skip
+    def of(cls, rig: Rig, y0: Tensor, lead: float = SETTLE) -> "Standing":
         """The places of the state y0 (size,)."""
         state = rig.unpack(y0.detach())
         pairs = zip(state.pose.items(), state.velocity.values())
-        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead, rests)
+        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead)
 
     def __repr__(self) -> str:
         rests, sd = dict(self.rests), dict(self.position_sd)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from torchsoft import csvfile
+from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.sysid.configuration import Beginning, Config, Entry, Rest
@@ -23,16 +24,16 @@ FINER = 0.1
 
 
 def planned(
-    stated: Config, file: RigFile, name: str, rtol: float, start: Beginning | None = None,
-    **how: Any,
+    stated: Config, file: RigFile, built: BuiltRig[Any], name: str, rtol: float,
+    start: Beginning | None = None, **how: Any,
 ) -> Recording:  # fmt: skip
-    """A planned recording of a file's rig by a configuration, from a run with the tolerance `rtol`;
-    `how` are further arguments of `record`. Raises `ValueError`, and `SimulationFailed`."""
-    plan, start, built = stated.rehearsal, start or stated.start, file.build()
+    """A planned recording of a file's rig, `built`, by a configuration, from a run with the
+    tolerance `rtol`; `how` are further arguments of `record`. Raises `ValueError`, and `SimulationFailed`."""
+    plan, start = stated.rehearsal, start or stated.start
     if plan.duration is not None:
         built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
     lead = start.lead if isinstance(start, Rest) else 0.0
-    at_rest = Standing.of(built.rig, built.y0, lead, file.rests())
+    at_rest = Standing.of(built.rig, built.y0, lead)._replace(rests=file.rests())
     return record(name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **how)
 
 
@@ -50,9 +51,10 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
         name = entry.name or Path(entry.paths[0]).stem
         with at_field("settings"):
             mine = file.override(**stated.settings).override(**entry.settings)
-        known = vocabulary(mine.build().rig, stated.columns)
+        built = mine.build()
+        known, rtol = vocabulary(built.rig, stated.columns), FINER * stated.fit.rtol
         try:
-            made = planned(stated, mine, name, FINER * stated.fit.rtol, entry.start, seed=random)
+            made = planned(stated, mine, built, name, rtol, entry.start, seed=random)
         except ValueError as error:
             raise ValueError(f"{config}: {error}") from None
         rig = made.rig

@@ -96,9 +96,9 @@ def choose(
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
         with at_field(f"design.candidates.{name}"):
             files[name] = file.override(**settings)
-            files[name].build()
+            built = files[name].build()
         try:
-            made = planned(stated, files[name], name, plan.rtol, noise=0.0)
+            made = planned(stated, files[name], built, name, plan.rtol, noise=0.0)
             problem = Problem([*recorded, made], stated.sensors, stated.unknowns)
             planner = Planner(
                 problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, plan.criterion,
