@@ -235,9 +235,8 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
     (folder / "fit.toml").write_text(stated(lab, settings, truth), encoding="utf-8")
     sensors = {channel: Sensor(noise=sd) for channel, sd in lab.noise.items()}
     built = file.build()
-    start = Standing.of(built.rig, built.y0)._replace(
-        rests=file.rests()
-    )  # at rest with the true numbers
+    # at rest with the true numbers
+    start = Standing.of(built.rig, built.y0)._replace(rests=file.rests())
     exact = record("measured", built, truth, sensors, start=start, rate=RATE, rtol=EXACT, noise=0.0)
 
     def repetition(seed: int) -> Repetition:

@@ -28,7 +28,8 @@ def planned(
     start: Beginning | None = None, **how: Any,
 ) -> Recording:  # fmt: skip
     """A planned recording of a file's rig, `built`, by a configuration, from a run with the
-    tolerance `rtol`; `how` are further arguments of `record`. Raises `ValueError`, and `SimulationFailed`."""
+    tolerance `rtol`; `how` are further arguments of `record`. Raises `ValueError`, and
+    `SimulationFailed`."""
     plan, start = stated.rehearsal, start or stated.start
     if plan.duration is not None:
         built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
