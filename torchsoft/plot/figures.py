@@ -109,7 +109,7 @@ def save(figure: Figure, path: Path, dpi: int = 150) -> None:
         figure.savefig(partial, dpi=dpi, format=path.suffix[1:])
 
 
-class EmbeddedFonts(Figure):
+class _EmbeddedFonts(Figure):
     """A figure that is saved as `save` does, with text as text: journals refuse Type 3 fonts."""
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
@@ -119,7 +119,7 @@ class EmbeddedFonts(Figure):
 
 
 def new_figure(title: str, width: float, height: float) -> Figure:
-    figure = EmbeddedFonts(figsize=(width, height), layout="constrained")
+    figure = _EmbeddedFonts(figsize=(width, height), layout="constrained")
     if title:
         figure.suptitle(title, x=0.01, ha="left")
     return figure
