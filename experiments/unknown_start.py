@@ -30,7 +30,6 @@ from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
 from torchsoft.sysid import (
     RIG,
-    AtRest,
     IdentificationResult,
     Known,
     MovingStart,
@@ -42,6 +41,7 @@ from torchsoft.sysid import (
     identify,
 )
 from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.initial_state import SETTLE, Standing
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 
@@ -104,11 +104,12 @@ def cut(case: str, config: Config) -> Cut:
     real = SoftGrasp(CATALOGUE[name].settings(nominal.override(TRUTH)), planned.rig.reference)
     until = since + 0.5 if config.smoke else CATALOGUE[name].duration
     at = since + np.arange(0.0, until - since + 0.5 / RATE, 1.0 / RATE)
-    t = torch.from_numpy(np.append(-AtRest().lead, at))
+    t = torch.from_numpy(np.append(-SETTLE, at))
     run = simulate(real, t, y0=planned.y0, rtol=1e-2 * config.rtol)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
     given = SoftGrasp(planned.rig.settings.override(known(config)), planned.rig.reference)
-    return Cut(Recording(case, given, samples), run.y[1].detach())
+    at_rest = Standing.of(given, planned.y0, rests={"disc": [1]})
+    return Cut(Recording(case, given, samples, at_rest), run.y[1].detach())
 
 
 def sought(config: Config) -> dict[str, float]:
@@ -169,7 +170,7 @@ def deviation(stated: Problem, J: Array, name: str) -> float:
 def at_rest(cut: Cut, config: Config) -> dict[str, object]:
     """What becomes of the first seed's recording where rest is assumed."""
     try:
-        found = fit(replace(noisy(cut.recording, 0), start=AtRest()), config)
+        found = fit(noisy(cut.recording, 0), config)
     except Unreachable as error:
         return {"library": [str(error)]}
     given = [name for name in sought(config) if found[name].ci95 is not None]

@@ -11,7 +11,7 @@ from torchsoft.paper.equilibrium import rest
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.rigs.build import RigFile
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.sysid import Problem, Recording, Sensor, Unknown
+from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
 MODEL = SoftGrasp(Parameters().override(COARSE))
 NAMES = tuple(extensions(MODEL))
@@ -67,7 +67,7 @@ def test_names_are_those_of_a_rig_file():
 def test_an_extension_may_be_unknown():
     """With the bounds of its own search, or with those that are given."""
     t = times(0.1, 11).numpy()
-    recording = Recording("one", deepcopy(MODEL), {"F_y": (t, 0 * t)})
+    recording = Recording("one", deepcopy(MODEL), {"F_y": (t, 0 * t)}, Known(rest(MODEL)))
     unknowns = {
         "guides.bracket.x.friction": Unknown(),
         "pads.U.E_ratio": Unknown(low=0.8, high=1.2),

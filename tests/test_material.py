@@ -30,11 +30,12 @@ from torchsoft import (
     SoftGrasp,
     StandardLinearSolid,
     Trajectory,
+    rest,
     simulate,
 )
 from torchsoft.physics.material import KINDS, Material, retarded
 from torchsoft.plot.diagram import graph_of
-from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify
+from torchsoft.sysid import Known, Problem, Recording, Sensor, Standing, Unknown, identify
 
 MATERIALS: dict[str, Callable[[], Material]] = {
     "kelvin_voigt": lambda: KelvinVoigt(**RUBBER, tau=0.01),
@@ -256,13 +257,14 @@ def test_the_graph_has_the_fields_of_the_chain(material):
 def test_a_recording_that_begins_before_the_pads_forget_is_named():
     model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
     samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
+    at_rest = Standing.of(model, rest(model))
     with pytest.warns(
         UserWarning,
         match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s",
     ) as said:
-        _ = Recording("slow", model, samples, AtRest()).start_coordinates
+        _ = Recording("slow", model, samples, at_rest).start_coordinates
     assert len(said) == 2
-    _ = Recording("slow", model, samples, AtRest(lead=20.0)).start_coordinates
+    _ = Recording("slow", model, samples, at_rest._replace(lead=20.0)).start_coordinates
 
 
 def test_every_material_has_a_name_in_files():

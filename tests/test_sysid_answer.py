@@ -19,9 +19,9 @@ from test_sysid_friction import Viscous
 
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.excitation import start as start_of
 from torchsoft.physics.motion import Reference
 from torchsoft.sysid import (
-    AtRest,
     IdentificationResult,
     Prior,
     Problem,
@@ -88,7 +88,8 @@ def problem():
         record(name, begin(GRASP, BASE), {"contact.K_n": 1.6e5}, SENSORS, rtol=1e-3, seed=seed)
         for seed, name in enumerate(("first", "second"))
     ]
-    recordings[1] = replace(recordings[1], start=AtRest(position_sd=2e-5))
+    start = recordings[1].start._replace(position_sd={"disc.x": 2e-5})
+    recordings[1] = replace(recordings[1], start=start)
     return Problem(recordings, SENSORS, UNKNOWNS)
 
 
@@ -243,7 +244,7 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path)
     assert own[0] != own[1]
     t = times(0.2, 30)
     begun = result.rigs["second"]
-    y0 = AtRest().begin(begun, {})({}).detach()
+    y0 = start_of(begun).detach()
     runs = [simulate(rig, t, y0=y0, reference=begun.reference, rtol=1e-3).y for rig in (mine, its)]
     assert torch.equal(*runs)
     assert not torch.equal(runs[0], simulate(begun, t, y0=y0, rtol=1e-3).y)

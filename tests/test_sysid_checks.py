@@ -99,7 +99,7 @@ def test_nothing_is_said_of_what_is_right(same):
     assert not assumption_notices(same)
     names = {one.name for one in same.checks}
     assert {
-        "mesh", "contact points", "mesh phase", "ramp", "ramp of the sliding", "x_C0",
+        "mesh", "contact points", "mesh phase", "ramp", "ramp of the sliding", "start of disc.x",
         "Coulomb friction", "feed-forward", "disc.radius", "control.K_98", "bias x_C", "delay F_x",
         "gain theta",
     } <= names  # fmt: skip
@@ -139,8 +139,8 @@ def late(data: Recording) -> Recording:
         (lambda: delayed(brief(), -3e-4), "clock of the set-points", 0.3,
          "set-points and sensors"),
         *(pytest.param(*row, marks=pytest.mark.slow) for row in (
-            (lambda: sampled(x_C0=STROKES.x_C0 + 1.5 * PLACE), "x_C0", 30.0,
-             "the disc begins at scenario.x_C0"),
+            (lambda: sampled(x_C0=STROKES.x_C0 + 1.5 * PLACE), "start of disc.x", 30.0,
+             "disc begins where the start says"),
             (lambda: turned(recorded()), "bias theta", 2e-3, "theta has no unknown bias"),
             (lambda: late(recorded()), "delay x_C", 1.0, "x_C has no unknown delay"),
             (lambda: sampled({"disc.inertia_ratio": 1.2}), "disc.inertia_ratio", 20.0,
@@ -422,7 +422,7 @@ def test_what_is_unknown_is_not_taken_for_granted():
     left = {
         one.name for one in assumptions([data], {"disc.radius", "contact.epsilon", "start.disc.x"})
     }
-    assert names - left == {"disc.radius", "ramp", "x_C0"}
+    assert names - left == {"disc.radius", "ramp", "start of disc.x"}
 
 
 def test_a_variation_that_cannot_be_run_is_said(monkeypatch):

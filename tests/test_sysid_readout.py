@@ -27,7 +27,6 @@ from torchsoft import (
 )
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import (
-    AtRest,
     Known,
     Prior,
     Problem,
@@ -64,7 +63,9 @@ def strokes():
 def test_every_kind_of_coordinate_has_its_derivative(strokes):
     """Of parameters, a place of the disc, and of everything that a sensor may have; by differences,
     and by the adjoint."""
-    moved = replace(strokes, name="moved", start=AtRest(position_sd=1e-4))
+    moved = replace(
+        strokes, name="moved", start=strokes.start._replace(position_sd={"disc.x": 1e-4})
+    )
     unknowns = {
         "pad.E": Unknown(prior=Prior(median=8e5, sd=1e5)),
         "contact.epsilon": Unknown(prior=Prior(median=1e-6, sd=1.0, kind="log-normal")),
@@ -176,8 +177,6 @@ def test_another_rig_is_identified_by_its_own_names(jaws):
         ValueError, match="`x_C` is not a channel of the rig of `jaws`; did you mean `x_disc`"
     ):
         replace(data, samples={"x_C": samples["x_disc"]})
-    with pytest.raises(ValueError, match="only the paper's rig has a rest of its own"):
-        Problem([replace(data, start=AtRest())], sensors, unknowns)
 
 
 def test_saturated_samples_have_tobins_likelihood():

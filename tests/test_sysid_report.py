@@ -21,7 +21,6 @@ from test_sysid_answer import HOSTILE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import (
-    AtRest,
     IdentificationResult,
     Prior,
     Problem,
@@ -80,7 +79,8 @@ def found():
         )
         for seed, (name, depth) in enumerate(depths.items())
     ]
-    recordings[1] = replace(recordings[1], start=AtRest(position_sd=2e-5))
+    start = recordings[1].start._replace(position_sd={"disc.x": 2e-5})
+    recordings[1] = replace(recordings[1], start=start)
     unknowns = {
         "contact.K_n": Unknown(),
         "pad.E": Unknown(prior=Prior(median=1e6, sd=0.5, kind="log-normal")),

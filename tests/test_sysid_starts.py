@@ -31,9 +31,9 @@ from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.solve.simulate import simulate
-from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, identify
+from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Stage, Unknown, identify
 from torchsoft.sysid.first_samples import WIDER, beginning, estimate_initial_state, lasting_stretch
-from torchsoft.sysid.initial_state import AtRest, MovingStart, Stretch
+from torchsoft.sysid.initial_state import SETTLE, MovingStart, Standing, Stretch
 from torchsoft.sysid.runs import Runner
 
 MOTION = Excitation(
@@ -51,9 +51,10 @@ def cut():
     """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
     model, y0, _ = begin(MOTION, Parameters().override(COARSE))
     at = np.arange(SINCE, MOTION.duration, 5e-3)
-    run = simulate(model, torch.from_numpy(np.append(-AtRest().lead, at)), y0=y0, rtol=1e-6)
+    run = simulate(model, torch.from_numpy(np.append(-SETTLE, at)), y0=y0, rtol=1e-6)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
-    return Recording("roll", model, samples), run.y[1].detach()
+    at_rest = Standing.of(model, y0, rests={"disc": [1]})
+    return Recording("roll", model, samples, at_rest), run.y[1].detach()
 
 
 def noisy(recording: Recording, seed: int = 0) -> Recording:
@@ -230,7 +231,8 @@ def test_another_rig_may_begin_underway():
     )  # fmt: skip
     t = np.arange(0.2, 0.5, 5e-3)
     sensors = {"y_roll": Sensor(noise=1e-6)}
-    recording = Recording("over a pad", rig, {"y_roll": (t, np.full(len(t), 0.0245))})
+    samples = {"y_roll": (t, np.full(len(t), 0.0245))}
+    recording = Recording("over a pad", rig, samples, Known(torch.zeros(rig.layout.size)))
     out = estimate_initial_state(recording, sensors)
     assert [c.name for c in out.start_coordinates][:2] == ["start.roll.y", "start.roll.v_y"]
     state = rig.unpack(out.begin().y0({}).detach(), t=float(t[0]))

@@ -38,8 +38,9 @@ laws = Pressed(*truth.values()), Pressed(mu=0.5, fall=0.02)  # of the bench, and
 bench, rig = (SoftGrasp(plain.settings, plain.reference, friction=law) for law in laws)
 made = record("bench", begin(motion, p), bench, sensors)
 
-# a recording is a rig with the reference that it followed, and samples (times, values) by channel
-recording = Recording("bench", rig, made.samples)
+# a recording is a rig with the reference that it followed, samples (times, values) by channel,
+# and the start of the run
+recording = Recording("bench", rig, made.samples, made.start)
 problem = Problem([recording], sensors, {name: Unknown() for name in truth})
 result = identify(problem, rtol=1e-4, assumptions="trusted")
 print(result.table())

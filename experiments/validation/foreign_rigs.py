@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from torchsoft import Parameters, Reference, SoftGrasp
-from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
+from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin, start
 from torchsoft.experiment import COARSE, coloured, markdown, options, repeated, write
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import (
@@ -39,6 +39,7 @@ from torchsoft.sysid import (
     Unreachable,
     explain,
 )
+from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import forget
 
@@ -229,7 +230,8 @@ class Case:
             sign = -1.0 if channel in self.flipped else 1.0
             samples[channel] = t, sign * (y + self.offset.get(channel, 0.0))
         rig = SoftGrasp(settings.override(dict(self.noted)), reference)
-        return Recording(excitation, rig, samples)
+        at_rest = Standing.of(rig, start(rig), rests={"disc": [1]})
+        return Recording(excitation, rig, samples, at_rest)
 
 
 def at_samples(reference: Reference, duration: float) -> Reference:
@@ -251,7 +253,7 @@ CASES = (
         differs={"ramp_stretch": False},
     ),
     Case("epsilon 0.1 um", ("epsilon", "ramp", "touch-down"), differs={"epsilon": 1e-7}),
-    Case("x_C0 off by 40 um", ("x_C0",), differs={"x_C0": 60.34e-3}),
+    Case("x_C0 off by 40 um", ("disc begins",), differs={"x_C0": 60.34e-3}),
     Case("theta zeroed elsewhere", ("theta",), offset={"theta": 0.02}),
     Case("set-points at 200 Hz", ("set-point", "setpoint"), sparse=True),
     Case("F_ff left out", ("F_ff", "fed forward", "feed-forward"), no_feed_forward=True),

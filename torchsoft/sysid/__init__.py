@@ -5,7 +5,7 @@ from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.identification import explain, identify
-from torchsoft.sysid.initial_state import AtRest, Known, MovingStart
+from torchsoft.sysid.initial_state import Known, MovingStart, Standing
 from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
@@ -16,7 +16,6 @@ from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
 __all__ = [
     "MEASURED",
     "RIG",
-    "AtRest",
     "Estimate",
     "IdentificationResult",
     "Known",
@@ -26,6 +25,7 @@ __all__ = [
     "Recording",
     "Sensor",
     "Stage",
+    "Standing",
     "Unknown",
     "Unreachable",
     "estimate_initial_state",

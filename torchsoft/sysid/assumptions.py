@@ -13,12 +13,11 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, nn
 
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.initial_state import SETTLE, AtRest, Standing
+from torchsoft.sysid.initial_state import SETTLE, Standing
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Nuisance, Sensor
@@ -28,7 +27,7 @@ Kind = Literal["numerical", "known", "sensor", "law"]
 """A constant of the computation, a known parameter of the rig, a property of a sensor, or a law."""
 
 PLACE = 20e-6
-"""Variation of x_C0 [m]: the accuracy with which a careful hand places a disc."""
+"""Variation of the start of a body [m]: the accuracy with which a careful hand places a disc."""
 
 RADIUS = 1e-3
 """Relative variation of known lengths of the rig."""
@@ -196,17 +195,13 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         stated = f"bodies were put where they stand {lead:g} s before the first sample (lead)"
         out.append(Variation("lead", "law", stated, f"it were {other:g} s",
                              vary=partial(led, lead=other)))  # fmt: skip
-    if isinstance(first.start, AtRest) and "start.disc.x" not in unknown:
-        out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0",
-            f"it began {1e6 * PLACE:g} um further right", 1e6 * PLACE, "um", vary=placed,
-                              by=lambda r, amount: placed(r, 1e-6 * amount)))  # fmt: skip
     if any(isinstance(law.friction, SmoothSlip) for law in laws(rig)):
         out.append(Variation("Coulomb friction", "law", "slip is smooth (friction \"smooth\")",
                               "it were Coulomb's", vary=coulomb))  # fmt: skip
     pushed = {one.pushes for one in rig.actuators.values()}
     for name, axes in rig.layout.free.items() if isinstance(first.start, Standing) else ():
         if 0 in axes and f"{name}.x" not in pushed and f"start.{name}.x" not in unknown:
-            stated = f"{name} begins where the rig file says"
+            stated = f"{name} begins where the start says"
             otherwise, by = f"it began {1e6 * PLACE:g} um further right", partial(moved, body=name)
             out.append(
                 Variation(f"start of {name}.x", "known", stated, otherwise, 1e6 * PLACE, "um",
@@ -226,9 +221,7 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         f"{name} were {(1 + part) * value:.6g}", 100 * part, "%", parameter=name, nominal=value,
                               step=part * value))  # fmt: skip
     for name, one in extensions(rig).items():
-        if ".slow(" not in name or all(
-            isinstance(r.start, AtRest | Standing) for r in (first, *others)
-        ):
+        if ".slow(" not in name or all(isinstance(r.start, Standing) for r in (first, *others)):
             out.append(Variation(name, "known", one.stated, one.otherwise, one.amount, one.unit,
             parameter=name, nominal=one.neutral, step=one.amount,
                                   one_sided=one.low == one.neutral, extension=True))  # fmt: skip
@@ -245,7 +238,7 @@ def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
 def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
     """Refine every pad's mesh by the factor `finer`, with other contact points; None where the
     start is a state of this mesh."""
-    if not isinstance(recording.start, AtRest | Standing):
+    if not isinstance(recording.start, Standing):
         return None
 
     def change(rig: Rig) -> None:
@@ -274,14 +267,6 @@ def scaled(recording: Recording, names: Collection[str], factor: float) -> Recor
         recording,
         lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}),
     )
-
-
-def placed(recording: Recording, by: float = PLACE) -> Recording | None:
-    """Start the disc further right by a distance [m]."""
-    start, rig = recording.start, recording.rig
-    if not isinstance(start, AtRest) or not isinstance(rig, SoftGrasp):
-        return None
-    return replace(recording, start=start._replace(x=start.place(rig) + by))
 
 
 def moved(recording: Recording, body: str, by: float = PLACE) -> Recording:

@@ -8,7 +8,6 @@ differentiable in both.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
@@ -18,14 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.excitation import start
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, resting, settled, standing
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.tangent import directions
 
 Array = NDArray[np.float64]
 
@@ -70,53 +66,13 @@ class Start(Protocol):
         ...
 
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
-        """What is unknown of it. Raises `ValueError` for a rig that cannot begin so."""
+        """Unknown coordinates. Raises `ValueError` for a rig that cannot begin so."""
         ...
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
         """The state as a function, for a rig that has the nominal parameters now and may be given
         others later."""
         ...
-
-
-class AtRest(NamedTuple):
-    """The disc of the paper's rig at rest on the lower pad at x [m], by default `scenario.x_C0`,
-    and the bracket clear of it.
-
-    `position_sd` [m] is how well that is known: above zero the place of the disc is a coordinate,
-    `start.disc.x`. The displacements of the pads are those at the nominal parameters, whatever the
-    others are: most of what that gets wrong has died away at the first sample.
-    """
-
-    position_sd: float = 0.0
-    x: float | None = None
-    lead: float = SETTLE
-
-    def __str__(self) -> str:
-        place = "scenario.x_C0" if self.x is None else f"x = {self.x:g} m"
-        return f"{self.lead:g} s early, the disc at rest at {place} ± {self.position_sd:g} m"
-
-    def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
-        if not isinstance(rig, SoftGrasp):
-            raise ValueError(
-                "only the paper's rig has a rest of its own: give the recording another `start`"
-            )
-        warn_of_memory(rig, self.lead)
-        if not 0 <= self.position_sd <= 0.1:
-            raise ValueError(f"`position_sd` must be from 0 to 0.1 m, but is {self.position_sd}")
-        return (
-            (StartCoordinate("start.disc.x", self.place(rig), self.position_sd),)
-            if self.position_sd > 0
-            else ()
-        )
-
-    def place(self, rig: SoftGrasp) -> float:
-        """x of the disc [m]."""
-        return rig.settings.scenario.x_C0 if self.x is None else self.x
-
-    def begin(self, rig: Rig, samples: Samples) -> Begin:
-        assert isinstance(rig, SoftGrasp)
-        return held(rig, self.place(rig), rig)
 
 
 class Standing(NamedTuple):
@@ -135,11 +91,16 @@ class Standing(NamedTuple):
     position_sd: Mapping[str, float] = MappingProxyType({})
 
     @classmethod
-    def of(cls, rig: Rig, y0: Tensor, lead: float = SETTLE) -> "Standing":
-        """The places of the state y0 (size,)."""
+    def of(
+        cls, rig: Rig, y0: Tensor, lead: float = SETTLE,
+        rests: Mapping[str, Sequence[int]] = MappingProxyType({}),
+        position_sd: Mapping[str, float] = MappingProxyType({}),
+    ) -> "Standing":  # fmt: skip
+        """Bodies at the places of the state y0 (size,)."""
         state = rig.unpack(y0.detach())
         pairs = zip(state.pose.items(), state.velocity.values())
-        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead)
+        bodies = {k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}
+        return cls(bodies, lead, rests, position_sd)
 
     def __repr__(self) -> str:
         rests, sd = dict(self.rests), dict(self.position_sd)
@@ -216,39 +177,6 @@ class Known(NamedTuple):
         return f"{self.lead:g} s early, in a known state"
 
 
-class HeldPads:
-    """A nominal state, given by the start's coordinates: displacements stay when parameters change,
-    and massless pads get the forces that hold them so."""
-
-    def __init__(self, nominal: Rig, rig: Rig, state: Begin) -> None:
-        self.rig, self.nominal, self.state = rig, deepcopy(nominal).requires_grad_(False), state
-
-    def __call__(self, values: Mapping[str, Tensor]) -> Tensor:
-        state = self.rig.unpack(self.state(values))
-        pads = dict(state.pads)
-        for name, pad in self.rig.pads.items():
-            if not pad.inertial:
-                pads[name] = held_forces(pad, pads[name], self.nominal.pads[name])
-        return self.rig.pack(state._replace(pads=pads))
-
-
-def held(nominal: SoftGrasp, place: float, rig: SoftGrasp) -> HeldPads:
-    """The state of `AtRest`, the disc at `place` [m] unless its coordinate says otherwise."""
-    own, known = deepcopy(nominal).requires_grad_(False), dict[float, tuple[Tensor, Tensor]]()
-
-    def state(values: Mapping[str, Tensor]) -> Tensor:
-        x = values.get("start.disc.x", torch.tensor(place, dtype=torch.float64))
-        if float(x.detach()) not in known:
-            at = x.detach().clone().requires_grad_(True)
-            y = start(own, at)
-            known.clear()
-            known[float(at.detach())] = y.detach(), torch.from_numpy(directions(y, [at])[:, 0])
-        y, slope = known[float(x.detach())]
-        return y + slope * (x - x.detach())
-
-    return HeldPads(nominal, rig, state)
-
-
 def warn_of_memory(rig: Rig, lead: float) -> None:
     """Warns of massless pads that do not forget their beginning before the first sample, `lead` [s]
     later."""
@@ -261,26 +189,6 @@ def warn_of_memory(rig: Rig, lead: float) -> None:
                 f"`lead` of {FORGOTTEN * longest:.3g} s would do",
                 stacklevel=2,
             )
-
-
-def held_forces(pad: Pad, z: Tensor, nominal: Pad) -> Tensor:
-    """Forces (branches, nodes, 2) [N] that make, with the pad's present material, the displacements
-    that z makes with the nominal one.
-
-    They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from
-    call to call, and a run that is made again must be the same.
-    """
-    material, was = pad.material, nominal.material
-    if float(material.nu.detach()) != float(was.nu):
-        fractions, _ = nominal.chain()
-        u = nominal.compliance() @ (fractions[:, None, None] * z).sum(-3).flatten()
-        f = torch.linalg.solve(pad.compliance(), u)
-        f = torch.round(f.detach(), decimals=9) + (f - f.detach())
-        return f.unflatten(0, (-1, 2)).expand(z.shape)
-    scaled = z * (pad.E * material.depth / float(nominal.E * was.depth))
-    C, dC = pad.unit_compliance()
-    by_nu = -torch.linalg.solve(C, dC @ scaled.detach().flatten(-2).mT).mT.reshape(z.shape)
-    return scaled + by_nu * (material.nu - material.nu.detach())
 
 
 # Starts in motion or in mid-grasp

@@ -22,7 +22,7 @@ from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import measurable, units
-from torchsoft.sysid.initial_state import AtRest, Begin, Start, StartCoordinate
+from torchsoft.sysid.initial_state import Begin, Start, StartCoordinate
 
 Array = NDArray[np.float64]
 
@@ -53,9 +53,6 @@ class Grid(NamedTuple):
     early: int
 
 
-REST = AtRest()
-
-
 @dataclass(frozen=True)
 class Recording:
     """One run of a rig, measured by sensors.
@@ -70,7 +67,7 @@ class Recording:
     name: str
     rig: Rig = field(repr=False)
     samples: dict[str, tuple[Array, Array]] = field(repr=False)
-    start: Start = REST
+    start: Start
 
     def __post_init__(self) -> None:
         if not self.samples:

@@ -122,8 +122,7 @@ def rig_recording(
     rig.reference = followed(tables, rig)
     if isinstance(start, Moving):
         return recorded(name, rig, tables, sensors, start, Standing.of(rig, y0))
-    at_rest = Standing.of(rig, y0, start.lead)
-    at_rest = at_rest._replace(rests=file.rests(), position_sd=start.position_sd)
+    at_rest = Standing.of(rig, y0, start.lead, file.rests(), start.position_sd)
     made = recorded(name, rig, tables, sensors, start, at_rest)
     check_start(made, y0, own, tables, sensors)
     return made

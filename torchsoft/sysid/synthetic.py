@@ -11,7 +11,7 @@ import torch
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
-from torchsoft.sysid.initial_state import AtRest, HeldPads, Standing, Start
+from torchsoft.sysid.initial_state import Standing, Start
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Grid, Recording
 from torchsoft.sysid.unknowns import Sensor, by_channel
@@ -39,25 +39,23 @@ def record(
 
     `planned` is the result of `RigFile.build` or, for the paper's rig, `excitation.begin`; `truth`
     holds parameters that differ, by the names of `Rig.parameter`, or is a rig with other laws and
-    the same pads. The run begins at `start`, by default at rest: `AtRest` in the paper's rig, the
-    planned state in another one. Samples are taken at `rate` [Hz] from a run with the tolerance
-    `rtol`, with Gaussian noise of `noise` times each sensor's own. The recording holds nothing of
-    the truth but the samples. Raises `ValueError` for an unknown name or channel, and
+    the same pads. The run begins at `start`, by default with bodies that stand as planned; the disc
+    of the paper's rig rests on the lower pad. Samples are taken at `rate` [Hz] from a run with the
+    tolerance `rtol`, with Gaussian noise of `noise` times each sensor's own. The recording holds
+    nothing of the truth but the samples. Raises `ValueError` for an unknown name or channel, and
     `SimulationFailed`.
     """
     rig, y0, t = planned
     sensors = by_channel([rig], sensors)
-    begins = start or (AtRest() if isinstance(rig, SoftGrasp) else Standing.of(rig, y0))
+    rests = {"disc": [1]} if isinstance(rig, SoftGrasp) else {}
+    begins = start or Standing.of(rig, y0, rests=rests)
     at = np.arange(float(t[0]), float(t[-1]) + 0.5 / rate, 1.0 / rate)
     made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)
     begun, early = made.begin(), int(begins.lead > 0)
     if isinstance(truth, Rig):
         own, truth = deepcopy(truth), {}
         own.reference = rig.reference
-        y0 = begins.begin(own, made.samples)
-        if isinstance(begun.y0, HeldPads):  # displacements at the nominal parameters
-            y0, begun.y0.rig = begun.y0, own
-        begun = begun._replace(rig=own, y0=y0)
+        begun = begun._replace(rig=own, y0=begins.begin(own, made.samples))
     grid = Grid(torch.from_numpy(np.append([at[0] - begins.lead] * early, at)), early)
     exact, rng = predict(begun, truth, grid, (), rtol).signals, np.random.default_rng(seed)
     samples = {}
