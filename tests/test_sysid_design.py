@@ -15,19 +15,13 @@ from torchsoft.excitation import Excitation, Knots, Strokes, begin
 from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.criterion import (
-    Optimality,
-    Outlook,
-    chosen,
-    deviations,
-    next_recording,
-    optimality,
-)
+from torchsoft.sysid.criterion import Optimality, chosen, deviations, optimality
 from torchsoft.sysid.design import BENT, design
 from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.planner import LEFT, Planner
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.rig_design import rank
 from torchsoft.sysid.runs import Runner
 
 P = Parameters().override(COARSE)
@@ -287,14 +281,14 @@ def test_the_next_recording_is_predicted(plan, problem):
     """What a recording would add is what it does add; one that cannot be made comes last."""
     strokes = PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)})
     roll = record("roll", begin(strokes, P), {}, SENSORS, rtol=1e-3, noise=0.0)
-    same, x = replace(plan, name="same"), problem.coordinates.start
-    first, second = next_recording(problem, x, [roll, same], rtol=1e-3)
-    assert first.gain >= second.gain > 0
-    by_name: dict[str, Outlook] = {one.name: one for one in (first, second)}
-    assert by_name["same"].gain == pytest.approx(np.log(2) / 2)  # twice the same halves variances
+    same = replace(plan, name="same")
+    ranked = rank([plan], [same, roll], SENSORS, problem.unknowns, rtol=1e-3)
+    assert ranked[0].score < ranked[1].score
+    by_name = {one.name: one for one in ranked}
+    for name, sd in rank([], [plan], SENSORS, problem.unknowns, rtol=1e-3)[0].deviations.items():
+        assert by_name["same"].deviations[name] == pytest.approx(sd / 2**0.5)  # twice the same
     both = Problem([plan, roll], SENSORS, problem.unknowns)
+    x = both.coordinates.start
     J = both.residuals(Runner(both.recordings), x, both.names, 1e-3, both.coordinates.free).J
     names, T = chosen(both, x, None)
-    assert by_name["roll"].after == pytest.approx(deviations(names, T, fisher(J)[0]))
-    with pytest.raises(ValueError, match="there is no candidate"):
-        next_recording(problem, x, [])
+    assert by_name["roll"].deviations == pytest.approx(deviations(names, T, fisher(J)[0]))

@@ -209,12 +209,11 @@ CATALOGUE = {
 """Ready excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
 
 
-def start(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
+def start(model: SoftGrasp) -> Tensor:
     """State (size,): the disc at rest under its weight, the bracket at `apart`, so that its pad is
     clear of the disc by the depth to which the disc has sunk. Differentiable in the model's
-    parameters, and in the place x () [m] of the disc, x_C0 by default; the bracket's place does not
-    depend on them."""
-    state, p = model.unpack(rest(model, x)), model.settings
+    parameters, on which the bracket's place does not depend."""
+    state, p = model.unpack(rest(model)), model.settings
     clear = torch.tensor([p.scenario.x_C0, apart(p), 0.0], dtype=torch.float64)
     return model.pack(state._replace(pose=state.pose | {"bracket": clear}))
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from torchsoft import Rig
 from torchsoft.display import markdown
-from torchsoft.files import replacing, write_json
+from torchsoft.files import save_text, write_json
 from torchsoft.plot.figures import save
 from torchsoft.threads import parallel_map
 
@@ -131,6 +131,5 @@ def write(
         save(figure, config.out / f"{name}.png")
     if table:
         print(f"\n{table}\n")
-        with replacing(config.out / "table.md") as partial:
-            partial.write_text(table + "\n", encoding="utf-8")
+        save_text(config.out / "table.md", table + "\n")
     print(f"written to {config.out}")

@@ -223,9 +223,12 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+def save_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8. It appears whole or not at all."""
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
 def write_json(path: str | Path, content: Any) -> None:
     """Write a JSON file, with null for numbers that are not finite."""
-    with replacing(path) as partial:
-        partial.write_text(
-            json.dumps(finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8"
-        )
+    save_text(path, json.dumps(finite(content), indent=2, allow_nan=False) + "\n")

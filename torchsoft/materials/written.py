@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from torchsoft.files import finite, replacing, write_json
+from torchsoft.files import finite, save_text, write_json
 from torchsoft.materials.fit import Fit
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, new_figure, save
 from torchsoft.plot.scene import INK
@@ -39,8 +39,7 @@ def write(
 ) -> None:
     """Write `FILES`. `assumed` are nu, rho and depth, which a test in one dimension does not tell;
     `options` are those of the command. Each file appears whole or not at all."""
-    with replacing(folder / "material.toml") as partial:
-        partial.write_text(toml(fit, assumed), encoding="utf-8")
+    save_text(folder / "material.toml", toml(fit, assumed))
     write_json(folder / "summary.json", summary(fit, assumed, options))
     save(fitted(fit), folder / "fit.png")
 

@@ -23,15 +23,12 @@ TOUCHING = 30
 """Newton iterations for the height of first touch on an undeformed pad."""
 
 
-def rest(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
-    """State (size,): the object at rest on the lower pad under its weight, the upper pad just
-    touching it from above.
-
-    `x` () [m] is where, by default the scenario's x_C0; the state is differentiable in it.
-    """
+def rest(model: SoftGrasp) -> Tensor:
+    """State (size,): the object at rest on the lower pad under its weight at the scenario's x_C0,
+    the upper pad just touching it from above."""
     check_statics(model)
     weightless = float((model.disc.mass * model.gravity).detach()) == 0.0
-    at = torch.tensor(model.settings.scenario.x_C0, dtype=torch.float64) if x is None else x
+    at = torch.tensor(model.settings.scenario.x_C0, dtype=torch.float64)
     top, (below, above) = model.settings.pad.height, reaches(model)
     start, away = (
         top + below - 0.1 * top,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.channels import CHANNELS
-from torchsoft.files import replacing
+from torchsoft.files import save_text
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.setup import von_mises
 from torchsoft.plot.dashboard import RIPPLE, curves, ripples, sums
@@ -173,5 +173,4 @@ def player(
     }  # fmt: skip
     data = json.dumps(about, allow_nan=False).replace("</", "<\\/")
     page = TEMPLATE.read_text(encoding="utf-8").replace("/*DATA*/null", data)
-    with replacing(path) as partial:
-        partial.write_text(page, encoding="utf-8")
+    save_text(path, page)

@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
 
-from torchsoft.files import replacing
+from torchsoft.files import save_text
 from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import Group, NumberOr
@@ -35,8 +35,7 @@ def to_toml(file: RigFile) -> str:
 def save(file: RigFile, path: Path) -> None:
     """Write the file to any folder, atomically; files that it names are referred to by absolute
     paths."""
-    with replacing(path) as partial:
-        partial.write_text(to_toml(located(file)), encoding="utf-8")
+    save_text(path, to_toml(located(file)))
 
 
 def heading(table: type[Group]) -> list[str]:

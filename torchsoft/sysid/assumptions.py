@@ -92,10 +92,6 @@ class Assumption:
     not. `parameter` is the name of the varied parameter: `nominal` is its stated value, and `step`
     its change in a variation by the amount.
 
-    A known number, or a property of a sensor, may differ by any part of the `amount` [unit], to
-    either side unless it is `one_sided`; a law or a constant of the computation holds or does not.
-    `parameter` is the number that is varied: stated as `nominal`, and changed by `step` in a
-    variation by the amount.
     """
 
     name: str

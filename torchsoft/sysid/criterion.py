@@ -1,16 +1,13 @@
-"""Criteria of optimal design, and a ranking of candidate recordings."""
+"""Criteria of optimal design."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
 
-from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import Array, Recording
-from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.recording import Array
 
 Optimality = Literal["D", "A", "worst"]
 
@@ -70,69 +67,3 @@ def deviations(names: Sequence[str], T: Array, C: Array) -> dict[str, float]:
     """Relative standard deviations of parameters, by the matrix T (s, n) of `chosen` and the
     covariance C of the coordinates."""
     return dict(zip(names, np.sqrt(np.diag(T @ C @ T.T)).tolist()))
-
-
-@dataclass(frozen=True)
-class Outlook:
-    """A candidate recording: its duration [s], the relative standard deviations of parameters
-    without it and with it, and the gain of the criterion, in the logarithm of standard deviations.
-    `lost` is the reason of a failed run."""
-
-    name: str
-    seconds: float
-    before: dict[str, float]
-    after: dict[str, float]
-    gain: float
-    lost: str = ""
-
-
-def next_recording(
-    problem: Problem, x: Array, candidates: Sequence[Recording], *,
-    names: Sequence[str] | None = None, criterion: Optimality = "D", rtol: float = 1e-4,
-    workers: int = 1,
-) -> list[Outlook]:  # fmt: skip
-    """Rank candidates for the next recording, after those of `problem`, at the coordinates x (n,),
-    such as the end of a fit.
-
-    The Fisher matrix of every candidate is added to that of the recordings; only the times of its
-    samples count. The best comes first, by the decrease of the `criterion` ("D", "A" or "worst") of
-    the parameters `names`. The prediction holds as far as the model does, and for small errors.
-    Raises `ValueError` for candidates that do not fit the problem.
-    """
-    if not candidates:
-        raise ValueError("there is no candidate to rank")
-    both = Problem(
-        [*problem.recordings, *candidates], problem.sensors, problem.unknowns, problem.noise
-    )
-    known = dict(zip(problem.coordinates.labels, x))
-    c = both.coordinates
-    x = c.begun(known)
-    names, T = chosen(both, x, names)
-    runner, priors = Runner(both.recordings, workers), len(c.priors)
-    have = both.residuals(runner, x, problem.names, rtol, c.free)
-    if have.lost:
-        raise ValueError(f"`x` does not reproduce what was recorded: {have.reasons}")
-
-    def covariance(J: Array, those: Sequence[str]) -> Array:
-        """Of the coordinates that matter to some recordings; zero for the others."""
-        mine = np.array([a.recording in (None, *those) for a in c.all]) & c.free
-        rows = np.ones(len(J), bool)
-        rows[len(J) - priors :] = [mine[i] for i, _ in c.priors]
-        C = np.zeros((len(x), len(x)))
-        C[np.ix_(mine, mine)] = fisher(J[np.ix_(rows, mine)])[0]
-        return C
-
-    C = covariance(have.J, problem.names)
-    before, out = deviations(names, T, C), []
-    for one in candidates:
-        new = both.residuals(runner, x, [one.name], rtol, c.free)
-        if new.lost:
-            out.append(
-                Outlook(one.name, one.duration, before, before, 0.0, new.lost[one.name].reason)
-            )
-            continue
-        J = np.concatenate((have.J[: len(have.J) - priors], new.J))
-        after = covariance(J, [*problem.names, one.name])
-        gain = optimality(criterion, T @ C @ T.T)[0] - optimality(criterion, T @ after @ T.T)[0]
-        out.append(Outlook(one.name, one.duration, before, deviations(names, T, after), gain))
-    return sorted(out, key=lambda o: (bool(o.lost), -o.gain))

@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from torchsoft.files import replacing
+from torchsoft.files import save_text
 from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.figures import (
     Trace,
@@ -194,8 +194,7 @@ def report(
     if result.made_by["recordings"] != {r.name: r.fingerprint for r in problem.recordings}:
         raise ValueError("the result was made from other recordings than the problem's")
     drawn, lost = traces(result, problem, Path(checkpoint) if checkpoint is not None else None)
-    with replacing(path) as partial:
-        partial.write_text(page(result, drawn, lost), encoding="utf-8")
+    save_text(path, page(result, drawn, lost))
 
 
 def traces(

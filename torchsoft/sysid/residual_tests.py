@@ -411,7 +411,7 @@ def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[
         for kind, some in kinds.items()
         if some
     }
-    if "larger" in out and widened > 1.0:
+    if "larger" in out and widened >= 1.005:
         out["larger"] += f"; intervals are widened by {widened:.3g}"
     return list(out.values())
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from torchsoft.display import Shown, suggestion
-from torchsoft.files import check_file, finite, replacing
+from torchsoft.files import check_file, finite, save_text
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.arguments import whole
@@ -359,8 +359,7 @@ class IdentificationResult(Shown):
 
     def save(self, path: str | Path) -> None:
         """Write the JSON file. It appears whole or not at all."""
-        with replacing(path) as partial:
-            partial.write_text(self.to_json(), encoding="utf-8")
+        save_text(path, self.to_json())
 
     def table(self) -> str:
         """The headline, and a line for each estimate."""

@@ -1,7 +1,7 @@
 """Design of a rig file's motion for an identification: a ranking of candidates, and the best one's
 knots moved by gradient, by one criterion."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,11 +13,13 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.configuration import Config
-from torchsoft.sysid.design import Design, design
-from torchsoft.sysid.planner import Planner
+from torchsoft.sysid.criterion import Optimality
+from torchsoft.sysid.design import RTOL, Design, design
+from torchsoft.sysid.planner import Planner, Range
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.rehearsal import planned
+from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import line
 
 AS_STATED = "as stated"
@@ -76,6 +78,35 @@ class Chosen(NamedTuple):
         return out
 
 
+def rank(
+    recorded: Sequence[Recording], candidates: Sequence[Recording], sensors: dict[str, Sensor],
+    unknowns: dict[str, Unknown], *, limits: Mapping[str, Range] | None = None,
+    criterion: Optimality = "D", names: Sequence[str] | None = None, rtol: float = RTOL,
+    workers: int = 1,
+) -> list[Rated]:  # fmt: skip
+    """Candidates for the next recording, the best first: by the uncertainty of the parameters
+    `names` (all by default), at their nominal values, from each together with what is `recorded`.
+
+    Only the times of a candidate's samples count. `limits` are ranges (low, high) [unit] of
+    channels. Raises `ValueError` for candidates that do not fit the problem.
+    """
+    rated = list[Rated]()
+    for one in candidates:
+        problem = Problem([*recorded, one], sensors, unknowns)
+        planner = Planner(
+            problem, one.name, Moves(one.rig.reference, {}, 0.0), limits or {}, criterion, names,
+            rtol, workers,
+        )  # fmt: skip
+        x = problem.coordinates.start
+        try:
+            seen = planner.evaluate(np.zeros(0), x)
+        except SimulationFailed as failure:
+            rated.append(Rated(one.name, np.inf, {}, {}, str(failure)))
+        else:
+            rated.append(Rated(one.name, seen.value, planner.deviations(x, seen), seen.peaks))
+    return sorted(rated, key=lambda one: (one.score, one.value))
+
+
 def choose(
     config: Path, stated: Config, recorded: Sequence[Recording] = (), *, workers: int = 1,
     progress: bool = False,
@@ -89,37 +120,29 @@ def choose(
     plan = stated.design
     with at_field("settings"):
         file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)
-    names = plan.parameters or None
-    files: dict[str, RigFile] = {}
-    problems: dict[str, Problem] = {}
-    rated = list[Rated]()
+    files, made, lost = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
         with at_field(f"design.candidates.{name}"):
             files[name] = file.override(**settings)
             built = files[name].build()
         try:
-            made = planned(stated, files[name], built, name, plan.rtol, noise=0.0)
-            problem = Problem([*recorded, made], stated.sensors, stated.unknowns)
-            planner = Planner(
-                problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, plan.criterion,
-                names, plan.rtol, workers,
-            )  # fmt: skip
-            x = problem.coordinates.start
-            seen = planner.evaluate(np.zeros(0), x)
-            problems[name] = problem
-            rated.append(Rated(name, seen.value, planner.deviations(x, seen), seen.peaks))
+            made[name] = planned(stated, files[name], built, name, plan.rtol, noise=0.0)
         except SimulationFailed as failure:
-            rated.append(Rated(name, np.inf, {}, {}, str(failure)))
-    rated.sort(key=lambda one: (one.score, one.value))
+            lost.append(Rated(name, np.inf, {}, {}, str(failure)))
+    common: dict[str, Any] = {
+        "limits": plan.limits, "criterion": plan.criterion, "names": plan.parameters or None,
+        "rtol": plan.rtol, "workers": workers,
+    }  # fmt: skip
+    rated = rank(recorded, [*made.values()], stated.sensors, stated.unknowns, **common) + lost
     best = rated[0].name
-    if best not in problems:
+    if rated[0].lost:
         raise ValueError(f"{config}: no candidate can be made: {rated[0].lost}")
     found, chosen = None, files[best]
     if plan.bounds:
+        problem = Problem([*recorded, made[best]], stated.sensors, stated.unknowns)
         found = design(
-            problems[best], best, plan.bounds, limits=plan.limits, criterion=plan.criterion,
-            names=names, iterations=plan.iterations, rtol=plan.rtol, seed=plan.seed,
-            workers=workers, progress=progress,
+            problem, best, plan.bounds, iterations=plan.iterations, seed=plan.seed,
+            progress=progress, **common,
         )  # fmt: skip
         chosen = chosen.override(motion=knots(found.recording.rig.reference, plan.bounds))
     return Chosen(rated, chosen, found)
