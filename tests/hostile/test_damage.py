@@ -212,7 +212,7 @@ def generated(tmp_path_factory):
     """By the check, which never raises, and by either way of reading."""
     place = tmp_path_factory.mktemp("damage")
     make(dataset(place), place / "sound")
-    names = ["x_C", "F_ff", "grasp_force", "contact_U", "steps"]
+    names = ["x_C", "F_ff", "materials.rubber.E", "contact_U", "steps"]
 
     def windows(root: Path) -> list[bytes]:
         numbers = Trajectories(str(root), names)
