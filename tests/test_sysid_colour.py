@@ -122,8 +122,9 @@ def test_a_robust_loss_sees_through_outliers(exact):
     """Every twentieth sample is off by twenty standard deviations: least squares says so, and a
     robust loss is as exact as the rest of the samples allow."""
     bad = problem(noisy(exact, 2, None, outliers=0.05))
+    exactly = replace(STAGE, rtol=1e-5)  # by 1e-4 a derivative by tau is off by some percent
     clean, plain, robust = (
-        identify(one, plan=[STAGE], loss=loss, assumptions="trusted")
+        identify(one, plan=[exactly], loss=loss, assumptions="trusted")
         for one, loss in (
             (problem(noisy(exact, 2, None)), "linear"),
             (bad, "linear"),

@@ -93,14 +93,14 @@ class Standing(NamedTuple):
     @classmethod
     def of(
         cls, rig: Rig, y0: Tensor, lead: float = SETTLE,
-        rests: Mapping[str, Sequence[int]] = MappingProxyType({}),
-        position_sd: Mapping[str, float] = MappingProxyType({}),
+        rests: Mapping[str, Sequence[int]] | None = None,
+        position_sd: Mapping[str, float] | None = None,
     ) -> "Standing":  # fmt: skip
         """Bodies at the places of the state y0 (size,)."""
         state = rig.unpack(y0.detach())
         pairs = zip(state.pose.items(), state.velocity.values())
         bodies = {k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}
-        return cls(bodies, lead, rests, position_sd)
+        return cls(bodies, lead, dict(rests or {}), dict(position_sd or {}))
 
     def __repr__(self) -> str:
         rests, sd = dict(self.rests), dict(self.position_sd)
