@@ -28,10 +28,9 @@ from torch import Tensor
 from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
 from torchsoft.experiment import COARSE, grid, markdown, options, write
 from torchsoft.plot import diagram
-from torchsoft.plot.animation import animate
+from torchsoft.plot.animation import animate, player
 from torchsoft.plot.dashboard import dashboard
 from torchsoft.plot.figures import snapshots
-from torchsoft.plot.player import player
 from torchsoft.scenario import grasp_and_roll
 
 

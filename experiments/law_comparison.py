@@ -7,7 +7,7 @@ recording, from the nominal parameters, with 2 to 4 unknowns, and `torchsoft.sys
 Three motions show the difference, two hardly do with sensors 4 and 5 times worse, and two do not:
 gentle rolling without slip, and a slow roll with sensors 10 times worse. Whether data can tell is
 measured without their noise: the wrong law is fitted to the exact recording, and what it leaves is
-D times the noise of one sample. By the rule (`torchsoft.sysid.comparison`) the right law should be
+D times the noise of one sample. By the rule (`torchsoft.sysid.compare`) the right law should be
 named in more than 95 % of cases from D = 7.3 on, and a wrong one in no more than 0.06 %, whatever
 D.
 
@@ -32,8 +32,7 @@ from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearS
 from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
-from torchsoft.sysid.compare import Evidence, compare, fitted
-from torchsoft.sysid.comparison import Comparison
+from torchsoft.sysid.compare import Comparison, Evidence, compare, fitted
 from torchsoft.sysid.runs import Runner
 
 NOMINAL = Parameters().override(

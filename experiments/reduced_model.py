@@ -45,7 +45,7 @@ from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics
 from torchsoft.scenario import Manipulation, grasp_and_roll
-from torchsoft.solve.stability import linearised
+from torchsoft.solve.diagnostics import linearised
 
 WAVE, KICK, BAND = 1e-5, 2e-3, (3.0, 150.0)
 """Of a tap: root mean square of its multi-sine over sqrt(2) [m] and of its initial velocities

@@ -28,11 +28,10 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from torchsoft.experiment import markdown, numbers, options, write
-from torchsoft.physics.sticking import SLIPPING
+from torchsoft.physics.energy import SLIPPING
 from torchsoft.plan import Plan
-from torchsoft.plan.evaluation import Evaluator, Look, Terms
 from torchsoft.plan.planning import kept
-from torchsoft.plan.variables import Variables
+from torchsoft.plan.problem import Evaluator, Look, Terms, Variables
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.goal import Goal, Range, drawn, plan_file
 

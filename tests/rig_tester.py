@@ -16,9 +16,9 @@ from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.solve.kernel.arrays import GAMMA
 from torchsoft.solve.progress import Segment
-from torchsoft.solve.rates import Rates
 from torchsoft.solve.stepper import ImplicitStepper
-from torchsoft.solve.touch import Touch
+from torchsoft.solve.system import Rates
+from torchsoft.solve.trajectory import Touch
 
 NEWTON = 1e-10
 """Newton's tolerance of the compiled steps [N]; 1e-11 is rounding, and not reached at every

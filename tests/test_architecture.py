@@ -12,36 +12,32 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels display extras diagnostic files threads tables csvfile quantity codegen
+        channels display extras diagnostic files parallel tables csvfile quantity codegen
         physics paper cost
-        solve scenario excitation processes plan
+        solve scenario excitation plan
         plot materials rigs sysid reduced datasets envs experiment cli __main__
     """,
-    "codegen": "graph derivatives operations trace pointwise emit .",
+    "codegen": "graph operations trace emit .",
     "physics": """
-        arguments mesh shapes contact material pads taxels motion multibond state parts condensed
-        validity rig summary extensions energy statics start setup sticking .
+        arguments mesh shapes contact material pads motion multibond state parts
+        validity rig summary extensions energy statics setup .
     """,
     "paper": "parameters rig equilibrium .",
-    "physics.mesh": "mesh compliance block quads .",
-    "physics.shapes": "shape oval rounded contour .",
+    "physics.mesh": "mesh block quads .",
+    "physics.shapes": "shape rounded contour .",
     "solve": """
-        grid kernel laws system progress tolerances rates stability stepper adjoint
-        touch tangent inputs trajectory netcdf vtk mcap
-        ledger simulate batch torchdiffeq .
+        kernel laws steps progress system stepper trajectory gradients formats
+        diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
         initial_state recording unknowns prediction noise runs problem first_samples
-        synthetic fit plan setpoints prechecks
-        residual_tests assumptions refits sensitivity suspects profile posterior nuts estimate
-        comparison result identification compare
-        criterion planner design
-        columns configuration rig_recordings rehearsal measured rig_design figures report .
+        synthetic fit plan prechecks
+        residual_tests assumptions refits sensitivity suspects profile posterior estimate
+        result identification compare
+        planner columns configuration measured design figures report .
     """,
-    "plan": "knots adam variables goals evaluation search planning .",
-    "rigs": """
-        fields parts control motion geometry build places course balance check written goal run .
-    """,
+    "plan": "knots problem search planning .",
+    "rigs": "fields parts control motion geometry build written course check goal run .",
     "cli": "results rigs plan identify design material dataset reduce plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
@@ -51,7 +47,7 @@ FLOWS = {
 own file imports."""
 APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets", "envs")
 """Folders over the engine; of these, only what is `SHARED` may be imported by another."""
-SHARED = ("plot", "materials.presets", "rigs.build", "rigs.fields", "rigs.places")
+SHARED = ("plot", "materials.presets", "rigs.build", "rigs.fields", "rigs.written")
 LONGEST = 600
 """Lines; a file that grows past them holds more than one idea."""
 OUTSIDE = ("data_gen", "experiments", "examples")
@@ -129,7 +125,7 @@ def test_physics_does_not_know_how_it_is_solved():
         own, others = layer(name, ""), {layer(other, "") for other in imports(path)}
         if own in ("physics", "codegen"):
             assert others <= (
-                {"physics", "quantity", "csvfile", "files", "display", "threads"}
+                {"physics", "quantity", "csvfile", "files", "display", "parallel"}
                 if own == "physics"
                 else {"codegen"}
             ), name

@@ -21,7 +21,7 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
-from torchsoft.threads import parallel_map
+from torchsoft.parallel import parallel_map
 
 T = times(0.2, 9)
 K_n = f64(2e4, 3e4, 4.5e4)

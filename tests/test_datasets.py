@@ -27,13 +27,12 @@ from torch.utils.data import DataLoader
 
 from torchsoft import Rig, simulate
 from torchsoft.cli import main
-from torchsoft.datasets import simulation
+from torchsoft.datasets import generate as making
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import Manifest, StoreError, digest, record, record_key, write_bytes
-from torchsoft.datasets.generate import Serial, generate, local_processes
+from torchsoft.datasets.generate import Serial, generate, local_processes, points, simulate_task
 from torchsoft.datasets.reader import Trajectories, open_dataset
-from torchsoft.datasets.simulation import points, simulate_task
 from torchsoft.datasets.subject import Task, split
 from torchsoft.datasets.writer import Store, create, laid_out, open_or_create
 from torchsoft.files import replacing
@@ -415,8 +414,8 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
     ):
         store.write(2, [row | {"theta": angle}])
     assert store.unfinished() == [0, 1, 2]
-    series = simulation.series
-    monkeypatch.setattr(simulation, "series", lambda *given: series(*given) | {"theta": angle})
+    series = making.series
+    monkeypatch.setattr(making, "series", lambda *given: series(*given) | {"theta": angle})
     row = simulate_task(config, config.subject.task(4, design[4]))
     assert (row["failed"], row["reason"]) == (1, "not finite: theta")
     assert np.isnan(row["theta"]).all()
@@ -465,7 +464,7 @@ def test_a_failed_simulation_is_recorded(tmp_path, monkeypatch):
         failure.trajectory = simulate(model, t[:11], **options)
         raise failure
 
-    monkeypatch.setattr("torchsoft.datasets.simulation.simulate", failing)
+    monkeypatch.setattr("torchsoft.datasets.generate.simulate", failing)
     config = Config.from_toml(write_config(tmp_path, trajectories=1))
     generate(config, str(tmp_path / "set"), Serial(), progress=False)
     data = xr.open_zarr(tmp_path / "set").load()

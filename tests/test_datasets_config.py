@@ -12,8 +12,8 @@ import pytest
 from torchsoft.cli import main
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.distributions import Uniform
+from torchsoft.datasets.generate import points
 from torchsoft.datasets.rig_files import embedded
-from torchsoft.datasets.simulation import points
 from torchsoft.tables import InvalidTable
 
 PATH = Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml"

@@ -22,15 +22,13 @@ from torchsoft.datasets import open_dataset
 from torchsoft.datasets.card import card
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.export import export, lerobot, the_well
-from torchsoft.datasets.export.source import Source
+from torchsoft.datasets.export import Source, export, lerobot, the_well
 from torchsoft.datasets.files import StoreError, listed
-from torchsoft.datasets.generate import Part, Serial, estimate, generate, unfinished
-from torchsoft.datasets.simulation import simulate_task
+from torchsoft.datasets.generate import Part, Serial, estimate, generate, simulate_task, unfinished
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid.columns import read_table
-from torchsoft.sysid.rig_recordings import vocabulary
+from torchsoft.sysid.measured import vocabulary
 
 
 @pytest.fixture(scope="module")
@@ -264,7 +262,7 @@ def test_episodes_are_those_of_the_set(made, data, tmp_path, monkeypatch):
 def test_a_log_is_a_recording(made, data, tmp_path):
     """With the numbers of the set to the last bit; one that is damaged or of others is refused."""
     pytest.importorskip("mcap")
-    from torchsoft.solve.mcap import read_log, write_log
+    from torchsoft.solve.formats import read_log, write_log
 
     export(str(made[0]), "mcap", tmp_path / "logs")
     read = read_log(tmp_path / "logs" / "000001.mcap")

@@ -16,8 +16,7 @@ from torch import Tensor, nn
 import torchsoft.envs
 from torchsoft import Trajectory, simulate
 from torchsoft.envs import Goal, Moment, RigEnv, RigVectorEnv, reorient
-from torchsoft.envs.rig_env import RedrawnStart
-from torchsoft.envs.view import View
+from torchsoft.envs.rig_env import RedrawnStart, View
 from torchsoft.physics.motion import Lines, Reference
 from torchsoft.rigs.build import RigFile
 
@@ -135,7 +134,7 @@ def test_steps_are_judged_like_runs(monkeypatch):
     env = small(judged=True, duration=0.1)
     env.reset(seed=0)
     assert env.step(TURN)[-1]["doubts"] == []
-    monkeypatch.setattr("torchsoft.solve.ledger.COMPRESSED", 1e-3)
+    monkeypatch.setattr("torchsoft.solve.diagnostics.COMPRESSED", 1e-3)
     (*_, said) = env.step(TURN)[-1]["doubts"]
     assert "beyond linear elasticity" in said
 

@@ -6,9 +6,9 @@ from conftest import coarse, f64, grasped, times
 from rig_tester import assert_gradients_exact
 from torch import Tensor
 
-import torchsoft.solve.adjoint
+import torchsoft.solve.gradients
 from torchsoft import SoftGrasp, simulate
-from torchsoft.solve.adjoint import GradientFailed
+from torchsoft.solve.gradients import GradientFailed
 
 Window = tuple[SoftGrasp, Tensor, float]
 """A model, its initial state (size,), and how long it runs [s]."""
@@ -71,7 +71,7 @@ def test_same_gradient_twice_and_from_checkpoints_to_the_bit(
         return torch.autograd.grad((weights * run.y).sum(), wanted, materialize_grads=True)
 
     first, second = gradients(), gradients()
-    monkeypatch.setattr(torchsoft.solve.adjoint, "TAPE_BYTES", 0)
+    monkeypatch.setattr(torchsoft.solve.gradients, "TAPE_BYTES", 0)
     for a, b, again in zip(first, second, gradients()):
         assert torch.equal(a, b)
         assert torch.equal(a, again)

@@ -20,7 +20,7 @@ from torchsoft import (
     simulate_batch,
 )
 from torchsoft.excitation import CATALOGUE, begin
-from torchsoft.solve.ledger import RESIDUAL, doubts
+from torchsoft.solve.diagnostics import RESIDUAL, doubts
 
 
 def told(model: Rig, run: Callable[..., object] = simulate, **options: object) -> list[str]:

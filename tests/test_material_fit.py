@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from torchsoft.cli import main
-from torchsoft.materials.fit import Fit, faded, fit, responses
-from torchsoft.materials.measured import Measured, read
+from torchsoft.materials.fit import Fit, Measured, faded, fit, read, responses
 from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.materials.written import FILES
 from torchsoft.physics.material import KINDS, GeneralisedKelvin, Prony

@@ -14,9 +14,8 @@ from tqdm import tqdm
 from torchsoft import simulate
 from torchsoft.cli import main
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
-from torchsoft.plan.evaluation import Evaluator, Terms
+from torchsoft.plan.problem import Evaluator, Free, Terms, Variables
 from torchsoft.plan.search import Search
-from torchsoft.plan.variables import Free, Variables
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.goal import Goal, drawn, plan_file
 

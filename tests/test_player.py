@@ -12,7 +12,7 @@ from conftest import coarse, times
 from PIL import Image
 
 from torchsoft import simulate
-from torchsoft.plot.player import charts, frame_rows, packed, player
+from torchsoft.plot.animation import charts, frame_rows, packed, player
 from torchsoft.scenario import grasp_and_roll
 
 SEEN = "return [...document.querySelectorAll('.chart span')].map(x => x.textContent)"

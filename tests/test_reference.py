@@ -14,7 +14,7 @@ from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.excitation import reference as excited
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.stability import NEUTRAL, loop_modes
+from torchsoft.solve.diagnostics import NEUTRAL, loop_modes
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
 

@@ -54,7 +54,7 @@ from torchsoft import (
 )
 from torchsoft.physics.material import Material
 from torchsoft.physics.validity import check_array, check_shape, check_slip
-from torchsoft.solve.rates import Rates
+from torchsoft.solve.system import Rates
 
 NAN, INF = float("nan"), float("inf")
 T = times(4e-3, 3)

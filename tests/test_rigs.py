@@ -28,8 +28,8 @@ from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.written import template, to_toml
 from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.diagnostics import linearised, loop_modes, modes
 from torchsoft.solve.simulate import Interrupted
-from torchsoft.solve.stability import linearised, loop_modes, modes
 from torchsoft.solve.trajectory import load
 
 READY = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))

@@ -22,7 +22,7 @@ from torchsoft import (
     simulate,
 )  # fmt: skip
 from torchsoft.excitation import Excitation, MultiSine, begin
-from torchsoft.solve.adjoint import GradientFailed
+from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
 
 T = times(0.02, 11)

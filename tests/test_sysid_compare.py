@@ -15,8 +15,7 @@ from test_sysid_friction import Viscous
 from torchsoft import Parameters, Profile, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Roll, Strokes, begin
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
-from torchsoft.sysid.compare import Density, compare, density, ratio, versus
-from torchsoft.sysid.comparison import LawFit, judged
+from torchsoft.sysid.compare import Density, LawFit, compare, density, judged, ratio, versus
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import Part
 

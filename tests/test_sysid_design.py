@@ -15,13 +15,11 @@ from torchsoft.excitation import Excitation, Knots, Strokes, begin
 from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.criterion import Optimality, chosen, deviations, optimality
-from torchsoft.sysid.design import BENT, design
+from torchsoft.sysid.design import BENT, design, rank
 from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
-from torchsoft.sysid.planner import LEFT, Planner
+from torchsoft.sysid.planner import LEFT, Optimality, Planner, chosen, deviations, optimality
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.rig_design import rank
 from torchsoft.sysid.runs import Runner
 
 P = Parameters().override(COARSE)

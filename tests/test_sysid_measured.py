@@ -27,8 +27,7 @@ from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Sensor, record
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.initial_state import MovingStart, StartCoordinate
-from torchsoft.sysid.measured import STATED, cost, load, stem
-from torchsoft.sysid.rig_recordings import vocabulary
+from torchsoft.sysid.measured import STATED, cost, load, stem, vocabulary
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 

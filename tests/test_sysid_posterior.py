@@ -16,8 +16,7 @@ from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll, begin
 from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, record
 from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.nuts import Whitened, nuts
-from torchsoft.sysid.posterior import laplace
+from torchsoft.sysid.posterior import Whitened, laplace, nuts
 from torchsoft.sysid.profile import Optimum
 
 STRAIGHT = np.random.default_rng(0).standard_normal((20, 3))

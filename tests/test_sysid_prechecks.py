@@ -20,10 +20,17 @@ from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.plan import LOOSE
-from torchsoft.sysid.prechecks import accepted, controller_findings, findings, precheck, together
+from torchsoft.sysid.prechecks import (
+    accepted,
+    controller_findings,
+    findings,
+    gaps,
+    precheck,
+    setpoint_findings,
+    together,
+)
 from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.setpoints import gaps, setpoint_findings
 
 NOMINAL = Parameters().override(COARSE)
 SENSORS = RIG | {"omega": Sensor(noise=0.02)}

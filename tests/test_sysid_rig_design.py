@@ -16,8 +16,7 @@ from torchsoft.rigs import RigFile
 from torchsoft.rigs.written import located
 from torchsoft.sysid import Problem
 from torchsoft.sysid.configuration import read_config
-from torchsoft.sysid.rehearsal import planned
-from torchsoft.sysid.rig_design import AS_STATED
+from torchsoft.sysid.design import AS_STATED, planned
 from torchsoft.sysid.runs import Runner
 
 RIG = Path(__file__).parents[1] / "rigs" / "orientation.toml"

@@ -24,10 +24,9 @@ from torchsoft.sysid import (
     record,
 )
 from torchsoft.sysid.assumptions import assumptions
-from torchsoft.sysid.measured import load
+from torchsoft.sysid.measured import load, vocabulary
 from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.refits import since
-from torchsoft.sysid.rig_recordings import vocabulary
 from torchsoft.sysid.runs import Runner
 
 RIG = Path(__file__).parents[1] / "rigs" / "two_fingers.toml"

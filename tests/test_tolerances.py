@@ -11,7 +11,7 @@ from torchdiffeq import odeint, odeint_adjoint
 from torchsoft import SimulationFailed, Trajectory, simulate
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.grid import given_steps
+from torchsoft.solve.steps import given_steps
 
 T = times(0.4, 9)
 

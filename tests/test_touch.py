@@ -34,7 +34,7 @@ from torchsoft import (
 )
 from torchsoft.excitation import begin
 from torchsoft.rigs.build import RigFile
-from torchsoft.solve.touch import LIGHT
+from torchsoft.solve.trajectory import LIGHT
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 from torchsoft.sysid.measured import load
 

@@ -24,7 +24,7 @@ from torchsoft.physics.setup import von_mises
 from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.rigs.written import template
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.inputs import SharedStart
+from torchsoft.solve.simulate import SharedStart
 from torchsoft.solve.trajectory import load, save
 
 T = times(0.1, 11)

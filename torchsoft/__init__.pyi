@@ -7,7 +7,7 @@ from .physics.contact import Coulomb, SmoothSlip, SoftContact
 from .physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
 from .physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
 from .physics.motion import Profile, Reference, Sampled, hold
-from .physics.pads import Pad
+from .physics.pads import Pad, Taxels
 from .physics.parts import PD, Actuator, Body, Contact, StateFeedback, controller
 from .physics.rig import Rig
 from .physics.shapes import (
@@ -20,7 +20,6 @@ from .physics.shapes import (
     Superellipse,
 )
 from .physics.statics import NoEquilibrium
-from .physics.taxels import Taxels
 from .solve.batch import Batch, SamplesFailed, simulate_batch
 from .solve.progress import SimulationFailed
 from .solve.simulate import Interrupted, simulate

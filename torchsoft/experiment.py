@@ -21,8 +21,8 @@ from tqdm import tqdm
 from torchsoft import Rig
 from torchsoft.display import markdown
 from torchsoft.files import save_text, write_json
+from torchsoft.parallel import parallel_map
 from torchsoft.plot.figures import save
-from torchsoft.threads import parallel_map
 
 C = TypeVar("C")
 T = TypeVar("T")

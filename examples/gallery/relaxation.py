@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from torchsoft import Parameters, Profile, Prony, Reference, SoftGrasp, rest, simulate
-from torchsoft.materials.fit import fit
-from torchsoft.materials.measured import read
+from torchsoft.materials.fit import fit, read
 
 # a file as a laboratory writes it: 2 % of strain held from t = 0 on, stress with 0.5 % of noise
 rng, seconds = np.random.default_rng(1), np.geomspace(1e-2, 30.0, 200)

@@ -9,7 +9,7 @@ noisy machine:
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
 - growth with the surface nodes, with a fitted exponent;
 - with `--peers` the same equations under scipy's, torchdiffeq's and diffrax's integrators over a
-  window in mid-roll. All call the compiled right-hand side (`torchsoft.solve.rates`). Every method
+  window in mid-roll. All call the compiled right-hand side (`torchsoft.solve.system`). Every method
   is run by a series of tolerances, from loose to tight, until it is as exact as the stepper, in the
   disc's place and in the nodal forces; that run is timed, without compiling.
 
@@ -38,7 +38,7 @@ from torchsoft import Parameters, SoftGrasp, simulate, simulate_batch
 from torchsoft.experiment import grid, markdown, numbers, options, timed, write
 from torchsoft.scenario import Manipulation, grasp_and_roll
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.rates import Rates
+from torchsoft.solve.system import Rates
 
 T = TypeVar("T")
 

@@ -13,8 +13,7 @@ from hostile.processes import ROOT
 from torchsoft import Parameters, SoftGrasp, Trajectory, rest, simulate
 from torchsoft.datasets import generate as generation
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.generate import Serial, generate
-from torchsoft.datasets.simulation import simulate_task
+from torchsoft.datasets.generate import Serial, generate, simulate_task
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 

@@ -44,7 +44,7 @@ from torchsoft import (
 )
 from torchsoft.paper.rig import NAMES
 from torchsoft.quantity import quantities
-from torchsoft.solve.adjoint import GradientFailed
+from torchsoft.solve.gradients import GradientFailed
 
 pytestmark = pytest.mark.slow
 

@@ -40,9 +40,9 @@ from torchsoft.solve.kernel import objects
 from torchsoft.solve.trajectory import load, save
 from torchsoft.sysid import IdentificationResult, Problem, identify
 from torchsoft.sysid.columns import read_table
+from torchsoft.sysid.measured import vocabulary
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.result import load_answer
-from torchsoft.sysid.rig_recordings import vocabulary
 from torchsoft.sysid.runs import CHECKPOINT, Journal, Runner, encoded, forget
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::zarr.errors.ZarrUserWarning")]

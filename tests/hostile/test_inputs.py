@@ -20,8 +20,8 @@ from torchsoft import Parameters, SoftGrasp, rest, simulate
 from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost as dataset_cost
+from torchsoft.datasets.generate import points
 from torchsoft.datasets.rig_files import embedded
-from torchsoft.datasets.simulation import points
 from torchsoft.excitation import Excitation, begin
 from torchsoft.sysid import measured
 from torchsoft.sysid.measured import cost

@@ -40,8 +40,8 @@ from torchsoft.excitation import (
     start,
 )
 from torchsoft.physics.statics import NoEquilibrium
-from torchsoft.solve.adjoint import GradientFailed
-from torchsoft.solve.ledger import NEGLIGIBLE, RESIDUAL
+from torchsoft.solve.diagnostics import NEGLIGIBLE, RESIDUAL
+from torchsoft.solve.gradients import GradientFailed
 
 pytestmark = pytest.mark.slow
 

@@ -100,7 +100,7 @@ def make(options: argparse.Namespace) -> int:
     from torchsoft.datasets.config import Config
     from torchsoft.datasets.files import listed
     from torchsoft.datasets.reader import open_dataset
-    from torchsoft.threads import cores
+    from torchsoft.parallel import cores
 
     workers = CLUSTER if options.scheduler else options.workers
     at_once = CLUSTER if options.scheduler else min(workers, cores())
@@ -144,7 +144,7 @@ def make(options: argparse.Namespace) -> int:
 
 def slurm(options: argparse.Namespace) -> int:
     """Print a job array."""
-    from torchsoft.datasets.slurm import job_array
+    from torchsoft.datasets.generate import job_array
 
     script, price = job_array(options.config, options.out, options.parts)
     say(script.rstrip())

@@ -37,8 +37,8 @@ def design(options: argparse.Namespace) -> int:
     from torchsoft.plot.figures import save
     from torchsoft.rigs import written
     from torchsoft.sysid import measured
+    from torchsoft.sysid.design import choose
     from torchsoft.sysid.figures import design_figure
-    from torchsoft.sysid.rig_design import choose
 
     stated = measured.read_config(config)
     recorded = measured.load(data, config).problem.recordings if data else ()

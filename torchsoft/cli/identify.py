@@ -93,7 +93,7 @@ def identify(options: argparse.Namespace) -> int:
         try:
             stated = None
             if options.rehearses:
-                from torchsoft.sysid.rehearsal import rehearsed
+                from torchsoft.sysid.design import rehearsed
 
                 if data:
                     return failed(f"a rehearsal makes its own data: leave {data[0]} out")

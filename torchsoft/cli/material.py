@@ -59,8 +59,7 @@ def add_commands(commands: Any) -> None:
 
 def fit_material(options: argparse.Namespace) -> int:
     """Fit a material to a test, and write the result."""
-    from torchsoft.materials.fit import fit
-    from torchsoft.materials.measured import read
+    from torchsoft.materials.fit import fit, read
     from torchsoft.materials.written import FILES, printed, write
     from torchsoft.paper.parameters import Parameters
 

@@ -36,9 +36,9 @@ def add_commands(commands: Any) -> None:
 
 def plot(options: argparse.Namespace) -> int:
     """Draw a saved run."""
+    from torchsoft.plot.animation import player
     from torchsoft.plot.dashboard import dashboard, named
     from torchsoft.plot.figures import SIZES, save
-    from torchsoft.plot.player import player
     from torchsoft.solve.trajectory import Trajectory
 
     run, title = Trajectory.load(options.file), options.title or options.file.stem

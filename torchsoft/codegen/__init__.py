@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.codegen import emit
-from torchsoft.codegen.derivatives import adjoints, dependent, jacobian
-from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.graph import Graph, adjoints, dependent, jacobian
 from torchsoft.codegen.trace import UnknownOperation, check_backward, traced
 
 __all__ = ["Law", "UnknownOperation", "compile_law"]

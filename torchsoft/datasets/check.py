@@ -22,9 +22,9 @@ from torchsoft.datasets.files import (
     listed,
     record_key,
 )
+from torchsoft.datasets.generate import points
 from torchsoft.datasets.reader import Vouched, open_dataset
 from torchsoft.datasets.schema import not_finite, variables
-from torchsoft.datasets.simulation import points
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line

@@ -5,25 +5,108 @@ Each part has shards of its own, and no two processes make one shard at the same
 """
 
 import math
+import shlex
 import statistics
 import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import qmc
 from tqdm import tqdm
 
-from torchsoft import threads
-from torchsoft.cost import Cost, rig_row, rig_step, steps_per_second
+from torchsoft.cost import Cost, rig_row, rig_step, span, steps_per_second
 from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, read_bytes
-from torchsoft.datasets.schema import variables
-from torchsoft.datasets.simulation import points, simulate_task
+from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, folder, read_bytes
+from torchsoft.datasets.schema import energies, not_finite, variables
+from torchsoft.datasets.subject import Row, Subject, Task
 from torchsoft.datasets.writer import Store, open_or_create
-from torchsoft.processes import local_processes
+from torchsoft.parallel import executor, local_processes, single_threaded
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.simulate import simulate
+from torchsoft.solve.trajectory import Trajectory
+
+# One trajectory: its parameters and motion from the configuration and its index alone, and its
+# run or the reason of its failure.
+
+
+COUNTS = ("steps", "newton_iterations")
+
+
+def points(config: Config) -> NDArray[np.floating]:
+    """The design in the unit cube, shape (trajectories, dimensions).
+
+    A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to
+    its size.
+    """
+    dimensions, rng = config.subject.drawn, np.random.default_rng(config.seed)
+    if config.method == "latin_hypercube":
+        return qmc.LatinHypercube(dimensions, rng=rng).random(config.trajectories)
+    power = int(np.ceil(np.log2(config.trajectories)))
+    return qmc.Sobol(dimensions, scramble=True, rng=rng).random_base2(power)[: config.trajectories]
+
+
+def simulate_task(config: Config, task: Task) -> Row:
+    """Every variable of the schema for one trajectory, without its first dimension.
+
+    A simulation that fails has NaN (and no contact) for its series, and its reason.
+    """
+    subject = config.subject
+    out = (
+        {name: variable.empty for name, variable in variables(config).items()}
+        | task.labels
+        | {"failed": 1}
+    )
+    t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
+    try:
+        rig, y0 = subject.begin(task)
+        run = simulate(rig, t, y0=y0, **subject.steps)
+    except SimulationFailed as failure:
+        done = (
+            {name: getattr(failure.trajectory.stats, name) for name in COUNTS}
+            if failure.trajectory
+            else {}
+        )
+        return out | done | {"reason": failure.reason, "failure_time": failure.time}
+    except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
+        return out | {"reason": f"{type(failure).__name__}: {failure}"}
+    row = out | series(subject, rig, run) | {"failed": 0}
+    bad = not_finite(config, row)
+    return out | {"reason": f"not finite: {', '.join(bad)}"} if bad else row
+
+
+@torch.no_grad()
+def series(subject: Subject, rig: Rig, run: Trajectory) -> Row:
+    """The series and numbers of a finished run."""
+    out: Row = {name: run[name].numpy() for name in subject.signals}
+    for pad, touching in subject.surfaces.items() if subject.config.nodal else ():
+        for name in touching:
+            out[f"normal_force_{name}"] = run.force[name][..., 0].numpy()
+            out[f"friction_force_{name}"] = run.force[name][..., 1].numpy()
+            depth = rig.penetration(name, run.state)
+            out[f"contact_{name}"] = (depth > 0).numpy().astype(np.uint8)
+        out[f"displacement_{pad}"] = (rig.pads[pad].spread @ run.displacement[pad]).numpy()
+    for kind, (_, parts) in energies(subject).items():
+        known = run.energy if kind == "stored" else getattr(run, kind)
+        out[f"{kind}_energy"] = np.stack([known[part].numpy() for part in parts], -1)
+    out["injected_energy"], out["energy_residual"] = (
+        run.injected.numpy(),
+        run.energy_residual.numpy(),
+    )
+    out["energy_residual_rel"] = run.energy_residual_rel
+    return out | {name: getattr(run.stats, name) for name in COUNTS}
+
+
+# Shards, and the processes that make them
+
 
 THREADS = 3
 """Most threads of one process: a third of a trajectory's time is interpreted code, which holds the
@@ -114,7 +197,7 @@ def measured(config: Config) -> tuple[float, float, float]:
     One run before them loads the kernels; the times are of the processor, which other programs
     hardly change."""
     design, times, steps = points(config), list[float](), 0
-    with threads.single_threaded():
+    with single_threaded():
         for i in (0, *range(TRIED)):
             began = time.thread_time()
             row = simulate_task(config, config.subject.task(i, design[i]))
@@ -145,7 +228,7 @@ def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
     """Simulate and write one shard. Returns how many of its trajectories are finished and how many
     of those simulated here failed, (0, 0) where another process makes the shard."""
     config, rows = store.config, list[dict[str, Any]]()
-    with store.claim(shard) as simulated, threads.single_threaded():
+    with store.claim(shard) as simulated, single_threaded():
         if simulated is None:
             return 0, 0
         if store.finished(shard):  # by another process, since it was submitted
@@ -207,7 +290,7 @@ def local_workers(workers: int) -> AbstractContextManager[Executor]:
     calls for 0."""
     if workers > THREADS:
         return local_processes(workers)
-    return threads.executor(workers) if workers else Serial()
+    return executor(workers) if workers else Serial()
 
 
 @contextmanager
@@ -219,3 +302,62 @@ def dask_cluster(address: str) -> Iterator[Executor]:
         raise StoreError("--scheduler needs Dask: pip install 'torchsoft[scale]'") from None
     with Client(address) as client:
         yield client.get_executor(retries=3, pure=False)
+
+
+# A job array of SLURM for a dataset in parts; each part can be submitted alone and repeatedly.
+
+
+SPARE, LEAST = 3.0, 600.0
+"""Requested time over the estimate [1], and least requested time [s]."""
+
+BASE = 1.5
+"""Memory of a process [GiB] besides its shard."""
+
+BEGINNING = 5
+"""Time [s] that a process takes to begin with its first shard."""
+
+SCRIPT = """\
+#!/bin/bash
+#SBATCH --job-name={name}
+#SBATCH --array={array}
+#SBATCH --cpus-per-task=1
+#SBATCH --mem={memory}G
+#SBATCH --time={hours:02d}:{minutes:02d}:00
+#SBATCH --output=%x-%A_%a.log
+# Add what your cluster wants, such as --partition and --account. A part that was stopped, or a job
+# that is submitted again, makes what is missing. Then: {check}
+export OMP_NUM_THREADS=1
+exec {command} --part "$SLURM_ARRAY_TASK_ID/{parts}" --workers "${{SLURM_CPUS_PER_TASK:-1}}" --yes
+"""
+
+
+def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
+    """The script for `sbatch`, and a sentence on its cost. Raises `ValueError` for more parts than
+    shards, and where no shard is left to make."""
+    config = Config.from_toml(path)
+    lacking = set(unfinished(config, url))
+    left = [i for i in range(1, parts + 1) if lacking & set(Part(i, parts).shards(config))]
+    if parts < 1 or not left:
+        raise ValueError(
+            f"--parts should be 1 or more, not {parts}" if parts < 1
+            else f"{url}: all {config.shards} shards are finished; there is nothing to be made"
+        )  # fmt: skip
+    out = str(here.absolute()) if (here := folder(url)) else url
+    program = [sys.executable, "-m", "torchsoft", "dataset"]
+    whole = estimate(config, url, 1)
+    most = max(len(lacking.intersection(Part(i, parts).shards(config))) for i in left)
+    price = whole.part(most / len(lacking))
+    minutes = math.ceil(max(SPARE * price.seconds, LEAST) / 60)
+    told = (
+        f"each of {len(left)} tasks: {price.sentence}; all of them: "
+        f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk; "
+        f"besides, every task takes {BEGINNING:g} s to start and {BASE:g} GiB for its process"
+    )
+    script = SCRIPT.format(
+        name=f"torchsoft-{path.stem}".replace(" ", "-"), parts=parts,
+        array=f"1-{parts}" if len(left) == parts else ",".join(map(str, left)),
+        memory=math.ceil(BASE + 1.5 * price.memory), hours=minutes // 60, minutes=minutes % 60,
+        command=shlex.join([*program, "make", str(path.absolute()), "--out", out]),
+        check=shlex.join([*program, "check", out]),
+    )  # fmt: skip
+    return script, told

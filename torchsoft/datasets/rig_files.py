@@ -15,10 +15,10 @@ from torchsoft.physics.energy import stores
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.quantity import metadata
-from torchsoft.rigs import places
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import NumberOr
-from torchsoft.rigs.places import Place
+from torchsoft.rigs.written import Place, files_renamed
+from torchsoft.rigs.written import place as place_in
 from torchsoft.solve.progress import Integrals
 from torchsoft.solve.trajectory import units
 from torchsoft.tables import line, read_toml, shown
@@ -55,7 +55,7 @@ def embedded(tree: Any, folder: Path) -> Any:
         return own
 
     fields = {key: tree[key] for key in ("fixed", "kinds") if key in tree}
-    known = places.files_renamed(fields | {"rig": read_toml(path)}, stored)
+    known = files_renamed(fields | {"rig": read_toml(path)}, stored)
     return {**tree, **known} | ({"files": contents} if contents else {})
 
 
@@ -70,7 +70,7 @@ def outputs_of(rig: Any) -> dict[str, Any]:
 def place(file: RigFile, name: str) -> Place:
     """The place of a name in the rig file of a dataset. Raises `ValueError` for an unknown name,
     and for a table that the dataset replaces."""
-    found = places.place(file, name)
+    found = place_in(file, name)
     if (own := OWN.get(str(found.keys[0]))) is not None:
         raise ValueError(f"`{line(name, 80)}` has no part in a dataset, whose own {own} decide it")
     return found

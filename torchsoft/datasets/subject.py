@@ -31,7 +31,7 @@ from torchsoft.physics.parts import PD, Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.quantity import quantity
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.places import replaced
+from torchsoft.rigs.written import replaced
 from torchsoft.solve.trajectory import channels, units
 from torchsoft.tables import line, shown
 

@@ -14,8 +14,7 @@ gymnasium = needed("gymnasium", "learn")
 
 # these need gymnasium
 from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Transition  # noqa: E402
-from torchsoft.envs.rig_env import RigEnv  # noqa: E402
-from torchsoft.envs.vector import RigVectorEnv  # noqa: E402
+from torchsoft.envs.rig_env import RigEnv, RigVectorEnv  # noqa: E402
 
 __all__ = ["Dynamics", "Goal", "Moment", "RigEnv", "RigVectorEnv", "Transition", "reorient"]
 

@@ -15,12 +15,11 @@ from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
-from torchsoft.solve.adjoint import TAPE_BYTES, attached
-from torchsoft.solve.grid import check_knots
+from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
 from torchsoft.solve.stepper import ImplicitStepper
-from torchsoft.solve.touch import Touch
-from torchsoft.solve.trajectory import Trajectory, channels, measurable
+from torchsoft.solve.steps import check_knots
+from torchsoft.solve.trajectory import Touch, Trajectory, channels, measurable
 
 Ranges = Mapping[str, tuple[float, float]]
 """Lower and upper bound by name, in SI units."""

@@ -2,26 +2,35 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium
+import matplotlib
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import iterate
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.registry import BackendFilter, backend_registry
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.display import suggestion
 from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, check_names, checked
-from torchsoft.physics.arguments import number
+from torchsoft.parallel import cores, executor, parallel_map
+from torchsoft.physics.arguments import number, whole
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
+from torchsoft.plot.scene import Scene, force_scale, instants
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.places import replaced
-from torchsoft.solve.ledger import doubts
+from torchsoft.rigs.written import replaced
+from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.trajectory import Trajectory
 
 Mode = Literal["rgb_array", "human"]
 
@@ -253,7 +262,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The picture (height, width, 3), or None in the mode "human", which shows it in a
         window."""
-        from torchsoft.envs.view import View
+        from torchsoft.envs.rig_env import View
 
         if self.moment is None or self.render_mode is None:
             raise ValueError("nothing to render: give a `render_mode`, and call `reset` first")
@@ -270,3 +279,116 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._view is not None:
             self._view.close()
         self._view = None
+
+
+# Vectors of environments in threads.
+
+
+class RigVectorEnv(SyncVectorEnv):
+    """Environments whose steps and resets run in `threads` threads, by default one for each core.
+    Results do not depend on the number of threads.
+
+    Only one thread at a time computes in Python, which is two thirds of a short step; where that
+    counts, gymnasium's `AsyncVectorEnv` takes processes.
+    """
+
+    def __init__(
+        self, make: Sequence[Callable[[], RigEnv]], *, threads: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:  # fmt: skip
+        if not make:
+            raise ValueError("`make` must hold one function an environment, but is empty")
+        threads = cores() if threads is None else whole("threads", threads, 1)
+        super().__init__(make, autoreset_mode=autoreset_mode)
+        self._pool = executor(min(threads, len(make)))
+
+    def step(self, actions: Any) -> Any:
+        """Step all environments, as gymnasium's `SyncVectorEnv` does."""
+        every, todo = self.envs, list(iterate(self.action_space, actions))
+        again = self.autoreset_mode is AutoresetMode.NEXT_STEP
+
+        def work(i: int) -> _Done:
+            if again and self._autoreset_envs[i]:
+                return _Done(None, every[i].reset())
+            stepped = every[i].step(todo[i])
+            over = (stepped[2] or stepped[3]) and self.autoreset_mode is AutoresetMode.SAME_STEP
+            return _Done(stepped, every[i].reset() if over else None)
+
+        done = dict(parallel_map(work, len(every), turns=True, pool=self._pool))
+        try:
+            self.envs = [done[i] for i in range(len(every))]  # pyright: ignore[reportAttributeAccessIssue]
+            return super().step(actions)
+        finally:
+            self.envs = every
+
+    def close_extras(self, **how: Any) -> None:
+        """End the threads and the environments."""
+        self._pool.shutdown()
+        super().close_extras(**how)
+
+
+class _Done(NamedTuple):
+    """Results of an environment, in the interface of an environment."""
+
+    stepped: Any
+    begun: Any
+
+    def step(self, _: Any) -> Any:
+        return self.stepped
+
+    def reset(self, **_: Any) -> Any:
+        return self.begun
+
+
+# Pictures of an environment with matplotlib.
+
+
+ROOM = 0.25
+"""Margin around the first picture, over its size."""
+
+
+class View:
+    """The scene of an episode, with the limits and the force scale of its first picture."""
+
+    def __init__(self, run: Trajectory) -> None:
+        (first,) = instants(run, [float(run.t[0])])
+        self.figure = Figure(figsize=(6.0, 4.8), dpi=100, layout="constrained")
+        self.canvas, axes = FigureCanvasAgg(self.figure), self.figure.subplots()
+        self.scene = Scene(axes, run.setup, curves=force_scale(run.setup, [first]))
+        sides = [np.array(x) for x in self.scene.limits([first])]
+        x, y = (side + ROOM * np.diff(side) * [-1, 1] for side in sides)
+        axes.set(xlim=x, ylim=y, xlabel="x [mm]", ylabel="y [mm]")
+        self.axes, self._window = axes, None
+
+    def picture(self, run: Trajectory) -> NDArray[np.uint8]:
+        """RGB (height, width, 3) of the first sample of a run."""
+        (instant,) = instants(run, [float(run.t[0])])
+        self.scene.show(instant)
+        self.axes.set_title(f"t = {instant.time:.3f} s")
+        self.canvas.draw()
+        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        """Show a picture in a window. Raises `ValueError` where matplotlib's backend has no
+        windows."""
+        from matplotlib import pyplot
+
+        if matplotlib.get_backend() not in backend_registry.list_builtin(BackendFilter.INTERACTIVE):
+            raise ValueError(
+                f"`render_mode` 'human' needs a window, which matplotlib's `{pyplot.get_backend()}`"
+                " has not; set MPLBACKEND, or take 'rgb_array'"
+            )
+        if self._window is None:
+            self._window = pyplot.figure()
+            self._window.figimage(picture, resize=True)
+            pyplot.show(block=False)
+        self._window.images[0].set_data(picture)
+        pyplot.pause(1e-3)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            from matplotlib import pyplot
+
+            pyplot.close(self._window)
+            self._window = None

@@ -13,11 +13,10 @@ from torchsoft.physics.contact import Coulomb, SlipLaw, SmoothSlip
 from torchsoft.physics.material import KelvinVoigt, Material
 from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.motion import Reference, hold
-from torchsoft.physics.pads import Pad
+from torchsoft.physics.pads import Pad, Taxels
 from torchsoft.physics.parts import PD, Actuator, Body, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Circle, Shape
-from torchsoft.physics.taxels import Taxels
 
 NAMES = {
     **{f"pad.{name}": f"pad.{name}" for name in ("E", "nu", "rho", "tau", "depth")},

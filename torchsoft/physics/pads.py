@@ -5,20 +5,24 @@ parts z_b (nodes, 2) [N] of its nodal forces that have set in, branch by branch 
 chain; an inertial pad's its displacements and velocities.
 """
 
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property, lru_cache
 from typing import Annotated, Any
 
 import numpy as np
 import torch
 from scipy import sparse
 from scipy.sparse.linalg import splu
+from scipy.special import ndtr
 from torch import Tensor, nn
 
+from torchsoft.display import suggestion
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import Array, Mesh, dofs_of, lame_moduli, unit_compliance, unit_loads
 from torchsoft.physics.shapes import parameter
-from torchsoft.quantity import Ratio
+from torchsoft.quantity import Length, Quantity, Ratio, quantities
 
 
 @lru_cache(maxsize=16)
@@ -253,3 +257,167 @@ def contact_points(mesh: Mesh, points: int) -> tuple[Any, Array, Array]:
     right = np.tile(0.5 * (1 + xi), count - 1)
     lengths = np.repeat(spacing, points) * np.tile(0.5 * weight, count - 1)
     return np.stack((left, left + 1), -1), np.stack((1 - right, right), -1), lengths
+
+
+# Massless pads: motion of their contact points, from the relation between nodal forces and the
+# contact law.
+#
+# Rates are u' = free + P F with P = C sum of J / (tau + a h) and free = -C sum of J z / (tau + a
+# h); `stage` = a h is zero for the ODE itself. Static displacements are u = C F.
+
+
+HALVINGS = 12
+"""Halvings of a step of Newton's method at the most."""
+
+
+def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
+    """Rates of a massless pad's nodes without contact (..., nodes, 2) [m/s] and its mobility P
+    [m/(N.s)], for the forces z (..., branches, nodes, 2) that have set in at the stage's start."""
+    fractions, times = pad.chain()
+    C, rest = pad.compliance(), fractions / (times + stage)
+    return -nodal(C, (rest[:, None, None] * z).sum(-3)), rest.sum() * C
+
+
+def nodal(A: Tensor, F: Tensor) -> Tensor:
+    """A F (..., nodes, 2) of forces on the nodes F (..., nodes, 2)."""
+    return (F.flatten(-2) @ A.mT).unflatten(-1, (-1, 2))
+
+
+def nodal_forces(
+    A: Tensor,
+    N: Tensor,
+    free: Tensor,
+    law: Callable[[Tensor], Tensor],
+    tolerance: float,
+    iterations: int,
+) -> tuple[Tensor, float]:
+    """Forces F = N^T f (..., nodes, 2) [N] of a law f(x) at contact points x = N (free + A F) (...,
+    points, 2), and the largest residual that is left of x.
+
+    A (2 nodes, 2 nodes) is the pad's compliance or mobility, N (points, nodes) its shape functions
+    at the points. Semi-smooth Newton from no force, in which the force on a point depends on its
+    own x only, so that only the points with a slope are unknowns. The last iteration is taken with
+    the gradient on, which makes the derivative the implicit function theorem's.
+    """
+    relation = A.detach()
+
+    def linearise(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mismatch of the forces, the mismatch of x that it causes, and the slopes (..., points, 2,
+        2) of the law."""
+        x = N @ (free + nodal(relation, N.mT @ f))
+        with torch.enable_grad():
+            twice = torch.stack((x, x)).requires_grad_()  # a copy for each component
+            at = law(twice)
+            components = (at[0, ..., 0] + at[1, ..., 1]).sum()
+            (G,) = torch.autograd.grad(components, twice, materialize_grads=True)
+        v = at[0].detach() - f
+        return v, N @ nodal(relation, N.mT @ v), G.movedim(0, -2)
+
+    def correction(v: Tensor, G: Tensor) -> Tensor:
+        """(1 - G B)^-1 v with B = N A N^T."""
+        sloped = torch.nonzero(G.flatten(-2).any(-1).reshape(-1, len(N)).any(0))[:, 0]
+        if not len(sloped):
+            return v
+        G, spread = G[..., sloped, :, :], torch.kron(N[sloped], torch.eye(2, dtype=N.dtype))
+        B = (spread @ relation @ spread.mT).unflatten(-1, (-1, 2))
+        J = torch.eye(len(spread), dtype=v.dtype) - torch.einsum(
+            "rpj,...pjk->...rpk", B, G
+        ).flatten(-2)
+        x = torch.linalg.solve(
+            J, (N @ nodal(relation, N.mT @ v))[..., sloped, :].flatten(-2)[..., None]
+        )
+        return v.index_add(-2, sloped, (G @ x.unflatten(-2, (-1, 2)))[..., 0])
+
+    with torch.no_grad():
+        f = torch.zeros(*free.shape[:-2], len(N), 2, dtype=free.dtype)
+        v, r, G = linearise(f)
+        for _ in range(iterations):
+            size = r.flatten(-2).norm(dim=-1)
+            going = r.abs().amax((-2, -1)) > tolerance
+            if not bool(going.any()):
+                break
+            way = correction(v, G) * going[..., None, None]
+            for _ in range(HALVINGS):  # sample by sample, until the residual falls
+                v, r, G = linearise(f + way)
+                worse = going & ~(r.flatten(-2).norm(dim=-1) < size)
+                if not bool(worse.any()):
+                    break
+                way = way * torch.where(worse, 0.5, 1.0)[..., None, None]
+            f = f + way
+        left = float(r.abs().max())
+        f = f + correction(v, G)
+    v = law(N @ (free + nodal(A, N.mT @ f))) - f
+    return N.mT @ (f + correction(v, G)), left
+
+
+# Taxels: an array of sensitive areas on the surface of a pad.
+
+
+@dataclass(frozen=True)
+class Taxels:
+    """Areas of `width` [m] along the undeformed surface of the pad called `pad`.
+
+    `count` of them lie side by side around the surface's middle; or `centres` [m] are the
+    coordinates of their middles along the surface, from its middle. Each takes the part of a force
+    that a Gaussian of standard deviation `spread` [m] about the place of that force has inside the
+    area. Without a spread a force belongs to the area that it acts on, by halves at an edge.
+    Raises `ValueError` unless one of count and centres is given, and for numbers out of range.
+    """
+
+    pad: str
+    width: Annotated[Length, "width of a taxel along the surface"]
+    _: KW_ONLY
+    count: int | None = None
+    centres: Annotated[
+        Iterable[float], Quantity("m", -100.0, 100.0, "middles along the surface, from its middle")
+    ] = ()
+    spread: Annotated[
+        float, Quantity("m", 0.0, 1.0, "standard deviation of the place where a force is felt")
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centres", tuple(map(float, self.centres)))
+        if (self.count is None) == (self.centres == ()):
+            raise ValueError("taxels need a `count` or their `centres`, and not both")
+        if self.count is not None:
+            whole("count", self.count, 1)
+        for name, known in quantities(type(self)).items():
+            given = getattr(self, name)
+            for value in given if name == "centres" else [given]:
+                try:
+                    known.check(float(value))
+                except ValueError as error:
+                    raise ValueError(f"`{name}` {error}") from None
+
+    @cached_property
+    def places(self) -> Array:
+        """Coordinates of the middles along the surface (taxels,) [m]."""
+        if self.count is None:
+            return np.array(self.centres)
+        return (np.arange(float(self.count)) - 0.5 * (self.count - 1)) * self.width
+
+    def weights(self, pad: Pad) -> Array:
+        """Part of a force at every contact point of the pad that each taxel takes (taxels,
+        points)."""
+        off = self.places[:, None] - pad.point_coordinates
+        left, right = (np.round(off + side * self.width, 12) for side in (0.5, -0.5))
+        if self.spread == 0.0:
+            return 0.5 * (np.sign(left) - np.sign(right))
+        return ndtr(left / self.spread) - ndtr(right / self.spread)
+
+
+def check_taxels(
+    taxels: Mapping[str, Taxels], pads: Mapping[str, Pad], contacts: Iterable[str]
+) -> None:
+    """Raises `ValueError` for taxels on no pad, and for those that are called like a contact."""
+    for name, one in taxels.items():
+        if one.pad not in pads:
+            raise ValueError(
+                f"taxels.{name}: they lie on `{one.pad}`, "
+                f"{suggestion(one.pad, pads, 'but the pads are')}"
+            )
+        if name in contacts:
+            raise ValueError(
+                f"taxels.{name}: a contact is called `{name}` too, whose forces have the same "
+                "names; call one of them otherwise"
+            )

@@ -13,15 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft.display import Shown, suggestion
-from torchsoft.physics.condensed import free_rates, nodal, nodal_forces
 from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, net_efforts
-from torchsoft.physics.pads import Pad
+from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import Layout, State
-from torchsoft.physics.taxels import Taxels, check_taxels
 from torchsoft.quantity import Gravity, Quantity, quantity_of
 
 GROUND = "ground"
@@ -199,7 +197,7 @@ class Rig(Shown, nn.Module):
         the rates are zero where they are not given. Differentiable. Raises `ValueError` for names
         and coordinates that do not fit, `NoEquilibrium` where there is no rest.
         """
-        from torchsoft.physics.start import start
+        from torchsoft.physics.statics import start
 
         return start(self, {**(bodies or {}), **more})
 

@@ -16,13 +16,11 @@ from tqdm import tqdm
 
 from torchsoft.display import Shown
 from torchsoft.physics.arguments import Numbers, tensor, whole
+from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.sticking import SLIPPING
-from torchsoft.plan.evaluation import Evaluator, Look, Terms
-from torchsoft.plan.goals import Term
+from torchsoft.plan.problem import Evaluator, Free, Look, Term, Terms, Variables
 from torchsoft.plan.search import SLACK, Search, Stopped, Visit
-from torchsoft.plan.variables import Free, Variables
 from torchsoft.solve.trajectory import Trajectory
 
 RTOL = 1e-4

@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from torchsoft.display import suggestion
+from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.setup import ActuatorSetup, von_mises
-from torchsoft.physics.sticking import SLIPPING
 from torchsoft.plot.figures import (
     ACTUAL,
     COLOURS,

@@ -16,9 +16,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
+from torchsoft.physics.energy import SEPARATED, SLIPPING, STICKING
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.setup import PadSetup, Setup, von_mises
-from torchsoft.physics.sticking import SEPARATED, SLIPPING, STICKING
 from torchsoft.solve.trajectory import Trajectory
 
 NORMAL, FRICTION, INK = "#cc3311", "#0077bb", "#333333"

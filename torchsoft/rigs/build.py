@@ -13,6 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from torch import Tensor, nn
 
 from torchsoft.display import suggestion
+from torchsoft.parallel import single_threaded
 from torchsoft.physics.material import Series
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
@@ -44,7 +45,6 @@ from torchsoft.rigs.parts import (
 )
 from torchsoft.solve.trajectory import units
 from torchsoft.tables import LISTED, from_toml, line
-from torchsoft.threads import single_threaded
 
 M = TypeVar("M")
 

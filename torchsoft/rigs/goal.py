@@ -15,7 +15,7 @@ from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
 from torchsoft.plan.planning import RTOL, Method, Robust
-from torchsoft.plan.variables import Free
+from torchsoft.plan.problem import Free
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.tables import SEED, Table, from_toml

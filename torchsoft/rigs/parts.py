@@ -13,7 +13,7 @@ from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.material import KINDS, Material
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, PadMesh, QuadMesh
-from torchsoft.physics.pads import Pad
+from torchsoft.physics.pads import Pad, Taxels
 from torchsoft.physics.parts import COORDINATES, Body, Contact
 from torchsoft.physics.shapes import (
     Circle,
@@ -24,7 +24,6 @@ from torchsoft.physics.shapes import (
     Superellipse,
 )
 from torchsoft.physics.shapes.contour import read_points
-from torchsoft.physics.taxels import Taxels
 from torchsoft.quantity import Angle, Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
 from torchsoft.rigs.fields import Group, NumberOr, PartTable, at_field, one_of, table_of
 from torchsoft.tables import LISTED, line, read_toml, refusing

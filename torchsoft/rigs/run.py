@@ -12,13 +12,13 @@ from torchsoft.cost import Cost, row_bytes, step_time, steps_per_second
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.files import make_folder, write_json
 from torchsoft.physics.mesh import Mesh
-from torchsoft.physics.mesh.compliance import SMALLEST_BLOCK
+from torchsoft.physics.mesh.mesh import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
-from torchsoft.solve.ledger import doubts
+from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
@@ -171,9 +171,8 @@ def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]
     files."""
     # matplotlib takes half a second, which `check` does not need
     from torchsoft.plot import figures
-    from torchsoft.plot.animation import animate
+    from torchsoft.plot.animation import animate, player
     from torchsoft.plot.dashboard import dashboard, liveliest
-    from torchsoft.plot.player import player
 
     end, written = float(run.t[-1]), []
     times = [t for t in file.outputs.snapshots if t <= end] or [

@@ -13,17 +13,17 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchsoft.display import Shown
+from torchsoft.parallel import cores, parallel_map, single_threaded
 from torchsoft.physics.arguments import Numbers, tensor, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
-from torchsoft.solve.adjoint import TAPE_BYTES, attached
+from torchsoft.solve.diagnostics import doubts
+from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.laws import copied
-from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RunOutcome, prepare, run
 from torchsoft.solve.trajectory import Trajectory
-from torchsoft.threads import cores, parallel_map, single_threaded
 
 
 class SamplesFailed(UserWarning):

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft.codegen import Law, UnknownOperation, compile_law
+from torchsoft.codegen.emit import check_pointwise
 from torchsoft.codegen.graph import Graph
-from torchsoft.codegen.pointwise import check_pointwise
 from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import distance_law, free_law, interface_law
 from torchsoft.physics.parts import Actuator

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.grid import Plan
 from torchsoft.solve.kernel.arrays import first_rows
 from torchsoft.solve.kernel.table import Array
+from torchsoft.solve.steps import Plan
 
 
 class SimulationFailed(RuntimeError):

@@ -5,7 +5,7 @@ import time as clock
 import warnings
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -13,24 +13,28 @@ from tqdm import tqdm
 
 from torchsoft.paper.equilibrium import rest
 from torchsoft.paper.rig import SoftGrasp
+from torchsoft.parallel import one_torch_thread
 from torchsoft.physics.arguments import Numbers, tensor
 from torchsoft.physics.energy import stored
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.validity import check_array
-from torchsoft.solve import tangent
-from torchsoft.solve.adjoint import TAPE_BYTES, Rows, Solved, attached, march, without_gradient
-from torchsoft.solve.grid import check_times
-from torchsoft.solve.inputs import shared
-from torchsoft.solve.ledger import doubts
+from torchsoft.solve.diagnostics import describe_instability, doubts
+from torchsoft.solve.gradients import (
+    TAPE_BYTES,
+    Rows,
+    Solved,
+    attached,
+    iterate,
+    march,
+    without_gradient,
+)
 from torchsoft.solve.progress import Progress, SimulationFailed
-from torchsoft.solve.stability import describe_instability
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
+from torchsoft.solve.steps import check_times
 from torchsoft.solve.system import independent
-from torchsoft.solve.touch import Touch
-from torchsoft.solve.trajectory import Stats, Trajectory, channels, units
-from torchsoft.threads import one_torch_thread
+from torchsoft.solve.trajectory import Stats, Touch, Trajectory, channels, units
 
 Route = Literal["none", "discrete", "forward"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`."""
@@ -273,7 +277,7 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor,
             raise ValueError("`dy0` must be finite, but has a component that is not")
     kept = stepper.layout.rigid if task.rigid else list(range(size))
     sums = Touch(stepper.rig).sums(task.touch)
-    for dy, felt, out in tangent.iterate(stepper, task.y0, task.t, wanted, dy0, kept, sums):
+    for dy, felt, out in iterate(stepper, task.y0, task.t, wanted, dy0, kept, sums):
         yield Solved(stepper, task.y0, task.t, out, None), (dy, felt)
 
 
@@ -338,3 +342,55 @@ def gather(
         ),
         units=units(rig), setup=Setup.of(rig), rig=rig,
     )  # fmt: skip
+
+
+# Inputs of a run: numbers in any usual form, and a start whose graph may be shared.
+
+
+class SharedStart(RuntimeError):
+    """A second backward pass through a start whose graph the first one has freed."""
+
+
+class _Start(torch.autograd.Function):
+    """Passes a start through; its backward says in words that the graph behind it is gone."""
+
+    @staticmethod
+    def forward(ctx: Any, y0: Tensor, origin: Any) -> Tensor:
+        ctx.origin = origin
+        return y0.view_as(y0)
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if freed(ctx.origin):
+            raise SharedStart(
+                "the start y0 was computed from parameters, and an earlier backward pass through "
+                "another run has freed that computation: make y0 anew for every backward pass, "
+                "give y0.detach() if its own derivative is not wanted, or call "
+                "backward(retain_graph=True) before"
+            )
+        return bar, None
+
+
+def freed(node: Any) -> bool:
+    """Whether a node of autograd's graph, or one behind it, has lost its saved tensors."""
+    seen, waiting = set(), [node]
+    while waiting:
+        one = waiting.pop()
+        if one is None or one in seen:
+            continue
+        seen.add(one)
+        try:
+            for name in dir(one):
+                if name.startswith("_saved") or name == "saved_tensors":
+                    getattr(one, name)
+        except RuntimeError:
+            return True
+        waiting += [behind for behind, _ in one.next_functions]
+    return False
+
+
+def shared(y0: Tensor) -> Tensor:
+    """Start of a run, whose backward explains a second pass through a graph that is freed."""
+    if y0.grad_fn is None or not torch.is_grad_enabled():
+        return y0
+    return _Start.apply(y0, y0.grad_fn)  # pyright: ignore[reportReturnType]

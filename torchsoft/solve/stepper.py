@@ -9,19 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.parallel import others_turn
 from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
-from torchsoft.solve.grid import (
-    CHUNK,
-    LONGEST,
-    Plan,
-    check_knots,
-    check_times,
-    equal_steps,
-    given_steps,
-)
 from torchsoft.solve.kernel.arrays import (
     CONVERGED,
     GAMMA,
@@ -45,9 +37,19 @@ from torchsoft.solve.kernel.arrays import (
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Integrals, Progress, RunState, Segment, SimulationFailed
+from torchsoft.solve.steps import (
+    CHUNK,
+    LONGEST,
+    Followed,
+    Plan,
+    check_knots,
+    check_times,
+    equal_steps,
+    error_parts,
+    given_steps,
+    part_name,
+)
 from torchsoft.solve.system import Compiled
-from torchsoft.solve.tolerances import Followed, error_parts, part_name
-from torchsoft.threads import others_turn
 
 HALVINGS = 6
 """How often a step that Newton does not solve is halved before the run is given up."""

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.parallel import cores, parallel_map
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.adjoint import Solved, attached, march, run_adjoint
+from torchsoft.solve.gradients import Solved, attached, march, run_adjoint
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.threads import cores, parallel_map
 
 REMEMBERED = 4
 """Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end

@@ -16,7 +16,7 @@ import xarray as xr
 from torchsoft import csvfile
 from torchsoft.channels import UNITS
 from torchsoft.display import enumerated, nearest, suggestion
-from torchsoft.solve.mcap import read_log
+from torchsoft.solve.formats import read_log
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown

@@ -1,23 +1,34 @@
 """Optimal design of motions: the knots of set-points, moved by gradient."""
 
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
-from torchsoft.plan.adam import ProjectedAdam
-from torchsoft.plan.knots import Bounds, Moves
-from torchsoft.solve.adjoint import GradientFailed
+from torchsoft import csvfile
+from torchsoft.physics.statics import BuiltRig
+from torchsoft.plan.knots import Bounds, Moves, knots
+from torchsoft.plan.search import ProjectedAdam
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.fields import at_field
+from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid.criterion import Optimality
-from torchsoft.sysid.planner import PRICE, DesignEvaluation, Planner, Range
+from torchsoft.sysid.configuration import Beginning, Config, Entry, Rest
+from torchsoft.sysid.initial_state import Standing
+from torchsoft.sysid.measured import vocabulary
+from torchsoft.sysid.planner import PRICE, RTOL, DesignEvaluation, Optimality, Planner, Range
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.synthetic import record
+from torchsoft.sysid.unknowns import Sensor, Unknown
+from torchsoft.tables import line
 
 OUTLIER = 10.0
 """Largest gradient component, in medians; larger ones are clipped."""
@@ -99,9 +110,6 @@ class Search:
 
 # The design of a motion
 
-
-RTOL = 1e-3
-"""Relative tolerance of the runs: standard deviations are right to some percent."""
 
 BENT = 1.0
 """Largest error, in standard deviations, of a fit's Gauss-Newton step that gets no notice."""
@@ -224,3 +232,208 @@ def design(
             **planner.cost, "wall_s": clock.perf_counter() - began,
         },
     )  # fmt: skip
+
+
+# Rehearsal of an experiment: simulated recordings with the sensors' noise, whose identification
+# shows the information of the experiment before it is built.
+
+
+FINER = 0.1
+"""Tolerance of the simulated experiment, over the fit's."""
+
+
+def planned(
+    stated: Config, file: RigFile, built: BuiltRig[Any], name: str, rtol: float,
+    start: Beginning | None = None, **how: Any,
+) -> Recording:  # fmt: skip
+    """A planned recording of a file's rig, `built`, by a configuration, from a run with the
+    tolerance `rtol`; `how` are further arguments of `record`. Raises `ValueError`, and
+    `SimulationFailed`."""
+    plan, start = stated.rehearsal, start or stated.start
+    if plan.duration is not None:
+        built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
+    lead = start.lead if isinstance(start, Rest) else 0.0
+    at_rest = Standing.of(built.rig, built.y0, lead, file.rests())
+    return record(name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **how)
+
+
+def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Path]]:
+    """Simulate the recordings of a configuration, with the parameters of its rig file, and write
+    them to `out` as CSV files, which are templates of those to record.
+
+    Returns the configuration of their identification, whose search begins away from the truth, and
+    the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot follow.
+    """
+    file, plan = RigFile.from_toml(config.parent / stated.rig), stated.rehearsal
+    entries = stated.recordings or (Entry(name="rehearsal"),)
+    paths, random = [], np.random.default_rng(plan.seed)
+    for entry in entries:
+        name = entry.name or Path(entry.paths[0]).stem
+        with at_field("settings"):
+            mine = file.override(**stated.settings).override(**entry.settings)
+        built = mine.build()
+        known, rtol = vocabulary(built.rig, stated.columns), FINER * stated.fit.rtol
+        try:
+            made = planned(stated, mine, built, name, rtol, entry.start, seed=random)
+        except ValueError as error:
+            raise ValueError(f"{config}: {error}") from None
+        rig = made.rig
+        followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
+        columns = {"t": made.times} | dict(zip(rig.signals, followed))
+        columns |= {channel: y for channel, (_, y) in made.samples.items()}
+        called = {of: heading for heading, of in known.headings.items()}
+        units = {called.get(one, one): known.units[one] for one in columns}
+        paths.append(out / f"{name}.csv")
+        csvfile.write(paths[-1], dict(zip(units, columns.values())), units)
+    own = [
+        entry.model_copy(update={"name": path.stem, "file": None, "files": ()})
+        for entry, path in zip(entries, paths)
+    ]
+    unknowns = dict(away(stated.unknowns, file, plan.away))
+    return stated.model_copy(update={"recordings": tuple(own), "unknowns": unknowns}), paths
+
+
+def away(
+    unknowns: dict[str, Unknown], file: RigFile, factor: float
+) -> Iterator[tuple[str, Unknown]]:
+    """The unknowns, with unstated starts moved by a factor, up and down in turns. Parameters that
+    bound each other stay."""
+    rig = file.assemble()
+    bound = {name for pair in rig.ordered.items() for name in pair}
+    for k, (name, one) in enumerate(unknowns.items()):
+        free = one.nominal is None and one.ratio_to is None and not one.fixed and name not in bound
+        if free and one.scale == "log":
+            value = rig.parameter(name).item() * factor ** (-1) ** k
+            low, high = one.low or 0.0, np.inf if one.high is None else one.high
+            one = one.model_copy(update={"nominal": float(np.clip(value, low, high))})
+        yield name, one
+
+
+# Design of a rig file's motion for an identification: a ranking of candidates, and the best one's
+# knots moved by gradient, by one criterion.
+
+
+AS_STATED = "as stated"
+"""Name of the candidate that is the motion of the rig file itself."""
+
+
+@dataclass(frozen=True)
+class Rated:
+    """A rated candidate: the criterion, a logarithm of standard deviations, the smaller the better;
+    the relative standard deviations of the parameters, and the largest fraction of their limits
+    that channels reach. `lost` is the reason of a failed run."""
+
+    name: str
+    value: float
+    deviations: dict[str, float]
+    peaks: dict[str, float]
+    lost: str = ""
+
+    @property
+    def score(self) -> float:
+        """The criterion; infinite beyond a limit."""
+        beyond = self.lost or max(self.peaks.values(), default=0.0) > 1
+        return np.inf if beyond else self.value
+
+
+class Chosen(NamedTuple):
+    """The candidates, the best first; the rig file with the best motion, and its design if knots
+    were moved."""
+
+    rated: list[Rated]
+    file: RigFile
+    found: Design | None
+
+    def table(self) -> str:
+        """A line for each candidate."""
+        names = list(next((one.deviations for one in self.rated if not one.lost), {}))
+        width = max([len(one.name) for one in self.rated] + [9])
+        rows = [f"{'candidate':{width}s} criterion  {'  '.join(names)}"]
+        for one in self.rated:
+            cells = [f"{one.deviations.get(name, np.nan):{len(name)}.2%}" for name in names]
+            said = f"cannot be made: {line(one.lost, 120)}" if one.lost else "  ".join(cells)
+            limit = [f"{k} goes beyond its limits" for k, part in one.peaks.items() if part > 1]
+            rows.append("  ".join([f"{one.name:{width}s} {one.value:9.3f}", said, *limit]))
+        return "\n".join(rows)
+
+    def summary(self) -> dict[str, Any]:
+        """Content of `design.json`."""
+        out: dict[str, Any] = {"candidates": [asdict(one) for one in self.rated]}
+        if self.found is not None:
+            one = self.found
+            out |= {
+                "before": one.before, "after": one.after, "limits": one.limits,
+                "history": [asdict(visit) for visit in one.history], "notices": one.notices,
+                "made_by": one.made_by,
+            }  # fmt: skip
+        return out
+
+
+def rank(
+    recorded: Sequence[Recording], candidates: Sequence[Recording], sensors: dict[str, Sensor],
+    unknowns: dict[str, Unknown], *, limits: Mapping[str, Range] | None = None,
+    criterion: Optimality = "D", names: Sequence[str] | None = None, rtol: float = RTOL,
+    workers: int = 1,
+) -> list[Rated]:  # fmt: skip
+    """Candidates for the next recording, the best first: by the uncertainty of the parameters
+    `names` (all by default), at their nominal values, from each together with what is `recorded`.
+
+    Only the times of a candidate's samples count. `limits` are ranges (low, high) [unit] of
+    channels. Raises `ValueError` for candidates that do not fit the problem.
+    """
+    rated = list[Rated]()
+    for one in candidates:
+        problem = Problem([*recorded, one], sensors, unknowns)
+        planner = Planner(
+            problem, one.name, Moves(one.rig.reference, {}, 0.0), limits or {}, criterion, names,
+            rtol, workers,
+        )  # fmt: skip
+        x = problem.coordinates.start
+        try:
+            seen = planner.evaluate(np.zeros(0), x)
+        except SimulationFailed as failure:
+            rated.append(Rated(one.name, np.inf, {}, {}, str(failure)))
+        else:
+            rated.append(Rated(one.name, seen.value, planner.deviations(x, seen), seen.peaks))
+    return sorted(rated, key=lambda one: (one.score, one.value))
+
+
+def choose(
+    config: Path, stated: Config, recorded: Sequence[Recording] = (), *, workers: int = 1,
+    progress: bool = False,
+) -> Chosen:  # fmt: skip
+    """Rank a configuration's candidates for the motion by the uncertainty of its unknowns, together
+    with the recordings in `recorded`, and move the knots of the best one that `bounds` name.
+
+    The rig is that of its file. Raises `ValueError` for parts that do not fit together, and where
+    no candidate can be run.
+    """
+    plan = stated.design
+    with at_field("settings"):
+        file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)
+    files, made, lost = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
+    for name, settings in ({AS_STATED: {}} | plan.candidates).items():
+        with at_field(f"design.candidates.{name}"):
+            files[name] = file.override(**settings)
+            built = files[name].build()
+        try:
+            made[name] = planned(stated, files[name], built, name, plan.rtol, noise=0.0)
+        except SimulationFailed as failure:
+            lost.append(Rated(name, np.inf, {}, {}, str(failure)))
+    common: dict[str, Any] = {
+        "limits": plan.limits, "criterion": plan.criterion, "names": plan.parameters or None,
+        "rtol": plan.rtol, "workers": workers,
+    }  # fmt: skip
+    rated = rank(recorded, [*made.values()], stated.sensors, stated.unknowns, **common) + lost
+    best = rated[0].name
+    if rated[0].lost:
+        raise ValueError(f"{config}: no candidate can be made: {rated[0].lost}")
+    found, chosen = None, files[best]
+    if plan.bounds:
+        problem = Problem([*recorded, made[best]], stated.sensors, stated.unknowns)
+        found = design(
+            problem, best, plan.bounds, iterations=plan.iterations, seed=plan.seed,
+            progress=progress, **common,
+        )  # fmt: skip
+        chosen = chosen.override(motion=knots(found.recording.rig.reference, plan.bounds))
+    return Chosen(rated, chosen, found)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear, minimize
 
-from torchsoft.plan.adam import ProjectedAdam
+from torchsoft.plan.search import ProjectedAdam
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
 from torchsoft.sysid.recording import Array

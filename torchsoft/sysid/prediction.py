@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout
+from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import simulate
-from torchsoft.solve.tangent import directions
 from torchsoft.solve.trajectory import Trajectory, channels, measurable, rate_channel
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.recording import REACH, Array, Grid, RunContext

@@ -12,7 +12,7 @@ from torchsoft.display import suggestion
 from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
-from torchsoft.solve.touch import Touch
+from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
     FailedRun,

@@ -12,11 +12,11 @@ from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
 from torchsoft.display import suggestion
+from torchsoft.parallel import parallel_map, single_threaded
 from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
-from torchsoft.threads import parallel_map, single_threaded
 
 if TYPE_CHECKING:
     from torchsoft.sysid.result import IdentificationResult

@@ -20,8 +20,7 @@ from torchsoft.display import suggestion
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.touch import Touch
-from torchsoft.solve.trajectory import measurable, units
+from torchsoft.solve.trajectory import Touch, measurable, units
 from torchsoft.sysid.initial_state import Begin, Start, StartCoordinate
 
 Array = NDArray[np.float64]

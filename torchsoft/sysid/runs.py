@@ -18,6 +18,7 @@ import numpy as np
 
 from torchsoft.cost import steps_per_second
 from torchsoft.files import CHECKPOINT, SEALED, check_file, make_folder, remove_partials, replacing
+from torchsoft.parallel import parallel_map, single_threaded
 from torchsoft.solve.kernel.objects import digest
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.noise import Autoregression
@@ -34,7 +35,6 @@ from torchsoft.sysid.prediction import (
 )
 from torchsoft.sysid.recording import Array, Recording, RunContext
 from torchsoft.sysid.unknowns import NUISANCES
-from torchsoft.threads import parallel_map, single_threaded
 
 MEANING = (
     "Runs of an identification that is not done; torchsoft removes the .run files in this folder "

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from torchsoft.display import suggestion
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.touch import Touch
+from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
 from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown

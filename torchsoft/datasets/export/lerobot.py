@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from torchsoft.datasets.export.source import Source
+from torchsoft.datasets.export import Source
 from torchsoft.extras import needed
 from torchsoft.files import write_json
 

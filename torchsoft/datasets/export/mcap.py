@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from torchsoft.datasets.export.source import Source
-from torchsoft.solve.mcap import write_log
+from torchsoft.datasets.export import Source
+from torchsoft.solve.formats import write_log
 
 
 def write(source: Source, out: Path) -> str:

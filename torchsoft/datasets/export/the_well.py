@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.datasets.export.source import Source
+from torchsoft.datasets.export import Source
 
 NAMES = {"train": "train", "validation": "valid", "test": "test"}
 

@@ -7,8 +7,16 @@ dilatational part is integrated at the element's centre and the shear part at 2 
 """
 
 from torchsoft.physics.mesh.block import CurvedPadMesh, FingertipMesh, PadMesh
-from torchsoft.physics.mesh.compliance import banded, unit_compliance, unit_loads
-from torchsoft.physics.mesh.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
+from torchsoft.physics.mesh.mesh import (
+    Array,
+    Mesh,
+    StoredMesh,
+    banded,
+    dofs_of,
+    lame_moduli,
+    unit_compliance,
+    unit_loads,
+)
 from torchsoft.physics.mesh.quads import QuadMesh
 
 __all__ = [

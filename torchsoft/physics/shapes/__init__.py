@@ -6,8 +6,13 @@ which the compiled kernels are generated.
 """
 
 from torchsoft.physics.shapes.contour import Contour
-from torchsoft.physics.shapes.oval import Circle, Ellipse, Superellipse
-from torchsoft.physics.shapes.rounded import RoundedBox, RoundedPolygon
+from torchsoft.physics.shapes.rounded import (
+    Circle,
+    Ellipse,
+    RoundedBox,
+    RoundedPolygon,
+    Superellipse,
+)
 from torchsoft.physics.shapes.shape import Shape, parameter
 
 __all__ = [

@@ -1,22 +1,30 @@
-"""A run as an xarray Dataset, and back: everything that a `Trajectory` holds but its graph, under
-the names that it has there."""
+"""Files of runs: NetCDF and HDF5 with units, MCAP logs, and VTK series of the pads."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as xml
 
 import numpy as np
 import torch
 import xarray as xr
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchsoft.channels import CHANNELS
-from torchsoft.physics.mesh import StoredMesh
+from torchsoft.extras import needed
+from torchsoft.files import check_file, replacing
+from torchsoft.physics.mesh import Array, StoredMesh
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.setup import Setup
+from torchsoft.physics.setup import Setup, von_mises
 from torchsoft.physics.state import Layout, State
 from torchsoft.solve.trajectory import Stats, Trajectory, load
+from torchsoft.tables import line
+
+# A run as an xarray Dataset, and back: everything that a `Trajectory` holds but its graph, under
+# the names that it has there.
+
 
 MESH = {
     "nodes": (("axis",), "m", "places of the nodes of the mesh of the pad {}, in its own frame"),
@@ -207,3 +215,145 @@ def from_xarray(data: xr.Dataset, source: str = "the dataset") -> Trajectory:
 def read(path: str | Path) -> Trajectory:
     """The run of a file that `Trajectory.save` wrote. Raises `ValueError` and `OSError`."""
     return from_xarray(load(path), str(path))
+
+
+# Runs as MCAP logs: one message of JSON a sample, whose schema says unit and meaning of every
+# channel.
+
+
+TOPIC = "/torchsoft"
+
+LARGEST = 2e9
+"""Size [B] of a log at the most."""
+
+NANO = 1_000_000_000
+
+
+def write_log(path: Path, data: xr.Dataset, about: Mapping[str, str]) -> None:
+    """Write the variables over time of a run, with `about` as metadata. Raises `ValueError` for a
+    number that is not finite."""
+    writing = needed("mcap.writer", "export")
+    series = {str(name): one for name, one in data.data_vars.items() if one.dims == ("time",)}
+    fields = {"t": {"type": "number", "unit": "s", "description": "time since the start"}}
+    for name, one in series.items():
+        unit, meaning = one.attrs.get("units", "1"), one.attrs.get("long_name", "")
+        fields[name] = {"type": "number", "unit": unit, "description": meaning}
+    if bad := [name for name, one in series.items() if not np.isfinite(one.values).all()]:
+        raise ValueError(f"`{bad[0]}` is not finite, and a log in JSON has finite numbers only")
+    times = data["time"].values.tolist()
+    columns = [times, *(one.values.tolist() for one in series.values())]
+    with replacing(path) as partial, partial.open("wb") as file:
+        writer = writing.Writer(file, enable_data_crcs=True)
+        writer.start(library="torchsoft")
+        schema = {"type": "object", "title": "torchsoft.Sample", "properties": fields}
+        known = writer.register_schema(
+            "torchsoft.Sample", "jsonschema", json.dumps(schema).encode()
+        )
+        channel = writer.register_channel(TOPIC, "json", known)
+        writer.add_metadata("torchsoft", dict(about))
+        for row in zip(*columns, strict=True):
+            at = round(row[0] * NANO)
+            said = json.dumps(dict(zip(fields, row)), allow_nan=False)
+            writer.add_message(channel, log_time=at, publish_time=at, data=said.encode())
+        writer.finish()
+
+
+def read_log(path: Path) -> xr.Dataset:
+    """The variables over time of a log that `write_log` wrote, or one like it. Raises `ValueError`
+    for anything else, and `OSError`."""
+    reading = needed("mcap.reader", "export")
+    rows, fields = list[dict[str, float]](), dict[str, dict[str, str]]()
+    try:
+        with check_file(path, LARGEST).open("rb") as file:
+            reader = reading.NonSeekingReader(file, validate_crcs=True)  # which reads all of it
+            for schema, channel, message in reader.iter_messages(topics=[TOPIC]):
+                if channel.message_encoding != "json" or schema is None:
+                    raise ValueError(f"{TOPIC} is in {channel.message_encoding}, not in json")
+                fields = fields or json.loads(schema.data)["properties"]
+                rows.append(json.loads(message.data))
+        if not rows:
+            raise ValueError(f"it has no messages on {TOPIC}")
+        columns = {name: np.array([row[name] for row in rows], float) for name in fields}
+        times = columns.pop("t")
+    except OSError:
+        raise
+    except Exception as error:  # whatever a damaged file makes a library raise
+        raise ValueError(
+            f"{path} is not a log of torchsoft: {line(error) or 'it was cut short'}"
+        ) from None
+    found = {
+        name: ("time", one, {"units": fields[name].get("unit")}) for name, one in columns.items()
+    }
+    return xr.Dataset(found, coords={"time": times})
+
+
+# Pads of a run as VTK files: deformed by `displacement`, with strain and stress of their
+# elements, for ParaView, and for meshio, which reads them back.
+
+
+def tensors(xx: Array, yy: Array, zz: Array, xy: Array) -> Array:
+    """Symmetric tensors (..., 9) of plane components."""
+    zero = np.zeros_like(xx)
+    return np.stack((xx, xy, zero, xy, yy, zero, zero, zero, zz), -1)
+
+
+def write(run: Trajectory, path: Path, times: Sequence[float] | None = None) -> list[Path]:
+    """Write `path`, a .pvd that lists a .vtu for each of the samples nearest to `times` [s] (all by
+    default); the files written. All pads are in one file, at their places of rest in the world [m]
+    with their base as it is then, and told apart by the number `pad`.
+
+    Points have `displacement` [m] from there; elements `strain`, `stress` [Pa], the elastic part,
+    and `von_mises` [Pa]. Raises `ValueError` for another suffix.
+    """
+    import meshio  # takes half a second, and few need it
+
+    if path.suffix != ".pvd":
+        raise ValueError(f"`path` must end in .pvd, but is {path}")
+    rows = range(len(run.t)) if times is None else sorted({run.at(time) for time in times})
+    pads = run.setup.pads
+    cells, first = [], 0
+    for pad in pads.values():
+        cells.append(("quad", pad.mesh.elements + first))
+        first += len(pad.mesh.nodes)
+    root = xml.Element("VTKFile", type="Collection", version="0.1")
+    listed, written = xml.SubElement(root, "Collection"), []
+    for number, row in enumerate(rows):
+        points, moved = [], []
+        fields: dict[str, list[ArrayLike]] = {
+            k: [] for k in ("pad", "strain", "stress", "von_mises")
+        }
+        for i, (name, pad) in enumerate(pads.items()):
+            own = pad.displacement(run.displacement[name][row].detach().numpy())
+            x, y, angle = (
+                (0.0, 0.0, 0.0) if pad.base is None
+                else run.state.pose[pad.base][row].detach().tolist()
+            )  # fmt: skip
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            axes = turn @ pad.axes
+            points.append(pad.placed(pad.mesh.nodes) @ turn.T + [x, y])
+            moved.append(own @ axes.T)
+            strain = pad.strain(own)
+            stress, zero = pad.stress(strain), np.zeros(len(strain))
+            fields["pad"].append(np.full(len(strain), i))
+            for key, own_axes in (
+                ("strain", tensors(strain[:, 0], strain[:, 1], zero, strain[:, 2])),
+                ("stress", tensors(*stress.T)),
+            ):
+                world = np.eye(3)
+                world[:2, :2] = axes
+                turned = world @ own_axes.reshape(-1, 3, 3) @ world.T
+                fields[key].append(turned.reshape(-1, 9))
+            fields["von_mises"].append(von_mises(stress))
+        flat = lambda parts: np.pad(np.concatenate(parts), ((0, 0), (0, 1)))
+        mesh = meshio.Mesh(
+            flat(points), cells, point_data={"displacement": flat(moved)}, cell_data=fields
+        )
+        file = path.with_name(f"{path.stem}_{number:05d}.vtu")
+        with replacing(file) as partial:
+            meshio.write(partial, mesh, file_format="vtu")
+        entry = {"timestep": f"{float(run.t[row])!r}", "part": "0", "file": file.name}
+        xml.SubElement(listed, "DataSet", entry)
+        written.append(file)
+    with replacing(path) as partial:
+        partial.write_bytes(xml.tostring(root, "utf-8", xml_declaration=True))
+    return [path, *written]

@@ -1,18 +1,22 @@
-"""Runs side by side in threads: the compiled kernels hold no lock, so runs of one process share its
-cores.
+"""Runs side by side: threads, whose compiled kernels hold no lock, and pools of processes.
 
-Python code does hold one; a run of a second has some twenty milliseconds of it.
+Python code does hold a lock; a run of a second has some twenty milliseconds of it.
 """
 
+import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Any, TypeVar
 
 import torch
 from threadpoolctl import threadpool_limits
+
+# Threads
+
 
 T = TypeVar("T")
 
@@ -123,3 +127,37 @@ def parallel_map(
             for future in futures:
                 future.cancel()
             wait(futures)
+
+
+# Simulations side by side: a pool of processes, one thread each, that end with their parent.
+
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def prepare_worker() -> None:
+    """Leave Ctrl-C to the parent, end with it however it ends, and compute on one thread."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+@contextmanager
+def local_processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of spawned processes. Scripts that use it need the usual `if __name__ ==
+    "__main__"`."""
+    for name in THREADS:
+        os.environ[name] = "1"
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,10 +1,4 @@
-"""Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in
-the compiled kernels.
-
-The inputs of a run are fixed when it is made: the vector of parameters and the signals at its
-stages are inputs of one autograd function, and the tensors that these were computed from receive
-their gradient, even where modules have changed since.
-"""
+"""Derivatives of a whole run: the discrete adjoint, and forward sensitivities."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -13,12 +7,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.solve.kernel.arrays import Backward, room
+from torchsoft.parallel import others_turn, parallel_map
+from torchsoft.solve.kernel.arrays import Backward, Forward, room
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper, stage_times
-from torchsoft.threads import others_turn, parallel_map
+from torchsoft.solve.trajectory import Sums
+
+# Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in
+# the compiled kernels.
+#
+# The inputs of a run are fixed when it is made: the vector of parameters and the signals at its
+# stages are inputs of one autograd function, and the tensors that these were computed from
+# receive their gradient, even where modules have changed since.
+
 
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from
@@ -178,3 +181,60 @@ def without_gradient(name: str, series: Tensor, y: Tensor) -> Tensor:
     """A series (T,) that came out of the run of states y (T, size), whose gradient would be wrong
     rather than zero."""
     return _Recorded.apply(name, series, y) if y.requires_grad else series  # pyright: ignore[reportReturnType]
+
+
+# Forward sensitivities: the derivative of a whole run along a handful of parameters, in one pass
+# of the compiled kernels.
+
+
+def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
+    """d value / d (scalar tensors) (..., n) from the graph of `value` (...): its pullback is linear
+    in the weights, so differentiated by them it pushes forward."""
+    out = np.zeros((*value.shape, len(wanted)))
+    weights = torch.zeros_like(value, requires_grad=True)
+    pulled = (
+        torch.autograd.grad(value, wanted, weights, create_graph=True, allow_unused=True)
+        if wanted and value.requires_grad
+        else ()
+    )
+    for k, part in enumerate(pulled):
+        if part is not None and part.requires_grad:
+            (row,) = torch.autograd.grad(part, weights, retain_graph=True)
+            out[..., k] = row.numpy()
+    return out
+
+
+def iterate(
+    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None,
+    columns: list[int], sums: Sums,
+) -> Iterator[tuple[Tensor, Tensor, Progress]]:  # fmt: skip
+    """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, and those of
+    sums of forces (T, sums, n), as the run grows; `columns` are the components of the state that
+    are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its columns
+    beyond those of `wanted` are directions of the start alone."""
+    size, count = stepper.layout.size, len(sums.start) - 1
+    dy = np.zeros((size, len(wanted))) if dy0 is None else dy0.detach().numpy().copy()
+    n = dy.shape[1]
+    dp = np.zeros((len(stepper.compiled.p), n))
+    dp[:, : len(wanted)] = directions(stepper.compiled.p, wanted)
+    kept, felt = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
+    segments: list[Segment] = []
+    for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):
+        while segments:  # none if the first step of a chunk was not solved, and is to be halved
+            segment = segments.pop(0)
+            plan, (tape, out_tape), s = (
+                segment.plan,
+                stepper.tapes(segment),
+                stepper.system(segment),
+            )
+            rows = np.empty((len(plan.out_step), size, n))
+            work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
+            sweep = Forward(
+                s, stepper.still, work, tangents, tape, plan.h, segment.signals, plan.out_step,
+                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, rows,
+                felt[segment.rows],
+            )  # fmt: skip
+            with others_turn():
+                call("forward", sweep)
+            kept[segment.rows] = rows[:, columns]
+        yield torch.from_numpy(kept), torch.from_numpy(felt), out
