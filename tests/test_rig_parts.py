@@ -420,7 +420,7 @@ REFUSED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "law of nothing": ({"laws__wet": WET},
         r"laws\.wet: no contact follows it; name it as the law of one"),
     "motion that is missing": ({"actuators__x__setpoint": "w"},
-        r"motion\.w is missing: bracket\.x is to follow it"),
+        r"motion\.w is missing: it is the setpoint of bracket\.x"),
     "time goes back": ({"motion__x_d__times": (1.5, 0.5)},
         r"motion\.x_d.*: times must increase, but 0\.5 s follows 1\.5 s"),
     "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}},

@@ -33,7 +33,7 @@ from torchsoft.sysid.fit import (
     newton_step,
     standard_deviations,
 )
-from torchsoft.sysid.plan import default_plan, sobol, tie_ratios, visible
+from torchsoft.sysid.plan import default_plan, jacobian_error, sobol, tie_ratios, visible
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.runs import Runner
@@ -278,12 +278,22 @@ def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes):
     unknowns |= {"contact.mu_s": Unknown(nominal=0.9)}
     problem = Problem([strokes], SENSORS, unknowns)
     answer = identify(problem, plan=[Stage("all", ("strokes",), FOUR, 1e-3)], **TRUSTED)
-    assert [stage["name"] for stage in answer.stages][:2] == ["all", "steps chosen anew"]
-    assert {stage["rtol"] for stage in answer.stages} == {1e-3}
+    first, anew = (stage["name"] for stage in answer.stages[:2])
+    assert (first, anew) == ("all", "steps chosen anew")
+    assert {stage["rtol"] for stage in answer.stages[:2]} == {1e-3}
+    assert answer.made_by["rtol"] == 1e-4, "the Jacobian by 1e-3 is too rough"
     assert answer.converged
     for name in FOUR:
         e = answer[name]
         assert abs(np.log(e.last / TRUTH[name])) < e.relative_sd, name
+
+
+def test_the_error_of_a_jacobian_is_that_along_a_standard_deviation():
+    """Of x_0, known to 0.05 where x_1 is held and to 0.1 where it is not; x_2 is not known."""
+    exact = np.array([[20.0, np.sqrt(300.0), 0], [0, 10.0, 0], [0, 0, 1.0]])
+    rough = exact + np.array([[0, 0, 0], [2.0, 0, 0], [0, 0, 9.0]])
+    assert jacobian_error(exact, exact) == 0
+    assert jacobian_error(rough, exact) == pytest.approx(0.2)
 
 
 def test_interrupted_it_continues_and_ends_the_same(strokes, tmp_path, monkeypatch):

@@ -230,12 +230,12 @@ class Mutant(NamedTuple):
         return number and isinstance(self.new, bool | str | list | dict)
 
     def named(self, text: str) -> bool:
-        """Whether a refusal names the changed place, by its last name; a range or a table is named
-        by itself."""
+        """Whether a refusal names the changed place, by its last name, or the place in a table of
+        measurements that it contradicts; a range or a table is named by itself."""
         names = [part for part in self.place if isinstance(part, str)]
         if names and names[-1] not in ("kind", "low", "high"):
             names = [names[-1], names[-1].rpartition(".")[2]]
-        return not names or any(name in text for name in names)
+        return not names or ", row " in text or any(name in text for name in names)
 
 
 def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:

@@ -363,12 +363,8 @@ class RigFile(Group):
         for name, who in followers.items():
             role, coordinate = who[0]
             if name not in self.motion:
-                why = {
-                    "setpoint": f"{coordinate} is to follow it", "feed_forward":
-                    f"{coordinate} is to be pushed by it",
-                    "driven": "the coordinate is driven by it",
-                }[role]  # fmt: skip
-                raise ValueError(f"motion.{line(name, 80)} is missing: {why}")
+                why = f"it is the {role} of" if role != "driven" else "it drives"
+                raise ValueError(f"motion.{line(name, 80)} is missing: {why} {coordinate}")
             if len({(r == "feed_forward", c.endswith(".theta")) for r, c in who}) > 1:
                 raise ValueError(
                     f"motion.{name} would be in two units: "

@@ -27,6 +27,7 @@ from torchsoft.sysid.fit import (
 )
 from torchsoft.sysid.plan import (
     FINER,
+    JACOBIAN_ERROR,
     STEP_BIAS,
     Method,
     Settled,
@@ -65,7 +66,7 @@ from torchsoft.sysid.unknowns import Coordinates
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
-"""Relative tolerance of the last stage, at which derivatives are right to some percent, and
+"""Relative tolerance of the last stage, at which derivatives are usually right to a tenth, and
 estimates to a fraction of a standard deviation with sensors as good as `RIG`."""
 
 PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
@@ -195,6 +196,12 @@ def conclude(
         found, held_by(problem), end.at_rest or bool(end.rough), rtol, end.bias is None
     )
     notices += rough_notices(c, end.rough)
+    if end.jacobian_error > JACOBIAN_ERROR and not end.rough:
+        notices.append(
+            f"the tolerance rtol = {rtol:g} is too coarse for derivatives: their error is "
+            f"{end.jacobian_error:.2g} of the noise, and estimates scatter more than their "
+            f"intervals say; take rtol = {FINER * rtol:g}"
+        )
     notices += assumption_notices(checked) if checked is not None else []
     notices += residual_notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
     notices += colour_notices(coloured.found, declared)

@@ -26,6 +26,7 @@ from torchsoft.sysid.fit import (
     Unreachable,
     chord,
     descend,
+    fisher,
     gauss_newton,
     newton_step,
     settled,
@@ -362,6 +363,11 @@ as too coarse."""
 FINER = 0.1
 """Tolerance of the check, over the tolerance under check."""
 
+JACOBIAN_ERROR = 0.3
+"""Largest error of a Jacobian along one standard deviation of a coordinate, in units of the noise,
+before the tolerance counts as too coarse: at 0.3 a standard deviation is up to 5 % too small, and
+the scatter of the estimate up to 5 % larger."""
+
 REFITS, EXACT = 15, 1e-6
 """Most evaluations with new Jacobians in the final fit, and its relative tolerance."""
 
@@ -374,13 +380,13 @@ class Settled(NamedTuple):
     `rtol` chooses at x, with the last Jacobian.
 
     `bias` is the shift of every coordinate (n,) by finite steps, None where it could not be
-    checked; `fits` are the fits on other steps since, with their tolerances and their end on the
-    clock [s]; `finer` are the residuals with a tenth of the tolerance, or those of `at` where such
-    runs fail. `at_rest` is whether with steps chosen anew no coordinate would move by more than
-    `SETTLED` standard deviations (where steps are only checked, whether the fit has converged).
-    `rough` names the coordinates that would move although steps do not matter, the largest move
-    first: samples are not smooth in them. `steps` are those of `at` where runs with steps chosen
-    anew fail.
+    checked; `jacobian_error` is that of `JACOBIAN_ERROR`, for `rtol`; `fits` are the fits on other
+    steps since, with their tolerances and their end on the clock [s]; `finer` are residuals and
+    Jacobian with a tenth of the tolerance, or those of `at` where such runs fail. `at_rest` is
+    whether with steps chosen anew no coordinate would move by more than `SETTLED` standard
+    deviations (where steps are only checked, whether the fit has converged). `rough` names the
+    coordinates that would move although steps do not matter, the largest move first: samples are
+    not smooth in them. `steps` are those of `at` where runs with steps chosen anew fail.
     """
 
     x: Array
@@ -392,6 +398,15 @@ class Settled(NamedTuple):
     at_rest: bool
     rough: tuple[str, ...] = ()
     steps: Mapping[str, Frozen] | None = None
+    jacobian_error: float = 0.0
+
+
+def jacobian_error(J: Array, exact: Array) -> float:
+    """Largest error of a Jacobian J (m, n) along one standard deviation of a coordinate."""
+    C = fisher(exact)[0]
+    seen = np.sqrt(np.diag(C)) <= FIRST_LOOK
+    steps = (C / np.sqrt(np.diag(C)))[:, seen]
+    return float(np.linalg.norm((J - exact) @ steps, axis=0).max(initial=0.0))
 
 
 def settle(
@@ -405,7 +420,8 @@ def settle(
 ) -> Settled:
     """Continue a fit with its Jacobian and a few runs: on steps chosen anew until they do not
     matter, and with a tighter tolerance, at most `tightenings` times, where a tenth of it shifts an
-    estimate by more than `STEP_BIAS`, or where steps keep the fit from settling. With no
+    estimate by more than `STEP_BIAS` or shows an error of the Jacobian above `JACOBIAN_ERROR`, or
+    where steps keep the fit from settling. The Jacobian at the end is that of the check. With no
     tightenings the steps are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
     at = fit.at
@@ -440,20 +456,22 @@ def settle(
             rounds -= 1
             if along(fresh, steps):
                 continue
-        finer, steps = problem.freeze(runner, x, which, FINER * rtol)
+        finer, steps = problem.freeze(runner, x, which, FINER * rtol, free)
         if finer.lost:
             return Settled(x, end, rtol, None, fits, end, at_rest)
-        J, bias = at.J[:, free], np.zeros(len(x))
+        J, bias = finer.J[:, free], np.zeros(len(x))
+        error = jacobian_error(at.J[:, free], J)
         bias[free], sd = shift(J, finer.r - at.r), standard_deviations(J)
         anew = np.abs(shift(J, fresh.r - at.r)) / sd
         shifts, rough = np.abs(bias[free]) / sd, tuple[str, ...]()
+        at, end = (one._replace(J=finer.J) for one in (at, end))
         if not at_rest and tightenings and max(anew.max(), shifts.max()) <= SETTLED:
             moves = np.abs(newton_step(problem, x, end, free)) / sd
             order = np.argsort(-moves)[: int(np.sum(moves > SETTLED))]
             rough = tuple(np.array(problem.coordinates.labels)[free][order].tolist())
-        elif left and not (at_rest and shifts.max() <= STEP_BIAS):
+        elif left and not (at_rest and shifts.max() <= STEP_BIAS and error <= JACOBIAN_ERROR):
             left, rounds, rtol = left - 1, ROUNDS, FINER * rtol
             if along(finer, steps):
                 continue
-            rtol /= FINER
-        return Settled(x, end, rtol, bias, fits, finer._replace(J=at.J), at_rest, rough)
+            rtol, error = rtol / FINER, 0.0
+        return Settled(x, end, rtol, bias, fits, finer, at_rest, rough, jacobian_error=error)
