@@ -35,7 +35,7 @@ class Cost(NamedTuple):
     least: float = 0.0
 
     def part(self, share: float) -> "Cost":
-        """Of a share of the work that is done one piece after the other."""
+        """Cost of a share of the work, done one piece after the other."""
         steps, seconds, memory, disk, least = self
         return Cost(share * steps, share * seconds, memory, share * disk, share * least)
 
@@ -86,8 +86,8 @@ def step_time(surface: int, points: int, inertial: int) -> float:
 
 
 def steps_per_second(rtol: float) -> float:
-    """How many steps [1/s] a tolerance chooses where a disc is rolled and shaken, by experience; a
-    gentle motion a tenth."""
+    """Rate of steps [1/s] by a tolerance for a disc that is rolled and shaken, from experience; a
+    gentle motion needs a tenth."""
     return 3700.0 * (1e-5 / rtol) ** 0.3
 
 

@@ -24,7 +24,7 @@ Units = Mapping[str, float]
 """Units that a column may have, and what they are in SI."""
 
 Hint = Callable[[str, int], str]
-"""What helps with a column of this name that is not known, in a table of so many columns."""
+"""Remedy for an unknown column, from its name and the number of columns of the table."""
 
 
 class Numbers(NamedTuple):
@@ -77,7 +77,7 @@ def write(path: Path, columns: Mapping[str, NDArray[np.float64]], units: Mapping
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
-    """What a heading `name [unit]` or `name (unit)` says; None where it has no unit."""
+    """Name and unit of a heading `name [unit]` or `name (unit)`; None where it has no unit."""
     match = re.fullmatch(r"\s*([^\[\]()]*?)\s*(?:[\[(]\s*([^\[\]()]*?)\s*[\])])?\s*", cell)
     return (match[1], match[2]) if match else (cell.strip(), None)
 

@@ -8,7 +8,7 @@ ALIKE = 0.6
 """Least ratio of common letters of two names that are alike."""
 
 FEW, SHOWN = 20, 6
-"""So many names are all shown besides the nearest one; of more, so many."""
+"""Most names that are all shown besides the nearest one, and number shown of longer lists."""
 
 
 def enumerated(names: Iterable[str]) -> str:

@@ -38,7 +38,7 @@ Frequency = Annotated[float, Field(ge=1e-6, le=1e5)]
 
 
 class Roll(Table):
-    """By `travel` [m] to the right over the whole time of the motion."""
+    """A roll by `travel` [m] to the right over the whole time of the motion."""
 
     kind: Literal["slow_roll"] = "slow_roll"
     travel: Length = 10e-3

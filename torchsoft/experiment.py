@@ -31,7 +31,7 @@ STEPS = (1e-6, 0.02)
 """Shortest and longest step [s]."""
 
 SMALLEST, LARGEST = 1e-9, 1e6
-"""Of every other number; counts, seeds and entries of lists may be zero."""
+"""Bounds of all other numbers; counts, seeds and entries of lists may be zero."""
 
 COARSE: dict[str, Any] = {
     "pad.elements_x": 60,

@@ -22,7 +22,7 @@ except ImportError:  # no such locks: partial files are then left where they are
     fcntl = None
 
 SEAL, DIGEST = b"\ntorchsoft-sha256\n", 64
-"""How a file with a checksum ends, and the length of the checksum before."""
+"""End of a file with a checksum, and length of the checksum before it."""
 
 SEALED = 64e9
 """Size [B] of a file with a checksum at the most."""
@@ -31,10 +31,10 @@ CHECKPOINT = "torchsoft-checkpoint"
 """File that marks a folder of unfinished runs."""
 
 PARTIAL = re.compile(r"\.[0-9a-f]{16}\.partial$")
-"""How the name of a partial file ends, after the name of the file that it becomes."""
+"""End of the name of a partial file, after the name of the file that it becomes."""
 
 TRIES = 5
-"""How often a file is asked for that somebody else has."""
+"""Attempts to open a file that another process holds."""
 
 
 @contextmanager

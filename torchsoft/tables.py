@@ -165,7 +165,7 @@ def path(loc: tuple[int | str, ...], data: Any, there: bool) -> str:
 
 SMALL = re.compile(r"(?<![\w.'])0\.0000\d+|(?<![\w.'])\d{6,}\.0\b")
 COLUMN = 44
-"""Where comments of a written TOML file begin."""
+"""Column at which comments of a written TOML file begin."""
 
 SHORT = reprlib.Repr()
 SHORT.maxother = SHORT.maxstring = SHORT.maxlong = 40

@@ -233,7 +233,7 @@ class Watch(Trace):
         return result
 
     def _owners(self, nodes: Nodes) -> Nodes:
-        """Of every entry the point it belongs to, `NONE` or `MIXED`."""
+        """Point to which each entry belongs, `NONE` or `MIXED`."""
         found = [self.points(int(node)) for node in nodes.flatten()]
         each = [next(iter(one)) if len(one) == 1 else MIXED if one else NONE for one in found]
         return np.array(each, dtype=np.int64).reshape(nodes.shape)

@@ -256,7 +256,7 @@ class Fit:
 
     @property
     def kind(self) -> str:
-        """Of the material, as files call it."""
+        """Kind of the material in files."""
         return "prony" if self.measured.test == "relaxation" else "generalised_kelvin"
 
     @property
@@ -270,7 +270,7 @@ class Fit:
 
     @property
     def rms(self) -> float:
-        """Of the residual, over the largest answer."""
+        """Root mean square of the residual, over the largest answer."""
         return float(np.sqrt(np.mean(self.residual**2)) / np.abs(self.measured.answer).max())
 
     def table(self) -> dict[str, Any]:

@@ -124,4 +124,4 @@ PRESETS: Mapping[str, Preset] = {
         natural_rubber(60, 4.45e6),
     )
 }
-"""By name."""
+"""Presets by name."""

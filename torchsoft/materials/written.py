@@ -31,7 +31,7 @@ UNITS = {
 }
 
 FILES = ("material.toml", "summary.json", "fit.png")
-"""What is written."""
+"""Files that are written."""
 
 
 def write(

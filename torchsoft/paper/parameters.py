@@ -225,7 +225,7 @@ class Parameters(Table):
 
     @property
     def compression(self) -> float:
-        """How much the two pads together are compressed in the grasp [m]."""
+        """Compression of both pads together in the grasp [m]."""
         face = self.scenario.y_Br_grasp - self.bracket.cm_height
         return 2.0 * self.pad.height + 2.0 * self.disc.radius - face
 

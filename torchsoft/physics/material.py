@@ -35,7 +35,7 @@ Fractions = Annotated[
 Moduli = Annotated[Iterable[float], Quantity("Pa", 1.0, 1e13, "moduli that fade, one per tau")]
 
 TOO_MUCH = 1e-12
-"""By how much fractions that sum to one may exceed it: rounding."""
+"""Largest rounding error of fractions that sum to one."""
 
 
 class SlowBranch(nn.Module):

@@ -139,8 +139,8 @@ class Pad(nn.Module):
 
     @property
     def state_shape(self) -> tuple[int, ...]:
-        """Of its part of the state: displacements (nodes, 2), or forces that have set in (branches,
-        nodes, 2)."""
+        """Shape of the pad's part of the state: displacements (nodes, 2), or forces that have set
+        in (branches, nodes, 2)."""
         return (self.nodes, 2) if self.inertial else (self.branches, self.nodes, 2)
 
     def placed(self, own: Array) -> Array:

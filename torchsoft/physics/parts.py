@@ -222,7 +222,7 @@ class Actuator(nn.Module):
 
     @property
     def is_loop(self) -> bool:
-        """Whether it is the loop of one coordinate, which follows one set-point."""
+        """Whether the actuator is the loop of one coordinate, which follows one set-point."""
         return len(self.measures) == len(self.setpoints) == 1
 
     @property
@@ -246,7 +246,7 @@ class Actuator(nn.Module):
 
     @property
     def inputs(self) -> int:
-        """How many numbers the law sees."""
+        """Number of inputs of the law."""
         return 2 * len(self.setpoints) + 1 + 2 * len(self.measures)
 
     def seen(self, signals: Mapping[str, Tensor], state: State, batch: Sequence[int]) -> Tensor:

@@ -246,7 +246,7 @@ class Rig(Shown, nn.Module):
 
     @property
     def layout(self) -> Layout:
-        """Where everything stands in the state vector."""
+        """Layout of the state vector."""
         return Layout(
             pads={name: pad.state_shape for name, pad in self.pads.items()},
             stretch=self.point_counts,

@@ -26,8 +26,8 @@ class State(NamedTuple):
 
 
 class Layout:
-    """Where each part stands in the flat vector: pads, stretches, free coordinates, pads'
-    velocities, free velocities.
+    """Layout of the flat state vector: pads, stretches, free coordinates, pads' velocities, free
+    velocities.
 
     `size` is the vector's length; `slices` and `shapes` are by (part, name), with part one of
     State's fields; the free coordinates are ("pose", body) and ("velocity", body), `free` their

@@ -14,7 +14,7 @@ NUMBERS = ("E", "tau", "K_n", "K_t", "mu_s", "mu_k", "Kp", "Kd")
 
 
 def numbers(rig: Rig, owner: str, part: object, names: Iterable[str]) -> str:
-    """Some parameters of a part with their units."""
+    """Parameters of a part with their units."""
     shown = []
     for name in names:
         value = getattr(part, name, None)

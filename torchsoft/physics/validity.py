@@ -22,19 +22,19 @@ LARGEST = 1e100
 numbers."""
 
 MISSING = 1e-9
-"""By how much a material's fractions may miss one, or fall below zero: rounding."""
+"""Largest rounding error of a material's fractions."""
 
 DEPTHS = (1e-3, -1e-3)
 """Distances from the boundary, over the body's size, at which a shape is tried: outside and
 inside."""
 
 ALIKE = 1e-3
-"""By how much a shape's normal, the slope of its distance, and its reach (over its size) may differ
-from their exact values."""
+"""Largest error of a shape's normal, of the slope of its distance, and of its support over its
+size."""
 
 ALIKE_POINTS = 1e-9
-"""By how much slip rates of several points at once may differ from those of each alone, relatively:
-rounding."""
+"""Largest relative difference, by rounding, between slip rates of all points at once and of each
+alone."""
 
 EFFORTS, NORMALS = (1e-3, 0.1, 1.0, 10.0, 100.0), (0.0, 0.1, 1.0, 10.0)
 """Trial efforts and normal forces [N] at which a slip law is tried."""

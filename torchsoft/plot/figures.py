@@ -113,7 +113,7 @@ class _EmbeddedFonts(Figure):
     """A figure that is saved as `save` does, with text as text: journals refuse Type 3 fonts."""
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
-        """As matplotlib's."""
+        """`savefig` of matplotlib."""
         with rc_context({name: STYLE[name] for name in ("pdf.fonttype", "svg.fonttype")}):
             super().savefig(*args, **kwargs)
 

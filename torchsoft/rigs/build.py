@@ -130,7 +130,7 @@ class OutputsTable(Group):
 
 
 class SolverTable(Group):
-    """How steps are chosen: by tolerance, or equal ones."""
+    """Choice of steps: by tolerance, or equal ones."""
 
     rtol: Annotated[float, Quantity("1", 1e-9, 1e-1)] | None = Field(
         default=None, description="relative tolerance; 1e-5 if not given"

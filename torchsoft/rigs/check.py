@@ -297,8 +297,8 @@ TOUCH = 1e-6
 """Depth [m] up to which touching things do not count as overlapping."""
 
 LONGER, FARTHER, TURNED = 100.0, 10.0, 20 * np.pi
-"""How often a recorded motion is longer than the run, how often a set-point goes farther than the
-rig is large, and how far it turns [rad], from where units are in doubt."""
+"""Thresholds of doubt in units: duration of a recorded motion over that of the run, range of a
+set-point over the size of the rig, and turn of a set-point [rad]."""
 
 OUTPUTS_PER_PERIOD = 4
 """Fewest outputs in a period of a motion."""

@@ -70,7 +70,7 @@ TOUCH = "touch"
 
 
 class StartTable(Group):
-    """Where a body is when the run begins, and how it moves; for coordinates that are free."""
+    """Free coordinates and rates of a body when the run begins."""
 
     x: Place | None = Field(default=None, description="centre of mass, to the right")
     y: Annotated[float | str | None, NumberOr("m", REST, TOUCH, optional=True)] = Field(

@@ -27,7 +27,7 @@ from torchsoft.solve.trajectory import Trajectory
 
 
 class SamplesFailed(UserWarning):
-    """Some runs of a batch could not be carried out."""
+    """Warning that runs of a batch failed."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -91,7 +91,7 @@ class Batch(Shown):
 
     @property
     def mask(self) -> Tensor:
-        """Where there is something (runs, T)."""
+        """Mask (runs, T) of the samples that exist."""
         there = torch.tensor([0 if run is None else len(run.t) for run in self.trajectories])
         return torch.arange(max(self.lengths)) < there[:, None]
 

@@ -122,8 +122,9 @@ class Modes(NamedTuple):
 
 @torch.no_grad()
 def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
-    """Of a rig with massless pads about a state y (size,) at rest, pads settled, with the constant
-    `reference`; constant loads out of balance there do not matter, touching and sticking points do.
+    """Modes of a rig with massless pads about a state y (size,) at rest, pads settled, under a
+    constant `reference`. Unbalanced constant loads do not change them; touching and sticking points
+    do.
 
     Away from contact nodal forces and stretches fade by themselves, independently of the rest:
     those modes are left out. An angle counts by the radius of gyration.

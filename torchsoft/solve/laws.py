@@ -50,7 +50,7 @@ def copied(
 
 
 class _Called(nn.Module):
-    """Some modules, and a function of them and of x, from which a compiled law is traced."""
+    """Modules, and the function of them and of x from which a compiled law is traced."""
 
     def __init__(self, function: Callable[..., Tensor], **modules: Any) -> None:
         super().__init__()

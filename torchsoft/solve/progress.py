@@ -41,7 +41,7 @@ class Progress:
 
     @property
     def knots(self) -> Array:
-        """Where the steps began and ended [s] (steps + 1,); empty without any."""
+        """Times of the steps' begins and ends [s] (steps + 1,); empty without steps."""
         return np.concatenate([*self.starts, np.full(min(self.steps, 1), self.end)])
 
 

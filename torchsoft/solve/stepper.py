@@ -52,7 +52,7 @@ from torchsoft.solve.steps import (
 from torchsoft.solve.system import Compiled
 
 HALVINGS = 6
-"""How often a step that Newton does not solve is halved before the run is given up."""
+"""Most halvings of a step that Newton does not solve before the run fails."""
 
 FIRST, SHORTEST = 1e-3, 1e-9
 """Length [s] of the first step that tolerances try, and the shortest that they may choose."""

@@ -34,7 +34,7 @@ class Plan(NamedTuple):
     out_part: NDArray[np.float64]
 
     def part(self, first: int, end: int) -> "Plan":
-        """Some of the steps."""
+        """Steps from `first` up to `end`, without it."""
         rows = (self.out_step >= first) & (self.out_step < end)
         return Plan(
             self.starts[first:end],

@@ -105,7 +105,7 @@ class Compiled:
         return self._add(torch.cat([torch.zeros(0).double(), *values]))
 
     def _start(self, part: str) -> int:
-        """Where a part of the state begins."""
+        """Index at which a part of the state begins."""
         return min((s.start for (of, _), s in self.layout.slices.items() if of == part), default=0)
 
     def _make_bodies(self) -> Bodies:
@@ -134,7 +134,7 @@ class Compiled:
 
     @property
     def signal_count(self) -> int:
-        """How many signals the kernels follow, fixed coordinates included."""
+        """Number of signals of the kernels, fixed coordinates included."""
         return len(self.rig.signals) + len(self.rig.fixed_values)
 
     @independent()

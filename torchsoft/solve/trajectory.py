@@ -35,8 +35,8 @@ from torchsoft.solve.kernel.table import Array, Index
 
 @dataclass(frozen=True)
 class Stats:
-    """How the run went: steps, linear solves (Newton iterations), steps that Newton did not solve
-    and that were taken shorter, steps refused for their error, and wall time [s]."""
+    """Statistics of a run: steps, linear solves (Newton iterations), steps that Newton did not
+    solve and that were shortened, steps rejected for their error, and wall time [s]."""
 
     steps: int
     newton_iterations: int
@@ -399,8 +399,8 @@ class Touch:
 
     @cached_property
     def _arrays(self) -> dict[str, tuple[Any, Array]]:
-        """By the name of a contact or of taxels, their weights on the normal forces at all points
-        (., points), and their coordinates along the pad's surface."""
+        """Weights (., points) on the normal forces at all points, and coordinates along the pad's
+        surface, by the name of a contact or of taxels."""
         rig, first, out = self._rig, dict[str, int](), dict[str, tuple[Any, Array]]()
         places = {name: rig.pads[c.pad].point_coordinates for name, c in rig.contacts.items()}
         count = sum(map(len, places.values()))

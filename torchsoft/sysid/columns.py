@@ -174,7 +174,7 @@ def read_table(path: Path, ignore: Collection[str], known: Vocabulary) -> Column
 
 
 def hint(name: str, columns: int, names: Collection[str]) -> str:
-    """What helps with a column that is not known: the nearest name, and how to leave it out."""
+    """Remedy for an unknown column: the nearest name, and how to leave the column out."""
     known = f"columns are {enumerated(names)}, each with its unit in brackets"
     if columns == 1:
         return f"; separate columns with commas; {known}"

@@ -1,5 +1,4 @@
-"""What a TOML file states of an identification: what is known, what is unknown, and how good the
-sensors are."""
+"""Tables of an identification in TOML: knowns, unknowns, sensors, recordings and the fit."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -43,7 +42,7 @@ class Rest(Table):
 
 
 class Known(Table):
-    """What is known of a coordinate: mean and standard deviation [m, rad, m/s or rad/s]."""
+    """Prior knowledge of a coordinate: mean and standard deviation [m, rad, m/s or rad/s]."""
 
     mean: float = Field(ge=-1e6, le=1e6)
     sd: float = Field(ge=0, le=1e6)
@@ -102,9 +101,9 @@ class Law(Table):
 
 
 class Rehearsal(Table):
-    """Of a rehearsal: samples a second, the recordings' `duration` [s] (that of the rig file if not
-    given), the `seed` of the noise, and the factor by which the search begins `away` from the
-    truth."""
+    """Settings of a rehearsal: samples a second, the recordings' `duration` [s] (by default that
+    of the rig file), the `seed` of the noise, and the factor by which the search begins `away` from
+    the truth."""
 
     rate: float = Field(default=200.0, ge=1.0, le=1e5)
     duration: float | None = Field(default=None, ge=1e-2, le=1e4)
@@ -113,8 +112,8 @@ class Rehearsal(Table):
 
 
 class DesignTable(Table):
-    """Of a design of motions: settings of the rig file by the name of a candidate, `bounds` of
-    signals whose knots may move, `limits` (low, high) [SI] of channels, the `criterion` of the
+    """Settings of a design of motions: those of the rig file by the name of a candidate, `bounds`
+    of signals whose knots may move, `limits` (low, high) [SI] of channels, the `criterion` of the
     unknowns, or of the `parameters` alone."""
 
     candidates: dict[Name, dict[str, Any]] = Field(default_factory=dict)

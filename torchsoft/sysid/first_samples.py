@@ -183,8 +183,8 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float, load: float) -> 
 
 
 def yielding(rig: Rig, coordinate: str) -> float:
-    """How far a coordinate's loop gives way to a force [m/N or rad/N], at the moment arm of its
-    body for an angle; zero where no stiffness is known."""
+    """Compliance of a coordinate's loop [m/N or rad/N], at the moment arm of its body for an angle;
+    zero where no stiffness is known."""
     arm = reach(rig, *coordinate.split(".")) if coordinate.endswith(".theta") else 1.0
     gains = [
         actuator.law.Kp.item()

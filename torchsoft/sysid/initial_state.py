@@ -1,5 +1,5 @@
-"""Where the run of a recording begins: at rest in a known place, in a known state, or where some
-coordinates tell.
+"""Starts of recorded runs: at rest in a known place, in a known state, or at coordinates to be
+estimated.
 
 A start adds coordinates of its own to a problem, called `start.<body>.<axis>` and the like, each
 with a prior; their values travel with those of the parameters, and the state at the beginning is
@@ -29,7 +29,7 @@ Samples = Mapping[str, tuple[Array, Array]]
 """Times (k,) [s] and values (k,) by channel."""
 
 PREFIX = "start."
-"""How the names of a start's coordinates begin."""
+"""Prefix of the names of a start's coordinates."""
 
 SETTLE = 0.2
 """Time [s] that a disc at rest is given, before the first sample, to sink into the pad: twenty of
@@ -58,7 +58,7 @@ in these and in the parameters of the rig that it was made for."""
 
 
 class Start(Protocol):
-    """Says where a run begins. Its `repr` names everything that decides it."""
+    """Start of a run. Its `repr` names everything that decides it."""
 
     @property
     def lead(self) -> float:
@@ -126,7 +126,7 @@ class Standing(NamedTuple):
         )
 
     def place(self, coordinate: str) -> float:
-        """Where the body of a coordinate stands [m or rad]."""
+        """Stated value of a coordinate [m or rad]."""
         body, axis = coordinate.split(".")
         return self.bodies[body][0][COORDINATES.index(axis)]
 

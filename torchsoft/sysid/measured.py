@@ -43,22 +43,22 @@ from torchsoft.tables import line
 
 
 FARTHEST = 10.0
-"""How many times as far from the origin as anything of the rig a place may be."""
+"""Largest distance of a measured place from the origin, over that of any part of the rig."""
 
 LARGEST = {"rad": 100.0, "m/s": 10.0, "rad/s": 1e3, "N": 1e4, "N.m": 1e3}
 """Largest plausible values of other columns, by unit."""
 
 APART = {"m": 1e-3, "rad": 0.05}
-"""How far [m, rad] the first sample of a coordinate may be from the file's start, besides what its
-sensor does: a body may roll into a dent while it settles."""
+"""Largest distance [m, rad] of the first sample of a coordinate from the file's start, besides the
+sensor's error: a body may roll into a dent while it settles."""
 
 ASIDE = {"m": 3e-4, "rad": 0.05}
-"""How far [m, rad] the first set-point may be from the file's: a body that is pushed must not press
+"""Largest distance [m, rad] of the first set-point from the file's: a pushed body must not press
 already."""
 
 BEGINNING, CREEP = 10e-3, 20e-3
-"""For so long [s] nothing may move faster than this [m/s] besides what the file does: a body put
-down on a pad still settles."""
+"""Time [s] from the first sample during which coordinates may not exceed a speed [m/s] besides that
+of the file: a body put down on a pad still settles."""
 
 WAY_OUT = 'or say start = {kind = "moving"} for a recording that begins in motion or in mid-grasp'
 
@@ -237,9 +237,8 @@ def check_start(
 
 
 def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[float, float]:
-    """How fast [m/s] anything may move at the first sample by the rig file, with its start in
-    `state` and its motions; and how much faster a body that nothing holds gets from the start on
-    [m/s2]."""
+    """Largest speed [m/s] at the first sample by the rig file, with its start in `state` and its
+    motions; and acceleration [m/s2] of a body that nothing holds."""
     rig, lead = made.rig, made.start.lead
     around = torch.linspace(first - lead, first + BEGINNING, 51, dtype=torch.float64)
     with torch.no_grad():
@@ -262,8 +261,8 @@ CHECKED = 30
 """Runs that a recording is asked for to check what is taken for granted."""
 
 FEW, COLUMN = 8, 0.09
-"""So many unknowns are a few; what each one more adds to the time of a step that is
-differentiated."""
+"""Number of unknowns that are few, and the share by which each one more lengthens a differentiated
+step."""
 
 
 def cost(
@@ -274,9 +273,9 @@ def cost(
     heldout: tuple[str, ...] = (),
     method: str = "gauss_newton",
 ) -> Cost:
-    """Of `default_plan` where every stage takes all its evaluations, and of the checks before and
-    after it; descents on the adjoint take more of them, and memory for a matrix that interpolates
-    between the rows."""
+    """Cost of `default_plan` where every stage takes all its evaluations, and of the checks before
+    and after it; descents on the adjoint take more of them, and memory for a matrix that
+    interpolates between the rows."""
     fitted = [r for r in problem.recordings if r.name not in heldout]
     slowest = min(fitted, key=lambda r: r.speed)
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
@@ -310,7 +309,7 @@ def cost(
 
 
 def one_by_one(costs: Iterable[Cost]) -> Cost:
-    """Of several identifications, such as those of competing laws."""
+    """Cost of several identifications, such as those of competing laws."""
     every = list(costs)
     return Cost(
         sum(c.steps for c in every), sum(c.seconds for c in every), max(c.memory for c in every)
@@ -343,8 +342,8 @@ def stem(path: Path) -> str:
 def sources(
     data: Sequence[str | Path], config: Path, stated: Config
 ) -> dict[str, tuple[Entry, list[Path]]]:
-    """What is particular about every recording, and its files, by name. Raises `ValueError` for
-    names that do not fit."""
+    """Entry and files of every recording, by name. Raises `ValueError` for names that do not
+    fit."""
     own = {entry.name or stem(Path(entry.paths[0])): entry for entry in stated.recordings}
     files = [(stem(Path(file)), [Path(file)]) for file in data]
     files += [
@@ -436,7 +435,7 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
 
 
 def unreachable(error: Unreachable, tables: Mapping[str, Tables]) -> str:
-    """Which recording the model could not follow, and the row of its file where the run ended."""
+    """Recordings that the model could not follow, and rows of their files where the runs ended."""
     return "; ".join(
         f"{tables[name].near(lost.time)}: the model cannot follow recording `{name}` here: "
         f"{lost.reason}"

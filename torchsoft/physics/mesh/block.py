@@ -213,7 +213,7 @@ class FingertipMesh(FreeMesh):
 
     @property
     def layers(self) -> int:
-        """Of elements around the core."""
+        """Number of layers of elements around the core."""
         return max(1, round((1 - CORE) * self.elements_around / np.pi))
 
     @cached_property

@@ -22,7 +22,7 @@ MEMORY = 8.0
 Modulus = TypeVar("Modulus", float, Tensor)
 
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=np.float64)
-"""Of the square that an element is the image of."""
+"""Corners of the reference square of an element."""
 
 
 def lame_moduli(E: Modulus, nu: Modulus) -> tuple[Modulus, Modulus]:
@@ -171,7 +171,7 @@ class Mesh:
 
     @property
     def band(self) -> int:
-        """How far apart the numbers of one element's nodes are at the most."""
+        """Largest difference between node numbers of one element."""
         return int(np.ptp(self.elements, axis=1).max())
 
     @property

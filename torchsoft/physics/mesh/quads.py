@@ -32,7 +32,7 @@ IGNORED = {"line", "vertex"}
 """Kinds of cells beside the quadrilaterals."""
 
 FLAT = 1e-9
-"""How far the points may be from one plane, over the size of the mesh."""
+"""Largest distance of the points from one plane, over the size of the mesh."""
 
 LARGEST = 2e9
 """Size [B] of a mesh file at the most."""
@@ -126,8 +126,7 @@ class QuadMesh(FreeMesh):
 
     @cached_property
     def number(self) -> dict[int, int]:
-        """Of the nodes by their points' numbers: points that belong to no quadrilateral are left
-        out."""
+        """Node number by point number; points that belong to no quadrilateral are left out."""
         used, elements = np.unique(np.array(self.quads), return_inverse=True)
         order = in_band(np.array(self.points)[used], elements.reshape(-1, 4))
         return {int(used[old]): new for new, old in enumerate(order)}

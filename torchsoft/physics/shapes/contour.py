@@ -32,20 +32,20 @@ LEAST, STEEPEST = 8, np.radians(60)
 around a corner."""
 
 PIECES = (32, 64, 128, 256, 512)
-"""How many pieces a contour may have; as many are taken as its tolerance asks for."""
+"""Allowed numbers of pieces of a contour; the tolerance decides."""
 
 BETWEEN = 8
 """Places from point to point at which a contour is held against the spline through the points."""
 
 SHARPEST = 1e-2
-"""How far from a contour, over its size, the nearest point must at least be the only one."""
+"""Least distance from a contour, over its size, up to which the nearest point must be unique."""
 
 JUDGED = 1024
 """Number of points, about, at which a contour is judged."""
 
 EXACT = 1e-9
-"""How exact distances [m] and normals [1] must be found up to half as far as the nearest point is
-the only one."""
+"""Largest error of distances [m] and normals [1], up to half the distance at which the nearest
+point ceases to be unique."""
 
 
 class Contour(Outlined):
@@ -66,7 +66,7 @@ class Contour(Outlined):
 
     given: ClassVar = "points"
     POINTS = 6
-    """Of the quadrature along a piece: its moments are polynomials of degree 11."""
+    """Quadrature points along a piece, whose moments are polynomials of degree 11."""
 
     def __init__(self, points: object, *, tolerance: float = 1e-6) -> None:
         super().__init__()
@@ -203,8 +203,8 @@ class Pieces(Prepared):
     """Points of the contour at the most among which the nearest is looked for, and steps of
     Newton's method from there."""
     ROUNDING = 1e-9
-    """How far a step of Newton's method may lead beyond known bounds [pieces]; farther, it goes to
-    their middle."""
+    """Largest overshoot of known bounds by a step of Newton's method [pieces]; beyond it the step
+    goes to their middle."""
 
     cubics: Tensor
 

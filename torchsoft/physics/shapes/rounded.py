@@ -293,8 +293,8 @@ class Superellipse(Shape):
 
     ITERATIONS, SLIM = 8, 3
     ROUNDING = 1e-12
-    """How far a step of Newton's method may lead beyond known bounds [1]; farther, it goes to their
-    middle."""
+    """Largest overshoot of known bounds by a step of Newton's method [1]; beyond it the step goes
+    to their middle."""
 
     def __init__(self, a: HalfAxisX, b: HalfAxisY, n: Exponent) -> None:
         super().__init__()

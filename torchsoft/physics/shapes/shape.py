@@ -57,9 +57,8 @@ class Shape(nn.Module):
         raise NotImplementedError
 
     def support(self, direction: Tensor) -> Tensor:
-        """How far the body reaches along unit vectors (..., 2) of its own frame [m], shape (...).
-        Of a body that is not convex it is its convex hull's: where a plane that comes from outside
-        first touches."""
+        """Support function (...) [m]: extent of the body along unit vectors (..., 2) of its own
+        frame. A body that is not convex has that of its convex hull."""
         raise NotImplementedError
 
     def size(self) -> float:
@@ -206,10 +205,10 @@ def crossing(points: Array) -> bool:
 
 
 def reach(points: Array, normals: Array, curvature: Array) -> float:
-    """How far [m] from a smooth closed curve the nearest point on it is the only one, from points
-    of it (n, 2) [m], normals (n, 2) and curvature (n,) [1/m] there: the smallest radius of a circle
-    that touches it at one of the points and passes through another (Federer 1959, Curvature
-    measures, Theorem 4.18), or of curvature."""
+    """Reach [m] of a smooth closed curve: the distance up to which the nearest point on it is
+    unique. From points (n, 2) [m], normals (n, 2) and curvature (n,) [1/m]: the smallest radius of
+    curvature, or of a circle that touches the curve at one of the points and passes through another
+    (Federer 1959, Curvature measures, Theorem 4.18)."""
     to = points[None] - points[:, None]
     off = np.abs((to * normals[:, None]).sum(-1))
     np.fill_diagonal(off, 0.0)

@@ -220,8 +220,8 @@ def inertial_state(
 
 @compiled
 def load_cotangent(s: Any, z: Any, c: int, row: int) -> float:
-    """Of the load that contact c puts on coordinate `row` of its body and its pad's base. An
-    inertial pad's base is moved by the force in the pad."""
+    """Cotangent of the load of contact c on coordinate `row` of its body and its pad's base. The
+    base of an inertial pad is moved by the force in the pad."""
     if s.pad_v_start[s.contact_pad[c]] >= 0 and 3 <= row < 5:
         return 0.0
     return z.load[s.contact_coordinate[c, row]]

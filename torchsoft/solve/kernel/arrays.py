@@ -349,8 +349,8 @@ Work, Step, Cotangents, Tangents, Tape = KINDS.values()
 
 @table
 class Limits(NamedTuple):
-    """Of Newton's iteration: its tolerance [N], its iterations, and how near a point has to be
-    [m] to be looked at."""
+    """Limits of Newton's iteration: tolerance [N], iterations, and distance [m] within which
+    points take part."""
 
     tolerance: float
     max_iterations: int
@@ -359,8 +359,8 @@ class Limits(NamedTuple):
 
 @table
 class Outputs(NamedTuple):
-    """Of a run: output i lies at the part out_part[i] of the step out_step[i], where the signals
-    are signals[i].
+    """Outputs of a run: output i lies at the fraction out_part[i] of the step out_step[i], where
+    the signals are signals[i].
 
     Its state goes to y, its integrals to integrals, its forces to recorded (as `recorded_size`
     orders them); tape has one row an output, or none, each a stage of no length there, whose y it
@@ -473,7 +473,7 @@ class Forward(NamedTuple):
 
 
 def recorded_size(s: Any) -> int:
-    """How many forces one output has: (F_N, F_T) of every point, force and moment of every pad,
+    """Number of forces of one output: (F_N, F_T) of every point, force and moment of every pad,
     loads on all coordinates, in this order."""
     return 2 * len(s.point_X) + 3 * len(s.pad_base) + len(s.body_free)
 

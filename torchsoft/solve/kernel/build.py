@@ -93,7 +93,7 @@ OPTIONS: dict[str, Any] = {
     "nogil": True, "_nrt": False, "error_model": "numpy", "fastmath": {"contract", "reassoc"},
     "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
 }  # fmt: skip
-"""How numba compiles a kernel: nothing is allocated, counted or called from Python."""
+"""Options of numba for kernels: nothing is allocated, counted or called from Python."""
 
 
 def placeless(function: Any) -> Any:

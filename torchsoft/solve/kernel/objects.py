@@ -88,8 +88,9 @@ def digest(*sources: Path) -> str:
 
 
 def folders(name: str) -> list[Path]:
-    """Where the objects called `name` may lie: in TORCHSOFT_CACHE_DIR if that is set, else beside
-    the sources and in the user's cache. Read from all, written to the first that can be."""
+    """Folders of the objects called `name`: TORCHSOFT_CACHE_DIR if that is set, else beside the
+    sources and in the user's cache. Objects are read from all, and written to the first
+    possible."""
     if chosen := os.environ.get("TORCHSOFT_CACHE_DIR"):
         return [Path(chosen) / name]
     out = [HERE / "objects" / name]
@@ -121,7 +122,7 @@ def trusted(status: os.stat_result) -> bool:
 
 
 def checksum(path: Path, content: bytes) -> bytes:
-    """Of an object with its name and its folder's, so that none stands for another."""
+    """Checksum of an object, its name and that of its folder, so that none passes for another."""
     return sha256(f"{path.parent.name}/{path.name}\0".encode() + content).digest()
 
 

@@ -104,7 +104,7 @@ def passing(s: Any, w: Any) -> float:
 
 @compiled
 def next_end(t: float, wanted: float, stops: Array, shift: bool) -> float:
-    """Where the next step ends: at the next stop, half way to it, or after the wanted length."""
+    """End of the next step: at the next stop, half way to it, or after the wanted length."""
     if not shift:
         return t + wanted
     stop = np.searchsorted(stops, t, side="right")

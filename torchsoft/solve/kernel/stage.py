@@ -39,8 +39,8 @@ SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
 part of it."""
 
 ROUNDED = 10.0
-"""Where no shorter step lessens the mismatch, rounding has stopped Newton: so many tolerances are
-then enough."""
+"""Mismatch, in tolerances, that is accepted where rounding stops Newton's iteration: no shorter
+step lessens it."""
 
 
 @compiled
@@ -75,7 +75,7 @@ def actuate(
 
 @compiled
 def coordinates_at(s: Any, i: int) -> int:
-    """Where the coordinates begin among the inputs of actuator i."""
+    """Index of the first coordinate among the inputs of actuator i."""
     return 2 * (s.act_setpoint_start[i + 1] - s.act_setpoint_start[i]) + 1
 
 

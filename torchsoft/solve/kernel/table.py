@@ -94,5 +94,5 @@ def _packed(self: Any) -> Any:
 
 
 def address(one: Any) -> int:
-    """Where the words of a table are, for as long as the table lives."""
+    """Address of the words of a table, valid while the table lives."""
     return one.packed.buffer_info()[0]
