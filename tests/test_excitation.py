@@ -17,6 +17,7 @@ ROLL = {"kind": "slow_roll"}
         ({"motion": ROLL, "duration": 0.4},
          "duration = 0.4 s leaves no motion: grasp_time = 0.375 s and settle = 0.125 s"),
         ({"motion": {"kind": "chirp"}, "duration": 0.7}, "chirp needs more than 0.3 s after them"),
+        ({"motion": {"kind": "multi_sine"}, "duration": 1e5}, "makes more than 100000 periods"),
         ({"motion": {"kind": "strokes", "stroke_time": 1e-5}, "duration": 9.0},
         "motion.stroke_time = 1e-05 s makes more than"),
         ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}},

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp, apart
-from torchsoft.physics.motion import FADE, Knotted, Profile, Reference, Wave, Waves, wave
+from torchsoft.physics.motion import FADE, PERIODS, Knotted, Profile, Reference, Wave, Waves, wave
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.tables import LISTED, SEED, Table
 
@@ -64,6 +64,11 @@ class MultiSine(Table):
     components: int = Field(default=5, ge=1, le=50)
     seed: int = Field(default=0, ge=0, le=SEED)
 
+    @property
+    def fastest(self) -> float:
+        """Largest frequency [Hz]."""
+        return max(self.frequency)
+
 
 class Chirp(Table):
     """Sweeps in x and y from `start` to `end` [Hz], of amplitudes in m."""
@@ -73,6 +78,11 @@ class Chirp(Table):
     amplitude_y: Length = 1e-4
     start: Frequency = 0.3
     end: Frequency = 8.0
+
+    @property
+    def fastest(self) -> float:
+        """Largest frequency [Hz]."""
+        return max(self.start, self.end)
 
 
 class Press(Table):
@@ -150,6 +160,12 @@ class Excitation(Table):
             raise ValueError(
                 f"duration = {self.duration:g} s at motion.stroke_time = {motion.stroke_time:g} s "
                 f"makes more than {MOST} strokes; take fewer"
+            )
+        fastest = motion.fastest if isinstance(motion, MultiSine | Chirp) else 0.0
+        if fastest * (self.duration - since) > PERIODS:
+            raise ValueError(
+                f"duration = {self.duration:g} s at {fastest:g} Hz makes more than {PERIODS:g} "
+                "periods; take a lower frequency or a shorter time"
             )
         if isinstance(motion, Knots):
             last = since + max(

@@ -161,6 +161,10 @@ def wave(*columns: object) -> Wave:
     )
 
 
+PERIODS = 1e5
+"""Most periods of a wave in one run."""
+
+
 class Waves(Profile):
     """A profile with sines on top: sum of a sin(phi + 2 pi (f tau + r tau^2 / 2)), tau [s] being
     the time since `since`; faded in from there and out until `until` [s].

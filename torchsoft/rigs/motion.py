@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from torchsoft import csvfile
 from torchsoft.channels import UNITS
 from torchsoft.files import check_file
-from torchsoft.physics.motion import FADE, Piecewise, Profile, Sampled, Waves, wave
+from torchsoft.physics.motion import FADE, PERIODS, Piecewise, Profile, Sampled, Waves, wave
 from torchsoft.quantity import Quantity, Time
 from torchsoft.rigs.fields import Group, NumberOr
 from torchsoft.tables import LISTED, line, shown
@@ -27,9 +27,6 @@ HELD = "held"
 
 STROKES = 10_000
 """Most strokes of one motion."""
-
-PERIODS = 1e5
-"""Most periods of a wave in one run."""
 
 Value = Annotated[float | str, NumberOr("m, rad, N or N.m", START, HELD)]
 
