@@ -1,4 +1,4 @@
-"""A rig file as an environment of gymnasium."""
+"""A rig file as an environment of gymnasium; vectors of environments, and their pictures."""
 
 import math
 import warnings

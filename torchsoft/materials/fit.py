@@ -1,5 +1,5 @@
-"""A material fitted to a relaxation or creep test: nonnegative least squares on a grid of times,
-then the times themselves.
+"""Relaxation and creep tests, and the materials fitted to them: nonnegative least squares on a grid
+of times, then the times themselves.
 
 A relaxation test gives a relaxation series (`Prony`), a creep test a chain of Kelvin elements
 (`GeneralisedKelvin`), in how many terms Schwarz's criterion (BIC) says. The residuals count alike

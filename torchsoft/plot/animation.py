@@ -1,4 +1,4 @@
-"""Videos: bodies, deformed pads with their stress and contact forces over a whole run."""
+"""Videos and interactive players: bodies, deformed pads and contact forces over a whole run."""
 
 import base64
 import importlib.util

@@ -1,7 +1,7 @@
 """Checks of a rig file before any run; each finding has a severity, a field and a sentence.
 
-Each check here is a function of the estimated course of the bodies. Checks in static
-equilibrium are those at some moments.
+They are made in static equilibrium at some moments of the motions, and along the estimated course
+of the bodies.
 """
 
 import itertools

@@ -1,5 +1,5 @@
 """A rig file as TOML text: every field with its unit and meaning from the schema as a comment;
-fields at their default are commented out."""
+fields at their default are commented out. Fields by dotted names."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""Results of a simulation: times, states, nodal forces, efforts, energies, and their origin."""
+"""Results of a simulation: times, states, nodal forces, efforts, energies, channels of touch, and
+their origin."""
 
 from __future__ import annotations
 

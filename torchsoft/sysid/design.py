@@ -1,4 +1,5 @@
-"""Optimal design of motions: the knots of set-points, moved by gradient."""
+"""Optimal design of motions: a ranking of candidates, and knots of set-points moved by gradient;
+rehearsal of an experiment."""
 
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,4 +1,5 @@
-"""Interface of a pad's mesh, and its element, a bilinear quadrilateral."""
+"""Interface of a pad's mesh; its element, a bilinear quadrilateral, its stiffness and
+compliance."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

@@ -1,8 +1,8 @@
-"""Bodies with flat sides and rounded corners: boxes and polygons.
+"""Shapes of a few numbers: rounded boxes and polygons, circles, ellipses and superellipses.
 
-Their boundaries are segments and arcs that continue each other's tangents. Distance and normal are
-exact wherever the nearest point is the only one, in particular down to the corners' radius; the
-curvature jumps where an arc begins.
+Boundaries of boxes and polygons are segments and arcs that continue each other's tangents. Distance
+and normal are exact wherever the nearest point is the only one, in particular down to the corners'
+radius; the curvature jumps where an arc begins.
 """
 
 from typing import Annotated, ClassVar, NamedTuple
