@@ -254,7 +254,7 @@ def resting(
         step = torch.linalg.solve(K + own, F - U[:, lost] @ along[lost])
         if float(step.norm()) <= residual:
             inverse = (V.mT[:, ~lost] / S[~lost]) @ U.mT[~lost]
-            return poses(q + inverse @ loads(q) if torch.is_grad_enabled() else q)
+            return poses(q + inverse @ (loads(q) if torch.is_grad_enabled() else F))
         path.append((size, q))
         q = q + step
     worst = int(F.abs().argmax())

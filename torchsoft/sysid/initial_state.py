@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 Samples = Mapping[str, tuple[Array, Array]]
 """Times (k,) [s] and values (k,) by channel."""
 
+BALANCED = 1e-8
+"""Last step of the search for a body at rest [m]; its convergence is quadratic."""
+
 PREFIX = "start."
 """Prefix of the names of a start's coordinates."""
 
@@ -147,7 +150,9 @@ class Standing(NamedTuple):
                     pose[body] = pose[body] + (place - self.place(name)) * row
             try:
                 if self.rests:
-                    pose = resting(rig, pose, self.rests, signals=still, actuators=())
+                    pose = resting(
+                        rig, pose, self.rests, signals=still, actuators=(), residual=BALANCED
+                    )
                 found = rig.unpack(standing(rig, pose))
             except NoEquilibrium as error:
                 raise SimulationFailed(f"the run cannot begin there: {error}", at) from None
