@@ -197,10 +197,10 @@ def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
         if wanted and value.requires_grad
         else ()
     )
-    for k, part in enumerate(pulled):
-        if part is not None and part.requires_grad:
-            (row,) = torch.autograd.grad(part, weights, retain_graph=True)
-            out[..., k] = row.numpy()
+    if own := [k for k, part in enumerate(pulled) if part is not None and part.requires_grad]:
+        each = [*torch.eye(len(own), dtype=torch.float64)]
+        rows = torch.autograd.grad([pulled[k] for k in own], weights, each, is_grads_batched=True)
+        out[..., own] = rows[0].movedim(0, -1).numpy()
     return out
 
 
