@@ -24,6 +24,7 @@ from torchsoft.sysid import (
     Unreachable,
     identify,
     record,
+    runs,
     sensitivity,
 )
 from torchsoft.sysid.assumptions import assumptions
@@ -294,6 +295,30 @@ def test_the_error_of_a_jacobian_is_that_along_a_standard_deviation():
     rough = exact + np.array([[0, 0, 0], [2.0, 0, 0], [0, 0, 9.0]])
     assert jacobian_error(exact, exact) == 0
     assert jacobian_error(rough, exact) == pytest.approx(0.2)
+
+
+def test_recordings_that_begin_alike_share_their_start(strokes, monkeypatch):
+    """To the bit as each by itself."""
+    started, inner = list[object](), runs.initial_state
+
+    def counted(*given):
+        started.append(given)
+        return inner(*given)
+
+    monkeypatch.setattr(runs, "initial_state", counted)
+    twin = replace(strokes, name="twin")
+    later = replace(strokes, name="later", start=strokes.start._replace(lead=0.3))
+    unknowns = {"pad.E": Unknown(nominal=1.1e6), "pad.tau": Unknown()}
+
+    def rows(*recordings):
+        problem = Problem(recordings, SENSORS, unknowns)
+        x, free = problem.coordinates.start, problem.coordinates.free
+        return problem.residuals(Runner(recordings), x, problem.names, 1e-3, free)
+
+    found, alone = rows(strokes, twin, later), [rows(strokes), rows(strokes), rows(later)]
+    assert len(started) == 2
+    np.testing.assert_array_equal(found.r, np.concatenate([one.r for one in alone]))
+    np.testing.assert_array_equal(found.J, np.concatenate([one.J for one in alone]))
 
 
 def test_interrupted_it_continues_and_ends_the_same(strokes, tmp_path, monkeypatch):

@@ -156,7 +156,7 @@ def test_what_is_done_is_kept_at_an_interruption(tmp_path, monkeypatch, count):
     jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(4)]
     running = threading.Barrier(count)
 
-    def made(recording: Any, start: Any, job: Job) -> Prediction:
+    def made(recording: Any, begun: Any, job: Job, start: Any) -> Prediction:
         if job is jobs[0] or (job is jobs[1] and count == 2):
             running.wait()
         if job is jobs[count - 1]:
@@ -165,7 +165,8 @@ def test_what_is_done_is_kept_at_an_interruption(tmp_path, monkeypatch, count):
         return PREDICTION
 
     monkeypatch.setattr(runs, "simulated", made)
-    recordings: Any = [SimpleNamespace(fingerprint="a", duration=1.0, begin=lambda: None)]
+    one = {"beginning": "", "fingerprint": "a", "duration": 1.0, "begin": lambda: None}
+    recordings: Any = [SimpleNamespace(**one)]
     with pytest.raises(KeyboardInterrupt):
         Runner(recordings, workers=count, journal=tmp_path).run(jobs)
     again = Journal(tmp_path, recordings)

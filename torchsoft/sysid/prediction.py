@@ -265,9 +265,11 @@ channels) and by the nuisances."""
 
 @torch.no_grad()
 def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
-    """Set parameters of the rig, by the names of `Rig.parameter`."""
+    """Set parameters of the rig, by the names of `Rig.parameter`; coordinates of a start are left
+    out."""
     for name, value in values.items():
-        rig.parameter(name).fill_(value)
+        if not name.startswith(PREFIX):
+            rig.parameter(name).fill_(value)
 
 
 class Run(NamedTuple):
@@ -281,9 +283,7 @@ class Run(NamedTuple):
 
 def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str]) -> Run:
     """Set the rig's parameters, and make its initial state, differentiable by `names`."""
-    set_parameters(
-        begun.rig, {name: value for name, value in values.items() if not name.startswith(PREFIX)}
-    )
+    set_parameters(begun.rig, values)
     at = {
         name: torch.tensor(value, dtype=torch.float64, requires_grad=name in names)
         for name, value in values.items()
@@ -326,16 +326,29 @@ def choice(steps: Steps) -> dict[str, Any]:
     return chosen | {"tolerance": TOLERANCE}
 
 
+def initial_state(
+    begun: RunContext, values: Mapping[str, float], names: Sequence[str]
+) -> tuple[Tensor, Tensor]:
+    """Initial state y0 (size,) of a run, and its derivatives (size, n) by `names`. Raises
+    `SimulationFailed`."""
+    run = prepared(begun, values, names)
+    return run.y0.detach(), torch.from_numpy(directions(run.y0, run.wanted))
+
+
 def predict(
-    begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps
-) -> Prediction:
-    """Signals on the grid, and their derivatives by `names`, if any. Raises `SimulationFailed`."""
-    rig, run, keys = begun.rig, prepared(begun, values, names), begun.channels
+    begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps,
+    start: tuple[Tensor, Tensor] | None = None,
+) -> Prediction:  # fmt: skip
+    """Signals on the grid, and their derivatives by `names`, if any. `start` is the
+    `initial_state`, if known. Raises `SimulationFailed`."""
+    rig, keys = begun.rig, begun.channels
+    y0, dy0 = start or initial_state(begun, values, names)
+    set_parameters(rig, values)
     touch = [key for key in keys if key not in measurable(rig)] if names else ()
-    dy0 = torch.from_numpy(directions(run.y0, run.wanted)) if names else None
+    wrt = tuple(name for name in names if not name.startswith(PREFIX))
     out = simulate(
-        rig, grid.t, y0=run.y0, gradient="forward" if names else "none", wrt=run.parameters,
-        dy0=dy0, rigid=bool(names), touch=touch, **choice(steps),
+        rig, grid.t, y0=y0, gradient="forward" if names else "none", wrt=wrt,
+        dy0=dy0 if names else None, rigid=bool(names), touch=touch, **choice(steps),
     )  # fmt: skip
     rows = slice(grid.early, None)
     slopes = derivatives(rig, out, keys)[rows] if names else None

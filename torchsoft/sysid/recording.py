@@ -167,6 +167,12 @@ class Recording:
         return Grid(torch.from_numpy(np.append([begin] * early, t)), early)
 
     @cached_property
+    def beginning(self) -> str:
+        """Checksum of everything that determines the initial state, besides the unknowns."""
+        signals = self.rig.follow(self.times[0] - self.start.lead).detach().numpy().tobytes()
+        return sha256(identity(self.rig) + signals + repr(self.start).encode()).hexdigest()
+
+    @cached_property
     def fingerprint(self) -> str:
         """Checksum of everything that determines a run or a residual of this recording."""
         t = torch.from_numpy(np.linspace(self.times[0] - self.start.lead, self.times[-1], 2000))

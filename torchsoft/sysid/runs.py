@@ -8,13 +8,16 @@ another run, is made again.
 import io
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from torchsoft.cost import steps_per_second
 from torchsoft.files import CHECKPOINT, SEALED, check_file, make_folder, remove_partials, replacing
@@ -30,6 +33,7 @@ from torchsoft.sysid.prediction import (
     Readout,
     Signals,
     Steps,
+    initial_state,
     misfit,
     predict,
 )
@@ -183,6 +187,9 @@ class Runner:
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.gradients = self.remembered = 0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
+        beginnings = {recording.beginning for recording in self.recordings}
+        self._alike, self._lock = len(beginnings) < len(self.recordings), Lock()
+        self._starts: dict[Any, tuple[Tensor, Tensor]] = {}
         self._idle: list[list[RunContext]] = [
             [] for _ in self.recordings
         ]  # models that no thread is using
@@ -193,6 +200,7 @@ class Runner:
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
+        self._starts = {}
         out = [self._journal.recall(job) if self._journal is not None else None for job in jobs]
         for job, result in zip(jobs, out):
             self._count(job, result is not None)
@@ -212,11 +220,20 @@ class Runner:
             begun = idle.pop()
         except IndexError:
             begun = self.recordings[job.recording].begin()
-        result = simulated(self.recordings[job.recording], begun, job)
+        start = partial(self._start, begun, job) if self._alike else None
+        result = simulated(self.recordings[job.recording], begun, job, start)
         idle.append(begun)
         if self._journal is not None:
             self._journal.keep(job, result)
         return result
+
+    def _start(self, begun: RunContext, job: Job) -> tuple[Tensor, Tensor]:
+        """The initial state of a run, computed once for recordings that begin alike."""
+        key = self.recordings[job.recording].beginning, repr((job.values, job.names))
+        with self._lock:
+            if key not in self._starts:
+                self._starts[key] = initial_state(begun, job.values, job.names)
+            return self._starts[key]
 
     def _length(self, job: Job) -> float:
         """Steps of a run [1], estimated where a tolerance chooses them."""
@@ -234,12 +251,16 @@ class Runner:
             self.simulations += 1
 
 
-def simulated(recording: Recording, begun: RunContext, job: Job) -> Any:
-    """A `Prediction`, a `Misfit`, or a `FailedRun`, with a rig that no other thread uses."""
+def simulated(
+    recording: Recording, begun: RunContext, job: Job,
+    start: Callable[[], tuple[Tensor, Tensor]] | None = None,
+) -> Any:  # fmt: skip
+    """A `Prediction`, a `Misfit`, or a `FailedRun`, with a rig that no other thread uses; `start`
+    computes the initial state."""
     run = begun, job.values, recording.grid(job.interpolated), job.names, job.steps
     try:
         if job.judged is None:
-            return predict(*run)
+            return predict(*run, start() if start is not None else None)
         return misfit(*run, lambda signals: judge(recording, job.judged or (), signals))
     except SimulationFailed as failure:
         return FailedRun(failure.reason, failure.time)
