@@ -35,7 +35,7 @@ def timed(name: str, solve) -> None:
     (1e9 * y[-1, height]).backward()
     slope = float(model.parameter("contact.K_n").grad) * 1.2e5
     wall = time.perf_counter() - began
-    moved = 1e9 * float(y[-1, height] - y0[height])
+    moved = 1e9 * float((y[-1, height] - y0[height]).detach())
     print(f"{name:20s} moved by {moved:.0f} nm, slope by ln(K_n) {slope:+.0f} nm, {wall:.2f} s")
     walls[name] = wall
 

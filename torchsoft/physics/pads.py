@@ -20,7 +20,15 @@ from torch import Tensor, nn
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.material import Material
-from torchsoft.physics.mesh import Array, Mesh, dofs_of, lame_moduli, unit_compliance, unit_loads
+from torchsoft.physics.mesh import (
+    Array,
+    Mesh,
+    dofs_of,
+    lame_moduli,
+    lame_slopes,
+    unit_compliance,
+    unit_loads,
+)
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Length, Quantity, Ratio, quantities
 
@@ -210,12 +218,15 @@ class Pad(nn.Module):
 
     def static_displacement(self, F: Tensor) -> Tensor:
         """Displacements (nodes, 2) [m] of an inertial pad's nodes under forces F (surface, 2) [N]
-        on its surface, with their derivative by E, depth and F; the one by nu is left out."""
-        K = self.stiffness(*lame_moduli(1.0, self.material.nu.item())).tocsc()
+        on its surface; their derivative by nu is exact to first order."""
+        nu = self.material.nu
+        K = splu(self.stiffness(*lame_moduli(1.0, nu.item())).tocsc())
         loads = unit_loads(2 * self.nodes, dofs_of(self.surface.numpy()))
-        everywhere = torch.from_numpy(splu(K).solve(loads))
-        u = everywhere @ F.flatten() / (self.E * self.material.depth)
-        return u.unflatten(0, (-1, 2))
+        u = torch.from_numpy(K.solve(loads)) @ F.flatten()
+        if nu.requires_grad and torch.is_grad_enabled():
+            slope = -K.solve(self.stiffness(*lame_slopes(nu.item())) @ u.detach().numpy())
+            u = u + torch.from_numpy(slope) * (nu - nu.detach())
+        return (u / (self.E * self.material.depth)).unflatten(0, (-1, 2))
 
     def elastic_force(self, u: Tensor) -> Tensor:
         """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape

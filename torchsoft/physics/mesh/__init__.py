@@ -14,6 +14,7 @@ from torchsoft.physics.mesh.mesh import (
     banded,
     dofs_of,
     lame_moduli,
+    lame_slopes,
     unit_compliance,
     unit_loads,
 )
@@ -21,5 +22,6 @@ from torchsoft.physics.mesh.quads import QuadMesh
 
 __all__ = [
     "Array", "CurvedPadMesh", "FingertipMesh", "Mesh", "PadMesh", "QuadMesh",
-    "StoredMesh", "banded", "dofs_of", "lame_moduli", "unit_compliance", "unit_loads",
+    "StoredMesh", "banded", "dofs_of", "lame_moduli", "lame_slopes", "unit_compliance",
+    "unit_loads",
 ]  # fmt: skip

@@ -325,14 +325,19 @@ def unit_loads(size: int, dofs: Index) -> Array:
     return loads
 
 
+def lame_slopes(nu: float) -> tuple[float, float]:
+    """Derivatives by nu of the Lame moduli for E = 1."""
+    with torch.inference_mode(False), torch.enable_grad():
+        nu_ = torch.tensor(nu, dtype=torch.float64, requires_grad=True)
+        both = lame_moduli(torch.ones_like(nu_), nu_)
+        first, second = (torch.autograd.grad(x, nu_, retain_graph=True)[0].item() for x in both)
+    return first, second
+
+
 @lru_cache(maxsize=16)
 def unit_compliance(mesh: Mesh, nu: float) -> tuple[Array, Array]:
     """Displacements of the surface per force on it, (K^-1)_ss for E depth = 1, and their derivative
     by nu, -K^-1 (dK/dnu) K^-1, both (2 surface, 2 surface)."""
     surface = dofs_of(mesh.surface)
     X = solved(mesh.stiffness(*lame_moduli(1.0, nu)), unit_loads(2 * len(mesh.free), surface))
-    with torch.inference_mode(False), torch.enable_grad():
-        nu_ = torch.tensor(nu, dtype=torch.float64, requires_grad=True)
-        moduli = lame_moduli(torch.ones_like(nu_), nu_)
-    slopes = (torch.autograd.grad(x, nu_, retain_graph=True)[0].item() for x in moduli)
-    return X[surface], -(X.T @ (mesh.stiffness(*slopes) @ X))
+    return X[surface], -(X.T @ (mesh.stiffness(*lame_slopes(nu)) @ X))
