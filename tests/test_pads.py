@@ -98,6 +98,15 @@ def test_condensed_compliance_is_the_surface_block_of_the_full_inverse(place):
             massless.nodes, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64
         )
         extended = inertial.static_displacement(forces).flatten().numpy()
+    slopes = [
+        torch.autograd.grad((w * u).sum(), pad.material.nu)[0]
+        for w in [torch.arange(2.0 * massless.nodes).reshape(-1, 2)]
+        for pad, u in (
+            (massless, (massless.compliance() @ forces.flatten()).reshape(-1, 2)),
+            (inertial, inertial.static_displacement(forces)[inertial.surface]),
+        )
+    ]
+    assert slopes[0].item() == pytest.approx(slopes[1].item(), rel=1e-9)
     assert np.abs(condensed - full[surface][:, surface]).max() < SOLVED * scale
     assert np.abs(
         extended - full[everywhere][:, surface] @ forces.flatten().numpy()

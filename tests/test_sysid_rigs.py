@@ -257,7 +257,7 @@ def test_a_grasp_in_mid_air_says_that_its_poses_are_to_be_measured():
     tried in vain."""
     sensors = {name: Sensor(noise=sd) for name, sd in SENSORS.items()}
     built = coarse(outputs={"duration": 2.0, "snapshots": []}).build()
-    made = record("lift", built, TRUTH, sensors, seed=1)
+    made = record("lift", built, TRUTH, sensors, seed=3)
     late = {c: (t[t >= 0.8], y[t >= 0.8]) for c, (t, y) in made.samples.items()}
     begun = estimate_initial_state(replace(made, samples=late), sensors)
     problem = Problem([begun], sensors, {name: Unknown() for name in TRUTH})
@@ -267,7 +267,7 @@ def test_a_grasp_in_mid_air_says_that_its_poses_are_to_be_measured():
     assert not result.converged
     assert len(result.stages) <= 7
     (said,) = result.notices
-    assert "not smooth in start." in said
+    assert re.search(r"not smooth in .*start\.right\.x", said)
     assert "measure every coordinate of the bodies when the recording begins" in said
 
 
