@@ -29,12 +29,20 @@ from torchsoft.sysid import (
 )
 from torchsoft.sysid.assumptions import assumptions
 from torchsoft.sysid.fit import (
+    Fit,
     descend,
     gauss_newton,
     newton_step,
     standard_deviations,
 )
-from torchsoft.sysid.plan import default_plan, jacobian_error, sobol, tie_ratios, visible
+from torchsoft.sysid.plan import (
+    default_plan,
+    jacobian_error,
+    run_plan,
+    sobol,
+    tie_ratios,
+    visible,
+)
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.runs import Runner
@@ -433,6 +441,28 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
     first = iter([True])
     with pytest.raises(Unreachable, match=r"recording `strokes`: at t = 0.5 s: no"):
         identify(problem, plan=other)
+
+
+def test_another_stage_that_cannot_begin_there_begins_where_the_plan_did(strokes, monkeypatch):
+    """One that has other coordinates or recordings; it is refused only if it fails there, too."""
+    begun: list[list[float]] = []
+
+    def simulated(problem, runner, stage, x, *_: Any):
+        begun.append(list(x))
+        if stage.name in failing and x[0] == failing[stage.name]:
+            raise Unreachable({"strokes": FailedRun("no", 0.5)})
+        return Fit(x + 1.0, 1.0, 1, True, {}, None)
+
+    monkeypatch.setattr("torchsoft.sysid.plan.run_stage", simulated)
+    stages = [Stage(name, ("strokes",), (name,), 1e-3) for name in ("one", "two", "three")]
+    failing = {"two": 1.0}
+    end = run_plan(strokes, None, stages, np.zeros(2))
+    assert begun == [[0.0, 0.0], [1.0, 1.0], [0.0, 0.0], [1.0, 1.0]]
+    assert end.lost is None
+    assert [entry["name"] for entry in end.entries] == ["one", "two", "three"]
+    failing = {"one": 0.0}
+    with pytest.raises(Unreachable, match="recording `strokes`"):
+        run_plan(strokes, None, stages, np.zeros(2))
 
 
 @pytest.mark.parametrize(

@@ -215,25 +215,23 @@ def run_plan(
     """Fit stage after stage, each from the end of the one before, the first from x.
 
     A stage that cannot be simulated where the one before it ended, and repeats it by a finer
-    tolerance, ends the plan. Raises `Unreachable` where another stage cannot be simulated, and
-    `ValueError` for a plan without stages.
+    tolerance, ends the plan; any other begins again from x. Raises `Unreachable` where it cannot be
+    simulated there, and `ValueError` for a plan without stages.
     """
     end: PlanEnd | None = None
     for number, stage in enumerate(plan):
         began = clock.perf_counter()
-        try:
-            with progress_bar(f"{label}{number + 1}/{len(plan)} {stage.name}", progress) as bar:
-                fit = run_stage(
-                    problem, runner, stage, end.fit.x if end is not None else x, loss, method,
-                    seed + number, notify or bar,
-                )  # fmt: skip
-        except Unreachable as lost:
-            if end is None or (stage.recordings, stage.free) != (
-                end.stage.recordings,
-                end.stage.free,
-            ):
-                raise
-            return end._replace(lost=lost)
+        with progress_bar(f"{label}{number + 1}/{len(plan)} {stage.name}", progress) as bar:
+            rest = loss, method, seed + number, notify or bar
+            try:
+                begin = end.fit.x if end is not None else x
+                fit = run_stage(problem, runner, stage, begin, *rest)
+            except Unreachable as lost:
+                if end is None:
+                    raise
+                if (stage.recordings, stage.free) == (end.stage.recordings, end.stage.free):
+                    return end._replace(lost=lost)
+                fit = run_stage(problem, runner, stage, x, *rest)
         entry = stage_entry(stage.name, stage, stage.rtol, fit, began, clock.perf_counter())
         end = PlanEnd(fit, stage, [*end.entries, entry] if end is not None else [entry])
     if end is None:
