@@ -105,7 +105,7 @@ SMOKE = {
 
 def check(part: Residuals) -> Residuals:
     """Raises `SimulationFailed` where there are none."""
-    for lost in part.lost.values():
+    for lost in part.failed.values():
         raise SimulationFailed(lost.reason, lost.time)
     return part
 

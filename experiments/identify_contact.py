@@ -75,8 +75,8 @@ class FiniteDifferences(Problem):
         J = np.zeros((len(at.r), len(x)))
         for i, one in zip(np.flatnonzero(free), ahead):
             J[:, i] = (one.r - at.r) / step[i]
-        lost = at.lost | {name: loss for one in ahead for name, loss in one.lost.items()}
-        return Residuals(at.r, J, lost)
+        failed = at.failed | {name: run for one in ahead for name, run in one.failed.items()}
+        return Residuals(at.r, J, failed)
 
 
 def excitations(config: Config) -> dict[str, Excitation]:

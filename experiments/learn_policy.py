@@ -229,7 +229,7 @@ def walk(env: RigEnv, policy: nn.Module, critic: nn.Module, moment: Any, horizon
             observed = after[:SEEN]
         except (SimulationFailed, np.linalg.LinAlgError):
             failed = True
-        rewards.append(torch.tensor(env.lost).double() if failed else reward)
+        rewards.append(torch.tensor(env.failure_reward).double() if failed else reward)
         values.append(torch.zeros(()).double() if failed else critic(observed)[0])
         if failed or now.steps >= env.limit:
             now = begun(env)

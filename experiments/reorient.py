@@ -31,7 +31,7 @@ from torchsoft.experiment import markdown, numbers, options, write
 from torchsoft.physics.energy import SLIPPING
 from torchsoft.plan import Plan
 from torchsoft.plan.planning import kept
-from torchsoft.plan.problem import Evaluator, Look, Terms, Variables
+from torchsoft.plan.problem import Evaluation, Evaluator, Terms, Variables
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.goal import Goal, Range, drawn, plan_file
 
@@ -138,23 +138,23 @@ def planner(file: RigFile, stated: Goal, over: Any = None, y0: Any = None) -> Ev
     )  # fmt: skip
 
 
-def errors(look: Look) -> dict[str, float]:
+def errors(evaluation: Evaluation) -> dict[str, float]:
     """How far a run is off: angle [degrees], place [mm], grip below its limit [N]."""
-    if look.lost:
+    if evaluation.failure:
         return dict.fromkeys(("angle_deg", "place_mm", "grip_N"), math.inf)
-    turn, x, y = look.errors[0].tolist()
+    turn, x, y = evaluation.errors[0].tolist()
     return {
         "angle_deg": abs(turn) * math.degrees(ANGLE), "place_mm": 1e3 * PLACE * math.hypot(x, y),
-        "grip_N": max(0.0, float(look.excess[0].max()) * GRIP),
+        "grip_N": max(0.0, float(evaluation.excess[0].max()) * GRIP),
     }  # fmt: skip
 
 
-def rated(look: Look) -> float:
+def rated(evaluation: Evaluation) -> float:
     """One number of a run for searches without constraints."""
-    if look.lost:
+    if evaluation.failure:
         return 1e6
-    over = np.maximum(look.excess, 0.0)
-    return float(0.5 * np.square(look.errors).sum() + 30.0 * 1e4 * np.square(over).sum())
+    over = np.maximum(evaluation.excess, 0.0)
+    return float(0.5 * np.square(evaluation.errors).sum() + 30.0 * 1e4 * np.square(over).sum())
 
 
 class TimeOver(Exception):
@@ -165,18 +165,18 @@ def rival(method: str, file: RigFile, stated: Goal, seconds: float) -> dict[str,
     """What finite differences or CMA-ES reach in so many seconds."""
     evaluator = planner(file, stated)
     variables, began = evaluator.variables, perf_counter()
-    best: tuple[float, Look] | None = None
+    best: tuple[float, Evaluation] | None = None
 
-    def look(z: NDArray[np.float64]) -> Look:
+    def evaluate(z: NDArray[np.float64]) -> Evaluation:
         nonlocal best
         if best is not None and perf_counter() - began > seconds:
             raise TimeOver
-        found = evaluator.look(variables.nearest(z), gradient=False)
+        found = evaluator.evaluate(variables.nearest(z), gradient=False)
         if best is None or rated(found) < best[0]:
             best = rated(found), found
         return found
 
-    cost: Callable[[NDArray[np.float64]], float] = lambda z: rated(look(z))
+    cost: Callable[[NDArray[np.float64]], float] = lambda z: rated(evaluate(z))
     try:
         if method == "finite differences":
             minimize(
@@ -190,7 +190,7 @@ def rival(method: str, file: RigFile, stated: Goal, seconds: float) -> dict[str,
     except TimeOver:
         pass
     assert best is not None
-    return errors(best[1]) | {"runs": evaluator.looks}
+    return errors(best[1]) | {"runs": evaluator.evaluations}
 
 
 def row(found: Plan) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def row(found: Plan) -> dict[str, Any]:
     return {
         "reached": found.reached, "angle_deg": abs(e["turn"]) * math.degrees(ANGLE),
         "place_mm": 1e3 * PLACE * math.hypot(e["x"], e["y"]),
-        "evaluations": found.made_by["looks"], "seconds": found.made_by["wall_s"],
+        "evaluations": found.made_by["evaluations"], "seconds": found.made_by["wall_s"],
         "seconds_to_reach": None if first is None else first.seconds, "slipping": slips,
         "reasons": list(found.reasons), "notices": list(found.notices),
     }  # fmt: skip
@@ -227,9 +227,13 @@ def uncertain(config: Config) -> dict[str, Any]:
     for name, stated in (("nominal", plain), ("robust", robust)):
         found = plan_file(file, stated)
         there = planner(found.file, stated, over, y0)
-        looks = there.look(there.variables.start, gradient=False)
-        held = kept(looks)[1:]
-        rms = np.sqrt(np.square(looks.errors[1:]).mean(0)) if not looks.lost else [math.inf] * 3
+        evaluation = there.evaluate(there.variables.start, gradient=False)
+        held = kept(evaluation)[1:]
+        rms = (
+            np.sqrt(np.square(evaluation.errors[1:]).mean(0))
+            if not evaluation.failure
+            else [math.inf] * 3
+        )
         out[name] = {
             "holds": float(held.mean()), "angle_deg": float(rms[0]) * math.degrees(ANGLE),
             "x_mm": 1e3 * PLACE * float(rms[1]), "y_mm": 1e3 * PLACE * float(rms[2]),
@@ -252,7 +256,7 @@ def run(config: Config) -> dict[str, Any]:
     stated, own = goal(file, 60.0, config.rtol), turns["ellipse, light, 60"]
     by_hand = planner(rolled(file, 60.0), stated)
     rivals = {
-        "by hand": errors(by_hand.look(by_hand.variables.start, gradient=False)) | {"runs": 1}
+        "by hand": errors(by_hand.evaluate(by_hand.variables.start, gradient=False)) | {"runs": 1}
     }
     rivals |= {
         name: rival(name, file, stated, own["seconds"]) for name in ("finite differences", "CMA-ES")

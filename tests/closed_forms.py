@@ -65,7 +65,9 @@ class ClosedForm:
     def misfit(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any) -> Any:
         runner.gradients += 1
         at = self.residuals(runner, x, which, steps, free)
-        return (np.inf, np.nan * x, at.lost) if at.lost else (0.5 * at.r @ at.r, at.r @ at.J, {})
+        return (
+            (np.inf, np.nan * x, at.failed) if at.failed else (0.5 * at.r @ at.r, at.r @ at.J, {})
+        )
 
 
 def optimum(problem: Any, *x: float, **options: Any) -> Optimum:

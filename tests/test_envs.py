@@ -154,7 +154,7 @@ def test_episodes_end_with_a_sentence():
     assert terminated
     assert "disc.theta = " in info["ended"]
     hung = FILE.override(bodies={"disc": {"start": {"y": 40e-3}}, "upper": {"start": {"y": 0.08}}})
-    env = small(rig=hung, interval=0.01, lost=-7.0)
+    env = small(rig=hung, interval=0.01, failure_reward=-7.0)
     env.reset(seed=0)
     _, reward, terminated, _, info = env.step(np.zeros(3, np.float32))
     assert (reward, terminated) == (-7.0, True)

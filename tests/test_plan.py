@@ -74,11 +74,13 @@ def test_slopes_are_the_differences():
     evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, over, 1e-8, None)
     z = variables.start.copy()
     z[:3] += [-0.1, 0.12, -0.05]
-    look = evaluator.look(z)
-    assert look.errors.shape == (2, 3)
-    slopes = np.concatenate([look.slopes[0][:, None], look.slopes[1], look.slopes[2]], 1)
+    evaluation = evaluator.evaluate(z)
+    assert evaluation.errors.shape == (2, 3)
+    slopes = np.concatenate(
+        [evaluation.slopes[0][:, None], evaluation.slopes[1], evaluation.slopes[2]], 1
+    )
     for way in np.random.default_rng(0).standard_normal((2, variables.n)):
-        ahead, behind = (evaluator.look(z + s * 1e-4 * way, gradient=False) for s in (1, -1))
+        ahead, behind = (evaluator.evaluate(z + s * 1e-4 * way, gradient=False) for s in (1, -1))
         differences = [
             (getattr(ahead, part) - getattr(behind, part)).reshape(2, -1) / 2e-4
             for part in ("value", "errors", "excess")
@@ -99,7 +101,7 @@ def test_the_target_is_reached_and_the_rig_carries_it_out(turned):
     assert abs(float(again["theta_object"][-1]) - TURN.value) < TURN.tolerance
     assert abs(float(again["y_object"][-1])) < 1e-4
     assert "reached" in repr(turned)
-    assert turned.made_by["looks"] >= len(turned.history)
+    assert turned.made_by["evaluations"] >= len(turned.history)
 
 
 def test_a_limit_is_kept_at_a_price(turned):
@@ -148,20 +150,20 @@ def test_the_best_of_several_starts_has_its_slopes():
     evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, {}, 1e-3, None)
     search = Search(evaluator, "mean", 1.0, math.inf, tqdm(disable=True))
     search.begin(4, 0)
-    assert np.abs(search.look(search.found.z).slopes[1]).min() > 0
+    assert np.abs(search.evaluate(search.found.z).slopes[1]).min() > 0
 
 
 def test_a_plan_whose_finer_run_fails_is_not_reached(monkeypatch):
     """Nor does the search lose it where a finer one cannot begin."""
-    look = Evaluator.look
+    evaluate = Evaluator.evaluate
 
     def failing(self: Evaluator, z: Any, rtol: float | None = None, **how: Any) -> Any:
-        found = look(self, z, rtol, **how)
+        found = evaluate(self, z, rtol, **how)
         if (self.rtol if rtol is None else rtol) < 1e-3:
-            found.lost = "draw 0: made to fail"
+            found.failure = "draw 0: made to fail"
         return found
 
-    monkeypatch.setattr(Evaluator, "look", failing)
+    monkeypatch.setattr(Evaluator, "evaluate", failing)
     found = planned(targets={"turn": TURN} | PLACE)
     assert not found.reached
     assert found.holds == 0.0
@@ -181,19 +183,19 @@ def test_what_cannot_be_reached_says_why():
 def test_a_run_that_fails_is_worse_and_an_interrupt_keeps_the_best(
     monkeypatch,
 ):
-    look, count = Evaluator.look, 0
+    evaluate, count = Evaluator.evaluate, 0
 
     def failing(self: Evaluator, z: Any, rtol: float | None = None, **how: Any) -> Any:
         nonlocal count
         count += 1
-        found = look(self, z, rtol, **how)
+        found = evaluate(self, z, rtol, **how)
         if count == 2:
-            found.lost = "draw 0: made to fail"
+            found.failure = "draw 0: made to fail"
         if count == 5:
             raise KeyboardInterrupt
         return found
 
-    monkeypatch.setattr(Evaluator, "look", failing)
+    monkeypatch.setattr(Evaluator, "evaluate", failing)
     found = planned(targets={"turn": TURN} | PLACE)
     assert any("made to fail" in notice for notice in found.notices)
     assert any("interrupted after" in notice for notice in found.notices)

@@ -118,8 +118,8 @@ def check_derivatives(
         )
         slope = (ahead - behind) / (2 * h)
         assert np.linalg.norm(at.J[:, i] - slope) < near * np.linalg.norm(slope), label
-    loss, gradient, lost = problem.misfit(runner, x, which, steps, free)
-    assert not lost
+    loss, gradient, failed = problem.misfit(runner, x, which, steps, free)
+    assert not failed
     assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
     np.testing.assert_allclose(
         gradient, at.J.T @ at.r, rtol=adjoint, atol=adjoint * np.abs(gradient).max()
@@ -417,8 +417,8 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
 
     def failing(*given: Any) -> Any:
         at, steps = freeze(*given)
-        lost = {} if next(first, False) else {"strokes": FailedRun("at t = 0.5 s: no", 0.5)}
-        return at._replace(lost=lost), steps
+        failed = {} if next(first, False) else {"strokes": FailedRun("at t = 0.5 s: no", 0.5)}
+        return at._replace(failed=failed), steps
 
     monkeypatch.setattr(Problem, "freeze", failing)
     few = lambda *given: [one for one in assumptions(*given) if one.name in tried]
@@ -458,7 +458,7 @@ def test_another_stage_that_cannot_begin_there_begins_where_the_plan_did(strokes
     failing = {"two": 1.0}
     end = run_plan(strokes, None, stages, np.zeros(2))
     assert begun == [[0.0, 0.0], [1.0, 1.0], [0.0, 0.0], [1.0, 1.0]]
-    assert end.lost is None
+    assert end.failure is None
     assert [entry["name"] for entry in end.entries] == ["one", "two", "three"]
     failing = {"one": 0.0}
     with pytest.raises(Unreachable, match="recording `strokes`"):

@@ -113,8 +113,8 @@ def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact):
     back = rewhitened(plain, other, parts(coloured, other.r, which))
     for a, b in ((again.r, other.r), (again.J, other.J), (back.r, one.r), (back.J, one.J)):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
-    loss, gradient, lost = coloured.misfit(runner, x, which, steps, free)
-    assert not lost
+    loss, gradient, failed = coloured.misfit(runner, x, which, steps, free)
+    assert not failed
     assert loss == pytest.approx(0.5 * other.r @ other.r, rel=1e-12)
     np.testing.assert_allclose(gradient, other.J.T @ other.r, rtol=1e-8)
 

@@ -246,12 +246,12 @@ def test_any_rig_with_profiles():
 
 def test_what_cannot_be_run_is_left(problem, monkeypatch):
     """In the search; the motion given is refused."""
-    look, lost = Planner.evaluate, cycle([False, False, True])
+    evaluate, lost = Planner.evaluate, cycle([False, False, True])
 
     def sometimes(self: Planner, *given: Any) -> Any:
         if next(lost):
             raise SimulationFailed("the disc was lost", 0.1)
-        return look(self, *given)
+        return evaluate(self, *given)
 
     monkeypatch.setattr(Planner, "evaluate", sometimes)
     found = design(problem, "plan", BOUNDS, iterations=2)

@@ -67,7 +67,7 @@ def test_candidates_are_ranked_by_what_they_tell(out):
     first, second, last = json.loads((out / "out" / "design.json").read_text())["candidates"]
     assert (first["name"], second["name"], last["name"]) == ("twist", AS_STATED, "far")
     assert first["value"] < second["value"]
-    assert "the body was lost" in last["lost"]
+    assert "the body was lost" in last["failure"]
     stated = read_config(out / "fit.toml")
     file = RigFile.from_toml(RIG).override(**stated.settings)
     twisted = file.override(**stated.design.candidates["twist"])

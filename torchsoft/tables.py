@@ -90,14 +90,14 @@ class Table(BaseModel):
         return data
 
     @classmethod
-    def model_validate(cls, obj: Any, **how: Any) -> Self:
+    def model_validate(cls, obj: Any, **options: Any) -> Self:
         with refusing(obj):
-            return super().model_validate(obj, **how)
+            return super().model_validate(obj, **options)
 
     @classmethod
-    def model_validate_json(cls, json_data: str | bytes | bytearray, **how: Any) -> Self:
+    def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Self:
         with refusing():
-            return super().model_validate_json(json_data, **how)
+            return super().model_validate_json(json_data, **options)
 
 
 def findings(error: ValidationError, data: Any = None, within: str = "") -> str:

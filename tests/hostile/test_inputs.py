@@ -296,8 +296,8 @@ def run_once(case: measured.Case) -> None:
     start, free = problem.coordinates.start, problem.coordinates.free
     runner = Runner(problem.recordings)
     out = problem.residuals(runner, start, problem.names[:1], RTOL, free)
-    assert all(sentence(lost.reason) for lost in out.lost.values()), out.lost
-    assert out.lost or (np.isfinite(out.r).all() and np.isfinite(out.J).all()), "not finite"
+    assert all(sentence(lost.reason) for lost in out.failed.values()), out.failed
+    assert out.failed or (np.isfinite(out.r).all() and np.isfinite(out.J).all()), "not finite"
 
 
 @pytest.fixture

@@ -123,8 +123,8 @@ def make(options: argparse.Namespace) -> int:
         failed("a worker was killed, perhaps for memory; start again to make what is missing")
         return 3
     except KeyboardInterrupt:
-        told = "interrupted: finished shards are kept; start again to make what is missing"
-        print(told, file=sys.stderr)
+        message = "interrupted: finished shards are kept; start again to make what is missing"
+        print(message, file=sys.stderr)
         return 130
     made = sum(len(config.rows(shard)) for shard in mine.shards(config))
     left = generate.unfinished(config, options.out)

@@ -56,10 +56,10 @@ def add_commands(commands: Any) -> None:
 
 def add_arguments(one: argparse.ArgumentParser) -> None:
     """Add the arguments of any of these commands."""
-    metavar, said = "DATA.csv ... CONFIG.toml", "data files and a configuration"
+    metavar, explanation = "DATA.csv ... CONFIG.toml", "data files and a configuration"
     if one.prog.endswith("rehearse"):
-        metavar, said = "CONFIG.toml", "the configuration"
-    one.add_argument("files", nargs="+", type=Path, metavar=metavar, help=said)
+        metavar, explanation = "CONFIG.toml", "the configuration"
+    one.add_argument("files", nargs="+", type=Path, metavar=metavar, help=explanation)
     add_out(one, "identify")
     one.add_argument("--workers", type=int, help="threads, one recording each (fit.workers)")
     one.add_argument(

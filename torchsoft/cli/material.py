@@ -63,18 +63,18 @@ def fit_material(options: argparse.Namespace) -> int:
     from torchsoft.materials.written import FILES, printed, write
     from torchsoft.paper.parameters import Parameters
 
-    asked = {name: getattr(options, name) for name in ("test", "length", "area")}
+    settings = {name: getattr(options, name) for name in ("test", "length", "area")}
     given = {name: getattr(options, name) for name in ("nu", "rho", "depth")}
     pad = (
         Parameters().override({f"pad.{name}": x for name, x in given.items() if x is not None}).pad
     )
-    found = fit(read(options.file, **asked), terms=options.terms)
+    found = fit(read(options.file, **settings), terms=options.terms)
     try_folder(options.out, options.force)
     write(
         found,
         options.out,
         {name: getattr(pad, name) for name in given},
-        {**asked, "terms": options.terms, **given},
+        {**settings, "terms": options.terms, **given},
     )
     say(printed(found))
     say(f"written to {', '.join(str(options.out / name) for name in FILES)}")

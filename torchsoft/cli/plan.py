@@ -23,8 +23,8 @@ def add_commands(commands: Any) -> None:
     one = add_command(commands, "plan", plan, "find a motion that reaches a goal", PLAN)
     one.add_argument("rig", type=Path, metavar="RIG.toml")
     one.add_argument("goal", type=Path, metavar="GOAL.toml")
-    said = "draw what an identification of the rig leaves unknown"
-    one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=said)
+    meaning = "draw what an identification of the rig leaves unknown"
+    one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=meaning)
     add_out(one, "plan")
     add_progress(one)
 

@@ -28,8 +28,8 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--radius", type=float, help="rolling radius [m]")
     one.add_argument("--disc", default="disc", help="body that rolls (%(default)s)")
     one.add_argument("--bracket", default="bracket", help="body of the other pad (%(default)s)")
-    said = "least part of a rate that a term must account for (%(default)s)"
-    one.add_argument("--threshold", type=float, default=0.05, help=said)
+    meaning = "least part of a rate that a term must account for (%(default)s)"
+    one.add_argument("--threshold", type=float, default=0.05, help=meaning)
     add_out(one, "reduced")
 
 

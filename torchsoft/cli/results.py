@@ -34,8 +34,8 @@ def add_out(command: Any, folder: str, **more: Any) -> None:
 
 def add_yes(command: Any) -> None:
     """Add the option on costly work."""
-    said = "begin even what takes hours, or much memory or disk"
-    command.add_argument("--yes", action="store_true", help=said)
+    meaning = "begin even what takes hours, or much memory or disk"
+    command.add_argument("--yes", action="store_true", help=meaning)
 
 
 def add_progress(command: Any) -> None:

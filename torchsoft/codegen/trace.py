@@ -82,11 +82,11 @@ class Trace(TorchDispatchMode):
         ] = {}  # the tensors are held, so no id is used twice
         self.refusal: UnknownOperation | None = None
 
-    def refused(self, what: str, remedy: str) -> UnknownOperation:
+    def refused(self, cause: str, remedy: str) -> UnknownOperation:
         """Error for an operation. It is kept, since torch's operators swallow a TypeError and
         report another."""
         self.refusal = UnknownOperation(
-            f"The law cannot be compiled because of {what} at {_place()}; {remedy}."
+            f"The law cannot be compiled because of {cause} at {_place()}; {remedy}."
         )
         return self.refusal
 

@@ -87,8 +87,8 @@ def rig(config: Config) -> str:
     it = config.subject.template
     touching = (f"{one.body} on {one.pad}" for one in it.contacts.values())
     groups = {"bodies": it.bodies, "pads": it.pads, "contacts": touching, "actuators": it.actuators}
-    said = (f"{name} {', '.join(some)}" for name, some in groups.items())
-    return f"`{config.rig.get('title', 'rig file')}`: {'; '.join(said)}."
+    parts = (f"{name} {', '.join(some)}" for name, some in groups.items())
+    return f"`{config.rig.get('title', 'rig file')}`: {'; '.join(parts)}."
 
 
 def drawn(config: Config) -> Iterable[tuple[str, ...]]:
@@ -97,21 +97,21 @@ def drawn(config: Config) -> Iterable[tuple[str, ...]]:
         unit = "1" if one.ratio_to else variables(config)[name].unit
         yield f"`{name}`", distribution(one), unit
     for kind in config.kinds:
-        said = (f"`{name}` {distribution(one)}" for name, one in kind.parameters.items())
-        yield f"kind `{kind.name}`, weight {kind.weight:g}", "; ".join(said), "SI"
+        parts = (f"`{name}` {distribution(one)}" for name, one in kind.parameters.items())
+        yield f"kind `{kind.name}`, weight {kind.weight:g}", "; ".join(parts), "SI"
 
 
 def distribution(one: Distribution) -> str:
     """A distribution in words."""
     span = f"{one.low:g} to {one.high:g}"
     if isinstance(one, Choice):
-        said = "one of " + ", ".join(f"{x:g}" for x in one.choices)
+        text = "one of " + ", ".join(f"{x:g}" for x in one.choices)
     elif isinstance(one, Normal):
-        said = f"normal, mean {one.mean:g}, standard deviation {one.sd:g}, {span}"
+        text = f"normal, mean {one.mean:g}, standard deviation {one.sd:g}, {span}"
     else:
-        said = span + (", logarithmic" if one.scale == "log" else "")
-        said += ", of either sign" if one.either_sign else ""
-    return said + (f", times `{one.ratio_to}`" if one.ratio_to else "")
+        text = span + (", logarithmic" if one.scale == "log" else "")
+        text += ", of either sign" if one.either_sign else ""
+    return text + (f", times `{one.ratio_to}`" if one.ratio_to else "")
 
 
 def arrays(config: Config) -> Iterable[tuple[str, ...]]:

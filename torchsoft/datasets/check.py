@@ -89,8 +89,10 @@ def failures(data: xr.Dataset) -> tuple[float, str]:
     if not failed.any():
         return 0.0, "none failed"
     reason, _ = Counter(data.reason.values[failed].tolist()).most_common(1)[0]
-    said = f"{failed.sum()} of {len(failed)} trajectories failed, most often: {line(reason, 200)}"
-    return float(failed.mean()), said
+    message = (
+        f"{failed.sum()} of {len(failed)} trajectories failed, most often: {line(reason, 200)}"
+    )
+    return float(failed.mean()), message
 
 
 def check_files(url: str, manifest: Manifest) -> Iterator[str]:
@@ -115,7 +117,7 @@ def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
             yield f"{name}: missing"
             continue
         array, size = data[name], config.trajectories_per_shard
-        for what, there, expected in (
+        for aspect, found, expected in (
             ("sizes", dict(array.sizes), variable.sizes),
             ("units", array.attrs.get("units"), variable.unit),
             (
@@ -124,8 +126,8 @@ def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
                 size,
             ),
         ):
-            if there != expected:
-                yield f"{name}: {what} are {there!r}, not {expected!r}"
+            if found != expected:
+                yield f"{name}: {aspect} are {found!r}, not {expected!r}"
 
 
 def check_shard(

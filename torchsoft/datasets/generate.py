@@ -256,14 +256,14 @@ def generate(
     running = dict[Future[tuple[int, int]], int]()
     total = sum(len(config.rows(shard)) for shard in mine)
     finished = total - sum(len(config.rows(shard)) for shard in left)
-    what: Any = {
+    options: Any = {
         "unit": " simulated s",
         "unit_scale": config.duration,
         "disable": not progress,
         "smoothing": 0.05,
         "mininterval": 0.1 if sys.stderr.isatty() else 30.0,  # [s], a line each in a log
     }
-    with tqdm(total=total, initial=finished, **what) as bar:
+    with tqdm(total=total, initial=finished, **options) as bar:
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):
@@ -348,7 +348,7 @@ def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
     most = max(len(lacking.intersection(Part(i, parts).shards(config))) for i in left)
     price = whole.part(most / len(lacking))
     minutes = math.ceil(max(SPARE * price.seconds, LEAST) / 60)
-    told = (
+    estimates = (
         f"each of {len(left)} tasks: {price.sentence}; all of them: "
         f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk; "
         f"besides, every task takes {BEGINNING:g} s to start and {BASE:g} GiB for its process"
@@ -360,4 +360,4 @@ def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
         command=shlex.join([*program, "make", str(path.absolute()), "--out", out]),
         check=shlex.join([*program, "check", out]),
     )  # fmt: skip
-    return script, told
+    return script, estimates

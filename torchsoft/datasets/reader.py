@@ -92,9 +92,9 @@ class Vouched(WrapperStore[Store]):
 
     _get_many = Store._get_many  # which asks `get`
 
-    def data(self, **how: Any) -> xr.Dataset:
+    def data(self, **options: Any) -> xr.Dataset:
         """The arrays, lazily."""
-        return xr.open_zarr(self, consolidated=True, zarr_format=3, **how)
+        return xr.open_zarr(self, consolidated=True, zarr_format=3, **options)
 
 
 def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
@@ -247,11 +247,11 @@ class Trajectories(Dataset[dict[str, Tensor]]):
                 rows = np.asarray(variable.isel(where, missing_dims="ignore").values)
                 given = torch.from_numpy(np.array(rows[here - here[0]], dtype=float))
                 parts.append(given.to(self.dtype))
-                lost = parts[-1].isinf() & given.isfinite()
-                if bool(lost.any()):
+                overflow = parts[-1].isinf() & given.isfinite()
+                if bool(overflow.any()):
                     raise ValueError(
-                        f"`{name}` of trajectory {int(here[lost.nonzero()[0, 0]])} holds "
-                        f"{float(given[lost][0]):.3g}, which {self.dtype} cannot; take a wider "
+                        f"`{name}` of trajectory {int(here[overflow.nonzero()[0, 0]])} holds "
+                        f"{float(given[overflow][0]):.3g}, which {self.dtype} cannot; take a wider "
                         "`dtype`"
                     )
             out[name] = torch.cat(parts) if parts else torch.empty(0, dtype=self.dtype)

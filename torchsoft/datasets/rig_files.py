@@ -113,9 +113,9 @@ def channel_meanings(rig: Rig) -> Iterator[tuple[str, str]]:
     rates = ("v_x", "v_y", "omega")
     for name, symbol in rig.symbols.items():
         for axis, rate in zip(COORDINATES, rates):
-            what = f"{axis} of the centre of mass of {name}"
-            what = f"rotation of {name}, anticlockwise" if axis == "theta" else what
-            yield f"{axis}_{symbol}", what
+            quantity = f"{axis} of the centre of mass of {name}"
+            quantity = f"rotation of {name}, anticlockwise" if axis == "theta" else quantity
+            yield f"{axis}_{symbol}", quantity
             yield f"{rate}_{symbol}", f"rate of {axis} of {name}"
         yield f"L_{symbol}", f"angular momentum of {name}"
     for name in rig.signals:

@@ -127,13 +127,13 @@ class Subject:
     def there(self) -> dict[str, Label]:
         """Every channel of the rig."""
         rig = self.template
-        nothing = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
-        state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), nothing)
+        signals = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+        state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), signals)
         moments = {name: torch.zeros((), dtype=torch.float64) for name in rig.pads}
         with torch.no_grad():
-            known = channels(rig, state, nothing, moments)
+            known = channels(rig, state, signals, moments)
         of = units(rig)
-        meanings = {rig.renamed.get(key, key): said for key, said in channel_meanings(rig)}
+        meanings = {rig.renamed.get(key, key): meaning for key, meaning in channel_meanings(rig)}
         return {key: Label(of[key], meanings[key]) for key in known}
 
     @property
@@ -182,8 +182,10 @@ class Subject:
         unit = declared.unit if declared else "1"
         if re.search(r",| or ", unit):  # it depends on what the number is of
             unit = self._unit_of(name, keys) or unit
-        said = f": {field.description}" if isinstance(keys[-1], str) and field.description else ""
-        return Label(unit, f"parameter {name} of the rig file{said}")
+        meaning = (
+            f": {field.description}" if isinstance(keys[-1], str) and field.description else ""
+        )
+        return Label(unit, f"parameter {name} of the rig file{meaning}")
 
     def _unit_of(self, name: str, keys: tuple[Any, ...]) -> str | None:
         """Unit of a parameter whose field takes several units, such as a motion or a gain."""
@@ -328,13 +330,13 @@ class Drawn(NamedTuple):
             values = in_ratio(self.file, parameters, middle | drawn)
             own = {name: values[name] for name in tried} if alone else values
             moves = {place(self.file, name).keys[0] for name in tried} == {"motion"}
-            if (why := self._impossible(own, moves)) is not None:
-                said = ", ".join(f"{tried[name]} = {x:g}" for name, x in drawn.items())
-                raise ValueError(f"{said or f'{within} in their middle'}: {why}")
+            if (reason := self._impossible(own, moves)) is not None:
+                drawn_ends = ", ".join(f"{tried[name]} = {x:g}" for name, x in drawn.items())
+                raise ValueError(f"{drawn_ends or f'{within} in their middle'}: {reason}")
 
         if self._impossible(in_ratio(self.file, parameters, middle)) is not None:
-            if (why := self._impossible({})) is not None:
-                raise ValueError(f"{f'{self.where}fixed' if self.where else 'rig'}: {why}")
+            if (reason := self._impossible({})) is not None:
+                raise ValueError(f"{f'{self.where}fixed' if self.where else 'rig'}: {reason}")
             for name, where in sorted(single, key=lambda one: parameters[one[0]].ratio_to is None):
                 check({name: where}, alone=True)
             check({})

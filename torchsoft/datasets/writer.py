@@ -185,18 +185,18 @@ def laid_out(config: Config) -> dict[str, bytes]:
     size = config.trajectories_per_shard
     for name, variable in variables(config).items():
         _, *series = variable.shape
-        how: dict[str, Any] = {"chunks": (size,), "compressors": SMALL}
+        storage: dict[str, Any] = {"chunks": (size,), "compressors": SMALL}
         if series:  # a chunk is one trajectory's stretch of time, a shard is one task's
             time, *rest = series
             samples = min(config.samples_per_chunk, time)
             shard = (size, samples * -(-time // samples), *rest)
-            how = {"chunks": (1, samples, *rest), "shards": shard, "compressors": LARGE}
+            storage = {"chunks": (1, samples, *rest), "shards": shard, "compressors": LARGE}
         attributes: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
         if variable.components:
             attributes["components"] = list(variable.components)
         group.create_array(
             name, shape=variable.shape, dtype=variable.dtype, dimension_names=tuple(variable.sizes),
-            attributes=attributes, fill_value=int(name == "failed") or variable.empty, **how,
+            attributes=attributes, fill_value=int(name == "failed") or variable.empty, **storage,
             # what was never written counts as failed
         )  # fmt: skip
     trajectories = np.arange(config.trajectories)

@@ -151,18 +151,18 @@ class Dynamics:
 
     def _set_goal(self) -> None:
         goal, free = self.goal, self.coordinates
-        wanted = dict(goal.target) if goal else {}
+        target = dict(goal.target) if goal else {}
         body = goal.body if goal else ""
-        check_names("goal.target", [f"{body}.{x}" for x in wanted], free, "free are")
-        if goal and wanted.keys() != goal.scale.keys():
+        check_names("goal.target", [f"{body}.{x}" for x in target], free, "free are")
+        if goal and target.keys() != goal.scale.keys():
             raise ValueError(
-                f"`goal.scale` must have the coordinates of `goal.target`, {', '.join(wanted)}, "
+                f"`goal.scale` must have the coordinates of `goal.target`, {', '.join(target)}, "
                 f"but has {', '.join(goal.scale) or 'none'}"
             )
-        self._goal_at = [free[f"{body}.{axis}"] for axis in wanted]
-        ends = [x if isinstance(x, tuple) else (x, x) for x in wanted.values()]
+        self._goal_at = [free[f"{body}.{axis}"] for axis in target]
+        ends = [x if isinstance(x, tuple) else (x, x) for x in target.values()]
         self.targets = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
-        scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in wanted] if goal else []
+        scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in target] if goal else []
         self._scale = torch.tensor(scale, dtype=torch.float64)
 
     def begin(self, target: Tensor | None = None) -> Moment:

@@ -57,12 +57,13 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     duration: time limit [s] after `begin`, a multiple of `interval`; by default the rest of the
     file's. bounds: by coordinate such as "disc.y", beyond which an episode terminates [m, rad].
-    held: bodies that terminate it when no contact touches them at a control time. lost: the reward
-    of such an end, and of a failed run. judged: whether every step is judged like a run of
-    `simulate`, by its energies and the depth of its pads, in two thirds more time; `info["doubts"]`
-    then holds the faults. parameters: ranges between which each episode draws numbers of the rig
-    file by name, such as "materials.rubber.E" [Pa] or "bodies.disc.start.x" [m]; the rig is then
-    built anew each time, which takes some tenths of a second.
+    held: bodies that terminate it when no contact touches them at a control time.
+    failure_reward: the reward of such an end, and of a failed run. judged: whether every step is
+    judged like a run of `simulate`, by its energies and the depth of its pads, in two thirds more
+    time; `info["doubts"]` then holds the faults. parameters: ranges between which each episode
+    draws numbers of the rig file by name, such as "materials.rubber.E" [Pa] or
+    "bodies.disc.start.x" [m]; the rig is then built anew each time, which takes some tenths of a
+    second.
 
     `info` has the time [s], and "ended" or, where the simulation failed, "failure", as a sentence.
     Raises `ValueError` naming the field and the remedy.
@@ -74,7 +75,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, rig: RigFile | BuiltRig[Rig] | str | Path, *, actions: Ranges,
         observations: Ranges, interval: float = 0.1, goal: Goal | None = None,
         reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
-        bounds: Ranges | None = None, held: Sequence[str] = (), lost: float = -1.0,
+        bounds: Ranges | None = None, held: Sequence[str] = (), failure_reward: float = -1.0,
         parameters: Ranges | None = None, disturbances: Ranges | None = None, samples: int = 1,
         judged: bool = False, render_mode: Mode | None = None,
     ) -> None:  # fmt: skip
@@ -85,17 +86,17 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 f"{type(rig).__name__}"
             )
         self.parameters = self._checked_parameters(parameters or {})
-        self.lost, self.judged = number("lost", lost), judged
+        self.failure_reward, self.judged = number("failure_reward", failure_reward), judged
         built, solver = self._built({}), SOLVER
         if isinstance(self._file, RigFile):
             solver = self._file.solver.model_dump(exclude_none=True)
             solver = solver if solver.keys() - {"tolerance"} else solver | SOLVER
-        self._how: dict[str, Any] = {
+        self._arguments: dict[str, Any] = {
             "actions": actions, "observations": observations, "interval": interval, "goal": goal,
             "reward": reward, "begin": begin, "samples": samples, "solver": solver,
             "disturbances": disturbances or {},
         }  # fmt: skip
-        self.dynamics = Dynamics(built, **self._how)
+        self.dynamics = Dynamics(built, **self._arguments)
         rest = float(built.t[-1]) - begin
         if rest <= 0:
             raise ValueError(
@@ -105,10 +106,10 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         left = rest if duration is None else number("duration", duration)
         self.limit = int(left / interval + 1e-9) if math.isfinite(left) else 0
         if self.limit < 1 or (duration is not None and abs(self.limit * interval - left) > 1e-9):
-            why = "" if duration is not None else ", the rest of the run after `begin`"
+            cause = "" if duration is not None else ", the rest of the run after `begin`"
             raise ValueError(
                 f"`duration` must be a multiple of `interval` = {interval:g} s, but is {left:g} s"
-                f"{why}"
+                f"{cause}"
             )
         free = self.dynamics.coordinates
         self.bounds = checked("bounds", bounds or {}, free, "free are")
@@ -190,24 +191,24 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _drawn_start(self) -> Moment:
         """The first moment, with newly drawn parameters."""
-        why = ""
+        message = ""
         for _ in range(DRAWS):
             values = {k: float(self.np_random.uniform(*x)) for k, x in self.parameters.items()}
             try:
                 if values:
                     self.close()
-                    self.dynamics = Dynamics(self._built(values), **self._how)
+                    self.dynamics = Dynamics(self._built(values), **self._arguments)
                 start = self.dynamics.begin()
             except (SimulationFailed, ValueError, np.linalg.LinAlgError) as error:
-                said = ", ".join(f"{name} = {x:.4g}" for name, x in values.items())
-                why = f"no episode begins with {said or 'this rig'}: {error}"
+                sample = ", ".join(f"{name} = {x:.4g}" for name, x in values.items())
+                message = f"no episode begins with {sample or 'this rig'}: {error}"
                 if not values:
-                    raise ValueError(f"{why}; see `begin`") from None
+                    raise ValueError(f"{message}; see `begin`") from None
                 continue
-            if why:
-                warnings.warn(f"{why}; others were drawn", RedrawnStart, stacklevel=3)
+            if message:
+                warnings.warn(f"{message}; others were drawn", RedrawnStart, stacklevel=3)
             return start
-        raise ValueError(f"{why}; narrow the ranges of `parameters`")
+        raise ValueError(f"{message}; narrow the ranges of `parameters`")
 
     @torch.no_grad()
     def step(
@@ -218,14 +219,14 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         now, dynamics = self.moment, self.dynamics
         if now is None or self._over:
             raise ValueError("the episode is over, or has not begun; call `reset` first")
-        wanted = torch.as_tensor(np.asarray(action), dtype=torch.float64)
-        dynamics.check_action(wanted)
+        command = torch.as_tensor(np.asarray(action), dtype=torch.float64)
+        dynamics.check_action(command)
         try:
-            done = dynamics.step(now, wanted)
+            done = dynamics.step(now, command)
         except (SimulationFailed, np.linalg.LinAlgError) as failure:
             self._over = True
             info = self._info(now) | {"failure": str(failure)}
-            return self._seen(dynamics.observe(now)), self.lost, True, False, info
+            return self._seen(dynamics.observe(now)), self.failure_reward, True, False, info
         self.moment = done.moment
         ended = self.ended(done.moment)
         truncated = done.moment.steps >= self.limit
@@ -236,7 +237,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             info["doubts"] = list(found.values())
         if self.render_mode == "human":
             self.render()
-        reward = self.lost if ended else float(done.reward)
+        reward = self.failure_reward if ended else float(done.reward)
         return self._seen(done.observation), reward, bool(ended), truncated, info
 
     def ended(self, now: Moment) -> str:
@@ -321,10 +322,10 @@ class RigVectorEnv(SyncVectorEnv):
         finally:
             self.envs = every
 
-    def close_extras(self, **how: Any) -> None:
+    def close_extras(self, **options: Any) -> None:
         """End the threads and the environments."""
         self._pool.shutdown()
-        super().close_extras(**how)
+        super().close_extras(**options)
 
 
 class _Done(NamedTuple):

@@ -443,10 +443,10 @@ def notices(
 ) -> list[str]:  # fmt: skip
     """Sentences on unidentifiable coefficients, and on assumptions."""
     (shortest, longest), terms = measured.window, (len(values) - 1) // 2
-    what = "relaxes" if measured.test == "relaxation" else "creeps"
-    said = [
+    verb = "relaxes" if measured.test == "relaxation" else "creeps"
+    sentences = [
         f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not tell what "
-        f"{what} faster, and what {what} slower counts to the relaxed modulus E, which may be "
+        f"{verb} faster, and what {verb} slower counts to the relaxed modulus E, which may be "
         "lower still"
     ]
     edge = [
@@ -455,34 +455,34 @@ def notices(
         if not EDGE * shortest < values[f"tau_{k}"] < longest / EDGE
     ]
     if edge:
-        said.append(f"at the edge of what the rows resolve, or beyond: {', '.join(edge)}")
+        sentences.append(f"at the edge of what the rows resolve, or beyond: {', '.join(edge)}")
     unsure = [name for name in values if not sd[name] <= UNSURE * values[name]]
     if unsure:
-        said.append(
+        sentences.append(
             f"hardly determined, with a standard deviation above {UNSURE:.0%}: {', '.join(unsure)}"
         )
     if len(scores) > 1 and terms == max(scores):
-        said.append(
+        sentences.append(
             f"more terms than {terms} might fit better still: the criterion was falling up to there"
         )
     if correlation > COLOURED:
-        said.append(
+        sentences.append(
             f"the residuals follow a pattern (neighbours correlate by {correlation:.2f}): the "
             "series, or the theory, misses something; the standard deviations count as many rows "
             "as that leaves independent, and are too small still"
         )
     largest = float(np.abs(measured.strain).max())
     if measured.per_load:
-        said.append(
+        sentences.append(
             "the file does not say how large the strain was: the material is linear, and holds for "
             "small ones"
         )
     elif largest > SMALL_STRAIN:
-        said.append(
+        sentences.append(
             f"strains go up to {largest:.0%}, and the material is linear: these moduli are secants "
             "at that strain, and rubber that is stretched less is another one"
         )
-    return said
+    return sentences
 
 
 def faded(t: Array, x: Array, tau: Array) -> Array:

@@ -110,9 +110,11 @@ def fitted(fit: Fit) -> Figure:
     = 0 is left out."""
     m, relaxes = fit.measured, fit.kind == "prony"
     seen = m.t > 0
-    what, per, scale = ("stress", "MPa", MPA) if relaxes else ("strain", "1", 1.0)
+    quantity, per, scale = ("stress", "MPa", MPA) if relaxes else ("strain", "1", 1.0)
     if m.per_load:
-        what, per, scale = ("modulus", "MPa", MPA) if relaxes else ("compliance", "1/MPa", 1 / MPA)
+        quantity, per, scale = (
+            ("modulus", "MPa", MPA) if relaxes else ("compliance", "1/MPa", 1 / MPA)
+        )
     series = "relaxation series" if relaxes else "generalised Kelvin chain"
     figure = new_figure(f"{m.path.name}: {m.test}, {series} of {fit.terms} terms", 9, 7.2)
     data, left, spectrum = figure.subplots(3, 1, height_ratios=(3, 1.4, 2), sharex=True)
@@ -125,7 +127,7 @@ def fitted(fit: Fit) -> Figure:
         color=OTHER,
         label=f"fitted, residual {fit.rms:.2%} of the largest",
     )
-    data.set(ylabel=f"{what} [{per}]", title=f"a) {what}")
+    data.set(ylabel=f"{quantity} [{per}]", title=f"a) {quantity}")
     data.legend()
     left.axhline(0.0, color=OTHER)
     left.plot(m.t[seen], scale * fit.residual[seen], ".", color=INK, ms=4)

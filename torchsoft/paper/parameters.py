@@ -273,10 +273,10 @@ class Parameters(Table):
     @model_validator(mode="after")
     def _slip_is_single_valued(self) -> Self:
         force = 10.0 * self.contact.node_spacing / 1e-3  # [N], middle node of the full grasp
-        if why := self.contact.law().jumps(force):
+        if reason := self.contact.law().jumps(force):
             warnings.warn(
-                f"{why}; the slip rate, and every gradient, jumps at slip onset. Raise contact.v_s "
-                "or contact.eta.",
+                f"{reason}; the slip rate, and every gradient, jumps at slip onset. Raise "
+                "contact.v_s or contact.eta.",
                 stacklevel=2,
             )
         return self

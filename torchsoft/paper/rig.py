@@ -143,7 +143,7 @@ class SoftGrasp(Rig):
 
     def description(self) -> dict[str, Any]:
         """Current parameters and laws, without those of `Parameters` that this rig lacks."""
-        own, said = self._values(), super().description()
+        own, whole = self._values(), super().description()
         absent = {name for name in (*NAMES, "contact.friction") if name not in own}
         given = {
             f"{group}.{field}": value
@@ -152,9 +152,9 @@ class SoftGrasp(Rig):
         }
         values = {name: own.get(name, x) for name, x in given.items() if name not in absent}
         others = {
-            name: x for name, x in said["parameters"].items() if name not in self.aliases.values()
+            name: x for name, x in whole["parameters"].items() if name not in self.aliases.values()
         }
-        return said | {"parameters": values | others}
+        return whole | {"parameters": values | others}
 
     @property
     def shape(self) -> Shape:

@@ -42,10 +42,13 @@ def extensions(rig: Rig) -> dict[str, Extension]:
     """Numbers that may be added to a rig, by the name of the parameter."""
     out: dict[str, Extension] = {}
     for name in rig.pads if len(rig.pads) > 1 else ():
-        for ratio, what, reach in (("E_ratio", "as stiff", 2.0), ("tau_ratio", "as viscous", 4.0)):
+        for ratio, comparison, reach in (
+            ("E_ratio", "as stiff", 2.0),
+            ("tau_ratio", "as viscous", 4.0),
+        ):
             out[f"pads.{name}.{ratio}"] = Extension(
-                1.0, 0.01, 1 / reach, reach, "", f"the pad {name} is {what} as its material",
-                f"the pad {name} were 1.01 times {what} as its material",
+                1.0, 0.01, 1 / reach, reach, "", f"the pad {name} is {comparison} as its material",
+                f"the pad {name} were 1.01 times {comparison} as its material",
                 partial(_pad_ratio, name=name, ratio=ratio),
             )  # fmt: skip
     for stem, material in _shared(rig, Material):

@@ -333,10 +333,10 @@ class StateFeedback(nn.Module):
         return torch.stack(entries).unflatten(0, (self.rows, self.columns))
 
     def forward(self, setpoints: Tensor, state: Tensor) -> Tensor:
-        given, there = setpoints.unflatten(-1, (2, -1)), state.unflatten(-1, (2, -1))
-        missing = there.shape[-1] - given.shape[-1]
-        wanted = torch.cat((given, torch.zeros_like(there[..., :missing])), -1)
-        return (wanted - there).flatten(-2) @ self.matrix().mT
+        given, actual = setpoints.unflatten(-1, (2, -1)), state.unflatten(-1, (2, -1))
+        missing = actual.shape[-1] - given.shape[-1]
+        desired = torch.cat((given, torch.zeros_like(actual[..., :missing])), -1)
+        return (desired - actual).flatten(-2) @ self.matrix().mT
 
 
 def gain_unit(law: nn.Module, name: str, users: Sequence[Actuator]) -> str | None:

@@ -247,13 +247,13 @@ def resting(
         size = float(F.norm())
         U, S, V = torch.linalg.svd(K)
         along = U.mT @ F
-        lost = (NEUTRAL * S[0] >= S) & (along.abs() <= ROUNDED * S[0] * stride)
+        neutral = (NEUTRAL * S[0] >= S) & (along.abs() <= ROUNDED * S[0] * stride)
         # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
         held = max(size / stride, torch.finfo(q.dtype).tiny)  # of a body without load, too
         own = held * torch.eye(len(q), dtype=q.dtype)
-        step = torch.linalg.solve(K + own, F - U[:, lost] @ along[lost])
+        step = torch.linalg.solve(K + own, F - U[:, neutral] @ along[neutral])
         if float(step.norm()) <= residual:
-            inverse = (V.mT[:, ~lost] / S[~lost]) @ U.mT[~lost]
+            inverse = (V.mT[:, ~neutral] / S[~neutral]) @ U.mT[~neutral]
             return poses(q + inverse @ (loads(q) if torch.is_grad_enabled() else F))
         path.append((size, q))
         q = q + step
@@ -307,7 +307,7 @@ def start(rig: Rig, bodies: Mapping[str, Mapping[str, Any]]) -> Tensor:
             )
     held, _ = rig.held(rig.follow(0.0))
     pose = {name: list(at.unbind()) for name, at in held.items()}
-    wanted: dict[str, list[int]] = {}
+    at_rest: dict[str, list[int]] = {}
     rates: dict[str, list[Tensor]] = {}
     for name, body in rig.bodies.items():
         given = checked(name, bodies.get(name, {}))
@@ -325,17 +325,17 @@ def start(rig: Rig, bodies: Mapping[str, Mapping[str, Any]]) -> Tensor:
                     + (f', or "{REST}"' if axis == "y" else "")
                 )
             if isinstance(place := given.get(axis, 0.0), str):
-                wanted.setdefault(name, []).append(i)
+                at_rest.setdefault(name, []).append(i)
             else:
                 pose[name][i] = scalar(f"{name}.{axis}", place)
             rates.setdefault(name, []).append(scalar(f"{name}.{rate}", given.get(rate, 0.0)))
     places = {name: torch.stack(at) for name, at in pose.items()}
-    for name, axes in wanted.items():
+    for name, axes in at_rest.items():
         if 1 in axes:
             places[name] = places[name] + torch.tensor([0.0, above(rig, places, name), 0.0])
-    if wanted:
+    if at_rest:
         places = resting(
-            rig, places, wanted, signals=torch.zeros(len(rig.signals), 2).double(), actuators=()
+            rig, places, at_rest, signals=torch.zeros(len(rig.signals), 2).double(), actuators=()
         )
     y = standing(rig, places)
     if any(bool(v.any()) for at in rates.values() for v in at):

@@ -211,11 +211,11 @@ class Moves:
                 np.float64
             ) * (one.speed / PEAK)
             near = 1e-3 * (one.high - one.low)
-            for what, count in (
+            for limit, count in (
                 (f"low = {one.low:g}", int(np.sum(values < one.low + near))),
                 (f"high = {one.high:g}", int(np.sum(values > one.high - near))),
                 (f"speed = {one.speed:g}", int(np.sum(np.abs(way) > 0.99 * span))),
             ):
                 if count:
-                    out.append(f"{name} at {what} in {count} of {len(values)} knots")
+                    out.append(f"{name} at {limit} in {count} of {len(values)} knots")
         return out

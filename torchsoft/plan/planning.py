@@ -19,7 +19,7 @@ from torchsoft.physics.arguments import Numbers, tensor, whole
 from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.plan.problem import Evaluator, Free, Look, Term, Terms, Variables
+from torchsoft.plan.problem import Evaluation, Evaluator, Free, Term, Terms, Variables
 from torchsoft.plan.search import SLACK, Search, Stopped, Visit
 from torchsoft.solve.trajectory import Trajectory
 
@@ -83,7 +83,7 @@ class Plan(Shown):
         kept = "reached" if self.reached else "NOT reached"
         draws = max(map(len, (*self.errors.values(), *self.excess.values())), default=1)
         holds = f", holds in {self.holds:.0%} of {draws} draws" if draws > 1 else ""
-        cost = f"{self.made_by['looks']} evaluations, {self.made_by['wall_s']:.1f} s"
+        cost = f"{self.made_by['evaluations']} evaluations, {self.made_by['wall_s']:.1f} s"
         return f"Plan: {kept}{holds}; {cost}", rows
 
 
@@ -141,18 +141,20 @@ def plan(
             search.begin(starts, seed)
             go = search.slsqp if method == "slsqp" else partial(search.adam, rate=rate)
             go(search.found.z, iterations)
-            checked = evaluator.look(search.found.z, CHECK * rtol, gradient=False)
+            checked = evaluator.evaluate(search.found.z, CHECK * rtol, gradient=False)
             if method == "slsqp" and not kept(checked)[:1].all():
                 search.refine(POLISH * rtol)
                 search.slsqp(search.found.z, iterations)
         except KeyboardInterrupt:
             if search.best is None:
                 raise
-            notices.append(f"interrupted after {evaluator.looks} evaluations")
+            notices.append(f"interrupted after {evaluator.evaluations} evaluations")
         except Stopped:
             notices.append(f"ended after {seconds:g} s, as was asked for")
-    if search.lost:
-        notices.append(f"{len(search.lost)} plans could not be run, the first: {search.lost[0]}")
+    if search.failures:
+        notices.append(
+            f"{len(search.failures)} plans could not be run, the first: {search.failures[0]}"
+        )
     return finished(search, checked, rig, notices, {
         "torchsoft": version("torchsoft"), "method": method, "robust": robust,
         "free": {k: tuple(v) if isinstance(v, tuple) else v.model_dump() for k, v in free.items()},
@@ -161,34 +163,38 @@ def plan(
     })  # fmt: skip
 
 
-def kept(look: Look) -> NDArray[np.bool_]:
+def kept(evaluation: Evaluation) -> NDArray[np.bool_]:
     """Mask of the draws (draws,) with every target and limit kept; False for a failed run."""
-    if look.lost:
+    if evaluation.failure:
         return np.zeros(1, bool)
     return np.logical_and(
-        (np.abs(look.errors) <= 1).all(axis=1), (look.excess <= SLACK).all(axis=1)
+        (np.abs(evaluation.errors) <= 1).all(axis=1), (evaluation.excess <= SLACK).all(axis=1)
     )
 
 
 def finished(
-    search: Search, checked: Look | None, rig: Rig, notices: list[str], made_by: dict[str, Any]
+    search: Search,
+    checked: Evaluation | None,
+    rig: Rig,
+    notices: list[str],
+    made_by: dict[str, Any],
 ) -> Plan:
     """The best plan of a search, judged by a run of a finer tolerance: `checked`, if that is of
     this plan. A plan whose finer run fails is not reached."""
     evaluator, z = search.evaluator, search.found.z
     rtol = CHECK * made_by["rtol"]
     if checked is None or not np.array_equal(checked.z, z):
-        checked = evaluator.look(z, rtol, gradient=False)
-    look, held = checked, kept(checked)
-    if look.lost:
-        notices.append(f"by rtol = {rtol:g} a run fails: {look.lost}")
-        look = search.found
-    assert look.batch is not None
-    run = next(one for one in look.batch.trajectories if one is not None)
+        checked = evaluator.evaluate(z, rtol, gradient=False)
+    evaluation, held = checked, kept(checked)
+    if evaluation.failure:
+        notices.append(f"by rtol = {rtol:g} a run fails: {evaluation.failure}")
+        evaluation = search.found
+    assert evaluation.batch is not None
+    run = next(one for one in evaluation.batch.trajectories if one is not None)
     names = evaluator.terms.labels(run)
     errors, excess = (
         {name: torch.from_numpy(column) for name, column in zip(those, values.T)}
-        for those, values in zip(names, (look.errors, look.excess))
+        for those, values in zip(names, (evaluation.errors, evaluation.excess))
     )
     reasons: list[str] = []
     if not held[0]:
@@ -203,7 +209,7 @@ def finished(
             if float(e[0]) > SLACK
         ]
         reasons += [*search.evaluator.variables.active(z), *slips(run)]
-        reasons += [f"further on a run fails: {why}" for why in search.lost[-1:]]
+        reasons += [f"further on a run fails: {reason}" for reason in search.failures[-1:]]
     now = torch.from_numpy(z)
     reference = evaluator.variables.reference(now)
     parameters = evaluator.variables.parameters(now)
@@ -212,13 +218,14 @@ def finished(
     with torch.no_grad():
         for name, value in parameters.items():
             planned.parameter(name).copy_(value)
+    combined = evaluation.value.max() if search.robust == "worst" else evaluation.value.mean()
     return Plan(
         rig=planned, reference=reference, parameters=parameters, trajectory=run,
-        value=float(look.value.max() if search.robust == "worst" else look.value.mean()),
+        value=float(combined),
         errors=errors, excess=excess, reached=bool(held[0]), holds=float(held.mean()),
         reasons=tuple(reasons), notices=tuple(notices), history=tuple(search.history),
         made_by=made_by | {
-            "looks": evaluator.looks, "wall_s": clock.perf_counter() - search.began,
+            "evaluations": evaluator.evaluations, "wall_s": clock.perf_counter() - search.began,
             "checked_rtol": rtol,
         },
     )  # fmt: skip

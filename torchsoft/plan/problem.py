@@ -248,15 +248,15 @@ class Terms(NamedTuple):
         return named(self.targets, "targets"), named(self.limits, "limits")
 
 
-class Look:
+class Evaluation:
     """A plan at z (n,): value (draws,), errors (draws, k) and excess (draws, m) of its runs, and
-    their derivatives. `lost` is the reason of a failed run."""
+    their derivatives. `failure` is the reason of a failed run."""
 
     def __init__(
-        self, z: Array, rows: Tensor, batch: Batch | None, terms: Terms, lost: str
+        self, z: Array, rows: Tensor, batch: Batch | None, terms: Terms, failure: str
     ) -> None:
-        self.z, self.rows, self.batch, self.lost = z, rows, batch, lost
-        if batch is None or lost:
+        self.z, self.rows, self.batch, self.failure = z, rows, batch, failure
+        if batch is None or failure:
             return
         parts = [terms.of(run) for run in batch.trajectories if run is not None]
         self._value, self._errors, self._excess = (torch.stack(part) for part in zip(*parts))
@@ -299,12 +299,12 @@ class Evaluator:
             raise ValueError(f"every draw needs one entry, but there are: {listed}")
         self.draws = next(iter(counts.values()), 1)
         self.rig, self.t, self.variables, self.terms, self.y0 = rig, t, variables, terms, y0
-        self.over, self.rtol, self.threads, self.looks = dict(over), rtol, threads, 0
+        self.over, self.rtol, self.threads, self.evaluations = dict(over), rtol, threads, 0
 
-    def look(self, z: Array, rtol: float | None = None, *, gradient: bool = True) -> Look:
+    def evaluate(self, z: Array, rtol: float | None = None, *, gradient: bool = True) -> Evaluation:
         """The plan at z, with the evaluator's relative tolerance or another. Raises `ValueError`
         for impossible values."""
-        self.looks += 1
+        self.evaluations += 1
         rows = torch.from_numpy(np.tile(z, (self.draws, 1))).requires_grad_(gradient)
         # the run that is kept is made again, and warns
         with warnings.catch_warnings(action="ignore"):
@@ -314,5 +314,5 @@ class Evaluator:
                 rtol=self.rtol if rtol is None else rtol, threads=self.threads,
                 gradient="discrete" if gradient else "none",
             )  # fmt: skip
-        lost = "; ".join(f"draw {i}: {why}" for i, why in list(batch.failures.items())[:1])
-        return Look(z, rows, batch, self.terms, lost)
+        failure = "; ".join(f"draw {i}: {reason}" for i, reason in list(batch.failures.items())[:1])
+        return Evaluation(z, rows, batch, self.terms, failure)

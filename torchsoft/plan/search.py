@@ -12,7 +12,7 @@ from scipy.stats import qmc
 from tqdm import tqdm
 
 from torchsoft.plan.knots import Array
-from torchsoft.plan.problem import Evaluator, Look
+from torchsoft.plan.problem import Evaluation, Evaluator
 from torchsoft.solve.gradients import GradientFailed
 
 WITHIN = 0.5
@@ -93,20 +93,20 @@ class Search:
         self.evaluator, self.robust, self.change, self.bar = evaluator, robust, change, bar
         self.began, self.seconds = clock.perf_counter(), seconds
         self.origin = evaluator.variables.start
-        self.best: Look | None = None
+        self.best: Evaluation | None = None
         self.best_visit = Visit(0.0, np.inf, np.inf)
         self.history: list[Visit] = []
-        self.lost: list[str] = []
+        self.failures: list[str] = []
         self.scale = 1.0
         self.at = 0  # number of the last evaluation that was clearly better
         self.aim: Array | None = None  # mean errors that a stage is to end with
         self._inverse: Array = np.linalg.inv(evaluator.variables.D).astype(np.float64)
         self._way = 0.0
         self.damping = 1.0  # of the objective, so that steps along it are shorter
-        self.reached: Look | None = None  # the end of a stage
-        self._last: Look | None = None
+        self.reached: Evaluation | None = None  # the end of a stage
+        self._last: Evaluation | None = None
 
-    def look(self, z: Array, *, gradient: bool = True) -> Look:
+    def evaluate(self, z: Array, *, gradient: bool = True) -> Evaluation:
         """Evaluate the plan at z, and record it. Raises `Stopped`."""
         for known in (self._last, self.best):
             if known is not None and np.allclose(known.z, z, rtol=0, atol=SAME):
@@ -114,15 +114,17 @@ class Search:
         if clock.perf_counter() - self.began > self.seconds and self.best is not None:
             raise Stopped
         try:
-            look = self.evaluator.look(z, gradient=gradient)
+            evaluation = self.evaluator.evaluate(z, gradient=gradient)
         except ValueError as refused:
             if not self.history:
                 raise
-            look = Look(z, torch.zeros(0), None, self.evaluator.terms, str(refused))
-        if look.lost:
-            self.lost.append(look.lost)
+            evaluation = Evaluation(z, torch.zeros(0), None, self.evaluator.terms, str(refused))
+        if evaluation.failure:
+            self.failures.append(evaluation.failure)
         else:
-            visit = Visit(clock.perf_counter() - self.began, self.value(look), self.missed(look))
+            visit = Visit(
+                clock.perf_counter() - self.began, self.value(evaluation), self.missed(evaluation)
+            )
             self.history.append(visit)
             old = self.best_visit
             if visit.missed < (1 - BETTER) * old.missed or (
@@ -130,22 +132,22 @@ class Search:
             ):
                 self.at = len(self.history)
             if (visit.missed, visit.value) < (old.missed, old.value):
-                self.best, self.best_visit = look, visit
-        self._last = look
+                self.best, self.best_visit = evaluation, visit
+        self._last = evaluation
         best = self.best_visit
-        said = f"missed {best.missed:.3g}" if best.missed else f"value {best.value:.4g}"
-        self.bar.set_postfix_str(f"best: {said}", refresh=False)
+        best_text = f"missed {best.missed:.3g}" if best.missed else f"value {best.value:.4g}"
+        self.bar.set_postfix_str(f"best: {best_text}", refresh=False)
         self.bar.update()
-        return look
+        return evaluation
 
-    def value(self, look: Look) -> float:
+    def value(self, evaluation: Evaluation) -> float:
         """The function to minimise within targets and limits."""
         if self._worst:
-            combined = self._costs(look).max()
+            combined = self._costs(evaluation).max()
         else:
-            spread = look.errors - look.errors.mean(0)
-            combined = (self.scale * look.value + 0.5 * np.square(spread).sum(1)).mean()
-        return float(combined) + self.changed(look.z)[0]
+            spread = evaluation.errors - evaluation.errors.mean(0)
+            combined = (self.scale * evaluation.value + 0.5 * np.square(spread).sum(1)).mean()
+        return float(combined) + self.changed(evaluation.z)[0]
 
     def changed(self, z: Array) -> tuple[float, Array]:
         """Penalty of the change of distances and parameters since the start, and its gradient
@@ -154,14 +156,14 @@ class Search:
         way = D @ (z - self.origin)
         return 0.5 * self.change * float(way @ way), self.change * D.T @ way
 
-    def missed(self, look: Look) -> float:
+    def missed(self, evaluation: Evaluation) -> float:
         """Miss of targets beyond `WITHIN` of their tolerance, and of limits beyond their slack."""
-        errors = np.abs(look.errors).max(initial=0.0)
-        excess = look.excess.max(initial=0.0)
+        errors = np.abs(evaluation.errors).max(initial=0.0)
+        excess = evaluation.excess.max(initial=0.0)
         return float(max(errors - WITHIN, 0.0) + EXCESS * max(excess - SLACK, 0.0))
 
     @property
-    def found(self) -> Look:
+    def found(self) -> Evaluation:
         """The best plan so far."""
         assert self.best is not None
         return self.best
@@ -172,7 +174,7 @@ class Search:
         self.evaluator.rtol, z, known = rtol, self.found.z, (self.best, self.best_visit)
         self.best, self._last, self.best_visit = None, None, Visit(0.0, np.inf, np.inf)
         try:
-            self.look(z)
+            self.evaluate(z)
         finally:
             if self.best is None:
                 self.best, self.best_visit = known
@@ -181,17 +183,17 @@ class Search:
         """Evaluate the starts: the given plan, and Sobol points within all bounds. Raises
         `ValueError` where none can be run."""
         variables = self.evaluator.variables
-        self.look(self.origin, gradient=starts == 1)
+        self.evaluate(self.origin, gradient=starts == 1)
         if starts > 1:
             sampler = qmc.Sobol(variables.n, rng=np.random.default_rng(seed))
             for u in sampler.random_base2((starts - 1).bit_length())[: starts - 1]:
-                self.look(variables.spread(u), gradient=False)
+                self.evaluate(variables.spread(u), gradient=False)
         if self.best is None:
-            raise ValueError(f"no start of the plan can be run: {self.lost[0]}")
+            raise ValueError(f"no start of the plan can be run: {self.failures[0]}")
         if starts > 1:
             self.refine(self.evaluator.rtol)
         if self.evaluator.terms.objective is not None:
-            slope = float(np.linalg.norm(self.look(self.best.z).slopes[0].mean(0)))
+            slope = float(np.linalg.norm(self.evaluate(self.best.z).slopes[0].mean(0)))
             self.scale = UNIT / slope if slope > 0 else 1.0
             self.best_visit = self.best_visit._replace(value=self.value(self.best))
 
@@ -200,7 +202,7 @@ class Search:
         for a fraction of the way to the targets first."""
         share = 1.0
         for _ in range(STAGES):
-            start = self.look(z)
+            start = self.evaluate(z)
             errors = start.errors.mean(0)
             self.aim = (1 - share) * errors if share < 1 and len(errors) else None
             self._way = share * float(np.abs(errors).max(initial=0.0))
@@ -236,11 +238,11 @@ class Search:
         """Projected Adam from z, with a penalty on squared errors and excess."""
         adam = ProjectedAdam(z, self.evaluator.variables.nearest, MEMORY)
         for _ in range(iterations):
-            look = self.look(adam.z)
+            evaluation = self.evaluate(adam.z)
             try:
-                slope = None if look.lost else self._priced(look)
+                slope = None if evaluation.failure else self._priced(evaluation)
             except GradientFailed as failure:
-                self.lost.append(str(failure))
+                self.failures.append(str(failure))
                 slope = None
             if slope is None or not np.isfinite(slope).all():
                 adam.set(self.found.z)
@@ -249,15 +251,15 @@ class Search:
             norm = float(np.linalg.norm(slope))
             rate *= 0.1 ** (1 / iterations)
             adam.step(slope * min(1.0, CLIPPED / max(norm, 1e-300)), rate)
-        self.look(adam.z, gradient=False)
+        self.evaluate(adam.z, gradient=False)
 
-    def _priced(self, look: Look) -> Array:
+    def _priced(self, evaluation: Evaluation) -> Array:
         """Gradient (n,) of the value with penalties on squared errors and excess."""
-        dx = look.slopes[2]
-        over = 2 * PRICE * np.maximum(look.excess, 0.0)
-        each = self._cost_slopes(look) + np.einsum("dm,dmn->dn", over, dx)
-        of = each[int(np.argmax(self._costs(look)))] if self._worst else each.mean(0)
-        return of + self.changed(look.z)[1]
+        dx = evaluation.slopes[2]
+        over = 2 * PRICE * np.maximum(evaluation.excess, 0.0)
+        each = self._cost_slopes(evaluation) + np.einsum("dm,dmn->dn", over, dx)
+        of = each[int(np.argmax(self._costs(evaluation)))] if self._worst else each.mean(0)
+        return of + self.changed(evaluation.z)[1]
 
     # SLSQP sees x = (ways, s): in these the price of change is round; s bounds what the worst draw
     # costs
@@ -265,7 +267,7 @@ class Search:
 
     def _x(self, z: Array) -> Array:
         ways = self.evaluator.variables.D @ z
-        return np.append(ways, self._costs(self.look(z)).max()) if self._worst else ways
+        return np.append(ways, self._costs(self.evaluate(z)).max()) if self._worst else ways
 
     def _by_x(self, slopes: Array, s: float = 0.0) -> Array:
         """Derivatives (..., n) by z, converted to derivatives by x."""
@@ -273,33 +275,35 @@ class Search:
         pad = [(0, 0)] * (slopes.ndim - 1) + [(0, int(self._worst))]
         return np.pad(by_ways, pad, constant_values=s)
 
-    def _step(self, x: Array) -> Look:
+    def _step(self, x: Array) -> Evaluation:
         """The plan at x. Raises `Failed`."""
-        look = self.look(self._inverse @ x[: self.evaluator.variables.n])
-        if look.lost:
+        evaluation = self.evaluate(self._inverse @ x[: self.evaluator.variables.n])
+        if evaluation.failure:
             raise Failed
-        return look
+        return evaluation
 
     def _objective(self, x: Array) -> float:
-        look = self._step(x)
+        evaluation = self._step(x)
         if len(self.history) - self.at > (PATIENCE if self.best_visit.missed else ENOUGH):
             raise Settled
         if self.aim is not None:
-            left = look.errors.mean(0) - self.aim
-            over = look.excess.max(initial=0.0)
+            left = evaluation.errors.mean(0) - self.aim
+            over = evaluation.excess.max(initial=0.0)
             if over <= DONE and np.abs(left).max() <= DONE * self._way:
-                self.reached = look
+                self.reached = evaluation
                 raise Settled
-        value = float(x[-1]) + self.changed(look.z)[0] if self._worst else self.value(look)
+        value = (
+            float(x[-1]) + self.changed(evaluation.z)[0] if self._worst else self.value(evaluation)
+        )
         return self.damping * value
 
     def _gradient(self, x: Array) -> Array:
-        look = self._step(x)
-        out = self.changed(look.z)[1]
+        evaluation = self._step(x)
+        out = self.changed(evaluation.z)[1]
         if self._worst:
             return self.damping * self._by_x(out, 1.0)
-        dv, de, _ = look.slopes
-        spread = look.errors - look.errors.mean(0)
+        dv, de, _ = evaluation.slopes
+        spread = evaluation.errors - evaluation.errors.mean(0)
         return self.damping * self._by_x(
             out + self.scale * dv.mean(0) + np.einsum("dk,dkn->n", spread, de) / len(dv)
         )
@@ -309,7 +313,9 @@ class Search:
         n, aim = variables.n, 0.0 if self.aim is None else self.aim
         out = []
 
-        def add(kind: str, of: Callable[[Look], Array], by: Callable[[Look], Array]) -> None:
+        def add(
+            kind: str, of: Callable[[Evaluation], Array], by: Callable[[Evaluation], Array]
+        ) -> None:
             out.append({
                 "type": kind, "fun": lambda x: of(self._step(x)),
                 "jac": lambda x: self._by_x(by(self._step(x))),
@@ -335,12 +341,12 @@ class Search:
     def _worst(self) -> bool:
         return self.robust == "worst"
 
-    def _costs(self, look: Look) -> Array:
-        return self.scale * look.value + 0.5 * np.square(look.errors).sum(1)
+    def _costs(self, evaluation: Evaluation) -> Array:
+        return self.scale * evaluation.value + 0.5 * np.square(evaluation.errors).sum(1)
 
-    def _cost_slopes(self, look: Look) -> Array:
-        dv, de, _ = look.slopes
-        return self.scale * dv + np.einsum("dk,dkn->dn", look.errors, de)
+    def _cost_slopes(self, evaluation: Evaluation) -> Array:
+        dv, de, _ = evaluation.slopes
+        return self.scale * dv + np.einsum("dk,dkn->dn", evaluation.errors, de)
 
     def _bounds(self) -> list[tuple[float | None, float | None]]:
         variables = self.evaluator.variables

@@ -74,15 +74,17 @@ class Curve(NamedTuple):
 
 def curves(run: Trajectory) -> Iterator[Curve]:
     """Every coordinate that is not fixed."""
-    wanted = {at: name for one in run.setup.actuators.values() for at, name in one.follows.items()}
+    setpoints = {
+        at: name for one in run.setup.actuators.values() for at, name in one.follows.items()
+    }
     for name, body in run.setup.bodies.items():
         for axis, place in zip(COORDINATES, run.state.pose[name].detach().numpy().T):
             if body.freedom[axis] == "fixed":
                 continue
             scale, unit = (1.0, "rad") if axis == "theta" else (MM, "mm")
             coordinate, setpoint = f"{name}.{axis}", None
-            if coordinate in wanted:
-                setpoint = scale * run[wanted[coordinate]].detach().numpy()
+            if coordinate in setpoints:
+                setpoint = scale * run[setpoints[coordinate]].detach().numpy()
             yield Curve(coordinate, f"{axis} of {name} [{unit}]", scale * place, setpoint)
 
 
@@ -187,7 +189,7 @@ def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
     """Label, energy [mJ] (T,) and colour of groups of stored and dissipated energies; each energy
     is in one group."""
     zero = torch.zeros_like(run.t)
-    stored, lost = dict(run.energy), dict(run.dissipated)
+    stored, dissipated = dict(run.energy), dict(run.dissipated)
 
     def taken(energies: dict[str, torch.Tensor], prefix: str) -> Array:
         names = [name for name in energies if name.startswith(prefix)]
@@ -198,9 +200,9 @@ def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
         ("in contact springs", taken(stored, "normal_springs") + taken(stored, "tangential"),
          "#9ecae1"),
         ("kinetic", taken(stored, ""), "#08306b"),
-        ("dissipated in pads", taken(lost, "pad_"), "#d94801"),
-        ("by slip", taken(lost, "slip"), "#fdae6b"),
-        ("by dashpots", taken(lost, ""), "#7f2704"),
+        ("dissipated in pads", taken(dissipated, "pad_"), "#d94801"),
+        ("by slip", taken(dissipated, "slip"), "#fdae6b"),
+        ("by dashpots", taken(dissipated, ""), "#7f2704"),
     ]  # fmt: skip
 
 
@@ -299,11 +301,11 @@ def dashboard(
     few = [*list(contacts)[:2], *(name for name in drawn if name == "friction")]
     if look == "column" and not only:
         only = ("scene", *few)
-    wanted = chosen(only, named(run))
-    pictured = "scene" in wanted
-    wanted = [name for name in wanted if name != "scene"]
+    selected = chosen(only, named(run))
+    pictured = "scene" in selected
+    selected = [name for name in selected if name != "scene"]
     with looking(look) as size:
-        columns = min(size.columns, max(1, len(wanted))) if not pictured else size.columns
+        columns = min(size.columns, max(1, len(selected))) if not pictured else size.columns
         width = size.width / size.columns
         each, span, tall, beside = 0.5 * width + 0.03 * size.font, max(1, columns - 1), 0.0, 0
         curves_, stress = force_scale(run.setup, [instant]), largest_stress([instant])
@@ -313,9 +315,9 @@ def dashboard(
         if pictured:
             share = 0.86 if columns > 1 else 0.73
             tall = min((high - low) / (right - left), 1.1) * share * width * span + 0.5
-            beside = min(len(contacts), len(wanted), round(tall / each)) if columns > 1 else 0
+            beside = min(len(contacts), len(selected), round(tall / each)) if columns > 1 else 0
         top = max(1, beside) if pictured else 0
-        rows = -(-(len(wanted) - beside) // columns)
+        rows = -(-(len(selected) - beside) // columns)
         heading = (title or "Run") if size.titled else ""
         room = (size.height - tall - 0.06 * size.font) / max(rows, 1)
         each = room if FLATTEST * each <= room < each else each
@@ -348,11 +350,11 @@ def dashboard(
             figure.legend(handles=handles, loc="outside upper right", ncols=5 if columns > 1 else 2)
         if size.titled and not only and ripples(run):
             figure.supxlabel(RIPPLE, fontsize="small", color="#666666")
-        for i, name in enumerate(wanted):
+        for i, name in enumerate(selected):
             k = i - beside
             grid, row = lines[i if k < 0 else top + k // columns]
             first = columns - 1 if k < 0 else k % columns
-            end = None if i == len(wanted) - 1 else first + 1  # the last takes what is left
+            end = None if i == len(selected) - 1 else first + 1  # the last takes what is left
             axes = figure.add_subplot(grid[row, first:end])
             drawn[name](axes)
             axes.set_title(f"{letter(i + pictured)} {name}")

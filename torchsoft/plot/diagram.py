@@ -132,11 +132,11 @@ def hubs_of(graph: nx.DiGraph) -> dict[str, Hub]:
         return sum(own) / len(own) if own else 0.0
 
     for layer in (*layers, *layers[::-1], *layers):
-        wanted = {name: near(name) for name in layer}
-        layer.sort(key=lambda name, wanted=wanted: wanted[name])
+        targets = {name: near(name) for name in layer}
+        layer.sort(key=lambda name, targets=targets: targets[name])
         free = -float("inf")
         for name in layer:
-            x[name] = max(wanted[name], free)
+            x[name] = max(targets[name], free)
             free = x[name] + 1
     return {
         name: (SPACING * x[name], LAYER * i, *FANS[i])

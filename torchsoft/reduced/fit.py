@@ -285,7 +285,7 @@ def _warn_of_misses(
     i = int(np.argmax(misses))
     on, out = records[i], scores[i]
     state = max(out.over_deviation, key=out.over_deviation.__getitem__)
-    said = (
+    miss = (
         f"misses it: the error of {state} is {misses[i]:.3g} of its standard deviations"
         if out.rollout.diverged_at is None
         else str(out.rollout)
@@ -314,7 +314,7 @@ def _warn_of_misses(
             f"no coarse samples of a large motion; here a sample is {1e3 * on.step:.3g} ms"
         )
     warnings.warn(
-        f"the reduced model is not to be trusted: rolled out on record {i}, it {said}; {remedy}",
+        f"the reduced model is not to be trusted: rolled out on record {i}, it {miss}; {remedy}",
         stacklevel=3,
     )
 

@@ -319,10 +319,10 @@ class RigFile(Group):
                 f"taxels.{name}: a contact is called `{name}` too, whose forces have the same "
                 "names; call one of them otherwise"
             )
-        for group, (others, field, why) in USED.items():
+        for group, (others, field, reason) in USED.items():
             named = {getattr(other, field) for other in getattr(self, others).values()}
             for name in sorted(getattr(self, group).keys() - named):
-                raise ValueError(f"{group}.{name}: {why}, or leave it out")
+                raise ValueError(f"{group}.{name}: {reason}, or leave it out")
         return self
 
     @model_validator(mode="after")
@@ -350,25 +350,25 @@ class RigFile(Group):
                 f"{field}: `{line(coordinate, 80)}` is not a coordinate; free ones are {there}"
             )
         if (kind := kinds[coordinate]) != "free":
-            how = "driven by its motion" if kind == "driven" else f"fixed at {kind:g}"
+            kinematics = "driven by its motion" if kind == "driven" else f"fixed at {kind:g}"
             verb = "push" if field.endswith("pushes") else "learn"
             raise ValueError(
-                f"{field}: {coordinate} is {how}, so that there is nothing to {verb}; make it "
-                "free, or leave this out"
+                f"{field}: {coordinate} is {kinematics}, so that there is nothing to {verb}; make "
+                "it free, or leave this out"
             )
 
     @model_validator(mode="after")
     def _motions_are_followed(self) -> Self:
         followers = self.followers()
-        for name, who in followers.items():
-            role, coordinate = who[0]
+        for name, users in followers.items():
+            role, coordinate = users[0]
             if name not in self.motion:
-                why = f"it is the {role} of" if role != "driven" else "it drives"
-                raise ValueError(f"motion.{line(name, 80)} is missing: {why} {coordinate}")
-            if len({(r == "feed_forward", c.endswith(".theta")) for r, c in who}) > 1:
+                reason = f"it is the {role} of" if role != "driven" else "it drives"
+                raise ValueError(f"motion.{line(name, 80)} is missing: {reason} {coordinate}")
+            if len({(r == "feed_forward", c.endswith(".theta")) for r, c in users}) > 1:
                 raise ValueError(
                     f"motion.{name} would be in two units: "
-                    f"{' and '.join(f'{r} of {c}' for r, c in who)} use it"
+                    f"{' and '.join(f'{r} of {c}' for r, c in users)} use it"
                 )
         for name in self.motion:
             if name not in followers:
@@ -451,7 +451,7 @@ class RigFile(Group):
         """
         rig = self.assemble()
         pose = self._starts(rig)
-        rig.reference = self.reference(pose, lambda *asked: self._held(rig, pose, *asked))
+        rig.reference = self.reference(pose, lambda *arguments: self._held(rig, pose, *arguments))
         try:
             y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
         except NoEquilibrium as error:
@@ -484,11 +484,11 @@ class RigFile(Group):
         body, axis = at(follows) if follows and not more else ("", 0)
         start = float(pose[body][axis]) if pose is not None and body else None
         effort = partial(held, fed) if held and fed and not others else None
-        asked = MotionContext(
+        context = MotionContext(
             name, self.unit(name), start, effort, self.outputs.duration, self.folder
         )
         try:
-            return self.motion[name].build(asked)
+            return self.motion[name].build(context)
         except ValueError as error:
             prefix = "" if str(error).startswith("motion.") else f"motion.{name}: "
             raise ValueError(f"{prefix}{error}") from None
@@ -500,8 +500,8 @@ class RigFile(Group):
         """Set the coordinates that follow motions in these roles to the motions' values at a time
         [s]; returns those coordinates."""
         moved = set[tuple[str, int]]()
-        for name, who in self.followers().items():
-            for body, axis in (at(coordinate) for role, coordinate in who if role in roles):
+        for name, users in self.followers().items():
+            for body, axis in (at(coordinate) for role, coordinate in users if role in roles):
                 value, _ = self._signal(name, start)(torch.tensor(time, dtype=torch.float64))
                 pose[body][axis] = float(value)
                 moved.add((body, axis))
@@ -515,17 +515,17 @@ class RigFile(Group):
             if given == TOUCH or not isinstance(given, str):
                 pose[name][COORDINATES.index(axis)] = AWAY if given == TOUCH else given or 0.0
         self._follow(pose, 0.0, ("driven",))
-        for name, axes in (wanted := self.rests()).items():
+        for name, axes in (resting_axes := self.rests()).items():
             if 1 in axes:
                 pose[name][1] = above(Scene(rig, pose), name)
         try:
-            pose = self._rested(rig, pose, wanted)
+            pose = self._rested(rig, pose, resting_axes)
         except NoEquilibrium as error:
-            name, (axis, *_) = next(iter(wanted.items()))
+            name, (axis, *_) = next(iter(resting_axes.items()))
             weight = self.bodies[name].weighted * rig.bodies[name].mass.item() * rig.gravity.item()
-            why = f"no rest under its weight of {weight:.3g} N is found; {error}"
+            reason = f"no rest under its weight of {weight:.3g} N is found; {error}"
             raise ValueError(
-                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {why}"
+                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {reason}"
             ) from None
         for name, body in self.bodies.items():
             if body.y == "free" and body.start.y == TOUCH:
@@ -543,15 +543,15 @@ class RigFile(Group):
         return out
 
     def _rested(
-        self, rig: Rig, pose: Mapping[str, Array], wanted: Mapping[str, list[int]]
+        self, rig: Rig, pose: Mapping[str, Array], axes: Mapping[str, list[int]]
     ) -> dict[str, Array]:
         """Poses with these coordinates in equilibrium, without efforts of actuators. Raises
         `NoEquilibrium`."""
-        if not wanted:
+        if not axes:
             return dict(pose)
         places = {name: torch.from_numpy(x) for name, x in pose.items()}
         still = torch.zeros(len(rig.signals), 2).double()
-        found = resting(rig, places, wanted, signals=still, actuators=())
+        found = resting(rig, places, axes, signals=still, actuators=())
         return {name: x.numpy() for name, x in found.items()}
 
     def _held(self, rig: Rig, start: Mapping[str, Array], coordinate: str, time: float) -> float:

@@ -85,13 +85,13 @@ def at_moments(e: Estimate) -> list[Diagnostic]:
             ]
         reference = hold(**signals(rig, time))
         there.append(Moment(time, scene, y, rig.unpack(y, rig.follow(0.0, reference)), reference))
-    for time, why in list(e.unbalanced.items())[:1]:
+    for time, reason in list(e.unbalanced.items())[:1]:
         found.append(
             Diagnostic(
                 "warning", "motion",
                 f"nothing was found to be in balance at t = {time:.3g} s, so that strains and "
                 "stability are not judged under the efforts there, only where set-points put "
-                f"bodies: {why}; push less, or leave bodies more room",
+                f"bodies: {reason}; push less, or leave bodies more room",
             )
         )  # fmt: skip
     return [*found, *presses(there), *strains(there), *swings(e, there), *slips(e, there)]
@@ -240,17 +240,17 @@ def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Di
     for name, motion in e.file.motion.items():
         if isinstance(motion, ProfileTable) and len(motion.times) > 1:
             span = min(b - a for a, b in pairwise(motion.times))
-            why = (
+            remedy = (
                 f"motion.{name} goes from value to value within {span:g} s; take "
                 f"{span / STEPS_PER_PROFILE:.2g} s or less"
             )
-            limits.append((span / STEPS_PER_PROFILE, why))
+            limits.append((span / STEPS_PER_PROFILE, remedy))
     if flies > 0:
-        why = (
+        remedy = (
             "a body comes flying and may be through a pad between two of them; take "
             f"{PASSED / flies:.2g} s or less"
         )
-        limits.append((PASSED / flies, why))
+        limits.append((PASSED / flies, remedy))
     swinging = {f"a mode of the rig swings with {fastest:.3g} rad/s": fastest}
     swinging |= {
         f"motion.{k} goes up to {m.fastest():g} Hz": 2 * np.pi * m.fastest()
@@ -266,11 +266,12 @@ def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Di
                     "shorter ones",
                 )
             )
-    for most, why in limits:
+    for most, remedy in limits:
         if step > most:
             yield Diagnostic(
                 "warning", "solver.step",
-                f"steps of {step:g} s are too coarse: {why}, or leave step out and let rtol choose",
+                f"steps of {step:g} s are too coarse: {remedy}, or leave step out and let rtol "
+                "choose",
             )  # fmt: skip
 
 
@@ -281,9 +282,11 @@ def slips(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
         if rig.pads[contact.pad].points:
             continue
         force = max(float(m.state.pads[contact.pad][0].norm(dim=-1).max()) for m in there)
-        if why := contact.law.jumps(force / float(rig.weight(key).max())):
+        if reason := contact.law.jumps(force / float(rig.weight(key).max())):
             yield Diagnostic(
-                "warning", f"laws.{e.file.contacts[key].law}.friction", f"{why}; raise v_s or eta"
+                "warning",
+                f"laws.{e.file.contacts[key].law}.friction",
+                f"{reason}; raise v_s or eta",
             )
 
 
@@ -324,13 +327,13 @@ def ties(e: Estimate) -> Iterator[Diagnostic]:
     """Errors on loops that cannot move the body that they measure, and on efforts of controllers
     that move none of the measured coordinates."""
     graph = tied(e.rig, e.rig.contacts)
-    wanted = [(one.field, one.pushes, (one.measured,)) for one in e.loops]
-    wanted += [
+    loops = [(one.field, one.pushes, (one.measured,)) for one in e.loops]
+    loops += [
         (f"controllers.{k}.pushes", pushed, one.measures)
         for k, one in e.file.controllers.items()
         for pushed in one.pushes
     ]
-    for field, pushed, measured in wanted:
+    for field, pushed, measured in loops:
         bodies = [at(one)[0] for one in measured]
         if not any(nx.has_path(graph, body, at(pushed)[0]) for body in bodies):
             yield Diagnostic(
@@ -395,8 +398,12 @@ def jumps(e: Estimate) -> Iterator[Diagnostic]:
     values, followed = signals(e.rig, 0.0), e.rig.follow(0.0)
     for loop in e.loops:
         body, axis = at(loop.measured)
-        unit, here, wanted = e.file.unit(loop.setpoint), e.start[body][axis], values[loop.setpoint]
-        if abs(wanted - here) > JUMP[unit]:
+        unit, here, setpoint = (
+            e.file.unit(loop.setpoint),
+            e.start[body][axis],
+            values[loop.setpoint],
+        )
+        if abs(setpoint - here) > JUMP[unit]:
             state = e.rig.unpack(e.y0, followed)
             efforts = [
                 float(e.rig.actuator_effort(name, state, followed).detach())
@@ -404,7 +411,7 @@ def jumps(e: Estimate) -> Iterator[Diagnostic]:
             ]
             yield Diagnostic(
                 "warning", f"motion.{loop.setpoint}",
-                f"it begins at {wanted:.6g} {unit}, but {loop.measured} at {here:.6g} {unit}: "
+                f"it begins at {setpoint:.6g} {unit}, but {loop.measured} at {here:.6g} {unit}: "
                 f"`{loop.field}` pushes "
                 f'with {max(map(abs, efforts)):.3g} at once; begin at "start"',
             )  # fmt: skip
@@ -433,23 +440,23 @@ def carried(e: Estimate) -> Iterator[Diagnostic]:
             for key, s in over.items()
         ):
             continue
-        why = (
+        reason = (
             "no pad that it has a contact with lies under it"
             if own
             else "it has no contact with any pad"
         )
         yield Diagnostic(
             "error", f"bodies.{name}",
-            f"nothing carries it: {why}, no actuator pushes {name}.y, and gravity pulls; it would "
-            "fall out of the picture. Put a pad with a contact under it, fix y, or say weighted = "
-            "false",
+            f"nothing carries it: {reason}, no actuator pushes {name}.y, and gravity pulls; it "
+            "would fall out of the picture. Put a pad with a contact under it, fix y, or say "
+            "weighted = false",
         )  # fmt: skip
 
 
 def overlaps(e: Estimate) -> Iterator[Diagnostic]:
     """Errors on overlapping things without a contact between them: at the start, and later those of
     known course."""
-    said, rig = set[tuple[str, str]](), e.rig
+    reported, rig = set[tuple[str, str]](), e.rig
     contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
     for time, scene in e.course:
         sure = [
@@ -473,8 +480,8 @@ def overlaps(e: Estimate) -> Iterator[Diagnostic]:
             for a, b in itertools.combinations(rig.pads, 2)
         }
         for (one, other), depth in depths.items():
-            if depth > TOUCH and (one, other) not in said:
-                said.add((one, other))
+            if depth > TOUCH and (one, other) not in reported:
+                reported.add((one, other))
                 yield Diagnostic(
                     "error", one,
                     f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no "

@@ -59,9 +59,9 @@ class NumberOr:
             return x
         if isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x):
             return float(x)
-        said = ", ".join(f'"{word}"' for word in self.words)
-        or_ = " or " if said else ""
-        raise ValueError(f"should be {said}{or_}a number [{self.unit}], not {shown(x)}")
+        listed = ", ".join(f'"{word}"' for word in self.words)
+        or_ = " or " if listed else ""
+        raise ValueError(f"should be {listed}{or_}a number [{self.unit}], not {shown(x)}")
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler

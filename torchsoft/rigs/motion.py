@@ -75,7 +75,7 @@ class Motion(Group):
     """A function of time, in m or rad where a coordinate follows it, in N or N.m where it is fed
     forward."""
 
-    def build(self, asked: MotionContext) -> Piecewise:
+    def build(self, context: MotionContext) -> Piecewise:
         """The signal. Raises `ValueError` naming the field."""
         raise NotImplementedError
 
@@ -92,8 +92,8 @@ class HoldTable(Motion):
         default=START, description=f'"{START}": where the coordinate that follows starts'
     )
 
-    def build(self, asked: MotionContext) -> Piecewise:
-        return Profile([0.0], [asked.value("value", self.value)])
+    def build(self, context: MotionContext) -> Piecewise:
+        return Profile([0.0], [context.value("value", self.value)])
 
 
 class Knots(Motion):
@@ -122,11 +122,11 @@ class Knots(Motion):
                 raise ValueError(f"times must increase, but {after:g} s follows {before:g} s")
         return self
 
-    def knots(self, asked: MotionContext) -> tuple[list[float], list[float]]:
+    def knots(self, context: MotionContext) -> tuple[list[float], list[float]]:
         """Times and values as numbers."""
-        offset = asked.value("offset", self.offset)
+        offset = context.value("offset", self.offset)
         known = zip(self.values, self.times)
-        return list(self.times), [offset + asked.value("values", *one) for one in known]
+        return list(self.times), [offset + context.value("values", *one) for one in known]
 
 
 class ProfileTable(Knots):
@@ -134,8 +134,8 @@ class ProfileTable(Knots):
 
     kind: Literal["profile"] = "profile"
 
-    def build(self, asked: MotionContext) -> Piecewise:
-        return Profile(*self.knots(asked))
+    def build(self, context: MotionContext) -> Piecewise:
+        return Profile(*self.knots(context))
 
 
 class StrokesTable(Motion):
@@ -155,15 +155,15 @@ class StrokesTable(Motion):
         default=None, description="when the last one has ended; the end of the run if not given"
     )
 
-    def build(self, asked: MotionContext) -> Piecewise:
-        until = asked.end if self.until is None else self.until
+    def build(self, context: MotionContext) -> Piecewise:
+        until = context.end if self.until is None else self.until
         count = int((until - self.since) / self.stroke_time + 1e-9)
         if not 1 <= count <= STROKES:
             raise ValueError(
-                f"motion.{asked.name}.stroke_time = {self.stroke_time:g} s makes {count} strokes "
+                f"motion.{context.name}.stroke_time = {self.stroke_time:g} s makes {count} strokes "
                 f"from {self.since:g} to {until:g} s, but a motion has 1 to {STROKES}; take another"
             )
-        near = asked.value("offset", self.offset)
+        near = context.value("offset", self.offset)
         times = [self.since + i * self.stroke_time for i in range(count + 1)]
         return Profile(times, [near + i % 2 * self.travel for i in range(count + 1)])
 
@@ -173,8 +173,8 @@ class SplineTable(Knots):
 
     kind: Literal["spline"] = "spline"
 
-    def build(self, asked: MotionContext) -> Piecewise:
-        times, values = self.knots(asked)
+    def build(self, context: MotionContext) -> Piecewise:
+        times, values = self.knots(context)
         if len(times) == 1:
             return Profile(times, values)
         slopes = CubicSpline(times, values, bc_type="clamped").derivative()(times)
@@ -197,18 +197,18 @@ class ModulatedMotion(Knots):
         description="when they have gone, again within 0.15 s; the end of the run if not given",
     )
 
-    def window(self, asked: MotionContext) -> tuple[float, float]:
+    def window(self, context: MotionContext) -> tuple[float, float]:
         """Begin and end [s] of the waves. Raises `ValueError`."""
-        until = asked.end if self.until is None else self.until
+        until = context.end if self.until is None else self.until
         if not until - self.since > 2 * FADE:
             raise ValueError(
-                f"motion.{asked.name}.since = {self.since:g} s leaves {until - self.since:g} s "
+                f"motion.{context.name}.since = {self.since:g} s leaves {until - self.since:g} s "
                 f"until {until:g} s, but waves take {2 * FADE:g} s to come and go"
             )
         if self.fastest() * (until - self.since) > PERIODS:
             raise ValueError(
-                f"motion.{asked.name} has more than {PERIODS:g} periods; take a lower frequency or "
-                "a shorter time"
+                f"motion.{context.name} has more than {PERIODS:g} periods; take a lower frequency "
+                "or a shorter time"
             )
         return self.since, until
 
@@ -234,11 +234,11 @@ class SinesTable(ModulatedMotion):
     def fastest(self) -> float:
         return max(one.frequency for one in self.components)
 
-    def build(self, asked: MotionContext) -> Piecewise:
+    def build(self, context: MotionContext) -> Piecewise:
         columns = np.array(
             [(one.amplitude, one.frequency, 0.0, one.phase) for one in self.components]
         ).T
-        return Waves(self.knots(asked), *self.window(asked), wave(*columns))
+        return Waves(self.knots(context), *self.window(context), wave(*columns))
 
 
 class ChirpTable(ModulatedMotion):
@@ -254,10 +254,12 @@ class ChirpTable(ModulatedMotion):
     def fastest(self) -> float:
         return max(self.first, self.last)
 
-    def build(self, asked: MotionContext) -> Piecewise:
-        since, until = self.window(asked)
+    def build(self, context: MotionContext) -> Piecewise:
+        since, until = self.window(context)
         sweep = (self.last - self.first) / (until - since)
-        return Waves(self.knots(asked), since, until, wave(self.amplitude, self.first, sweep, 0.0))
+        return Waves(
+            self.knots(context), since, until, wave(self.amplitude, self.first, sweep, 0.0)
+        )
 
 
 class CsvTable(Motion):
@@ -273,13 +275,13 @@ class CsvTable(Motion):
         description=f'what is added; "{START}": where the coordinate that follows starts',
     )
 
-    def build(self, asked: MotionContext) -> Piecewise:
+    def build(self, context: MotionContext) -> Piecewise:
         try:
-            path = asked.folder / self.file
-            times, values = read_column(path, self.column, asked.unit, self.time)
+            path = context.folder / self.file
+            times, values = read_column(path, self.column, context.unit, self.time)
         except ValueError as error:
-            raise ValueError(f"motion.{asked.name}.file: {error}") from None
-        offset = asked.value("offset", self.offset)
+            raise ValueError(f"motion.{context.name}.file: {error}") from None
+        offset = context.value("offset", self.offset)
         return Sampled(times, [offset + value for value in values])
 
 

@@ -79,7 +79,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
     """The run in numbers, in SI units, and its provenance."""
     run, rig = done.trajectory, done.ready.rig
     stopped = done.stopped
-    why = (
+    reason = (
         None
         if stopped is None
         else stopped.reason
@@ -88,7 +88,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
     )
     return {
         "title": file.title,
-        "stopped": why,
+        "stopped": reason,
         "simulated_s": float(run.t[-1]),
         "bodies": {name: coordinates(rig, run, name) for name in rig.bodies},
         "contacts": {

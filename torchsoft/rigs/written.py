@@ -77,11 +77,11 @@ def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[
 
 def remark(field: FieldInfo) -> str:
     """Meaning and unit of a field."""
-    said = (*field.metadata, *metadata(field.annotation))
+    annotations = (*field.metadata, *metadata(field.annotation))
     unit = next(
         (
             one.unit
-            for one in said
+            for one in annotations
             if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")
         ),
         "",

@@ -77,7 +77,7 @@ class Batch(Shown):
             )
             rows.append(("steps", f"{min(steps)} to {max(steps)} a run"))
             rows.append(("energy", f"at most {worst:.1e} of what was injected is missing"))
-        rows += [(f"run {i} failed", str(why)) for i, why in list(self.failures.items())[:3]]
+        rows += [(f"run {i} failed", str(reason)) for i, reason in list(self.failures.items())[:3]]
         count, wall = len(self), self.wall_s
         return f"Batch: {count} runs, {len(self.failures)} failed, {wall:.2g} s", rows
 
@@ -124,11 +124,11 @@ class Batch(Shown):
                 "the runs' rows have different shapes, "
                 f"{' and '.join(str(tuple(s)) for s in shapes)}"
             )
-        nothing = torch.full(
+        unfilled = torch.full(
             (max(self.lengths), *next(iter(shapes), ())), torch.nan, dtype=torch.float64
         )
         rows = [
-            nothing if part is None else torch.cat((part, nothing[len(part) :])) for part in parts
+            unfilled if part is None else torch.cat((part, unfilled[len(part) :])) for part in parts
         ]
         return torch.stack(rows)
 
@@ -226,12 +226,12 @@ def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> No
             found.setdefault(subject, {})[i] = doubt
     for runs in found.values():
         first, *others = runs
-        who = (
+        label = (
             f"runs {', '.join(map(str, runs))} (numbers of run {first})"
             if others
             else f"run {first}"
         )
-        warnings.warn(f"{who}: {runs[first]}", stacklevel=3)
+        warnings.warn(f"{label}: {runs[first]}", stacklevel=3)
 
 
 def _rows(name: str, given: Any) -> Any:

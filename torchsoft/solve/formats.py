@@ -253,8 +253,8 @@ def write_log(path: Path, data: xr.Dataset, about: Mapping[str, str]) -> None:
         writer.add_metadata("torchsoft", dict(about))
         for row in zip(*columns, strict=True):
             at = round(row[0] * NANO)
-            said = json.dumps(dict(zip(fields, row)), allow_nan=False)
-            writer.add_message(channel, log_time=at, publish_time=at, data=said.encode())
+            message = json.dumps(dict(zip(fields, row)), allow_nan=False)
+            writer.add_message(channel, log_time=at, publish_time=at, data=message.encode())
         writer.finish()
 
 

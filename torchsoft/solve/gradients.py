@@ -72,15 +72,15 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
     """The rows of finished runs with the discrete adjoint behind them, by y0, parameters and
     signals, but not by the times, where anything wants it. The backward sweeps of several runs go
     side by side in so many threads."""
-    wanted = [run for run in runs if run.segments is not None]
+    differentiated = [run for run in runs if run.segments is not None]
     inputs: list[Tensor] = []
-    for run in wanted:
+    for run in differentiated:
         stepper = run.stepper
         times = [stage_times(segment.plan) for segment in run.segments or []]
         signals = stepper.compiled.signals(torch.cat([*times, run.t]), stepper.reference)
         at_stages, at_outputs = signals[: -len(run.t)], signals[-len(run.t) :]
         inputs += [run.y0, stepper.compiled.p, at_stages, at_outputs]
-    flat = iter(_Solutions.apply(wanted, threads, *inputs) if wanted else ())
+    flat = iter(_Solutions.apply(differentiated, threads, *inputs) if differentiated else ())
     solutions = map(Rows, flat, flat)
     return [run.rows if run.segments is None else next(solutions) for run in runs]
 
@@ -112,13 +112,13 @@ class _Solutions(torch.autograd.Function):
             )
         bars: list[Tensor | None] = [None] * (4 * len(ctx.runs))
         pairs = list(zip(given[::2], given[1::2]))
-        asked = [i for i, (y, felt) in enumerate(pairs) if y is not None or felt is not None]
+        needed = [i for i, (y, felt) in enumerate(pairs) if y is not None or felt is not None]
 
         def sweep(k: int) -> tuple[Tensor, ...]:
-            return run_adjoint(ctx.runs[asked[k]], *pairs[asked[k]])
+            return run_adjoint(ctx.runs[needed[k]], *pairs[needed[k]])
 
-        for k, result in parallel_map(sweep, len(asked), ctx.threads, turns=True):
-            bars[4 * asked[k] : 4 * asked[k] + 4] = result
+        for k, result in parallel_map(sweep, len(needed), ctx.threads, turns=True):
+            bars[4 * needed[k] : 4 * needed[k] + 4] = result
         return None, None, *bars
 
 
@@ -187,14 +187,14 @@ def without_gradient(name: str, series: Tensor, y: Tensor) -> Tensor:
 # of the compiled kernels.
 
 
-def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
+def directions(value: Tensor, wrt: Sequence[Tensor]) -> Array:
     """d value / d (scalar tensors) (..., n) from the graph of `value` (...): its pullback is linear
     in the weights, so differentiated by them it pushes forward."""
-    out = np.zeros((*value.shape, len(wanted)))
+    out = np.zeros((*value.shape, len(wrt)))
     weights = torch.zeros_like(value, requires_grad=True)
     pulled = (
-        torch.autograd.grad(value, wanted, weights, create_graph=True, allow_unused=True)
-        if wanted and value.requires_grad
+        torch.autograd.grad(value, wrt, weights, create_graph=True, allow_unused=True)
+        if wrt and value.requires_grad
         else ()
     )
     if own := [k for k, part in enumerate(pulled) if part is not None and part.requires_grad]:
@@ -205,18 +205,18 @@ def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
 
 
 def iterate(
-    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None,
+    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wrt: Sequence[Tensor], dy0: Tensor | None,
     columns: list[int], sums: Sums,
 ) -> Iterator[tuple[Tensor, Tensor, Progress]]:  # fmt: skip
-    """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, and those of
+    """Derivatives (T, components, n) of the states by the scalar tensors `wrt`, and those of
     sums of forces (T, sums, n), as the run grows; `columns` are the components of the state that
     are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its columns
-    beyond those of `wanted` are directions of the start alone."""
+    beyond those of `wrt` are directions of the start alone."""
     size, count = stepper.layout.size, len(sums.start) - 1
-    dy = np.zeros((size, len(wanted))) if dy0 is None else dy0.detach().numpy().copy()
+    dy = np.zeros((size, len(wrt))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
     dp = np.zeros((len(stepper.compiled.p), n))
-    dp[:, : len(wanted)] = directions(stepper.compiled.p, wanted)
+    dp[:, : len(wrt)] = directions(stepper.compiled.p, wrt)
     kept, felt = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
     segments: list[Segment] = []
     for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):

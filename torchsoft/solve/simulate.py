@@ -261,8 +261,8 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor,
         for solved in march(stepper, task.y0, task.t, tape_bytes):
             yield solved, None
         return
-    wanted = [stepper.rig.parameter(name) for name in wrt]
-    for name, value in zip(wrt, wanted):
+    leaves = [stepper.rig.parameter(name) for name in wrt]
+    for name, value in zip(wrt, leaves):
         if value.ndim or not value.requires_grad:
             raise ValueError(f"`{name}` must be a scalar parameter that requires a gradient")
     size = stepper.layout.size
@@ -277,7 +277,7 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor,
             raise ValueError("`dy0` must be finite, but has a component that is not")
     kept = stepper.layout.rigid if task.rigid else list(range(size))
     sums = Touch(stepper.rig).sums(task.touch)
-    for dy, felt, out in iterate(stepper, task.y0, task.t, wanted, dy0, kept, sums):
+    for dy, felt, out in iterate(stepper, task.y0, task.t, leaves, dy0, kept, sums):
         yield Solved(stepper, task.y0, task.t, out, None), (dy, felt)
 
 

@@ -199,12 +199,12 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
             parts = [(here.start, split, "length"), (split, here.stop, "angle")]
         if kind == "pose":
             origin[here] = y0[here]
-        for begin, end, what in parts:
+        for begin, end, dimension in parts:
             if end > begin:
                 first.append(begin)
                 last.append(end)
                 rate.append(kind in ("rates", "velocity"))
-                unit.append(UNITS[what])
+                unit.append(UNITS[dimension])
                 size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
     whole = [np.array(numbers, np.int64) for numbers in (first, last, rate)]
     return Errors(whole[0], whole[1], whole[2], atol * np.array(unit), np.array(size), origin)
@@ -212,14 +212,14 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
 
 def part_name(rig: Rig, errors: Errors, number: int) -> str:
     """Quantity of a part's error, in words."""
-    what = {
+    quantities = {
         "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
         "pose": "the pose of body", "rates": "the nodal velocities of pad",
         "velocity": "the velocity of body",
     }  # fmt: skip
     for (kind, name), here in rig.layout.slices.items():
         if here.start <= errors.first[number] < here.stop:
-            return f"{what[kind]} `{name}`"
+            return f"{quantities[kind]} `{name}`"
     return "the state"
 
 

@@ -201,8 +201,8 @@ def register_method() -> None:
         raise ImportError(
             "this torchdiffeq keeps its solvers elsewhere; torchsoft was made for torchdiffeq 0.2.5"
         )
-    theirs = solvers.get(METHOD)
-    if theirs is None:
+    present = solvers.get(METHOD)
+    if present is None:
         solvers[METHOD] = TorchdiffeqSolver
-    elif not (isinstance(theirs, type) and issubclass(theirs, TorchdiffeqSolver)):
-        solvers[METHOD] = type("TorchdiffeqSolver", (TorchdiffeqSolver,), {"theirs": theirs})
+    elif not (isinstance(present, type) and issubclass(present, TorchdiffeqSolver)):
+        solvers[METHOD] = type("TorchdiffeqSolver", (TorchdiffeqSolver,), {"theirs": present})

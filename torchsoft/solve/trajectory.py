@@ -202,24 +202,24 @@ class Trajectory(Shown):
         touching = {name: force[..., 0] > 0 for name, force in self.force.items()}
         return {name: -there.to(torch.int8) for name, there in touching.items()}
 
-    def plot(self, **how: Any) -> Figure:
+    def plot(self, **options: Any) -> Figure:
         """A dashboard of the run as a matplotlib figure; options of
         `torchsoft.plot.dashboard.dashboard`."""
         from torchsoft.plot.dashboard import dashboard
 
-        return dashboard(self, **how)
+        return dashboard(self, **options)
 
-    def animate(self, path: str | Path, **how: Any) -> None:
+    def animate(self, path: str | Path, **options: Any) -> None:
         """Write a video, .mp4 or .gif, or the interactive player, .html; options of
         `torchsoft.plot.animation.animate` or `torchsoft.plot.animation.player`."""
         if Path(path).suffix == ".html":
             from torchsoft.plot.animation import player
 
-            player(self, Path(path), **how)
+            player(self, Path(path), **options)
             return
         from torchsoft.plot.animation import animate
 
-        animate(self, Path(path), **how)
+        animate(self, Path(path), **options)
 
     def to_xarray(self) -> xr.Dataset:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""

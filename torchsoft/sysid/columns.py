@@ -121,8 +121,8 @@ class Tables:
 
     def near(self, time: float) -> str:
         """Names the file with the set-points, and the first row at or after a time [s]."""
-        asked = (self.of(name) for name in self.known.signals if name in self)
-        table = next(asked, self.tables[0])
+        tables_of = (self.of(name) for name in self.known.signals if name in self)
+        table = next(tables_of, self.tables[0])
         return f"{table.path}, {table.near(time)}"
 
 
@@ -151,8 +151,8 @@ def read_tables(paths: Sequence[Path], ignore: Collection[str], known: Vocabular
 
 def check_times(tables: Tables) -> None:
     """Raises `ValueError` for samples that were taken where a set-point is not known."""
-    asked = {name: tables.of(name) for name in tables.known.signals if name in tables}
-    for name, known in asked.items():
+    tables_of = {name: tables.of(name) for name in tables.known.signals if name in tables}
+    for name, known in tables_of.items():
         t = known.values["t"]
         slack = float(np.diff(t).max())
         for table in tables.tables:
@@ -239,30 +239,30 @@ def check_table(table: Columns, known: Vocabulary) -> Columns:
     path, values = table.path, table.values
     if "t" not in values:
         raise ValueError(f"{path} has no column `t`")
-    asked = [name for name in known.asked if name in values]
-    if len(table.rows) < (least := ROWS if asked else 2):
+    setpoints = [name for name in known.asked if name in values]
+    if len(table.rows) < (least := ROWS if setpoints else 2):
         raise ValueError(
             f"{path} has {len(table.rows)} rows of numbers, but needs at least {least}"
         )
-    for name in ("t", *asked):
+    for name in ("t", *setpoints):
         if (empty := np.flatnonzero(np.isnan(values[name]))).size:
             raise ValueError(
                 f"{table.at(empty[0])}, column `{name}` is empty; only measured channels may have "
                 "gaps"
             )
     apart_by = np.diff(values["t"])
-    for i in np.flatnonzero(~((apart_by > 0) & (apart_by <= (GAP if asked else np.inf))))[:1]:
+    for i in np.flatnonzero(~((apart_by > 0) & (apart_by <= (GAP if setpoints else np.inf))))[:1]:
         t, before = values["t"][i + 1], values["t"][i]
         if t == before:
-            what = f"the time {t:g} s is there twice"
+            fault = f"the time {t:g} s is there twice"
         elif t < before:
-            what = f"time goes back, from {before:g} to {t:g} s"
+            fault = f"time goes back, from {before:g} to {t:g} s"
         else:
-            what = (
+            fault = (
                 f"{t - before:.3g} s are missing before it; set-points are needed every {GAP} s or "
                 "oftener"
             )
-        raise ValueError(f"{table.at(i + 1)}, column `t`: {what}")
+        raise ValueError(f"{table.at(i + 1)}, column `t`: {fault}")
     if (late := np.flatnonzero(np.abs(values["t"]) > LATE)).size:
         raise ValueError(
             f"{table.at(late[0])}, column `t`: {values['t'][late[0]]:.9g} s is too far from zero; "

@@ -133,21 +133,21 @@ class Versus:
             )
         sure = self.evidence - self.numerical
         if sure < EVIDENCE or self.z < APART:
-            said = (
+            doubt = (
                 f"the evidence for {a} over {b} is {self.evidence:.2g} nats ({EVIDENCE:g} are "
                 f"needed), and z = {self.z:.2g} ({APART:g} is needed)"
             )
             if self.evidence >= EVIDENCE > sure and self.z >= APART:
-                said += (
+                doubt += (
                     f", but the steps of the simulation move that by {self.numerical:.2g}: take a "
                     "tighter tolerance"
                 )
             elif self.distance < 2 * APART:
-                said += (
+                doubt += (
                     f"; their predictions differ by {self.distance:.2g} times the noise over all "
                     "samples together, so that these motions and sensors cannot tell them apart"
                 )
-            out.append(said)
+            out.append(doubt)
         return out
 
 
@@ -185,8 +185,8 @@ class Comparison:
         for one in self.laws:
             own = f"{one.name:20s} {one.parameters:3d} {one.log_likelihood:11.1f} {one.chi2:7.3f}"
             delta = " ".join(f"{getattr(one, key) - least[key]:9.1f}" for key in least)
-            told = "" if one.heldout is None else f" {one.heldout:9.3f}"
-            rows.append(f"{own} {delta} {one.weight:7.3f}{told}")
+            density = "" if one.heldout is None else f" {one.heldout:9.3f}"
+            rows.append(f"{own} {delta} {one.weight:7.3f}{density}")
         return "\n".join(rows)
 
 
@@ -201,24 +201,24 @@ def judged(laws: list[LawFit], against: list[Versus]) -> tuple[Outcome, str | No
     ]
     ahead = [v.other for v in against if not v.doubts]
     if not best.fits:
-        said = f"none of the laws explains these data: the best, `{best.name}`, {best.misses}"
+        verdict = f"none of the laws explains these data: the best, `{best.name}`, {best.misses}"
         if ahead:
-            said += f"; it is nearer than {listed(ahead)}, but that does not make it right"
+            verdict += f"; it is nearer than {listed(ahead)}, but that does not make it right"
         return (
             "none fits",
             None,
-            f"{said}. Or the noise is not as it was stated: it is larger, or coloured.",
+            f"{verdict}. Or the noise is not as it was stated: it is larger, or coloured.",
         )
     if doubts or unsure:
         return "cannot tell", None, "the data cannot tell: " + "; ".join((*doubts, *unsure)) + "."
-    said = [f"`{best.name}` made these data"]
+    sentences = [f"`{best.name}` made these data"]
     for versus in against:
-        said.append(
+        sentences.append(
             f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard "
             "deviations"
         )
-    said += [f"But beware: {sentence}" for sentence in best.left]
-    return "law", best.name, ". ".join(said) + "."
+    sentences += [f"But beware: {sentence}" for sentence in best.left]
+    return "law", best.name, ". ".join(sentences) + "."
 
 
 def listed(names: list[str]) -> str:
@@ -321,9 +321,9 @@ class Evidence:
         at = self.law.problem.residuals(
             self._runner, self.law.x, which, rtol, self.law.free if derivatives else None
         )
-        if at.lost:
+        if at.failed:
             raise ValueError(
-                f"the law `{self.name}` cannot be run at its estimates: {Unreachable(at.lost)}"
+                f"the law `{self.name}` cannot be run at its estimates: {Unreachable(at.failed)}"
             )
         return at
 
@@ -367,10 +367,10 @@ def ratio(a: Density, b: Density) -> Ratio:
     for mine, its in zip(a.parts, b.parts):
         score = b.s[its.rows] - a.s[mine.rows]
         if mine.noise != its.noise:
-            theirs = (
+            other_score = (
                 b.s[its.rows] if its.noise is None else its.noise.whitener(its.t).T @ b.s[its.rows]
             )
-            score = coloured(theirs, mine.noise, mine.t) - a.s[mine.rows]
+            score = coloured(other_score, mine.noise, mine.t) - a.s[mine.rows]
         left = fit_noise([(mine.t, a.r[mine.rows])], most=COLOUR).noise
         stated += float(score @ score)
         variance += float(np.sum(coloured(score, left, mine.t) ** 2))
@@ -432,8 +432,8 @@ def compare(
             law = fitted(
                 name, problem, runners[name], which, (plans or {}).get(name), rtol, starts, progress
             )
-        except Unreachable as lost:
-            raise ValueError(f"the law `{name}` cannot follow the recordings: {lost}") from None
+        except Unreachable as error:
+            raise ValueError(f"the law `{name}` cannot follow the recordings: {error}") from None
         evidence[name] = Evidence(law, runners[name], which, heldout)
     best = max(evidence, key=lambda name: evidence[name].total)
     for name in (name for name in laws if name != best):
@@ -505,8 +505,8 @@ def fitted(
     end = run_plan(
         problem, runner, plan, problem.coordinates.start, label=f"{name} ", progress=progress
     )
-    if end.lost is not None:  # laws are compared by the same tolerance
-        raise end.lost
+    if end.failure is not None:  # laws are compared by the same tolerance
+        raise end.failure
     fit = end.fit
     free = np.isin(problem.coordinates.labels, plan[-1].free)
 

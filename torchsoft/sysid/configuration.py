@@ -22,7 +22,7 @@ SURE = 1e-12
 known: say 0."""
 
 
-def told_apart(sd: float, value: float = 1.0) -> float:
+def resolvable(sd: float, value: float = 1.0) -> float:
     """A standard deviation that is zero or can be computed with. Raises `ValueError` for
     another."""
     if 0 < sd < (least := SURE * max(abs(value), 1.0)):
@@ -36,7 +36,7 @@ class Rest(Table):
 
     kind: Literal["rest"] = "rest"
     lead: float = Field(default=SETTLE, ge=0, le=10)
-    position_sd: dict[Name, Annotated[float, AfterValidator(told_apart), Field(ge=0, le=0.1)]] = (
+    position_sd: dict[Name, Annotated[float, AfterValidator(resolvable), Field(ge=0, le=0.1)]] = (
         Field(default_factory=dict)
     )
 
@@ -49,7 +49,7 @@ class Known(Table):
 
     @model_validator(mode="after")
     def _is_a_distribution(self) -> "Known":
-        told_apart(self.sd, self.mean)
+        resolvable(self.sd, self.mean)
         return self
 
 

@@ -67,7 +67,7 @@ class Search:
         self, planner: Planner, x: Array, rate: float, smoothing: float, seed: int
     ) -> None:
         self.planner, self.x, self.rate, self.smoothing = planner, x, rate, smoothing
-        self.rng, self.iteration, self.lost, self.in_a_row = np.random.default_rng(seed), 0, 0, 0
+        self.rng, self.iteration, self.failed, self.in_a_row = np.random.default_rng(seed), 0, 0, 0
         self.z = planner.moves.start
         self.adam = ProjectedAdam(self.z, planner.moves.nearest, MEMORY)
         self.seen = planner.evaluate(self.z, x)
@@ -77,7 +77,7 @@ class Search:
     def visit(self, seen: DesignEvaluation) -> Visit:
         return Visit(self.iteration, seen.value, max(seen.peaks.values(), default=0.0))
 
-    def look(self) -> None:
+    def evaluate(self) -> None:
         """Evaluate the current motion, and keep it if it is the best."""
         z, seen, visit = self.adam.z, None, Visit(self.iteration, np.inf, np.inf)
         with suppress(SimulationFailed):
@@ -95,7 +95,7 @@ class Search:
             there = self.planner.evaluate(shifted, self.x)
             slopes = self.planner.slopes(shifted, self.x, there)
         except (SimulationFailed, GradientFailed):
-            self.lost, self.in_a_row = self.lost + 1, self.in_a_row + 1
+            self.failed, self.in_a_row = self.failed + 1, self.in_a_row + 1
             if self.in_a_row >= FAILURES:
                 self.in_a_row, self.rate = 0, 0.5 * self.rate
                 self.adam.set(self.z)
@@ -106,7 +106,7 @@ class Search:
         rate = self.rate * min(1.0, self.iteration / 5) * (0.1 + 0.9 * (1 - part))
         self.adam.step(np.clip(slopes, -most, most), rate)
         if self.iteration % LOOK == 0:
-            self.look()
+            self.evaluate()
 
 
 # The design of a motion
@@ -196,7 +196,7 @@ def design(
                 search.move(iterations)
                 bar.set_postfix_str(f"criterion {search.best.value:.3f}", refresh=False)
                 bar.update(search.iteration - bar.n)
-            search.look()
+            search.evaluate()
             notices = []
         except KeyboardInterrupt:
             notices = [f"interrupted after {search.iteration} of {iterations} iterations"]
@@ -219,8 +219,8 @@ def design(
             f"ends {bent[most]:.2g} of them from it in `{most}`: take finer steps, and count "
             "intervals that hold before this motion is used"
         )
-    if search.lost:
-        notices.append(f"{search.lost} motions that the search tried could not be run")
+    if search.failed:
+        notices.append(f"{search.failed} motions that the search tried could not be run")
     return Design(
         given=given, recording=planner.made(search.z, x, last), before=before,
         after=planner.deviations(x, last), history=tuple(search.history),
@@ -245,17 +245,19 @@ FINER = 0.1
 
 def planned(
     stated: Config, file: RigFile, built: BuiltRig[Any], name: str, rtol: float,
-    start: Beginning | None = None, **how: Any,
+    start: Beginning | None = None, **options: Any,
 ) -> Recording:  # fmt: skip
     """A planned recording of a file's rig, `built`, by a configuration, from a run with the
-    tolerance `rtol`; `how` are further arguments of `record`. Raises `ValueError`, and
+    tolerance `rtol`; `options` are further arguments of `record`. Raises `ValueError`, and
     `SimulationFailed`."""
     plan, start = stated.rehearsal, start or stated.start
     if plan.duration is not None:
         built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
     lead = start.lead if isinstance(start, Rest) else 0.0
     at_rest = Standing.of(built.rig, built.y0, lead, file.rests())
-    return record(name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **how)
+    return record(
+        name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **options
+    )
 
 
 def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Path]]:
@@ -322,18 +324,18 @@ AS_STATED = "as stated"
 class Rated:
     """A rated candidate: the criterion, a logarithm of standard deviations, the smaller the better;
     the relative standard deviations of the parameters, and the largest fraction of their limits
-    that channels reach. `lost` is the reason of a failed run."""
+    that channels reach. `failure` is the reason of a failed run."""
 
     name: str
     value: float
     deviations: dict[str, float]
     peaks: dict[str, float]
-    lost: str = ""
+    failure: str = ""
 
     @property
     def score(self) -> float:
         """The criterion; infinite beyond a limit."""
-        beyond = self.lost or max(self.peaks.values(), default=0.0) > 1
+        beyond = self.failure or max(self.peaks.values(), default=0.0) > 1
         return np.inf if beyond else self.value
 
 
@@ -347,14 +349,16 @@ class Chosen(NamedTuple):
 
     def table(self) -> str:
         """A line for each candidate."""
-        names = list(next((one.deviations for one in self.rated if not one.lost), {}))
+        names = list(next((one.deviations for one in self.rated if not one.failure), {}))
         width = max([len(one.name) for one in self.rated] + [9])
         rows = [f"{'candidate':{width}s} criterion  {'  '.join(names)}"]
         for one in self.rated:
             cells = [f"{one.deviations.get(name, np.nan):{len(name)}.2%}" for name in names]
-            said = f"cannot be made: {line(one.lost, 120)}" if one.lost else "  ".join(cells)
+            content = (
+                f"cannot be made: {line(one.failure, 120)}" if one.failure else "  ".join(cells)
+            )
             limit = [f"{k} goes beyond its limits" for k, part in one.peaks.items() if part > 1]
-            rows.append("  ".join([f"{one.name:{width}s} {one.value:9.3f}", said, *limit]))
+            rows.append("  ".join([f"{one.name:{width}s} {one.value:9.3f}", content, *limit]))
         return "\n".join(rows)
 
     def summary(self) -> dict[str, Any]:
@@ -412,7 +416,7 @@ def choose(
     plan = stated.design
     with at_field("settings"):
         file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)
-    files, made, lost = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
+    files, made, failures = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
         with at_field(f"design.candidates.{name}"):
             files[name] = file.override(**settings)
@@ -420,15 +424,15 @@ def choose(
         try:
             made[name] = planned(stated, files[name], built, name, plan.rtol, noise=0.0)
         except SimulationFailed as failure:
-            lost.append(Rated(name, np.inf, {}, {}, str(failure)))
+            failures.append(Rated(name, np.inf, {}, {}, str(failure)))
     common: dict[str, Any] = {
         "limits": plan.limits, "criterion": plan.criterion, "names": plan.parameters or None,
         "rtol": plan.rtol, "workers": workers,
     }  # fmt: skip
-    rated = rank(recorded, [*made.values()], stated.sensors, stated.unknowns, **common) + lost
+    rated = rank(recorded, [*made.values()], stated.sensors, stated.unknowns, **common) + failures
     best = rated[0].name
-    if rated[0].lost:
-        raise ValueError(f"{config}: no candidate can be made: {rated[0].lost}")
+    if rated[0].failure:
+        raise ValueError(f"{config}: no candidate can be made: {rated[0].failure}")
     found, chosen = None, files[best]
     if plan.bounds:
         problem = Problem([*recorded, made[best]], stated.sensors, stated.unknowns)

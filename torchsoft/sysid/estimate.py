@@ -242,21 +242,21 @@ def contributions(
     if at < len(J):
         rows[None] = slice(at, len(J))
     J = J[:, free]
-    C, wanted = fisher(J)[0], {one.label: one.slope[free] for one in quantities(problem, x, free)}
-    sd = {label: float(np.sqrt(g @ C @ g)) for label, g in wanted.items()}
+    C, slopes = fisher(J)[0], {one.label: one.slope[free] for one in quantities(problem, x, free)}
+    sd = {label: float(np.sqrt(g @ C @ g)) for label, g in slopes.items()}
     parts = {
-        name: {label: float(np.sum((J[own] @ (C @ g)) ** 2)) for label, g in wanted.items()}
+        name: {label: float(np.sum((J[own] @ (C @ g)) ** 2)) for label, g in slopes.items()}
         for name, own in rows.items()
     }
-    total = {label: max(sum(part[label] for part in parts.values()), 1e-300) for label in wanted}
+    total = {label: max(sum(part[label] for part in parts.values()), 1e-300) for label in slopes}
     out = []
     for name, own in rows.items():
         left = fisher(np.delete(J, own, 0))[0] if len(rows) > 1 else None
-        without: dict[str, float | None] = dict.fromkeys(wanted)
-        for label, g in wanted.items():
+        without: dict[str, float | None] = dict.fromkeys(slopes)
+        for label, g in slopes.items():
             alone = float(np.sqrt(g @ left @ g)) if left is not None else np.inf
             if alone < IDENTIFIABLE and sd[label] > 0:
                 without[label] = alone / sd[label]
-        shares = {label: parts[name][label] / total[label] for label in wanted}
+        shares = {label: parts[name][label] / total[label] for label in slopes}
         out.append(Contribution(name, shares, without))
     return out

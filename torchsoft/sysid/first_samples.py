@@ -69,7 +69,7 @@ def estimate_initial_state(
     coordinate that is neither measured nor given nor can be assumed, a delay that may be longer
     than `lead`, and pads that cannot be settled.
     """
-    rig, first, whose = recording.rig, float(recording.times[0]), f"recording `{recording.name}`"
+    rig, first, owner = recording.rig, float(recording.times[0]), f"recording `{recording.name}`"
     late = {channel: t >= first + lead - SAME for channel, (t, _) in recording.samples.items()}
     if strange := [name for name in given or {} if name not in free_coordinates(rig)]:
         raise ValueError(
@@ -83,7 +83,7 @@ def estimate_initial_state(
         )
     if empty := [channel for channel, kept in late.items() if kept.sum() < 2]:
         raise ValueError(
-            f"{whose} has no two samples of `{empty[0]}` left after `lead` = {lead:g} s"
+            f"{owner} has no two samples of `{empty[0]}` left after `lead` = {lead:g} s"
         )
     early = {
         c: (t[~late[c]] - first, y[~late[c]])
@@ -95,7 +95,7 @@ def estimate_initial_state(
     efforts = [abs(y).max() for c, (_, y) in early.items() if recording.units[c] == "N"]
     weight = sum(one.mass.item() for one in rig.bodies.values()) * rig.gravity.item()
     load = float(max(efforts, default=weight))
-    bodies = completed(rig, measured(rig, early, sensors, whose) | dict(given or {}), first, load)
+    bodies = completed(rig, measured(rig, early, sensors, owner) | dict(given or {}), first, load)
     return replace(
         recording,
         samples=samples,
@@ -104,7 +104,7 @@ def estimate_initial_state(
 
 
 def measured(
-    rig: Rig, early: Mapping[str, tuple[Array, Array]], sensors: Mapping[str, Sensor], whose: str
+    rig: Rig, early: Mapping[str, tuple[Array, Array]], sensors: Mapping[str, Sensor], owner: str
 ) -> dict[str, Normal]:
     """Coordinates and rates at time zero from the `early` samples, each by the most accurate
     channel."""
@@ -117,14 +117,16 @@ def measured(
         if sensors[channel].misalignment > 0:
             beside, _ = partner(rig, channel)
             other = float(np.abs(early[beside][1]).max()) if beside in early else np.inf
-        fits = beginning(f"`{channel}` of {whose}", *early[channel], sensors[channel], other)
+        fits = beginning(f"`{channel}` of {owner}", *early[channel], sensors[channel], other)
         for end, fit in zip((name, names[k + count]) if k < count else (name,), fits):
             if end not in found or fit[1] < found[end][1]:
                 found[end] = fit
     return {name: fit for name, fit in found.items() if np.isfinite(fit[1])}
 
 
-def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tuple[Normal, Normal]:
+def beginning(
+    subject: str, t: Array, y: Array, sensor: Sensor, other: float
+) -> tuple[Normal, Normal]:
     """Value and rate at t = 0 of a channel, by a polynomial through the samples y (k,) at t (k,)
     [s]; `other` is the size of the perpendicular channel that a misaligned sensor sees. Raises
     `ValueError` for too few samples."""
@@ -132,8 +134,8 @@ def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tu
     t, y = t[inside], y[inside]
     if len(t) < DEGREE + 1:
         raise ValueError(
-            f"{what} has {len(t)} samples in the beginning, but at least {DEGREE + 1} are needed "
-            "to tell where the run begins; take a longer `lead`"
+            f"{subject} has {len(t)} samples in the beginning, but at least {DEGREE + 1} are "
+            "needed to tell where the run begins; take a longer `lead`"
         )
     degree, span = min(DEGREE, len(t) - 2), float(t[-1])
     V = np.vander(t / span, degree + 1, increasing=True)

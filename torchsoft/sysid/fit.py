@@ -214,14 +214,14 @@ SETTLED = 0.2
 
 
 class Unreachable(RuntimeError):
-    """The model cannot follow a recording at the start of a fit; `lost` has reason and time by
+    """The model cannot follow a recording at the start of a fit; `failed` has reason and time by
     recording, `findings` the doubts about the recordings themselves."""
 
-    def __init__(self, lost: dict[str, FailedRun], findings: Sequence[str] = ()) -> None:
-        reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
+    def __init__(self, failed: dict[str, FailedRun], findings: Sequence[str] = ()) -> None:
+        reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in failed.items())
         behind = f"; what may be behind it: {'; '.join(findings)}" if findings else ""
         super().__init__(f"the model cannot reach the data from this start: {reasons}{behind}")
-        self.lost, self.findings = lost, tuple(findings)
+        self.failed, self.findings = failed, tuple(findings)
 
 
 class Fit(NamedTuple):
@@ -271,8 +271,8 @@ def gauss_newton(
             notify(float(np.mean(seen[key].r ** 2)))
         return seen[key]
 
-    if lost := at(zero).lost:
-        raise Unreachable(lost)
+    if failed := at(zero).failed:
+        raise Unreachable(failed)
     solve: Any = least_squares
     out = solve(
         lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free],
@@ -299,7 +299,7 @@ def chord(
         trial = x.copy()
         trial[free] = x[free] + newton_step(problem, x, at, free)
         there, count = problem.residuals(runner, trial, which, steps), count + 1
-        if there.lost or there.r @ there.r > at.r @ at.r:
+        if there.failed or there.r @ there.r > at.r @ at.r:
             break
         x, at = trial, there._replace(J=at.J)
         notify(float(np.mean(at.r**2)))
@@ -348,9 +348,9 @@ def descend(
         nonlocal best, count
         now = x.copy()
         now[free] = z
-        value, gradient, lost = problem.misfit(runner, now, which, steps, free)
-        if lost and count == 0:
-            raise Unreachable(lost)
+        value, gradient, failed = problem.misfit(runner, now, which, steps, free)
+        if failed and count == 0:
+            raise Unreachable(failed)
         count += 1
         if value < best[0]:
             best = value, now

@@ -102,7 +102,7 @@ class Settings(Table):
 # Conclusion of a fit
 
 
-class How(NamedTuple):
+class FitContext(NamedTuple):
     """Arguments of an identification besides its stages; `identify` documents the fields."""
 
     fitted: list[str]
@@ -121,12 +121,12 @@ class How(NamedTuple):
 
 
 def conclude(
-    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How,
-    findings: list[str], asked: float, began: float, progress: bool,
+    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]],
+    context: FitContext, findings: list[str], rtol_asked: float, began: float, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
     """The result, from the fit of the last stage with its estimated noise. `findings` are sentences
-    on the recordings and the plan, `asked` is the tolerance of the whole plan, `began` is on the
-    clock [s]."""
+    on the recordings and the plan, `rtol_asked` is the tolerance of the whole plan, `began` is on
+    the clock [s]."""
     c = coloured.problem.coordinates
     free, stages = np.isin(c.labels, stage.free), list(stages)
 
@@ -135,7 +135,7 @@ def conclude(
         start, by = clock.perf_counter(), stage.rtol
         with progress_bar("check of the steps", progress) as notify:
             end = settle(
-                coloured.problem, runner, stage, coloured.fit, free, how.tightenings, notify
+                coloured.problem, runner, stage, coloured.fit, free, context.tightenings, notify
             )
         for rtol, one, at in end.fits:
             name = "steps chosen anew" if rtol == by else "tighter tolerance"
@@ -148,8 +148,8 @@ def conclude(
         stage, start = replace(stage, rtol=end.rtol), clock.perf_counter()
         with progress_bar("colour of the noise", progress) as notify:
             coloured = with_its_noise(
-                coloured.problem, runner, stage, end.fits[-1][1], how.loss, how.settings.method,
-                notify,
+                coloured.problem, runner, stage, end.fits[-1][1], context.loss,
+                context.settings.method, notify,
             )  # fmt: skip
         stages += noise_entries(coloured, stage, start)
         end = at_rest()
@@ -161,7 +161,7 @@ def conclude(
     rows = np.append(exact, np.arange(len(at.r) - len(c.priors), len(at.r)))
     chi2 = float(at.r[rows] @ at.r[rows]) / max(len(rows) - int(free.sum()), 1)
     verdicts = judge_residuals(
-        left, at.r, J, robust=how.loss != "linear",
+        left, at.r, J, robust=context.loss != "linear",
         priors=[c.labels[i] for i, _ in c.priors] if end.at_rest else (),
     )  # fmt: skip
     declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
@@ -169,28 +169,30 @@ def conclude(
     larger = any(one.alarming and not (one.test == "level" and one.size < 1) for one in verdicts)
     doubtful = not end.at_rest or colour or bound or larger
     checked = None
-    if how.settings.assumptions != "trusted":
-        checked = tested_assumptions(coloured, runner, end, stage, free, doubtful, how, progress)
+    if context.settings.assumptions != "trusted":
+        checked = tested_assumptions(
+            coloured, runner, end, stage, free, doubtful, context, progress
+        )
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
     C_fit = (
         C_free * max(1.0, chi2)
-        if how.loss == "linear"
-        else covariance(J, at.r, how.loss, len(c.priors), exact)
+        if context.loss == "linear"
+        else covariance(J, at.r, context.loss, len(c.priors), exact)
     )
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
     labels = [one.label for one in c.within(free)]
     found = estimates(problem, x, free, C, shift)
     predicted, notices = {}, list(findings)
-    if how.heldout:
-        held = problem.with_noise({}).residuals(runner, x, how.heldout, rtol)
-        if held.lost:
+    if context.heldout:
+        held = problem.with_noise({}).residuals(runner, x, context.heldout, rtol)
+        if held.failed:
             notices += [
                 f"held-out recording `{k}` could not be simulated: {v.reason}"
-                for k, v in held.lost.items()
+                for k, v in held.failed.items()
             ]
         else:
-            predicted = nrmse(problem, held.r, list(how.heldout))
-            notices += guesses(problem, x, how.heldout)
+            predicted = nrmse(problem, held.r, list(context.heldout))
+            notices += guesses(problem, x, context.heldout)
     sd = np.sqrt(np.diag(C_free))
     notices += notices_on(
         found, held_by(problem), end.at_rest or bool(end.rough), rtol, end.bias is None
@@ -203,7 +205,9 @@ def conclude(
             f"intervals say; take rtol = {FINER * rtol:g}"
         )
     notices += assumption_notices(checked) if checked is not None else []
-    notices += residual_notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
+    notices += residual_notices(
+        verdicts, max(1.0, chi2) ** 0.5 if context.loss == "linear" else 1.0
+    )
     notices += colour_notices(coloured.found, declared)
     return IdentificationResult(
         estimates=found,
@@ -215,7 +219,7 @@ def conclude(
         chi2_stated=sum(float(one.raw @ one.raw) for one in left)
         / max(len(exact) - int(free.sum()), 1),
         converged=end.at_rest,
-        residuals=residual_channels(problem, at, how.fitted),
+        residuals=residual_channels(problem, at, context.fitted),
         heldout=predicted,
         notices=notices,
         stages=stages,
@@ -223,11 +227,11 @@ def conclude(
             "simulations": runner.simulations, "jacobians": runner.jacobians,
             "gradients": runner.gradients, "remembered": runner.remembered, "samples": len(at.r),
             "wall_s": clock.perf_counter() - began,
-            "data_seconds": sum(r.duration for r in problem.recordings if r.name in how.fitted),
+            "data_seconds": sum(r.duration for r in problem.recordings if r.name in context.fitted),
         },
         made_by={
-            "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol,
-            "rtol_asked": asked, "acknowledged": list(how.acknowledged),
+            "torchsoft": version("torchsoft"), **context.settings.model_dump(), "rtol": rtol,
+            "rtol_asked": rtol_asked, "acknowledged": list(context.acknowledged),
             "untried": list(checked.untried) if checked is not None else [],
             "candidates": list(checked.candidates) if checked is not None else [],
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
@@ -235,10 +239,10 @@ def conclude(
             "recordings": {r.name: r.fingerprint for r in problem.recordings},
         },
         covariance=C.tolist(),
-        recordings=recorded_rigs(problem, x, how.fitted), unknowns=dict(problem.unknowns),
+        recordings=recorded_rigs(problem, x, context.fitted), unknowns=dict(problem.unknowns),
         sensors=dict(problem.sensors),
         coordinates=[replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
-        contributions=contributions(problem, x, free, at.J, how.fitted),
+        contributions=contributions(problem, x, free, at.J, context.fitted),
         combinations=seen_together(problem, free, C),
         noise=[
             ChannelNoise(
@@ -263,7 +267,7 @@ def noise_entries(coloured: Coloured, stage: Stage, began: float) -> list[dict[s
 
 def tested_assumptions(
     coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_],
-    doubtful: bool, how: How, progress: bool,
+    doubtful: bool, context: FitContext, progress: bool,
 ) -> Checked:  # fmt: skip
     """Tests of the assumptions at the end of a fit, on residuals whitened by declared colour only:
     undeclared colour may be the trace of a wrong assumption. The columns in the result are whitened
@@ -280,8 +284,8 @@ def tested_assumptions(
         plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, end.steps
     )
     found = check_assumptions(
-        plain, there, doubtful=doubtful, explain=how.settings.assumptions == "explained",
-        loss=how.loss, progress=progress,
+        plain, there, doubtful=doubtful, explain=context.settings.assumptions == "explained",
+        loss=context.loss, progress=progress,
     )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
@@ -451,19 +455,19 @@ def identify(
             progress=progress,
         )
     except Unreachable as error:  # what looked wrong with the recordings may be behind it
-        raise Unreachable(error.lost, findings) from None
+        raise Unreachable(error.failed, findings) from None
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
         coloured = with_its_noise(problem, runner, end.stage, end.fit, loss, method, bar)
     stages = end.entries + noise_entries(coloured, end.stage, before)
-    how = How(fitted, tuple(heldout), tuple(acknowledged), settings)
+    context = FitContext(fitted, tuple(heldout), tuple(acknowledged), settings)
     findings += end.notices
     return conclude(
-        coloured, runner, end.stage, stages, how, findings, plan[-1].rtol, began, progress
+        coloured, runner, end.stage, stages, context, findings, plan[-1].rtol, began, progress
     )
 
 
-def explain(problem: Problem, **how: Any) -> IdentificationResult:
+def explain(problem: Problem, **options: Any) -> IdentificationResult:
     """Identify, and look for the cause of a misfit that no test of an assumption explains to first
     order.
 
@@ -472,7 +476,7 @@ def explain(problem: Problem, **how: Any) -> IdentificationResult:
     arguments of `identify`, and with its `checkpoint` begins where that ended; Ctrl-C keeps what
     was tried. Raises what `identify` does.
     """
-    return identify(problem, **how, assumptions="explained")
+    return identify(problem, **options, assumptions="explained")
 
 
 def with_its_noise(

@@ -195,9 +195,9 @@ def check_start(
     with torch.no_grad():
         signals = rig.follow(first)
         here = channels(rig, rig.unpack(y0, signals), signals)
-        asked = own(torch.tensor(first, dtype=torch.float64), rig.signals)[:, 0]
+        stated = own(torch.tensor(first, dtype=torch.float64), rig.signals)[:, 0]
     places = {name: [float(value)] for name, value in here.items() if name in made.samples}
-    places |= {name: [float(value)] for name, value in zip(rig.signals, asked)}
+    places |= {name: [float(value)] for name, value in zip(rig.signals, stated)}
     for coordinate, setpoint in (pair for one in rig.actuators.values() for pair in one.follows):
         places[setpoint].append(float(here[channel_of(rig, coordinate)]))
     unsure = {
@@ -403,7 +403,7 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     if strange := [name for name in stated.ignore if name not in left_out]:
         raise ValueError(f"{config}, ignore: no file has a column `{line(strange[0], 80)}`")
 
-    def problem(law: Law, what: str) -> Problem:
+    def problem(law: Law, field: str) -> Problem:
         made = []
         for name, (entry, _) in entries.items():
             settings = (stated.settings, entry.settings, law.settings)
@@ -415,14 +415,14 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
             except ValueError as error:
                 known = any(str(table.path) in str(error) for table in tables[name].tables)
                 raise (
-                    error if known else ValueError(f"{config}{what}, recording `{name}`: {error}")
+                    error if known else ValueError(f"{config}{field}, recording `{name}`: {error}")
                 ) from None
         unknowns = {k: one for k, one in (stated.unknowns | law.unknowns).items()
                     if k not in law.without}  # fmt: skip
         try:
             return Problem(made, stated.sensors, unknowns)
         except ValueError as error:
-            raise ValueError(f"{config}{what}: {error}") from None
+            raise ValueError(f"{config}{field}: {error}") from None
 
     main = problem(Law(), "")
     laws = {name: problem(law, f", compare.{name}") for name, law in stated.compare.items()}
@@ -437,7 +437,7 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
 def unreachable(error: Unreachable, tables: Mapping[str, Tables]) -> str:
     """Recordings that the model could not follow, and rows of their files where the runs ended."""
     return "; ".join(
-        f"{tables[name].near(lost.time)}: the model cannot follow recording `{name}` here: "
-        f"{lost.reason}"
-        for name, lost in error.lost.items()
+        f"{tables[name].near(failed.time)}: the model cannot follow recording `{name}` here: "
+        f"{failed.reason}"
+        for name, failed in error.failed.items()
     )

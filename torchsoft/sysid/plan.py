@@ -129,8 +129,8 @@ def default_plan(
     order = sorted(which, key=lambda name: speed[name])
     loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
     look = problem.residuals(runner, x, order[:1], loose, free)
-    if look.lost:
-        raise Unreachable(look.lost)
+    if look.failed:
+        raise Unreachable(look.failed)
     ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
     slowest, first = (order[0],), tuple(labels[visible(look.J, free & ~ratios)])
     plan = [
@@ -194,16 +194,16 @@ class PlanEnd(NamedTuple):
     fit: Fit
     stage: Stage
     entries: list[dict[str, Any]]
-    lost: Unreachable | None = None
+    failure: Unreachable | None = None
 
     @property
     def notices(self) -> list[str]:
         """A sentence where a finer stage could not begin."""
-        if self.lost is None:
+        if self.failure is None:
             return []
         return [
-            f"the fit ended by rtol = {self.stage.rtol:g}: by a finer tolerance {self.lost}; the "
-            "model may lack something that drives its parameters to where it has no solution"
+            f"the fit ended by rtol = {self.stage.rtol:g}: by a finer tolerance {self.failure}; "
+            "the model may lack something that drives its parameters to where it has no solution"
         ]
 
 
@@ -226,11 +226,11 @@ def run_plan(
             try:
                 begin = end.fit.x if end is not None else x
                 fit = run_stage(problem, runner, stage, begin, *rest)
-            except Unreachable as lost:
+            except Unreachable as failure:
                 if end is None:
                     raise
                 if (stage.recordings, stage.free) == (end.stage.recordings, end.stage.free):
-                    return end._replace(lost=lost)
+                    return end._replace(failure=failure)
                 fit = run_stage(problem, runner, stage, x, *rest)
         entry = stage_entry(stage.name, stage, stage.rtol, fit, began, clock.perf_counter())
         end = PlanEnd(fit, stage, [*end.entries, entry] if end is not None else [entry])
@@ -267,13 +267,13 @@ def run_stage(
     failure: Unreachable | None = None
     for start in (x, *sobol(problem, x, free, stage, seed)):
         try:
-            wanted = free if method == "gauss_newton" else None
-            first, steps = problem.freeze(runner, start, stage.recordings, stage.rtol, wanted)
-            if first.lost:
-                raise Unreachable(first.lost)
+            jacobian = free if method == "gauss_newton" else None
+            first, steps = problem.freeze(runner, start, stage.recordings, stage.rtol, jacobian)
+            if first.failed:
+                raise Unreachable(first.failed)
             fit = on_steps(problem, runner, stage, start, steps, loss, method, notify, first)
-        except Unreachable as lost:
-            failure = failure or lost
+        except Unreachable as error:
+            failure = failure or error
             continue
         if best is None or fit.chi2 < best.chi2:
             best = fit
@@ -442,7 +442,7 @@ def settle(
 
     while True:
         fresh, steps = problem.freeze(runner, x, which, rtol)
-        if fresh.lost:
+        if fresh.failed:
             own = fits[-1][1].steps if fits else fit.steps
             return Settled(
                 x, at, rtol, None, fits, at, at_rest=False,
@@ -455,7 +455,7 @@ def settle(
             if along(fresh, steps):
                 continue
         finer, steps = problem.freeze(runner, x, which, FINER * rtol, free)
-        if finer.lost:
+        if finer.failed:
             return Settled(x, end, rtol, None, fits, end, at_rest)
         J, bias = finer.J[:, free], np.zeros(len(x))
         error = jacobian_error(at.J[:, free], J)

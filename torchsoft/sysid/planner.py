@@ -87,13 +87,13 @@ def chosen(
         for name, row in zip(c.names, rows)
         if row.any() and name not in own and not name.startswith(PREFIX)
     ]
-    wanted = tuple(known if names is None else names)
-    if not wanted or len(set(wanted)) < len(wanted) or not set(wanted) <= set(known):
+    selected = tuple(known if names is None else names)
+    if not selected or len(set(selected)) < len(selected) or not set(selected) <= set(known):
         raise ValueError(
             f"`names` must be some of the parameters {', '.join(known)}, each once, but is "
-            f"{list(wanted)}"
+            f"{list(selected)}"
         )
-    return wanted, np.stack([rows[c.names.index(name)] for name in wanted])
+    return selected, np.stack([rows[c.names.index(name)] for name in selected])
 
 
 def deviations(names: Sequence[str], T: Array, C: Array) -> dict[str, float]:
@@ -197,7 +197,7 @@ class Planner:
             J = np.zeros((0, len(x)))
             if which:
                 at = p.residuals(self._others, x, which, self.rtol, p.coordinates.free)
-                if at.lost:
+                if at.failed:
                     raise ValueError(
                         f"a draw of the parameters does not reproduce what was recorded: "
                         f"{at.reasons}"

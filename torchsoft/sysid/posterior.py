@@ -158,22 +158,22 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
     runs, began = o.runner.simulations, clock.perf_counter()
     z, noise = inside(rng, o.x[o.free], o.covariance, low, high, draws)
     log_q = -0.5 * (noise**2).sum(-1)
-    log_p, lost = np.full(draws, -np.inf), list[str]()
+    log_p, failures = np.full(draws, -np.inf), list[str]()
 
     def density(k: int) -> tuple[float, str]:
         x = o.place(z[k])
         at = o.residuals(x)
-        if at.lost:
+        if at.failed:
             return -np.inf, at.reason
         return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
 
     with single_threaded(), tqdm(desc="Laplace", total=draws, disable=not progress) as bar:
         for k, (value, reason) in parallel_map(density, draws, o.workers):
-            log_p[k], lost = value, [*lost, reason] if reason else lost
+            log_p[k], failures = value, [*failures, reason] if reason else failures
             bar.update()
     w, k_hat = importance(log_p - log_q)
     share, limit = 1.0 / float(draws * (w @ w)), min(K_HAT, 1 - 1 / np.log10(draws))
-    notices = notices_on_runs(o, lost, draws)
+    notices = notices_on_runs(o, failures, draws)
     if k_hat > limit and share < ALIKE:
         notices.append(
             "Laplace's approximation is not to be trusted here: the tail of its importance "
@@ -186,7 +186,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
         )
     off = steps_off(o, z[np.argsort(log_q)[: CHECKED // 2].tolist() + list(range(CHECKED // 2))])
     notices += notices_on_steps(o, off)
-    checks = {"k_hat": k_hat, "efficiency": share, "failed": len(lost), "steps_off": off}
+    checks = {"k_hat": k_hat, "efficiency": share, "failed": len(failures), "steps_off": off}
     cost = {
         "simulations": o.runner.simulations - runs,
         "gradients": 0,
@@ -258,12 +258,14 @@ def notices_on_steps(o: Optimum, off: float) -> list[str]:
     ]
 
 
-def notices_on_runs(o: Optimum, lost: Sequence[str], runs: int) -> list[str]:
+def notices_on_runs(o: Optimum, failures: Sequence[str], runs: int) -> list[str]:
     """Sentences on failed runs, and on residuals larger than the noise."""
     m = o.problem.samples(o.which)
     chi2, out = o.square / m, []
-    if lost:
-        out.append(f"{len(lost)} of {runs} runs failed, so the posterior ends there: {lost[0]}")
+    if failures:
+        out.append(
+            f"{len(failures)} of {runs} runs failed, so the posterior ends there: {failures[0]}"
+        )
     if chi2 > 1 + 4 * np.sqrt(2 / m):
         out.append(
             f"the residuals are larger than the noise that was given (chi2 = {chi2:.3g}): the "
@@ -355,7 +357,7 @@ def nuts(
             f"NUTS needs a chain, 4 draws and 20 for tuning at least, but has {chains}, {draws} "
             f"and {tune}"
         )
-    package, white, lost = sampler(), Whitened.of(o), list[str]()
+    package, white, failures = sampler(), Whitened.of(o), list[str]()
     n, began, gradients, lock = (
         len(white.low),
         clock.perf_counter(),
@@ -368,7 +370,7 @@ def nuts(
             return white.density(o, z)
         except Failed as failure:
             with lock:
-                lost.append(str(failure))
+                failures.append(str(failure))
             raise
 
     def start(number: int) -> Array:
@@ -395,7 +397,7 @@ def nuts(
     seconds = clock.perf_counter() - began
     values = o.values(z)
     divergences, spent = int(stats["diverging"].sum()), o.runner.gradients - gradients
-    notices = notices_on_runs(o, lost, spent)
+    notices = notices_on_runs(o, failures, spent)
     if z.shape[:2] != (chains, draws):
         notices.append(
             f"interrupted: there are {z.shape[1]} of {draws} draws from {z.shape[0]} of {chains} "
@@ -405,7 +407,7 @@ def nuts(
     off = steps_off(o, z.reshape(-1, n)[rng.choice(z.shape[0] * z.shape[1], CHECKED)])
     notices += notices_on_steps(o, off)
     weights = np.full(z.shape[:2], 1.0 / (z.shape[0] * z.shape[1]))
-    checks = {"divergences": divergences, "failed": len(lost), "steps_off": off}
+    checks = {"divergences": divergences, "failed": len(failures), "steps_off": off}
     cost = {"simulations": 2 * CHECKED, "gradients": spent, "wall_s": seconds}
     made_by = {
         "nutpie": version("nutpie"),

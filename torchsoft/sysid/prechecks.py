@@ -326,15 +326,17 @@ def controller_findings(
             t, F = t[near], F[near]
         if len(t) < FEWEST:
             continue
-        asked = [part for one in actuator.setpoints for part in rig.reference[one](torch.tensor(t))]
+        setpoints = [
+            part for one in actuator.setpoints for part in rig.reference[one](torch.tensor(t))
+        ]
         feed = actuator.feed_forward
         fed = rig.reference[feed](torch.tensor(t))[0] if feed else torch.zeros(len(t)).double()
         splines = [CubicSpline(*recording.samples[one]) for one in others]
         seen = [torch.from_numpy(s(t, order)) for s in splines for order in (0, 1)]
-        inputs = torch.stack((*asked, fed, *seen), -1).detach().requires_grad_(True)
+        inputs = torch.stack((*setpoints, fed, *seen), -1).detach().requires_grad_(True)
         given = actuator(inputs)
         (slopes,) = torch.autograd.grad(given.sum(), inputs)
-        by = slopes[:, len(asked) + 1 :: 2].square().mean(0).tolist()
+        by = slopes[:, len(setpoints) + 1 :: 2].square().mean(0).tolist()
         noise = [sensors[force].noise ** 2]
         noise += [slope * sensors[one].noise ** 2 for slope, one in zip(by, others)]
         off = float(np.mean(F - given.detach().numpy()))
@@ -481,12 +483,12 @@ def against_run(
                 "start"
             )
             known = [
-                (abs(math.log(ratio / factor)), said)
-                for factor, said in confusions(recording.units[name])
+                (abs(math.log(ratio / factor)), confusion)
+                for factor, confusion in confusions(recording.units[name])
             ]
-            distance, said = min(known, default=(math.inf, ""))
+            distance, confusion = min(known, default=(math.inf, ""))
             if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
-                yield found(f"unit of {name}", recording, f"{text}: {said}?", grave=True)
+                yield found(f"unit of {name}", recording, f"{text}: {confusion}?", grave=True)
             else:
                 yield found(
                     f"size of {name}",
@@ -518,19 +520,21 @@ def another_body(
         mine, run = (apart(recording, sensors, setpoint, own, by) for by in (None, expected))
         others = [name for name in rig.bodies if name != body and f"{name}.{axis}" in movable]
         for other in others:
-            its = channel(rig, f"{other}.{axis}")
-            far, there = (apart(recording, sensors, setpoint, its, by) for by in (None, expected))
-            near = any(part is not None and part < APART for part in (mine, there))
-            if far is not None and far < SAME and not near:
-                said = f"{its} follows it to {far:.1%} of its motion"
+            alternative = channel(rig, f"{other}.{axis}")
+            other_data, other_run = (
+                apart(recording, sensors, setpoint, alternative, by) for by in (None, expected)
+            )
+            near = any(part is not None and part < APART for part in (mine, other_run))
+            if other_data is not None and other_data < SAME and not near:
+                evidence = f"{alternative} follows it to {other_data:.1%} of its motion"
             elif (
                 mine is not None
                 and mine > APART
-                and far is None
+                and other_data is None
                 and (run is None or run < SAME)
                 and len(others) == 1
             ):
-                said = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
+                evidence = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
             else:
                 continue
             paper = isinstance(rig, SoftGrasp) and axis == "x"
@@ -539,7 +543,7 @@ def another_body(
             code = "control.senses" if paper else f"what {setpoint} is of"
             text = (
                 f"{setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
-                f"or are {own} and {its} exchanged? ({said})"
+                f"or are {own} and {alternative} exchanged? ({evidence})"
             )
             yield found(code, recording, text, grave=True)
 
@@ -559,6 +563,6 @@ def apart(
     if expected is not None:
         one, signals = expected[name]
         y = one.expected(signals, t)[0]
-    asked = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
-    moved = float(np.std(asked))
-    return float(np.std(asked - y)) / moved if moved > MOVES * sensors[name].sd else None
+    values = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
+    moved = float(np.std(values))
+    return float(np.std(values - y)) / moved if moved > MOVES * sensors[name].sd else None

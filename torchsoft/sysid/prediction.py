@@ -278,7 +278,7 @@ class Run(NamedTuple):
 
     y0: Tensor
     parameters: tuple[str, ...]
-    wanted: list[Tensor]
+    inputs: list[Tensor]
 
 
 def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str]) -> Run:
@@ -291,8 +291,8 @@ def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str
     }
     parameters = tuple(name for name in names if name not in at)
     assert tuple(names[: len(parameters)]) == parameters
-    wanted = [*map(begun.rig.parameter, parameters), *(at[name] for name in names if name in at)]
-    return Run(begun.y0(at), parameters, wanted)
+    inputs = [*map(begun.rig.parameter, parameters), *(at[name] for name in names if name in at)]
+    return Run(begun.y0(at), parameters, inputs)
 
 
 def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
@@ -332,7 +332,7 @@ def initial_state(
     """Initial state y0 (size,) of a run, and its derivatives (size, n) by `names`. Raises
     `SimulationFailed`."""
     run = prepared(begun, values, names)
-    return run.y0.detach(), torch.from_numpy(directions(run.y0, run.wanted))
+    return run.y0.detach(), torch.from_numpy(directions(run.y0, run.inputs))
 
 
 def predict(
@@ -379,7 +379,7 @@ def misfit(
         Signals(grid.t[rows].numpy(), keys, signals.detach().numpy(), None)
     )
     gradient = torch.autograd.grad(
-        signals, run.wanted, torch.from_numpy(weights), allow_unused=True
+        signals, run.inputs, torch.from_numpy(weights), allow_unused=True
     )
     by = np.array([0.0 if g is None else float(g) for g in gradient])
     return Misfit(loss, by, nuisances)

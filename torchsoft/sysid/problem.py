@@ -40,17 +40,17 @@ class Residuals(NamedTuple):
 
     r: Array
     J: Array
-    lost: dict[str, FailedRun]
+    failed: dict[str, FailedRun]
 
     @property
     def reason(self) -> str:
         """Reason of the first failed run, empty if there is none."""
-        return next((one.reason for one in self.lost.values()), "")
+        return next((one.reason for one in self.failed.values()), "")
 
     @property
     def reasons(self) -> str:
         """Every failed run with its reason."""
-        return "; ".join(f"`{name}`: {one.reason}" for name, one in self.lost.items())
+        return "; ".join(f"`{name}`: {one.reason}" for name, one in self.failed.items())
 
 
 def with_extensions(
@@ -289,20 +289,20 @@ class Problem:
         runs = runner.run(jobs)
         at = self.gather(x, jobs, runs)
         names = [self.recordings[job.recording].name for job in jobs]
-        return at, {} if at.lost else {name: Frozen(run.knots) for name, run in zip(names, runs)}
+        return at, {} if at.failed else {name: Frozen(run.knots) for name, run in zip(names, runs)}
 
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
         """Residuals at x (n,) from the results of jobs."""
-        lost = {
+        failed = {
             self.recordings[job.recording].name: got
             for job, got in zip(jobs, results)
             if isinstance(got, FailedRun)
         }
-        if lost:
+        if failed:
             m = self.samples([self.recordings[job.recording].name for job in jobs]) + len(
                 self.coordinates.priors
             )
-            return Residuals(np.full(m, np.inf), np.full((m, len(x)), np.inf), lost)
+            return Residuals(np.full(m, np.inf), np.full((m, len(x)), np.inf), failed)
         parts = [self._compare(x, job, got) for job, got in zip(jobs, results)]
         parts.append(self._priors(x))
         return Residuals(
@@ -354,11 +354,11 @@ class Problem:
         """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a
         run fails."""
         c, jobs = self.coordinates, self.jobs(x, which, steps, free, adjoint=True)
-        total, gradient, lost = 0.0, np.zeros(len(x)), {}
+        total, gradient, failed = 0.0, np.zeros(len(x)), {}
         for job, got in zip(jobs, runner.run(jobs)):
             name = self.recordings[job.recording].name
             if isinstance(got, FailedRun):
-                lost[name] = got
+                failed[name] = got
                 continue
             rows = [c.names.index(n) for n in job.names]
             total, gradient = (
@@ -368,7 +368,7 @@ class Problem:
             for one, row in zip(self.readouts(x, job.recording), got.nuisances):
                 for kind, (_, at) in c.nuisances(x, one, name).items():
                     gradient[at] += row[NUISANCES.index(kind)] * c.all[at].slope(x[at])
-        if lost:
-            return np.inf, np.full(len(x), np.nan), lost
+        if failed:
+            return np.inf, np.full(len(x), np.nan), failed
         r, J = self._priors(x)
         return total + 0.5 * float(r @ r), np.where(free, gradient + r @ J, 0.0), {}

@@ -50,8 +50,8 @@ class Optimum:
         self.free = problem.coordinates.free if free is None else free
         self.runner = Runner(problem.recordings)
         self.at, self.steps = problem.freeze(self.runner, self.x, self.which, rtol, self.free)
-        if self.at.lost:
-            raise Unreachable(self.at.lost)
+        if self.at.failed:
+            raise Unreachable(self.at.failed)
         self.square = float(self.at.r @ self.at.r)
 
     @classmethod
@@ -123,10 +123,10 @@ class Optimum:
     def misfit(self, x: Array) -> tuple[float, Array, str]:
         """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; infinite,
         with the reason, where a run fails."""
-        value, gradient, lost = self.problem.misfit(
+        value, gradient, failed = self.problem.misfit(
             self.runner, x, self.which, self.steps, self.free
         )
-        return value, gradient[self.free], next((one.reason for one in lost.values()), "")
+        return value, gradient[self.free], next((one.reason for one in failed.values()), "")
 
     def off(self, x: Array) -> float:
         """Change of |r|^2 at x (n,) by steps chosen there, in place of the optimum's; NaN where a
@@ -135,7 +135,7 @@ class Optimum:
         fresh, _ = self.problem.freeze(self.runner, x, self.which, self.rtol)
         return (
             float("nan")
-            if fresh.lost or frozen.lost
+            if fresh.failed or frozen.failed
             else float(fresh.r @ fresh.r - frozen.r @ frozen.r)
         )
 
@@ -293,7 +293,7 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
         x[others] = np.clip(x[others] + tangent * (aim - x[i]), low[others], high[others])
     x[i] = aim
     at = o.residuals(x, derivatives=True)
-    if others.any() and not at.lost:
+    if others.any() and not at.failed:
         with suppress(Unreachable):
             fit = gauss_newton(
                 o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at,
@@ -303,7 +303,7 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
                 return None, "the other coordinates could not be fitted there"
             x, at = fit.x, fit.at
             x[i] = aim
-    if at.lost:
+    if at.failed:
         return None, at.reason
     return Point(x, (float(at.r @ at.r) - o.square) / o.variance, at), ""
 
@@ -341,10 +341,10 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
     physical = [None if e is None else one.to_value(e) for e in ends]
     straight = one.to_value(max(wald[0], -700.0)), one.to_value(min(wald[1], 700.0))
     if worst > DIFFERENT:
-        told = [f"{e:.4g}" if e is not None else "open" for e in physical]
+        bounds = [f"{e:.4g}" if e is not None else "open" for e in physical]
         notices.append(
-            f"the misfit is no parabola in {one.label}: its profile's interval is {told[0]} .. "
-            f"{told[1]}, the covariance's {straight[0]:.4g} .. {straight[1]:.4g}; take the "
+            f"the misfit is no parabola in {one.label}: its profile's interval is {bounds[0]} .. "
+            f"{bounds[1]}, the covariance's {straight[0]:.4g} .. {straight[1]:.4g}; take the "
             "profile's"
         )
     every = [k for k in np.flatnonzero(o.free) if k != i]

@@ -64,7 +64,7 @@ def ended(
         return End(x, at, free, tuple(which), at, own, rtol, runner, rtol)
     usual = max(rtol, USUAL)
     base, steps = problem.freeze(runner, x, which, usual)
-    if base.lost and usual > rtol:
+    if base.failed and usual > rtol:
         usual = rtol
         base, steps = problem.freeze(runner, x, which, rtol)
     return End(x, at, free, tuple(which), base, steps, usual, runner, rtol)
@@ -123,7 +123,7 @@ def farthest(recordings: Sequence[Recording], name: str, value: float, part: flo
 
 def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
     """Change of the residuals (m,) by a variation, on the same steps, or None and the reason."""
-    if end.base.lost:
+    if end.base.failed:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
     other = varied(problem, end.which, one)
     if isinstance(other, str):
@@ -132,7 +132,7 @@ def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None
     steps = {r.name: since(end.steps[r.name], float(r.times[0] - r.start.lead))
              for r in other.recordings if r.name in end.steps}  # fmt: skip
     got = other.residuals(runner, end.x, end.which, steps)
-    if got.lost:
+    if got.failed:
         return None, f"a run failed: {got.reason}"
     return got.r - end.base.r, ""
 

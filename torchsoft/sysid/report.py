@@ -193,8 +193,8 @@ def report(
     """
     if result.made_by["recordings"] != {r.name: r.fingerprint for r in problem.recordings}:
         raise ValueError("the result was made from other recordings than the problem's")
-    drawn, lost = traces(result, problem, Path(checkpoint) if checkpoint is not None else None)
-    save_text(path, page(result, drawn, lost))
+    drawn, failures = traces(result, problem, Path(checkpoint) if checkpoint is not None else None)
+    save_text(path, page(result, drawn, failures))
 
 
 def traces(
@@ -204,7 +204,7 @@ def traces(
     runs."""
     if result.noise:
         problem = problem.with_noise({one.channel: one.model for one in result.noise})
-    x, out, lost = np.array(result.x), list[Trace](), dict[str, str]()
+    x, out, failures = np.array(result.x), list[Trace](), dict[str, str]()
     runner, jobs = (
         Runner(problem.recordings, journal=journal),
         problem.jobs(x, problem.names, float(result.made_by["rtol"]), None),
@@ -212,7 +212,7 @@ def traces(
     for job, run in zip(jobs, runner.run(jobs)):
         recording = problem.recordings[job.recording]
         if isinstance(run, FailedRun):
-            lost[recording.name] = run.reason
+            failures[recording.name] = run.reason
             continue
         for one in problem.readings(x, job, run):
             out.append(
@@ -221,10 +221,10 @@ def traces(
                     one.expected, one.r, problem.whitened(recording, one.channel, one.r),
                 )
             )  # fmt: skip
-    return out, lost
+    return out, failures
 
 
-def page(result: IdentificationResult, drawn: list[Trace], lost: dict[str, str]) -> str:
+def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, str]) -> str:
     """The HTML text."""
     within = {(one.recording, one.channel): one for one in result.residuals}
     noise = {one.channel: one.model for one in result.noise}
@@ -237,8 +237,8 @@ def page(result: IdentificationResult, drawn: list[Trace], lost: dict[str, str])
             figure = trace_figure(
                 trace, within.get((recording, trace.channel)), noise.get(trace.channel)
             )
-            said = f"{trace.channel} of {recording}, measured and predicted"
-            out.append((figure, f"{said}: residuals are {rms:.2f} times the noise"))
+            caption = f"{trace.channel} of {recording}, measured and predicted"
+            out.append((figure, f"{caption}: residuals are {rms:.2f} times the noise"))
         return out
 
     parameters = [e for e in result.estimates if e.kind == "parameter"]
@@ -248,7 +248,7 @@ def page(result: IdentificationResult, drawn: list[Trace], lost: dict[str, str])
         "remembered": "of them read from the checkpoint",
     }  # fmt: skip
     return PAGES.get_template("report.html").render(
-        result=result, png=png, kept=kept, cell=cell, lost=lost, traces=traces, moved=MOVED,
+        result=result, png=png, kept=kept, cell=cell, failures=failures, traces=traces, moved=MOVED,
         fitted=", ".join(one.name for one in result.recordings if one.fitted),
         notices=list(dict.fromkeys(result.notices)),
         estimates=estimates(result), estimates_figure=estimates_figure(parameters),

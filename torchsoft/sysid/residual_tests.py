@@ -316,12 +316,12 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
             s = CubicSpline(other.t, other.reading)
             others |= {other.channel: s(t), f"the rate of {other.channel}": s(t, 1)}
             others |= {f"the acceleration of {other.channel}": s(t, 2)}
-    for what in (own, others):
-        if len(t) < 4 * len(what) or not what:
+    for signals in (own, others):
+        if len(t) < 4 * len(signals) or not signals:
             continue
-        p, share, alone = explained(part, np.stack(list(what.values()), 1), r, Q)
-        likest = list(what)[int(np.argmax(np.abs(alone)))]
-        words = f"({share:.0%} of it, most like {likest})"
+        p, share, alone = explained(part, np.stack(list(signals.values()), 1), r, Q)
+        best = list(signals)[int(np.argmax(np.abs(alone)))]
+        words = f"({share:.0%} of it, most like {best})"
         out.append(part.verdict("motion", p, share, words))
     return out
 
@@ -487,7 +487,7 @@ def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residual
         )
         r[part.rows] = problem.whitened(recordings[part.recording], part.channel, part.raw)
         J[part.rows] = problem.whitened(recordings[part.recording], part.channel, rows)
-    return Residuals(r, J, at.lost)
+    return Residuals(r, J, at.failed)
 
 
 def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> dict[str, NoiseFit]:

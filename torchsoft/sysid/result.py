@@ -96,8 +96,8 @@ def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str
 
 def undetermined(values: Mapping[str, float]) -> str:
     """A clause on values that the data do not determine."""
-    said = ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
-    return f"not identifiable from the data, and so only where the search ended: {said}"
+    listed = ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
+    return f"not identifiable from the data, and so only where the search ended: {listed}"
 
 
 def rebuildable(rig: Rig) -> bool:
@@ -290,12 +290,13 @@ class IdentificationResult(Shown):
             rig.parameter(name)
         other = [name for name, value in one.known.items() if mine.get(name) != value]
         if other:
-            said = ", ".join(
+            changes = ", ".join(
                 f"{name} is {shown(mine.get(name))} and was {shown(one.known[name])}"
                 for name in other
             )
             warnings.warn(
-                f"this rig is not the one of the fit, so its values may mislead: {line(said, 300)}",
+                "this rig is not the one of the fit, so its values may mislead: "
+                f"{line(changes, 300)}",
                 stacklevel=2,
             )
         rig = deepcopy(rig)
@@ -315,10 +316,10 @@ class IdentificationResult(Shown):
         """
         whole("count", count, 1)
         one = self.recorded(recording)
-        told = self._told(one)
+        determined = self._told(one)
         mine = [(i, c) for i, c in enumerate(self.coordinates)
                 if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
-        free = [i for i, c in mine if c.name in told]
+        free = [i for i, c in mine if c.name in determined]
         if not free:
             raise ValueError("no parameter is identifiable, so that there is nothing to draw")
         x = np.tile(self.x, (1 + count, 1))
@@ -340,15 +341,15 @@ class IdentificationResult(Shown):
         mine = [
             e for e in self.estimates if e.kind == "parameter" and e.recording in (None, one.name)
         ]
-        told, named = {e.name for e in mine if e.identifiable}, {e.name for e in mine}
+        identifiable, named = {e.name for e in mine if e.identifiable}, {e.name for e in mine}
         weak = {
             c.name: one.identified[c.name] for c in self.coordinates
-            if c.kind == "parameter" and c.recording in (None, one.name) and c.name not in told
-            and (c.name in named or not self.unknowns[c.name].fixed)
+            if c.kind == "parameter" and c.recording in (None, one.name)
+            and c.name not in identifiable and (c.name in named or not self.unknowns[c.name].fixed)
         }  # fmt: skip
         if weak:
             warnings.warn(undetermined(weak), stacklevel=3)
-        return told
+        return identifiable
 
     def to_json(self) -> str:
         """Content of the file."""
@@ -400,8 +401,8 @@ def checksum(content: Any) -> str:
 
 def schema() -> dict[str, Any]:
     """The JSON Schema (2020-12) of the file."""
-    said = finite(adapter().json_schema(by_alias=True, mode="serialization"))
-    said["properties"].pop("rigs", None)
+    definition = finite(adapter().json_schema(by_alias=True, mode="serialization"))
+    definition["properties"].pop("rigs", None)
     head = {
         "schema": {"const": SCHEMA, "description": "Name and version of the file's form."},
         "checksum": {
@@ -413,9 +414,9 @@ def schema() -> dict[str, Any]:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": f"urn:{SCHEMA}",
-        **said,
-        "properties": head | said["properties"],
-        "required": [*head, *said["required"]],
+        **definition,
+        "properties": head | definition["properties"],
+        "required": [*head, *definition["required"]],
     }
 
 
@@ -432,13 +433,14 @@ def load_answer(path: str | Path) -> IdentificationResult:
     form = content.pop("schema", None) if isinstance(content, dict) else None
     if form != SCHEMA:
         older = isinstance(content, dict) and {"estimates", "made_by"} <= content.keys()
-        why = (
+        reason = (
             "an older version wrote it, so identify again"
             if form is None and older
             else f"its `schema` is {shown(form)}"
         )
         raise ValueError(
-            f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: {why}"
+            f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: "
+            f"{reason}"
         )
     if content.pop("checksum", None) != checksum(content):
         raise ValueError(

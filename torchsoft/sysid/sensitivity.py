@@ -94,10 +94,10 @@ class AssumptionTest(Assumption):
                 and self.pattern < PATTERN
                 and (either_side or self.favoured > 0)
             )
-            object.__setattr__(self, "suspected", enough and not self.absurd)
+            object.__setattr__(self, "suspected", enough and not self.beyond_first_order)
 
     @property
-    def absurd(self) -> bool:
+    def beyond_first_order(self) -> bool:
         """Whether a parameter of the rig would have to vanish or to double, so that a test to first
         order is void."""
         return (
@@ -208,7 +208,7 @@ def check_assumptions(
             untried.remove(one.name)
         suspects = {one.name: one for one in (*taken, *(one for one, _ in first))}
         explained = judge.explained(checks.values())
-        if doubtful and not end.base.lost:
+        if doubtful and not end.base.failed:
             look = rivals if explained else doubted
             candidates = look(suspects.values(), checks)
         if explain and candidates:
@@ -474,7 +474,7 @@ def columns_of(
     """Columns of the residuals, to first order, for known parameters, extensions of the rigs, and
     faults of sensors that are not unknowns: from one run for each recording with its derivatives,
     and another for extensions that exclude each other. Empty where a run fails."""
-    if end.base.lost:
+    if end.base.failed:
         return []
     out: list[tuple[Variation, Array]] = []
     for number, known in enumerate(batches(problem, [one for one in taken if one.parameter])):

@@ -93,6 +93,6 @@ def contradictions(
         return [f"{text}. Nearly as much falls with {near}: `explain` compares them by new fits"]
     rivals = [c for c in favoured[1:] if c.odds > LIKELY]
     if rivals:
-        said = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
-        text += f". The data cannot tell it (odds {best.odds:.2g}) from: {said}"
+        listed = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
+        text += f". The data cannot tell it (odds {best.odds:.2g}) from: {listed}"
     return [text]

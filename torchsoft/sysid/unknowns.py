@@ -196,9 +196,9 @@ class Coordinate:
     @property
     def label(self) -> str:
         """Readable name, such as `contact.K_n`, `contact.mu_k / contact.mu_s`, `delay of theta`."""
-        what = self.name if self.of_the_rig else f"{self.kind} of {self.name}"
+        quantity = self.name if self.of_the_rig else f"{self.kind} of {self.name}"
         ratio = f" / {self.ratio_to}" if self.ratio_to else ""
-        return f"{what}{ratio}" + (f" in {self.recording}" if self.recording else "")
+        return f"{quantity}{ratio}" + (f" in {self.recording}" if self.recording else "")
 
     def to_x(self, value: float) -> float:
         return math.log(value) if self.scale == "log" else value / (self.high - self.low)
@@ -314,11 +314,11 @@ class Coordinates:
             for field in ("low", "high", "nominal"):
                 value = getattr(u, field)
                 if value is not None and not least <= value <= most:
-                    what = f"{name} / {u.ratio_to}" if u.ratio_to else name
+                    quantity = f"{name} / {u.ratio_to}" if u.ratio_to else name
                     where = " in all recordings" if len(set(ends)) > 1 else ""
                     raise ValueError(
-                        f"unknowns.{name}.{field} = {value:g} is beyond what {what} may be{where}, "
-                        f"from {least:g} to {most:g}"
+                        f"unknowns.{name}.{field} = {value:g} is beyond what {quantity} may be"
+                        f"{where}, from {least:g} to {most:g}"
                     )
             low = max(nominal / SPREAD, least) if u.low is None else u.low
             high = min(nominal * SPREAD, most) if u.high is None else u.high

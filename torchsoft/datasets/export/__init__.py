@@ -37,13 +37,13 @@ def export(url: str, to: str, out: Path) -> str:
         make_folder(out.absolute().parent)
         partial = Path(mkdtemp(prefix=f"{out.name}.", suffix=".partial", dir=out.absolute().parent))
         try:
-            said = write(Source(config, data, sound), partial)
+            content = write(Source(config, data, sound), partial)
             partial.chmod(0o755)
             partial.replace(out)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     failed = data.sizes["trajectory"] - len(sound)
-    return f"{said}; {failed} failed trajectories are left out; written to {out}"
+    return f"{content}; {failed} failed trajectories are left out; written to {out}"
 
 
 # The sound trajectories of a dataset, as exporters read them.

@@ -73,8 +73,8 @@ def write(source: Source, out: Path) -> str:
             | {"dataset_from_index": i * length, "dataset_to_index": (i + 1) * length}
             | {"data/chunk_index": chunk, "data/file_index": file}
             | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-            | {f"stats/{key}/{what}": x for key, one in columns.items()
-               for what, x in statistics(one).items()}
+            | {f"stats/{key}/{statistic}": x for key, one in columns.items()
+               for statistic, x in statistics(one).items()}
         )  # fmt: skip
     sink.close()
     path = out / "meta" / "episodes" / PLACE.format(chunk_index=0, file_index=0)
@@ -146,11 +146,11 @@ def together(episodes: list[dict[str, Any]], features: dict[str, Any]) -> dict[s
     """LeRobot's statistics over all episodes, which are of equal length."""
     out = dict[str, Any]()
     for key in features:
-        of = {what: np.array([one[f"stats/{key}/{what}"] for one in episodes])
-              for what in ("min", "max", "mean", "std", "count")}  # fmt: skip
+        of = {statistic: np.array([one[f"stats/{key}/{statistic}"] for one in episodes])
+              for statistic in ("min", "max", "mean", "std", "count")}  # fmt: skip
         mean = of["mean"].mean(0)
         spread = np.sqrt((of["std"] ** 2 + (of["mean"] - mean) ** 2).mean(0))
         found = {"min": of["min"].min(0), "max": of["max"].max(0), "mean": mean, "std": spread}
-        out[key] = {what: one.tolist() for what, one in found.items()}
+        out[key] = {statistic: one.tolist() for statistic, one in found.items()}
         out[key]["count"] = of["count"].sum(0).tolist()
     return out

@@ -199,9 +199,9 @@ def build(name: str) -> bytes:
                 for process in at_work.values():
                     process.kill()
         for one, process in at_work.items():
-            said = process.communicate()[0]
+            output = process.communicate()[0]
             if process.returncode:
-                raise RuntimeError(f"the kernel `{one}` could not be compiled: {said}")
+                raise RuntimeError(f"the kernel `{one}` could not be compiled: {output}")
             path = Path(folder) / NAME / f"{one}-{level()}.o"
             if not path.exists():
                 raise RuntimeError(CHANGED)

@@ -24,7 +24,7 @@ from torchsoft.solve.kernel.arrays import (
 from torchsoft.solve.kernel.invoke import call_value
 from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.stage import actuate
-from torchsoft.solve.kernel.step import gone, solve_near, take_back, take_step, write_rows
+from torchsoft.solve.kernel.step import departed, solve_near, take_back, take_step, write_rows
 from torchsoft.solve.kernel.table import Array
 
 ERROR = 2.0 * abs(3.0 * GAMMA**2 - 2.0 * GAMMA**3 - 1.0 / 6.0)
@@ -103,15 +103,15 @@ def passing(s: Any, w: Any) -> float:
 
 
 @compiled
-def next_end(t: float, wanted: float, stops: Array, shift: bool) -> float:
+def next_end(t: float, length: float, stops: Array, shift: bool) -> float:
     """End of the next step: at the next stop, half way to it, or after the wanted length."""
     if not shift:
-        return t + wanted
+        return t + length
     stop = np.searchsorted(stops, t, side="right")
     left = stops[min(stop, stops.size - 1)] - t
-    if wanted >= left * (1.0 - 1e-9):
+    if length >= left * (1.0 - 1e-9):
         return stops[min(stop, stops.size - 1)]
-    return t + (0.5 * left if wanted > 0.5 * left else wanted)
+    return t + (0.5 * left if length > 0.5 * left else length)
 
 
 @compiled
@@ -138,7 +138,7 @@ def run(r: Any) -> None:
     steps, row, solves, refused, failed, which = 0, r.row, 0, 0, 0, -1
     status, begin = CONVERGED, h.size == 0
     while (steps < h.size and (given or row < t_out.size)) or begin:
-        t, wanted, end, error, last = clock[0], min(clock[1], r.longest), 0.0, 0.0, row
+        t, length, end, error, last = clock[0], min(clock[1], r.longest), 0.0, 0.0, row
         if begin:  # the output at the start, where nothing has moved
             d.K[:], d.powers[:], w.travelled[0], now, last = 0.0, 0.0, np.inf, 0.0, row + 1
             put(y, d.y)
@@ -147,10 +147,10 @@ def run(r: Any) -> None:
         else:
             now = h[steps]
             if not given:
-                if rung > 0.0 and not rung * (1.0 - 1e-9) <= wanted < 2.0 * rung:
+                if rung > 0.0 and not rung * (1.0 - 1e-9) <= length < 2.0 * rung:
                     status = OFF_THE_RUNG
                     break
-                end = next_end(t, rung if rung > 0.0 else wanted, r.stops, rung == 0.0)
+                end = next_end(t, rung if rung > 0.0 else length, r.stops, rung == 0.0)
                 now = rung if rung > 0.0 else end - t
                 follow(r.f, t + GAMMA * now, end, r.signals[steps])
             status, count = take_step(r, now, r.signals[steps], 2 * steps)
@@ -161,7 +161,7 @@ def run(r: Any) -> None:
                 if not error <= 1.0:
                     status = REFUSED
             if status == CONVERGED:
-                status = gone(s, w)
+                status = departed(s, w)
             if status == CONVERGED:
                 while last < out.step.size and (
                     out.step[last] == steps if given else t_out[last] <= end
@@ -186,13 +186,13 @@ def run(r: Any) -> None:
                 longer = now * min(
                     LARGEST, max(SMALLEST, SAFETY * error**-INTEGRAL * clock[2] ** PROPORTIONAL)
                 )
-                wanted = max(longer, wanted) if now < wanted else longer
-                clock[0], clock[1], clock[2] = end, wanted, error
+                length = max(longer, length) if now < length else longer
+                clock[0], clock[1], clock[2] = end, length, error
             row, steps = last, steps + 1
         else:
             take_back(r)
             # not `now`, which rounding leaves a little longer
-            again = not given and wanted > r.shortest
+            again = not given and length > r.shortest
             if again and status == REFUSED:
                 refused, smaller = refused + 1, SAFETY * error ** (-1.0 / 3.0)
                 clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), r.shortest)

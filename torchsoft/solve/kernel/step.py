@@ -59,7 +59,7 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array, way: float) -> boo
 
 
 @compiled
-def gone(s: Any, w: Any) -> int:
+def departed(s: Any, w: Any) -> int:
     """Whether a contact has reached the end of a pad, or a body has left the space over one."""
     for c in range(s.contact_pad.size):
         at = s.pad_point_start[s.contact_pad[c]]
