@@ -1,6 +1,7 @@
 """What an identification takes for granted: data say where it is otherwise; intervals allow for
 what they cannot tell."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -37,7 +38,17 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.identification import held_by, notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
-from torchsoft.sysid.refits import AMOUNTS, End, Joint, difference, ended, joint_fit, refit, varied
+from torchsoft.sysid.refits import (
+    AMOUNTS,
+    End,
+    Joint,
+    difference,
+    ended,
+    fewest,
+    joint_fit,
+    refit,
+    varied,
+)
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
@@ -251,7 +262,7 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
         one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction"
     )
     as_stated, again = (
-        refit(problem, end, one, "linear", lambda chi2: None) for one in (None, law)
+        refit(problem, end, tried, "linear", lambda chi2: None) for tried in ((), [law])
     )
     assert as_stated.fit.chi2 > 1e3  # nothing can be done with smooth friction
     assert again.fit.chi2 < 2  # on steps as coarse as those of the checks
@@ -281,19 +292,50 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     assert np.exp(found.at["pad.E"]) == pytest.approx(TRUTH["pad.E"], rel=0.02)
 
 
+@pytest.mark.slow
+def test_faults_that_only_together_explain_the_data_are_named_together():
+    """A camera that is late: two channels are, by the same time."""
+    data = record("strokes", begin(STROKES, BASE), TRUTH, QUIET, rtol=1e-6, seed=4)
+    other = {
+        channel: (t, np.interp(t - 2e-3, t, y)) if channel in ("x_C", "theta") else (t, y)
+        for channel, (t, y) in data.samples.items()
+    }
+    found = checked(replace(data, samples=other), doubtful=True, sensors=QUIET)
+    (one,) = (one for one in found.checks if one.kind == "several")
+    assert one.name == "delay theta and delay x_C"
+    assert one.odds > 0.9
+    notice = assumption_notices(found)[0]
+    assert "theta has no unknown delay and x_C has no unknown delay" in notice
+    assert re.search(r" if theta came late \(\+(1\.9|2)\S* ms fit best, .*\) and if x_C", notice)
+    assert one.under["pad.E"] == pytest.approx(TRUTH["pad.E"], rel=0.01)
+
+
+def test_the_fewest_effects_that_span_a_misfit_are_found():
+    """Without e, which resembles the misfit most, but is not needed beside a and c."""
+    effects = dict(zip("abcd", np.eye(8)))
+    effects["e"] = np.array([0.7, 0.2, 0.65, 0, 0, 0, 0, 0.2]) / 1.006**0.5
+    r = 5 * effects["a"] + 4 * effects["c"]
+    assert fewest(effects, r, 0.01) == ["a", "c"]
+    assert fewest(effects, r, 5.0) == ["e"]
+    assert fewest(effects, r, 50.0) == []
+    assert fewest(effects, np.ones(8), 0.1) == []
+
+
 @pytest.mark.parametrize(
-    ("joint_left", "lefts", "tried"),
+    ("joint_left", "lefts", "tried", "together"),
     [
-        (10.0, {"b": 50.0}, ["b"]),
-        (10.0, {}, ["b", "a", "law"]),
-        (500.0, {"law": 50.0}, ["law"]),
-        (500.0, {"law": 150.0}, ["law"]),
-        (500.0, {"law": 200.0}, ["law", "a", "b"]),
+        (10.0, {"b": 50.0}, ["b"], ()),
+        (10.0, {}, ["b", "a", "law"], ()),
+        (10.0, {}, [], ("a", "b")),
+        (500.0, {"law": 50.0}, ["law"], ()),
+        (500.0, {"law": 150.0}, ["law"], ()),
+        (500.0, {"law": 200.0}, ["law", "a", "b"], ("a", "b")),
     ],
 )
-def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, monkeypatch):
-    """Where it explains the data, numbers by their part; where not, no number before a law, and
-    none at all after a law that leaves much less than all numbers together."""
+def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, monkeypatch):
+    """Where it explains the data, those first that explain it together, then numbers by their part;
+    where not, no number before a law, and none at all after a law that leaves much less than all
+    numbers together."""
     taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
@@ -306,8 +348,11 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, monkeypatch
         fit=lambda one, again, stated, linear: replace(
             linear, left=lefts.get(one.name, 999.0), refitted=True
         ),
+        together=lambda name, found: replace(
+            found[0], name=name, left=50.0 if len(found) > 1 else found[0].left
+        ),
     )
-    joint = Joint({}, joint_left, {"a": 0.25, "b": 0.9})
+    joint = Joint({}, joint_left, {"a": 0.25, "b": 0.25 if together else 0.9}, together)
     monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)
     monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
     end: Any = SimpleNamespace(far=True)

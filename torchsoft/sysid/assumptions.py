@@ -23,8 +23,9 @@ from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Nuisance, Sensor
 from torchsoft.tables import Number
 
-Kind = Literal["numerical", "known", "sensor", "law"]
-"""A constant of the computation, a known parameter of the rig, a property of a sensor, or a law."""
+Kind = Literal["numerical", "known", "sensor", "law", "several"]
+"""A constant of the computation, a known parameter of the rig, a property of a sensor, a law, or
+several of these at once."""
 
 PLACE = 20e-6
 """Variation of the start of a body [m]: the accuracy with which a careful hand places a disc."""

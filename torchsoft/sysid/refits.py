@@ -31,6 +31,13 @@ AMOUNTS = 10.0
 HALVINGS = 10
 """Most halvings of that range where the rig is impossible at its end."""
 
+NEARLY = 0.99
+"""Fraction of the misfit above the noise that suspects must explain to make most other fits
+needless."""
+
+TOGETHER = 4
+"""Most suspects that explain a misfit between them."""
+
 
 class End(NamedTuple):
     """End of a fit: coordinates x (n,), residuals there, mask `free` (n,), fitted recordings,
@@ -149,11 +156,13 @@ def since(steps: Frozen, begin: float) -> Frozen:
 class Joint(NamedTuple):
     """A fit with many suspects as unknowns: coordinates by label, the final sum of squares, and the
     fraction of the misfit, with all of them as stated, that each suspect alone explains to first
-    order there, by name."""
+    order there, by name; and the suspects that explain nearly all of it between them, if a few
+    do."""
 
     at: Mapping[str, float]
     left: float
     parts: Mapping[str, float]
+    together: Sequence[str] = ()
 
 
 def joint_fit(
@@ -199,12 +208,38 @@ def joint_fit(
         return d - Q @ (Q.T @ d)
 
     stated = across(fit.at.r - J[:, columns] @ (fit.x - c.start)[columns])
-    left, parts = float(fit.at.r @ fit.at.r), dict[str, float]()
+    left, effects = float(fit.at.r @ fit.at.r), dict[str, Array]()
     misfit = max(float(stated @ stated) - left, 1e-300)
     for one, k in zip(tried, columns):
         d = across(J[:, k])
-        parts[one.name] = float(d @ stated) ** 2 / max(float(d @ d), 1e-300) / misfit
-    return Joint(dict(zip(c.labels, fit.x.tolist())), left, parts)
+        effects[one.name] = d / max(float(np.linalg.norm(d)), 1e-150)
+    parts = {name: float(d @ stated) ** 2 / misfit for name, d in effects.items()}
+    together = fewest(effects, stated, left + (1 - NEARLY) * misfit)
+    return Joint(dict(zip(c.labels, fit.x.tolist())), left, parts, together)
+
+
+def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
+    """Names of effects (m,), of length one, whose span leaves at most `enough` of the square of r
+    (m,): by orthogonal matching pursuit, then without those that are not needed. None where that
+    takes more than `TOGETHER`."""
+
+    def left(names: Sequence[str]) -> Array:
+        A = np.stack([effects[name] for name in names], 1) if names else np.zeros((len(r), 0))
+        return r - A @ np.linalg.lstsq(A, r, rcond=None)[0]
+
+    def explains(names: Sequence[str]) -> bool:
+        return float(np.sum(left(names) ** 2)) <= enough
+
+    out = list[str]()
+    while not explains(out):
+        if len(out) == min(TOGETHER, len(effects)):
+            return []
+        rest = left(out)
+        out.append(max(effects.keys() - out, key=lambda name: abs(float(effects[name] @ rest))))
+    for name in tuple(out):
+        if explains(others := [one for one in out if one != name]):
+            out = others
+    return out
 
 
 def freed(problem: Problem, other: Problem, end: End) -> NDArray[np.bool_]:
@@ -226,19 +261,22 @@ class Refit(NamedTuple):
 
 
 def refit(
-    problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify,
+    problem: Problem, end: End, tried: Sequence[Variation], loss: Loss, notify: Notify,
     joint: Joint | None = None,
 ) -> Refit | None:  # fmt: skip
-    """The fit with one assumption varied, or with all as stated, on its own steps; None where it
+    """The fit with some assumptions varied, or with all as stated, on its own steps; None where it
     cannot begin.
 
     It starts at the end of the fit, or of a joint fit; ratios at a bound are scanned again over
     their whole range. Without a joint fit, and with a misfit above `FAR`, variations other than of
     a sensor also start where the first fit did, and the better end counts.
     """
-    other = varied(problem, end.which, one) if one is not None else problem
-    if isinstance(other, str):
-        return None
+    other = problem
+    for one in tried:
+        added = varied(other, end.which, one)
+        if isinstance(added, str):
+            return None
+        other = added
     c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
     if joint is not None:
         at |= {label: joint.at[label] for label in c.labels if label in joint.at}
@@ -256,12 +294,12 @@ def refit(
 
     once = Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)
     fits = [*carried_out([once], x)]
-    if one is not None and one.kind != "sensor" and end.far and joint is None:
+    if any(one.kind != "sensor" for one in tried) and end.far and joint is None:
         with suppress(Unreachable):
             plan = default_plan(other, runner, end.rtol, end.which)
             if set(plan[-1].free) == set(labels):
                 fits += carried_out(plan, c.start)
-    if one is None and not fits:  # it stays where it ended
+    if not tried and not fits:  # it stays where it ended
         chi2 = float(np.mean(end.base.r**2))
         fits = [Fit(end.x, chi2, 0, False, end.steps, end.base._replace(J=end.at.J))]
     return Refit(other, min(fits, key=lambda fit: fit.chi2), free) if fits else None

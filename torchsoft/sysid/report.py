@@ -156,12 +156,12 @@ def assumptions(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
     for one in sorted(result.assumptions, key=lambda one: -abs(one.most_moved[1])):
         label, move = one.most_moved
         amount, measured = "", one.kind in ("known", "sensor")
-        if np.isfinite(one.favoured_sd) and not one.unchecked:
+        if np.isfinite(one.favoured_sd) and not one.unchecked and one.kind != "several":
             by = one.unit if measured else "of that"
             amount = f" {signed(one.favoured)} ± {grouped(one.favoured_sd, 2)} {by}".rstrip()
         asks: Cell = f"no:{amount}" if amount else "they cannot tell"
         if one.suspected:
-            asks = "weak", f"yes{amount}: the sum of squares would fall by {one.gain:.0f}"
+            asks = "weak", f"yes{amount}: the sum of squares {one.falls}"
         if one.unchecked:
             asks = "weak", f"not checked: {one.unchecked}"
         moved = ("", f"{signed(move)} sd of {label}" if label else "")

@@ -26,7 +26,7 @@ from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, extended
-from torchsoft.sysid.refits import End, Refit, difference, joint_fit, refit
+from torchsoft.sysid.refits import NEARLY, End, Refit, difference, joint_fit, refit
 from torchsoft.sysid.residual_tests import LEVEL, parts
 from torchsoft.tables import Number, plain
 
@@ -49,10 +49,6 @@ MOST = 24
 
 RIVAL = 0.3
 """Fraction of the best suspect's gain to first order above which another one is its rival."""
-
-NEARLY = 0.99
-"""Fraction of the misfit above the noise that a suspect must explain to make most other fits
-needless."""
 
 BESIDES = 3
 """Most effects that are looked for besides the likeliest suspect."""
@@ -119,6 +115,8 @@ class AssumptionTest(Assumption):
     @property
     def found(self) -> str:
         """The variation that fits best, as the end of a sentence."""
+        if self.kind == "several":
+            return self.otherwise
         amount = f"{self.favoured:+.3g} {self.unit}".rstrip()
         if self.parameter and self.unit == "%":
             return (
@@ -231,13 +229,12 @@ def new_fits(
 ) -> Iterator[Variation]:  # fmt: skip
     """Repeat the fit with one suspect after the other, and replace its test in `checks`.
 
-    Once one explains the misfit, or `NEARLY` all of it, those with much smaller gains are left
-    out; numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that all
-    numbers together leave.
+    Suspects that explain the misfit between them come first, in one fit. Once one explains it, or
+    `NEARLY` all of it, those with much smaller gains are left out; numbers are left out, too, once
+    a law leaves less than `RIVAL` of the misfit that all numbers together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
-    count = len(candidates)
-    bar = tqdm(total=count + 1, unit="fit", disable=not progress)
+    bar = tqdm(total=len(candidates) + 1, unit="fit", disable=not progress)
     with warnings.catch_warnings(action="ignore"), bar:
 
         def notify(chi2: float) -> None:
@@ -253,27 +250,38 @@ def new_fits(
             if not explains:
                 bounded = dict.fromkeys(joint.parts, RIVAL * judge.misfit(joint.left))
         blind = end.far and not explains  # gains to first order say little
-        order = sorted(candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name]))
+        order = [[one] for one in sorted(
+            candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name])
+        )]  # fmt: skip
+        if joint is not None and explains and len(joint.together) > 1:
+            order.insert(0, [one for one in candidates if one.name in joint.together])
         bar.set_description("new fit with all assumptions")
-        as_stated = refit(problem, end, None, loss, notify)
+        as_stated = refit(problem, end, (), loss, notify)
         bar.update()
         enough = 0.0
-        for number, one in enumerate(order if as_stated is not None else (), 1):
-            if gains[one.name] < enough:
+        for number, some in enumerate(order if as_stated is not None else (), 1):
+            name = " and ".join(one.name for one in some)
+            gain = gains.get(name, judge.square)
+            if gain < enough:
                 return
-            if one.name in bounded and least < bounded[one.name]:
+            if name in bounded and least < bounded[name]:
                 continue
-            bar.set_description(plain(f"new fit with another {one.name} ({number} of {count})"))
-            tried = one.of(checks[one.name].favoured)
+            bar.set_description(plain(f"new fit with another {name} ({number} of {len(order)})"))
+            tried = [one.of(checks[one.name].favoured) for one in some]
             other = refit(problem, end, tried, loss, notify, joint if explains else None)
             if other is not None and as_stated is not None:
-                found = judge.fit(tried, other, as_stated, checks[one.name])
-                checks[one.name] = replace(found, amount=one.amount, step=one.step)
-                least = min(least, judge.misfit(found.left)) if found.refitted else least
+                found = [
+                    judge.fit(changed, other, as_stated, checks[one.name])
+                    for one, changed in zip(some, tried)
+                ]
+                if all(one.refitted for one in found):
+                    checks[name] = judge.together(name, found)
+                    least = min(least, judge.misfit(found[0].left))
             bar.update()
-            yield one
-            if judge.nearly(checks[one.name]):
-                enough = max(enough, RIVAL * gains[one.name])
+            if len(some) == 1:
+                yield some[0]
+            if name in checks and judge.nearly(checks[name]):
+                enough = max(enough, RIVAL * gain)
 
 
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
@@ -303,7 +311,10 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
     if not favoured:
         return checked._replace(left=judge.remaining(judge.r))
     rest = max(1.0, min(one.left for one in favoured) / judge.dof)
-    amplitudes = [float(not one.refitted or one.kind in ("known", "sensor")) for one in favoured]
+    amplitudes = [
+        one.amount if one.kind == "several"
+        else float(not one.refitted or one.kind in ("known", "sensor")) for one in favoured
+    ]  # fmt: skip
     left = np.array([one.left for one in favoured])
     score = left / rest + np.log(judge.dof) * np.array(amplitudes)
     odds = np.exp(-0.5 * (score - score.min()))
@@ -417,7 +428,20 @@ class Judge:
             scale = one.amount / one.step
             favoured, sd = (value - one.nominal) * scale, own * scale
         self.ends[one.name] = at.r, at.J[:, again.free]
-        return self.made(one, moves / self.sd, gain, left, favoured, sd, rest, at.r, before.r, True)
+        test = self.made(one, moves / self.sd, gain, left, favoured, sd, rest, at.r, before.r, True)
+        return replace(test, amount=linear.amount, step=linear.step)
+
+    def together(self, name: str, found: Sequence[AssumptionTest]) -> AssumptionTest:
+        """The test of one or several variations in one new fit, from the test of each in that
+        fit."""
+        if len(found) == 1:
+            return found[0]
+        self.ends[name] = self.ends[found[0].name]
+        return replace(
+            found[0], name=name, kind="several", parameter="", amount=float(len(found)), unit="",
+            stated=" and ".join(one.stated for one in found),
+            otherwise=" and".join(one.found for one in found),
+        )  # fmt: skip
 
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]
