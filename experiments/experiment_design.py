@@ -105,8 +105,8 @@ SMOKE = {
 
 def check(part: Residuals) -> Residuals:
     """Raises `SimulationFailed` where there are none."""
-    for lost in part.failed.values():
-        raise SimulationFailed(lost.reason, lost.time)
+    for failed in part.failed.values():
+        raise SimulationFailed(failed.reason, failed.time)
     return part
 
 

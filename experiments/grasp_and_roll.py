@@ -157,7 +157,10 @@ def table(numbers: Mapping[str, Any]) -> str:
     head = ("", "paper", *(f"{c['friction']} friction" for c in columns))
     return markdown(
         head,
-        [(what, paper, *(cell(c, key, form) for c in columns)) for what, paper, key, form in ROWS],
+        [
+            (quantity, paper, *(cell(c, key, form) for c in columns))
+            for quantity, paper, key, form in ROWS
+        ],
     )
 
 

@@ -100,9 +100,9 @@ def record_all(config: Config, noise: float) -> list[Recording]:
     """What the rig gives; the last one is to be predicted."""
     coarse = COARSE | {"contact.mu_k": 0.5} if config.smoke else {}
     nominal = Parameters().override({"contact.v_s": 0.05} | coarse)
-    how: dict[str, Any] = {"rtol": 0.1 * config.rtol, "noise": noise}
+    options: dict[str, Any] = {"rtol": 0.1 * config.rtol, "noise": noise}
     return [
-        record(name, begin(e, nominal), truths(config.smoke), RIG, seed=k, **how)
+        record(name, begin(e, nominal), truths(config.smoke), RIG, seed=k, **options)
         for k, (name, e) in enumerate(excitations(config).items())
     ]
 

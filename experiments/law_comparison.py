@@ -209,14 +209,14 @@ class Judged:
 
     case: Case
     apart: float
-    said: Comparison
+    comparison: Comparison
     wall_s: float
 
     @property
     def answer(self) -> str:
-        if self.said.law is None:
-            return self.said.outcome
-        return "right" if self.said.law == self.case.law else "wrong"
+        if self.comparison.law is None:
+            return self.comparison.outcome
+        return "right" if self.comparison.law == self.case.law else "wrong"
 
 
 def counts(config: Config) -> dict[str, int]:
@@ -254,9 +254,9 @@ def summed(judged: Sequence[Judged], motions: Iterable[str]) -> list[dict[str, A
     out = []
     for name, some in groups.items():
         answers, D = Counter(one.answer for one in some), [one.apart for one in some]
-        told = {key: answers[key] for key in ANSWERS}
+        counts = {key: answers[key] for key in ANSWERS}
         spread = np.quantile(D, [0, 0.5, 1]).tolist() if D else []
-        out.append({"group": name, "cases": len(some), **told, "D": spread})
+        out.append({"group": name, "cases": len(some), **counts, "D": spread})
     return out
 
 
@@ -276,7 +276,7 @@ def main(config: Config) -> None:
         {
             "motion": one.case.setting, "law": one.case.law, "truth": one.case.truth,
             "seed": one.case.seed, "D": one.apart, "answer": one.answer, "wall_s": one.wall_s,
-            "verdict": one.said.verdict,
+            "verdict": one.comparison.verdict,
         }
         for one in judged
     ]  # fmt: skip

@@ -298,7 +298,7 @@ def surrogates(config: Config, url: str) -> tuple[dict[str, float], float]:
         "motion and touch": lambda one: torch.cat((one.motion, one.touch), -1),
     }  # fmt: skip
     mean, sd = train.friction.mean(0), train.friction.std(0)
-    wanted, truth = (train.friction - mean) / sd, (test.friction - mean) / sd
+    target, truth = (train.friction - mean) / sd, (test.friction - mean) / sd
     out: dict[str, float] = {}
     for name, of in senses.items():
         middle, spread = of(train).mean((0, 1)), of(train).std((0, 1)).clamp(min=1e-9)
@@ -306,15 +306,15 @@ def surrogates(config: Config, url: str) -> tuple[dict[str, float], float]:
         flat = [torch.cat((one.flatten(1), torch.ones(len(one), 1)), 1).double()
                 for one in (x, held)]  # fmt: skip
         ridge = flat[0].T @ flat[0] + 1e-2 * len(x) * torch.eye(flat[0].shape[1]).double()
-        linear = flat[1] @ torch.linalg.solve(ridge, flat[0].T @ wanted.double())
+        linear = flat[1] @ torch.linalg.solve(ridge, flat[0].T @ target.double())
         out[f"linear, {name}"] = float((linear - truth).square().mean().sqrt())
-        network = trained(config, x, wanted)
+        network = trained(config, x, target)
         with torch.no_grad():
             out[f"network, {name}"] = float((network(held) - truth).square().mean().sqrt())
     return out, train.per_second
 
 
-def trained(config: Config, x: Tensor, wanted: Tensor) -> Surrogate:
+def trained(config: Config, x: Tensor, target: Tensor) -> Surrogate:
     torch.manual_seed(config.seed)
     network = Surrogate(x.shape[-1], config.hidden)
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
@@ -322,7 +322,7 @@ def trained(config: Config, x: Tensor, wanted: Tensor) -> Surrogate:
     for _ in tqdm(range(config.epochs), desc="epochs of the surrogate"):
         for part in torch.randperm(len(x)).split(128):
             optimiser.zero_grad()
-            (network(x[part]) - wanted[part]).square().mean().backward()
+            (network(x[part]) - target[part]).square().mean().backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimiser.step()
         schedule.step()

@@ -275,8 +275,8 @@ def by_evolution(config: Config, seed: int) -> tuple[History, nn.Module]:
     env, evaluated = environment(), environment()
     policy = network(config.hidden, len(env.dynamics.actions), seed)
     start = nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()
-    how = {"seed": seed + 1, "popsize": 16, "verbose": -9, "CMA_diagonal": True}
-    search = cma.CMAEvolutionStrategy(start, 0.2, how)
+    options = {"seed": seed + 1, "popsize": 16, "verbose": -9, "CMA_diagonal": True}
+    search = cma.CMAEvolutionStrategy(start, 0.2, options)
     training, samples, mean = Training(config, "CMA-ES", seed, evaluated), 0, deepcopy(policy)
     draws = np.random.default_rng(seed)
 

@@ -224,8 +224,8 @@ def simulate(case: Case, rtol: float) -> tuple[Trajectory, str]:
 
 def errors(case: Case, run: Trajectory) -> tuple[Tensor, Tensor]:
     """How far the centre is from where it should be [mm], and the angle [deg], (T,)."""
-    wanted = {name: case.signals[f"{name}_d"](run.t)[0].detach() for name in ("x", "y", "theta")}
-    x, y, theta = (run[f"{name}_disc"].detach() - w for name, w in wanted.items())
+    setpoints = {name: case.signals[f"{name}_d"](run.t)[0].detach() for name in ("x", "y", "theta")}
+    x, y, theta = (run[f"{name}_disc"].detach() - w for name, w in setpoints.items())
     return MM * torch.hypot(x, y), DEGREES * theta
 
 
@@ -327,11 +327,11 @@ def table(result: Result) -> str:
          x.verdict)
         for group, some in result.outcomes.items() for key, x in some.items()
     ]  # fmt: skip
-    asked = markdown(
+    demand = markdown(
         ("rigid", "asks for a friction of"),
         [(name, f"{one.friction:.3g}") for name, one in result.rigid.items()],
     )
-    return f"{markdown(head, rows)}\n\n{asked}"
+    return f"{markdown(head, rows)}\n\n{demand}"
 
 
 def peak(signal: Any) -> float:

@@ -38,8 +38,8 @@ actuators = ts.controller(
 actuators["y"] = paper.actuators["y"]  # the vertical loop stays
 parts = {name: dict(getattr(paper, name)) for name in ("bodies", "pads", "contacts")}
 rig = ts.Rig(**parts, actuators=actuators, symbols={"disc": "C", "bracket": "Br"})
-wanted = ts.Profile([0.5, 0.9], [60.3e-3, 57.3e-3])
-reference = ts.Reference(x_d=wanted, y_d=paper.reference["y_d"], F_ff=paper.reference["F_ff"])
+target = ts.Profile([0.5, 0.9], [60.3e-3, 57.3e-3])
+reference = ts.Reference(x_d=target, y_d=paper.reference["y_d"], F_ff=paper.reference["F_ff"])
 t = torch.linspace(0, 1.2, 241, dtype=torch.float64)
 optimiser, history = torch.optim.Adam(policy.parameters(), lr=0.02), []
 for i in range(25):

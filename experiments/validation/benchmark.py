@@ -209,13 +209,13 @@ class Window:
 
     def attempt(self, method: str, rtol: float, solver: Solver, repeats: int) -> Attempt:
         """Run and time one method, in the first run with what it compiles."""
-        self.f.calls, lost = 0, Attempt(method, rtol, np.inf, 0, np.inf, np.inf)
+        self.f.calls, failed = 0, Attempt(method, rtol, np.inf, 0, np.inf, np.inf)
         try:
             y = solver(rtol)
         except (RuntimeError, AssertionError):  # a trial state without forces, or steps of nothing
-            return lost
+            return failed
         if y.shape != self.exact.shape:  # given up on the way
-            return lost
+            return failed
         calls, wall = self.f.calls, median(timed(partial(solver, rtol))[1] for _ in range(repeats))
         off = np.abs(y - self.exact)
         largest = np.linalg.norm(self.exact[:, self.pads], axis=1).max()
@@ -228,9 +228,9 @@ def scipy_solvers(w: Window) -> dict[str, Solver]:
     y0, t = w.y0.numpy(), w.t.numpy()
 
     def solver(method: str) -> Solver:
-        how: dict[str, Any] = {"method": method, "t_eval": t}
+        options: dict[str, Any] = {"method": method, "t_eval": t}
         return lambda rtol: (
-            solve_ivp(w.f, (t[0], t[-1]), y0, rtol=rtol, atol=rtol * w.size, **how).y.T
+            solve_ivp(w.f, (t[0], t[-1]), y0, rtol=rtol, atol=rtol * w.size, **options).y.T
         )
 
     return {f"scipy {name}": solver(name) for name in ("LSODA", "BDF", "Radau", "RK23", "RK45")}

@@ -341,16 +341,16 @@ def study(case: Case, made: Sequence[Made], config: Config) -> Outcome:
             stated(recordings, truth), rtol=config.rtol, workers=config.workers, checkpoint=runs,
             progress=not config.smoke,
         )  # fmt: skip
-        rows, chi2, said = judged(found, truth), found.chi2, list(found.notices)
+        rows, chi2, notices = judged(found, truth), found.chi2, list(found.notices)
     except (Unreachable, ValueError) as error:
-        said = [str(error)]
-    named = any(word.lower() in text.lower() for word in case.cause for text in said)
+        notices = [str(error)]
+    named = any(word.lower() in text.lower() for word in case.cause for text in notices)
     if rows and all(row["inside"] is not False for row in rows.values()):
         verdict = "holds"
     else:
-        verdict = "cause named" if named else "warned, cause not named" if said else "silent"
+        verdict = "cause named" if named else "warned, cause not named" if notices else "silent"
     slip, wall = max(one.slip for one in made), perf_counter() - began
-    return Outcome(case.name, rows, chi2, said, verdict, slip, wall)
+    return Outcome(case.name, rows, chi2, notices, verdict, slip, wall)
 
 
 def table(outcomes: list[Outcome]) -> str:
@@ -363,9 +363,9 @@ def table(outcomes: list[Outcome]) -> str:
             for row in one.parameters.values()
         ]  # fmt: skip
         chi2 = "-" if one.chi2 is None else f"{one.chi2:.3f}"
-        said = "; ".join(textwrap.shorten(text, 110) for text in one.warnings).replace("|", "/")
+        warnings = "; ".join(textwrap.shorten(text, 110) for text in one.warnings).replace("|", "/")
         errors = " ".join(cells)
-        rows.append((one.name, errors, chi2, one.verdict, f"{one.wall_s:.0f}", said or "-"))
+        rows.append((one.name, errors, chi2, one.verdict, f"{one.wall_s:.0f}", warnings or "-"))
     names = max((one.parameters for one in outcomes), key=len)
     short = " ".join(name.split(".")[1] for name in names)
     head = ("case", f"errors [%] of {short}", "chi2", "verdict", "wall [s]", "warnings")

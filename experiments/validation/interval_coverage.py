@@ -247,9 +247,9 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
         }
         csvfile.write(path, columns, {"t": "s", **exact.units})
         one = load([path], folder / "fit.toml")
-        how: dict[str, Any] = one.config.fit.model_dump()
-        how |= {} if seed < config.checked else {"assumptions": "trusted"}
-        result = identify(one.problem, **how)
+        options: dict[str, Any] = one.config.fit.model_dump()
+        options |= {} if seed < config.checked else {"assumptions": "trusted"}
+        result = identify(one.problem, **options)
         path.unlink()
         return Repetition(judged({name: result[name] for name in truth}, truth), result.notices, [])
 

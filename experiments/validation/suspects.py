@@ -136,8 +136,8 @@ class Repetition(NamedTuple):
 
 
 def names_the_suspect(case: Case, one: Repetition) -> bool:
-    said = any(word in text for word in case.words for text in one.notices)
-    return said or any(name.startswith(case.suspects) for name in one.named)
+    worded = any(word in text for word in case.words for text in one.notices)
+    return worded or any(name.startswith(case.suspects) for name in one.named)
 
 
 def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
@@ -151,7 +151,7 @@ def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
     return {
         "name": case.name, "held": sum(abs(z) < 1.96 for z in every), "of": len(every),
         "worst": worst, "named": sum(named), "odds": {k: x / len(reps) for k, x in odds.items()},
-        "silent": sum(z > OFF and not told for z, told in zip(worst, named)),
+        "silent": sum(z > OFF and not warned for z, warned in zip(worst, named)),
         "identify_s": max(one.identify_s for one in reps),
         "explain_s": max((one.explain_s for one in reps if one.explain_s), default=None),
         "repetitions": [one._asdict() for one in reps],
@@ -168,11 +168,11 @@ def stated_case(case: Case, made: Made, seed: int) -> Problem:
 
 def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
     one, folder = stated_case(case, made, seed), config.out / f"runs-{CASES.index(case)}-{seed}"
-    how: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
-    result, identify_s = timed(lambda: identify(one, **how))
+    options: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
+    result, identify_s = timed(lambda: identify(one, **options))
     explain_s = None
     if result.made_by["candidates"]:
-        result, explain_s = timed(lambda: explain(one, **how))
+        result, explain_s = timed(lambda: explain(one, **options))
     forget(folder)
     off = {
         e.name: float(np.log(e.value / TRUTH[e.name]) / e.relative_sd)
