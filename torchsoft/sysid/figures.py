@@ -1,5 +1,6 @@
 """Pictures of an identification: estimates, the Fisher spectrum, correlations, residuals."""
 
+import re
 from collections.abc import Sequence
 from textwrap import fill, shorten
 from typing import Any, NamedTuple
@@ -66,8 +67,14 @@ def direction_name(d: Direction) -> str:
 
 
 def literal(text: str, width: int = 200) -> str:
-    """Text for matplotlib, with dollars escaped, in lines of at most `width` characters."""
-    return fill(plain(text), width).replace("$", r"\$")
+    """Text for matplotlib, with dollars escaped, in lines of at most `width` characters; names of
+    parameters are broken after a dot."""
+    parts = rf"\S{{1,{width - 1}}}(?:\.|$)|\S{{1,{width}}}"
+    broken = [
+        " ".join(re.findall(parts, word)) if len(word) > width else word
+        for word in plain(text).split()
+    ]
+    return fill(" ".join(broken), width).replace("$", r"\$")
 
 
 @rc_context(STYLE)
