@@ -36,9 +36,11 @@ from torchsoft.sysid.fit import (
     standard_deviations,
 )
 from torchsoft.sysid.plan import (
+    SCANNED,
     default_plan,
     jacobian_error,
     run_plan,
+    scan,
     sobol,
     tie_ratios,
     visible,
@@ -52,6 +54,7 @@ RTOL = 1e-4
 TRUSTED: dict[str, Any] = {"assumptions": "trusted"}
 """Nothing but the fit."""
 SENSORS = RIG
+RATIO = "contact.mu_k / contact.mu_s"
 GRASP: dict[str, Any] = {"grasp_time": 0.2, "settle": 0.05, "senses": "bracket"}
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.65, **GRASP)
 SHAKE = Excitation(
@@ -441,6 +444,29 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
     first = iter([True])
     with pytest.raises(Unreachable, match=r"recording `strokes`: at t = 0.5 s: no"):
         identify(problem, plan=other)
+
+
+@pytest.mark.parametrize(
+    ("truth", "free", "ends"),
+    [
+        ((0.5, 0.55), ("contact.mu_s", RATIO), (0.5, 0.55)),  # its denominator by the factor's root
+        ((0.3708, 0.7), ("contact.mu_s", RATIO), (0.3708, 0.7)),  # it stays
+        ((0.5, 0.55), (RATIO,), (0.3708, 0.55)),  # it is not free
+    ],
+)
+def test_a_ratio_is_scanned_with_its_denominator(strokes, monkeypatch, truth, free, ends):
+    """Friction coefficients that were fitted as one lie between those that are not."""
+    monkeypatch.setattr(
+        Problem, "gather", lambda self, x, jobs, runs: Residuals(x - at, np.zeros((2, 2)), {})
+    )
+    unknowns = {"contact.mu_s": Unknown(), "contact.mu_k": Unknown(ratio_to="contact.mu_s")}
+    problem = Problem([strokes], SENSORS, unknowns)
+    c, runner = problem.coordinates, SimpleNamespace(run=lambda jobs: [None for _ in jobs])
+    place = lambda values: np.array([one.to_x(v) for one, v in zip(c.all, values)])
+    at, tied = place(truth), place((0.3708, 1.0))
+    stage = Stage("everything", ("strokes",), free, 1e-4)
+    x = scan(problem, runner, stage, tied, 1, SCANNED, lambda chi2: None)
+    assert x == pytest.approx(place(ends), abs=1e-3)
 
 
 def test_another_stage_that_cannot_begin_there_begins_where_the_plan_did(strokes, monkeypatch):

@@ -11,6 +11,7 @@ import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -53,15 +54,20 @@ FIRST, ALL, FREE, LAST = 8, 15, 30, 20
 SCANNED = (1.0, 0.85, 0.7, 0.55)
 """Fractions of its upper bound at which a ratio is tried before it is free."""
 
+SPLITS = (0.0, 0.5, 1.0)
+"""Exponents of a ratio's change by which its denominator changes inversely in these trials: with 0
+it stays, with 1 the numerator does. Coefficients of friction fitted as one come between the two."""
+
 
 @dataclass(frozen=True)
 class Stage:
     """One fit: recordings, free coordinates by label, the relative tolerance that chooses its
     steps, limits of its iteration, and coordinates to set or scan before it.
 
-    `tied` sets coordinates to values; `scanned` tries each value with the relative tolerance
-    `LOOSE`, the others held, and keeps the best. With `starts` above one, that many Sobol points
-    within a factor `spread` of the start are fitted, and the best end is kept.
+    `tied` sets coordinates to values; `scanned` tries each value of a ratio with the relative
+    tolerance `LOOSE`, the others held but for its denominator, and keeps the best. With `starts`
+    above one, that many Sobol points within a factor `spread` of the start are fitted, and the best
+    end is kept.
     """
 
     name: str
@@ -310,12 +316,20 @@ def scan(
     values: Sequence[float],
     notify: Notify,
 ) -> Array:
-    """x with the best of some values for coordinate i, the others held; all are run side by
-    side."""
-    rtol = max(LOOSE, stage.rtol)
-    trials = [x.copy() for _ in values]
-    for trial, value in zip(trials, values):
-        trial[i] = problem.coordinates.all[i].to_x(value)
+    """x with the best of some values for the ratio i, and of `SPLITS` for its denominator; all are
+    run side by side."""
+    rtol, c = max(LOOSE, stage.rtol), problem.coordinates.all
+    now, trials = c[i].to_value(x[i]), list[Array]()
+    below = [
+        j for j, one in enumerate(c) if one.name == c[i].ratio_to and one.label in stage.free
+        and one.recording in (None, c[i].recording)
+    ]  # fmt: skip
+    for value, split in product(values, SPLITS if below else SPLITS[:1]):
+        trials.append(x.copy())
+        trials[-1][i] = c[i].to_x(value)
+        for j in below:
+            moved = c[j].to_value(x[j]) * (now / value) ** split
+            trials[-1][j] = c[j].to_x(float(np.clip(moved, c[j].low, c[j].high)))
     jobs = [problem.jobs(trial, stage.recordings, rtol, None) for trial in trials]
     runs = iter(runner.run([job for some in jobs for job in some]))
     misfits = []
