@@ -172,9 +172,9 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = {key: float(rig.penetration(key, moment.state).max()) for key in rig.contacts}
-        if any(0 < deep < float(rig.contacts[key].law.epsilon) for key, deep in depth.items()):
-            continue  # it only just touches, which it does not for long
-        ties = tied(rig, [key for key, deep in depth.items() if deep > -NEAR])
+        if any(-NEAR < deep < float(rig.contacts[key].law.epsilon) for key, deep in depth.items()):
+            continue  # it only just touches, or is about to, which it does not for long
+        ties = tied(rig, [key for key, deep in depth.items() if deep > 0])
         for one in e.loops:
             (measured, _), (pushed, _) = at(one.measured), at(one.pushes)
             if not nx.has_path(ties, measured, pushed):
