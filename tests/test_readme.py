@@ -32,7 +32,6 @@ SHORTER = {
     "identify(problem, ": 'identify(problem, rtol=1e-3, assumptions="trusted", ',
 }
 ELSEWHERE = {
-    "make ": "a target of the Makefile",
     "pip install": "an installation",
     "rehearse fit.toml": "test_sysid_rigs.py",
     "tcp://head": "test_datasets.py",
@@ -65,6 +64,7 @@ def code(page: Path) -> str:
 
 def commands(page: Path) -> list[str]:
     lines = [line for block in blocks(page, "sh") for line in block.splitlines()]
+    lines = [line for line in lines if not line.startswith("make ")]
     return [line for line in lines if not any(part in line for part in ELSEWHERE)]
 
 

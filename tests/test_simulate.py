@@ -344,6 +344,16 @@ def test_routes_agree_on_the_run():
 # ----------------------------------------------------------------------
 
 
+def test_every_second_number_of_a_tensor_is_as_good_as_a_tensor():
+    model, t = coarse(), times(0.02, 5)
+    y0 = grasped(model, (0.05, 0.0)).detach()
+    run = simulate(model, t, y0=y0)
+    twice = lambda x: torch.stack((x, x), 1)[:, 0]
+    for gradient in ("none", "discrete"):
+        again = simulate(model, twice(t), y0=twice(y0), knots=twice(run.knots), gradient=gradient)
+        torch.testing.assert_close(again.y, run.y, rtol=0, atol=1e-12)
+
+
 def test_parts_replaced_after_a_run_run():
     """A material with more branches after the first run, in the group and in the pads."""
     model = coarse()

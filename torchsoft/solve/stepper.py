@@ -280,7 +280,7 @@ class ImplicitStepper:
 
     def _by_tolerance(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
-        times, out = t.numpy(), now.out
+        times, out = np.ascontiguousarray(t.numpy()), now.out
         followed = Followed(
             lambda x: self.compiled.signals(x, self.reference), self.rig, self.reference
         )

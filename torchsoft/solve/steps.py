@@ -146,7 +146,7 @@ def check_knots(knots: Tensor) -> NDArray[np.float64]:
             "`knots` must be two times or more [s], finite and increasing, but has shape "
             f"{tuple(knots.shape)}"
         )
-    return knots.detach().numpy()
+    return np.ascontiguousarray(knots.detach().numpy())
 
 
 def given_steps(t: Tensor, knots: NDArray[np.float64]) -> Iterator[Plan]:
