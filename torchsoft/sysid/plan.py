@@ -54,9 +54,10 @@ FIRST, ALL, FREE, LAST = 8, 15, 30, 20
 SCANNED = (1.0, 0.85, 0.7, 0.55)
 """Fractions of its upper bound at which a ratio is tried before it is free."""
 
-SPLITS = (0.0, 0.5, 1.0)
+SPLITS = (0.0, 0.5)
 """Exponents of a ratio's change by which its denominator changes inversely in these trials: with 0
-it stays, with 1 the numerator does. Coefficients of friction fitted as one come between the two."""
+it stays, with 1/2 the product with the numerator does. Coefficients of friction that were fitted as
+one lie between the two."""
 
 
 @dataclass(frozen=True)
@@ -325,6 +326,8 @@ def scan(
         and one.recording in (None, c[i].recording)
     ]  # fmt: skip
     for value, split in product(values, SPLITS if below else SPLITS[:1]):
+        if split and value == now:
+            continue
         trials.append(x.copy())
         trials[-1][i] = c[i].to_x(value)
         for j in below:
