@@ -422,6 +422,12 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same):
     assert said[0].startswith("the data contradict that a is 1: the sum of squares falls by 300")
     assert "cannot tell it (odds 0.62) from: b with b = 1.05 (+5 %, +- 0.5), odds 0.38" in said[0]
     assert said[1] == "none of 3 suspects explains F_y: 3.1 times the noise left"
+    first, second = assumption_notices(found._replace(left={"F_y": 58.0}))
+    assert first == (
+        "no suspect explains these data: the sum of squares falls by 300 in a new fit with a = "
+        "1.05 (+5 %, +- 0.5), which leaves too much to be the cause"
+    )
+    assert second == "none of 3 suspects explains F_y: 58 times the noise left"
 
 
 def test_two_causes_are_both_named():

@@ -11,6 +11,10 @@ LIKELY = 0.01
 UNEXPLAINED = 1.15
 """Least RMS residual of a channel, over its noise, that is reported as unexplained."""
 
+NO_CAUSE = 5.0
+"""RMS residual of a channel, over its noise, left by the new fit with the likeliest suspect, from
+which on that suspect explains nothing."""
+
 UNDER = 8
 """Most estimates that a sentence states under an alternative."""
 
@@ -40,7 +44,13 @@ def assumption_notices(checked: Checked) -> list[str]:
             f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
             "tries them"
         )
-    if favoured:
+    if favoured and favoured[0].refitted and max(checked.left.values(), default=0.0) > NO_CAUSE:
+        best = favoured[0]
+        out.append(
+            f"no suspect explains these data: the sum of squares {best.falls}{best.found}, which "
+            "leaves too much to be the cause"
+        )
+    elif favoured:
         out += contradictions(favoured, [c for c in checks if c.name in checked.candidates])
     out += [
         f"besides, the data contradict that {c.stated}: the sum of squares would fall by another "
