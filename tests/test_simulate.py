@@ -312,6 +312,19 @@ def test_other_settings_of_the_process_do_not_matter():
 # ----------------------------------------------------------------------
 
 
+def test_a_run_with_gradients_may_follow_one_in_inference_mode():
+    """Both use the same compliances, which the first has computed."""
+    model = coarse()
+    model.pads["L"].material.nu.data.fill_(0.4321)  # of no other test
+    y0 = torch.from_numpy(grasped(coarse(), (0.05, 0.0)).detach().numpy())
+    with torch.inference_mode():
+        run = simulate(model, T, y0=y0)
+    again = simulate(model, T, y0=y0, gradient="discrete")
+    assert torch.equal(again.y, run.y)
+    again["y_C"][-1].backward()
+    assert model.pads["L"].material.nu.grad.abs() > 0
+
+
 def test_no_grad_is_honoured():
     model = coarse()
     y0 = grasped(model, (0.01, 0.0)).requires_grad_()

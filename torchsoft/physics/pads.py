@@ -34,6 +34,7 @@ from torchsoft.quantity import Length, Quantity, Ratio, quantities
 
 
 @lru_cache(maxsize=16)
+@torch.inference_mode(False)  # whoever asks first, others need graphs
 def turned_compliance(mesh: Mesh, nu: float, axes: tuple[float, ...]) -> tuple[Tensor, Tensor]:
     """C of a mesh for E depth = 1 and its derivative by nu, turned from the pad's own axes into the
     base's."""
