@@ -41,7 +41,7 @@ MOMENTS = 5
 """Most times at which the rig is brought into equilibrium."""
 
 NEAR = 1e-4
-"""Gap [m] below which a body counts as touching a pad."""
+"""Gap [m] below which a body is about to touch a pad."""
 
 STEPS_PER_PERIOD = 5
 """Fewest steps in a period of an oscillation."""
@@ -398,11 +398,8 @@ def jumps(e: Estimate) -> Iterator[Diagnostic]:
     values, followed = signals(e.rig, 0.0), e.rig.follow(0.0)
     for loop in e.loops:
         body, axis = at(loop.measured)
-        unit, here, setpoint = (
-            e.file.unit(loop.setpoint),
-            e.start[body][axis],
-            values[loop.setpoint],
-        )
+        unit, here = e.file.unit(loop.setpoint), e.start[body][axis]
+        setpoint = values[loop.setpoint]
         if abs(setpoint - here) > JUMP[unit]:
             state = e.rig.unpack(e.y0, followed)
             efforts = [

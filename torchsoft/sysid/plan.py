@@ -230,8 +230,8 @@ def run_plan(
         began = clock.perf_counter()
         with progress_bar(f"{label}{number + 1}/{len(plan)} {stage.name}", progress) as bar:
             rest = loss, method, seed + number, notify or bar
+            begin = end.fit.x if end is not None else x
             try:
-                begin = end.fit.x if end is not None else x
                 fit = run_stage(problem, runner, stage, begin, *rest)
             except Unreachable as failure:
                 if end is None:

@@ -224,20 +224,18 @@ def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
     takes more than `TOGETHER`."""
 
     def left(names: Sequence[str]) -> Array:
-        A = np.stack([effects[name] for name in names], 1) if names else np.zeros((len(r), 0))
+        A = np.array([effects[name] for name in names]).reshape(len(names), len(r)).T
         return r - A @ np.linalg.lstsq(A, r, rcond=None)[0]
 
-    def explains(names: Sequence[str]) -> bool:
-        return float(np.sum(left(names) ** 2)) <= enough
-
-    out = list[str]()
-    while not explains(out):
+    out, rest = list[str](), r
+    while float(rest @ rest) > enough:
         if len(out) == min(TOGETHER, len(effects)):
             return []
-        rest = left(out)
         out.append(max(effects.keys() - out, key=lambda name: abs(float(effects[name] @ rest))))
+        rest = left(out)
     for name in tuple(out):
-        if explains(others := [one for one in out if one != name]):
+        others = [one for one in out if one != name]
+        if float(np.sum(left(others) ** 2)) <= enough:
             out = others
     return out
 
