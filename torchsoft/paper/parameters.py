@@ -108,9 +108,7 @@ class ContactParameters(Table):
     R_t: float = of(SoftContact, "R_t", 441.7149, "assumed", "tangential dashpot, R_24 and R_60")
     mu_s: float = of(SmoothSlip, "mu_s", 0.8, "assumed")
     mu_k: float = of(SmoothSlip, "mu_k", 0.7, "assumed")
-    eta: float = of(SmoothSlip, "eta", 10.0, "assumed")
     v_s: float = of(SmoothSlip, "v_s", 5e-3, "assumed")
-    epsilon: float = of(SoftContact, "epsilon", 1e-6, "assumed")
     node_spacing: float = of(
         SoftContact, "node_spacing", 1e-3, "assumed", "spacing the per-node values refer to"
     )
@@ -130,7 +128,7 @@ class ContactParameters(Table):
         """Law of a contact point; `friction` replaces the one of the settings."""
         smooth = self.friction == "smooth"
         slip = (
-            SmoothSlip(self.mu_s, self.mu_k, self.v_s, self.eta)
+            SmoothSlip(self.mu_s, self.mu_k, self.v_s)
             if smooth
             else Coulomb(self.mu_s, self.mu_k)
         )
@@ -140,7 +138,6 @@ class ContactParameters(Table):
             self.K_t,
             self.R_t,
             friction=friction or slip,
-            epsilon=self.epsilon,
             node_spacing=self.node_spacing,
         )
 
@@ -276,7 +273,7 @@ class Parameters(Table):
         if reason := self.contact.law().jumps(force):
             warnings.warn(
                 f"{reason}; the slip rate, and every gradient, jumps at slip onset. Raise "
-                "contact.v_s or contact.eta.",
+                "contact.v_s or contact.R_t.",
                 stacklevel=2,
             )
         return self

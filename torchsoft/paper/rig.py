@@ -20,8 +20,8 @@ from torchsoft.physics.shapes import Circle, Shape
 
 NAMES = {
     **{f"pad.{name}": f"pad.{name}" for name in ("E", "nu", "rho", "tau", "depth")},
-    **{f"contact.{name}": f"contact.{name}" for name in ("K_n", "R_n", "K_t", "R_t", "epsilon")},
-    **{f"contact.{name}": f"contact.friction.{name}" for name in ("mu_s", "mu_k", "v_s", "eta")},
+    **{f"contact.{name}": f"contact.{name}" for name in ("K_n", "R_n", "K_t", "R_t")},
+    **{f"contact.{name}": f"contact.friction.{name}" for name in ("mu_s", "mu_k", "v_s")},
     "control.K_81": "control.x.Kp",
     "control.R_80": "control.x.Kd",
     "control.K_98": "control.y.Kp",

@@ -2,10 +2,11 @@
 stick-slip friction.
 
 Equations of the paper in brackets. Everything else is generated from these functions: the compiled
-law with its Jacobian and its derivatives in every parameter. Departures from the paper keep forces
-and gradients continuous: the ramp rho = g / (g + epsilon), which takes the dashpots and the
-tangential branch in at touch-down, max(0, .), which removes adhesion, and the moving frame, which
-follows the point on the body nearest to the pad's instead of the first one touched.
+law with its Jacobian and its derivatives in every parameter. Two departures from the paper keep
+forces continuous: the normal dashpot never carries more than the spring, so that it begins at zero
+and nothing adheres, and the moving frame follows the point on the body nearest to the pad's instead
+of the first one touched. Neither has a length, a force or a speed of its own: the law is the same at
+every load and size.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,8 @@ from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Stiffness
 SlipLaw = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Slip rate |gamma'| >= 0 [m/s] under a trial effort E >= 0 [N], a normal force F_N [N] and the
 dashpot R [N.s/m] that the slip relieves, each per reference spacing: a function or an `nn.Module`,
-in torch operations. The slip must not take more than the effort: R |gamma'| <= E."""
+in torch operations. The slip must not take more than the effort, R |gamma'| <= E, and all of it
+where nothing presses, R |gamma'| = E at F_N = 0: friction is continuous at touch-down then."""
 
 
 class Frame(NamedTuple):
@@ -35,15 +37,14 @@ class Frame(NamedTuple):
 
 
 class ContactState(NamedTuple):
-    """Per point, shape (...): forces [N], stretch rate s' and slip rate gamma' [m/s], effort e [N],
-    ramp rho [1]."""
+    """Per point, shape (...): forces [N], stretch rate s' and slip rate gamma' [m/s], effort e of
+    the tangential elements [N], which is F_T where the point touches."""
 
     F_N: Tensor
     F_T: Tensor
     s_dot: Tensor
     gamma_dot: Tensor
     e: Tensor
-    rho: Tensor
 
 
 def cross(d: Tensor) -> Tensor:
@@ -68,16 +69,16 @@ def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
     return Frame(d, n, cross(n), -phi)
 
 
-def ramp(g: Tensor, epsilon: Tensor) -> Tensor:
-    """rho = g / (g + epsilon) for g > 0, else 0. Continuous; not smooth at g = 0."""
-    depth = g.clamp(min=0.0)
-    return depth / (depth + epsilon)
+def normal_force(spring: Tensor, dashpot: Tensor) -> Tensor:
+    """F_N = S + D S / (S + |D|) while S > 0, else 0 [N], of the spring's force S = K_n g and the
+    dashpot's D = R_n g' (Eq. 8, 9).
 
-
-def normal_force(spring: Tensor, g_dot: Tensor, rho: Tensor, R_n: Tensor) -> Tensor:
-    """F_N = max(0, K_n g + R_n g' rho) while g > 0 (Eq. 8, 9) [N], of the spring's force K_n g. Not
-    smooth at g = 0 and where the max cuts."""
-    return (spring + R_n * rho * g_dot).clamp(min=0.0)
+    S + D where the spring is the stronger one, 2 S on approach and 0 on withdrawal where the
+    dashpot is; never negative. Continuous; not smooth at S = 0, once differentiable at D = 0.
+    """
+    pressed = spring > 0
+    S = torch.where(pressed, spring, 1.0)
+    return torch.where(pressed, S + dashpot * S / (S + dashpot.abs()), 0.0)
 
 
 StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]
@@ -105,11 +106,11 @@ class Friction(nn.Module):
 
 
 class SmoothSlip(Friction):
-    """The slip element: (eta + R) |gamma'| = <E - mu(gamma') F_N>+, mu = mu_k + (mu_s - mu_k) / (1
-    + |gamma'| / v_s).
+    """The slip element: R |gamma'| = <E - mu(gamma') F_N>+, mu = mu_k + (mu_s - mu_k) / (1 +
+    |gamma'| / v_s).
 
     A quadratic in |gamma'|, with one positive root when E > mu_s F_N. Continuous, not smooth at
-    slip onset; continuous only if eta + R >= (mu_s - mu_k) F_N / v_s.
+    slip onset; continuous only if R >= (mu_s - mu_k) F_N / v_s.
     """
 
     def __init__(
@@ -119,18 +120,16 @@ class SmoothSlip(Friction):
         v_s: Annotated[
             float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")
         ] = 5e-3,
-        eta: Annotated[Dashpot, "viscosity of the slip element; 0 is Coulomb's limit"] = 10.0,
     ) -> None:
         super().__init__(mu_s, mu_k)
-        self.v_s, self.eta = parameter(v_s), parameter(eta)
+        self.v_s = parameter(v_s)
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        a = self.eta + R
-        b = a * self.v_s - (E - self.mu_k * F_N)
+        b = R * self.v_s - (E - self.mu_k * F_N)
         c = (self.v_s * (E - self.mu_s * F_N)).clamp(min=0.0)
-        root = torch.sqrt(b * b + 4 * a * c)
+        root = torch.sqrt(b * b + 4 * R * c)
         rising = b >= 0  # two forms of the same root, neither of which cancels
-        rate = torch.where(rising, 2 * c / torch.where(rising, b + root, 1.0), (root - b) / (2 * a))
+        rate = torch.where(rising, 2 * c / torch.where(rising, b + root, 1.0), (root - b) / (2 * R))
         return torch.where(self.mu_s * F_N <= E, rate, 0.0)
 
 
@@ -148,28 +147,11 @@ class Coulomb(Friction):
 REFERENCE_DEPTH = 1e-4
 """Penetration g_0 [m] at which the normal spring's force is K_n g_0, whatever its power."""
 
-Sliding = Callable[[Tensor], Tensor]
-"""The part [1] of the sliding that stretches the tangential elements, where the ramp is rho [1]."""
-
-
-def ramped(rho: Tensor) -> Tensor:
-    """rho: as much of the sliding as of the force is taken in, which is the power that the element
-    gets."""
-    return rho
-
-
-def at_once(rho: Tensor) -> Tensor:
-    """All of the sliding from touch-down on, while the force is ramped in: power (1 - rho) e v_T
-    comes from nowhere. Not continuous at touch-down."""
-    return torch.where(rho > 0, torch.ones_like(rho), torch.zeros_like(rho))
-
-
 class SoftContact(nn.Module):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
-    R_n, R_t [N.s/m], the ramp's depth epsilon [m], and a friction law. `weight` scales them to the
-    length of surface that a point stands for. With a `power` m [1] the normal spring's force is K_n
-    g_0 (g / g_0)^m, g_0 being `REFERENCE_DEPTH`. `sliding` other than `ramped` breaks the power
-    balance."""
+    R_n, R_t [N.s/m], and a friction law. `weight` scales them to the length of surface that a point
+    stands for. With a `power` m [1] the normal spring's force is K_n g_0 (g / g_0)^m, g_0 being
+    `REFERENCE_DEPTH`."""
 
     def __init__(
         self,
@@ -179,9 +161,6 @@ class SoftContact(nn.Module):
         R_t: Annotated[Dashpot, "tangential dashpot"],
         *,
         friction: SlipLaw,
-        epsilon: Annotated[
-            float, Quantity("m", 1e-12, 1.0, "touch-down depth of the ramp g / (g + epsilon)")
-        ] = 1e-6,
         node_spacing: Annotated[
             float, Quantity("m", 1e-7, 1.0, "length of surface that the four numbers belong to")
         ] = 1e-3,
@@ -194,7 +173,6 @@ class SoftContact(nn.Module):
         self.K_n, self.R_n, self.K_t, self.R_t = (
             parameter(value) for value in (K_n, R_n, K_t, R_t)
         )
-        self.epsilon = parameter(epsilon, trained=False)
         self.power = None if power is None else parameter(power)
         if not callable(friction):
             raise ValueError(
@@ -202,20 +180,12 @@ class SoftContact(nn.Module):
                 f"but is {friction!r}"
             )
         self.node_spacing, self.friction = positive("node_spacing", node_spacing), friction
-        self.sliding: Sliding = ramped
 
     def well_posed(self) -> str:
-        """Conflict between the parameters; empty where there is none."""
-        if (
-            isinstance(self.friction, SmoothSlip)
-            and self.R_t.item() + self.friction.eta.item() <= 0
-        ):
-            return "eta + R_t must be positive, since the slip rate is effort / (eta + R_t)"
-        if isinstance(self.friction, Coulomb) and self.R_t.item() <= 0:
-            return (
-                "Coulomb's friction needs R_t > 0, since the stretch is re-anchored through the "
-                "dashpot"
-            )
+        """Conflict between the parameters, or in the friction law; empty where there is none."""
+        R_t = self.R_t.item()
+        if R_t <= 0:
+            return "R_t must be positive, since slip relieves the stretch through the dashpot R_t"
         return ""
 
     def spring(self, g: Tensor) -> Tensor:
@@ -236,12 +206,12 @@ class SoftContact(nn.Module):
             return ""
         falls, damps = (
             ((slip.mu_s - slip.mu_k) * F_N / slip.v_s).item(),
-            (slip.eta + self.R_t).item(),
+            self.R_t.item(),
         )
         if damps >= falls:
             return ""
         return (
-            f"slip is not single-valued at a normal force of {F_N:.3g} N: eta + R_t = {damps:.3g} "
+            f"slip is not single-valued at a normal force of {F_N:.3g} N: R_t = {damps:.3g} "
             f"N.s/m is below (mu_s - mu_k) F_N / v_s = {falls:.3g}"
         )
 
@@ -262,16 +232,17 @@ class SoftContact(nn.Module):
         nothing else.
         """
         R = self.R_t + stage * self.K_t
-        rho = ramp(g, self.epsilon)
-        part = self.sliding(rho)
-        F_N = normal_force(self.spring(g), g_dot, rho, self.R_n)  # (8), (9)
-        trial = self.K_t * s + R * part * v_T  # (10), (11): the effort if nothing slipped
+        spring = self.spring(g)
+        F_N = normal_force(spring, self.R_n * g_dot)  # (8), (9)
+        slides = torch.where(spring > 0, v_T, 0.0)
+        trial = self.K_t * s + R * slides  # (10), (11): the effort if nothing slipped
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
         gamma_dot = sign * self.friction(sign * trial, F_N, R)  # (12), (13)
-        s_dot = part * v_T - gamma_dot
+        s_dot = slides - gamma_dot
         e = self.K_t * s + R * s_dot
-        return ContactState(weight * F_N, weight * rho * e, s_dot, gamma_dot, weight * e, rho)
+        F_T = torch.where(spring > 0, e, 0.0)
+        return ContactState(weight * F_N, weight * F_T, s_dot, gamma_dot, weight * e)
 
     def dissipated(
         self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float

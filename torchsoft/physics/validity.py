@@ -241,7 +241,8 @@ def check_slip(where: str, law: Any, R: float) -> str:
     """Fault of a slip law at some efforts and normal forces, with the dashpot R [N.s/m]; empty
     where there is none.
 
-    A slip that takes more than the effort, R gamma' > E, supplies power. Raises `ValueError` for a
+    A slip that takes more than the effort, R gamma' > E, supplies power; one that leaves some of it
+    at F_N = 0 makes friction jump at touch-down. Raises `ValueError` for a
     function that is no law of three tensors, gives no number, or gives several points at once other
     rates than each alone.
     """
@@ -268,14 +269,23 @@ def check_slip(where: str, law: Any, R: float) -> str:
             "len) or mix them"
         )
     wrong = torch.nonzero((R * alone < 0) | (R * alone > E * (1 + 1e-9)))[:, 0]
-    if not len(wrong):
-        return ""
-    k = int(wrong[0])
-    return (
-        f"the slip law of `{where}` gives {alone[k]:.3g} m/s at an effort of {E[k]:g} N and a "
-        f"normal force of {F_N[k]:g} N: times the dashpot, {R:.3g} N.s/m, that must be from 0 to "
-        "the effort, or slip supplies power"
-    )
+    if len(wrong):
+        k = int(wrong[0])
+        return (
+            f"the slip law of `{where}` gives {alone[k]:.3g} m/s at an effort of {E[k]:g} N and a "
+            f"normal force of {F_N[k]:g} N: times the dashpot, {R:.3g} N.s/m, that must be from 0 "
+            "to the effort, or slip supplies power"
+        )
+    left = E - R * alone
+    loose = torch.nonzero((F_N == 0.0) & (left > ALIKE * E))[:, 0]
+    if len(loose):
+        k = int(loose[0])
+        return (
+            f"the slip law of `{where}` leaves {left[k]:.3g} N of an effort of {E[k]:g} N where "
+            "nothing presses, so that friction jumps at touch-down and exceeds mu F_N under light "
+            "loads; divide by R alone, or make a viscosity proportional to F_N"
+        )
+    return ""
 
 
 @torch.no_grad()

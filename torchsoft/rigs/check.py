@@ -40,8 +40,9 @@ cent."""
 MOMENTS = 5
 """Most times at which the rig is brought into equilibrium."""
 
-NEAR = 1e-4
-"""Gap [m] below which a body is about to touch a pad."""
+NEAR, GRAZING = 1e-4, 1e-7
+"""Gap [m] below which a body is about to touch a pad, and the penetration over the pad's height
+below which it only just does."""
 
 STEPS_PER_PERIOD = 5
 """Fewest steps in a period of an oscillation."""
@@ -172,7 +173,10 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = {key: float(rig.penetration(key, moment.state).max()) for key in rig.contacts}
-        if any(-NEAR < deep < float(rig.contacts[key].law.epsilon) for key, deep in depth.items()):
+        if any(
+            -NEAR < deep < GRAZING * rig.pads[rig.contacts[key].pad].mesh.height
+            for key, deep in depth.items()
+        ):
             continue  # it only just touches, or is about to, which it does not for long
         ties = tied(rig, [key for key, deep in depth.items() if deep > 0])
         for one in e.loops:
@@ -286,7 +290,7 @@ def slips(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             yield Diagnostic(
                 "warning",
                 f"laws.{e.file.contacts[key].law}.friction",
-                f"{reason}; raise v_s or eta",
+                f"{reason}; raise v_s or R_t",
             )
 
 

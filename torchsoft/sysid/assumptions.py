@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, nn
 
-from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
+from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
 from torchsoft.physics.rig import Rig
@@ -45,9 +45,6 @@ CLOCK, SLOWER = 1e-4, 1e-4
 NEAR, WIDEST = 5.0, 5.0
 """Number of variation amounts, by the test to first order, within which a new fit searches for a
 known parameter, and the largest factor on that range."""
-
-SMALLER_RAMP = 0.1
-"""Factor on the depth epsilon of the touch-down ramp in its variation."""
 
 
 class Fault(NamedTuple):
@@ -154,22 +151,6 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         "nodes lay a quarter of an element on",
                    vary=lambda r: shifted(r, 0.25)),
     ]  # fmt: skip
-    ramps = {
-        name: float(value)
-        for name, value in first.parameters.items()
-        if name.split(".")[-1] == "epsilon"
-    }
-    if not ramps.keys() & unknown:
-        small = ", ".join(f"{SMALLER_RAMP * value:.3g}" for value in ramps.values())
-        stated = ", ".join(f"{value:.3g}" for value in ramps.values())
-        out.append(Variation("ramp", "numerical",
-        f"forces are ramped in at touch-down over epsilon = {stated} m",
-                              f"epsilon were {small} m",
-                              vary=lambda r: scaled(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
-    out.append(Variation("ramp of the sliding", "law",
-    "sliding stretches the tangential springs by the ramp of touch-down",
-                          "it did in full from touch-down on, without a ramp",
-                          vary=unramped))  # fmt: skip
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
         out.append(Variation("set-points", "numerical",
         "set-points are what a smooth curve through the recorded ones says",
@@ -205,13 +186,7 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
                           vary=by, by=lambda r, amount, name=name: moved(r, name, 1e-6 * amount))
             )  # fmt: skip
     for name, value in first.parameters.items():
-        if (
-            name in unknown
-            or value == 0.0
-            or name in ramps
-            or name.startswith("start.")
-            or "fixed" in name
-        ):
+        if name in unknown or value == 0.0 or name.startswith("start.") or "fixed" in name:
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
         out.append(Variation(name, "known", f"{name} is {value:.6g}",
@@ -258,14 +233,6 @@ def shifted(recording: Recording, part: float) -> Recording:
     return with_rig(recording, change)
 
 
-def scaled(recording: Recording, names: Collection[str], factor: float) -> Recording:
-    """Multiply parameters by a factor."""
-    return with_rig(
-        recording,
-        lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}),
-    )
-
-
 def moved(recording: Recording, body: str, by: float = PLACE) -> Recording:
     """Start a body further right by a distance [m]."""
     start = recording.start
@@ -278,16 +245,6 @@ def moved(recording: Recording, body: str, by: float = PLACE) -> Recording:
 def laws(rig: Rig) -> list[SoftContact]:
     """The distinct contact laws of a rig."""
     return list({id(contact.law): contact.law for contact in rig.contacts.values()}.values())
-
-
-def unramped(recording: Recording) -> Recording:
-    """Count sliding in full from touch-down on."""
-
-    def change(rig: Rig) -> None:
-        for law in laws(rig):
-            law.sliding = at_once
-
-    return with_rig(recording, change)
 
 
 def coulomb(recording: Recording) -> Recording:
