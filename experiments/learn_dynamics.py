@@ -52,8 +52,8 @@ TAXEL, TAXELS, TAXEL_NOISE = 6e-3, 8, 0.02
 """Width [m] and number of each skin's, and the standard deviation [N] of what they feel."""
 
 SWEEPS = 4
-"""Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta +
-R) v_s), 0.1 here."""
+"""Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / (R v_s),
+0.1 here."""
 
 MOTION = tuple(f"{channel}_{jaw}" for channel in ("x", "v_x") for jaw in JAWS) + (
     "y_upper", "v_y_upper",
@@ -76,12 +76,12 @@ class Config:
 
 class MuNetwork(nn.Module):
     """Friction whose coefficient is a network of the slip speed: mu(v) = 0.5 + 0.4 tanh(net(log(1 +
-    v / v_0))), with (eta + R) |gamma'| = <E - mu(|gamma'|) F_N>+. Without hidden neurons the
+    v / v_0))), with R |gamma'| = <E - mu(|gamma'|) F_N>+. Without hidden neurons the
     coefficient is a constant."""
 
-    def __init__(self, eta: float, width: int = 8, v_0: float = 0.01) -> None:
+    def __init__(self, width: int = 8, v_0: float = 0.01) -> None:
         super().__init__()
-        self.eta, self.v_0 = eta, v_0
+        self.v_0 = v_0
         self.constant = nn.Parameter(torch.zeros((), dtype=torch.float64))
         self.net = None
         if width:
@@ -99,7 +99,7 @@ class MuNetwork(nn.Module):
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         v = torch.zeros_like(E + F_N)
         for _ in range(SWEEPS):
-            v = (E - self.mu(v) * F_N).clamp(min=0.0) / (self.eta + R)
+            v = (E - self.mu(v) * F_N).clamp(min=0.0) / R
         return v
 
 
@@ -180,7 +180,7 @@ class Residual:
         laws = {id(one.law): one.law for one in self.rig.contacts.values()}.values()
         truth = next(iter(laws)).friction
         assert isinstance(truth, SmoothSlip)
-        self.truth, self.law = truth, MuNetwork(truth.eta.item(), width)
+        self.truth, self.law = truth, MuNetwork(width)
         self.rig.requires_grad_(False)
         for one in laws:
             one.friction = self.law

@@ -66,7 +66,7 @@ def nested(name: str, value: Any) -> dict[str, Any]:
 
 def dry(**how: Any) -> SoftContact:
     """A contact with smooth slip."""
-    return SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), **how)
+    return SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05), **how)
 
 
 def times(end: float, n: int) -> Tensor:

@@ -124,9 +124,7 @@ class Wave(nn.Module):
 
 
 def law(friction: Any = None) -> SoftContact:
-    return SoftContact(
-        1.2e5, 441.7, 1.1e5, 430.0, friction=friction or SmoothSlip(0.5, 0.4, 5e-2, 10.0)
-    )
+    return SoftContact(1.2e5, 441.7, 1.1e5, 430.0, friction=friction or SmoothSlip(0.5, 0.4, 5e-2))
 
 
 def grip(

@@ -62,15 +62,14 @@ def test_grasp_and_roll_smoke(tmp_path):
 
 def test_pad_fidelity_smoke(tmp_path):
     """Inertia changes the disc by nanometres and the forces by millinewtons, and more in a fast
-    stroke; the mesh moves the grasp by little, eta not at all."""
+    stroke; the mesh moves the grasp by little."""
     module = experiment("pad_fidelity")
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    slow, fast, mesh, eta = result.values()
+    slow, fast, mesh = result.values()
     assert slow["y_C"]["difference"] < 0.02  # [um]
     assert slow["F_y"]["difference"] < 10  # [mN]
     assert fast["x_C"]["difference"] > slow["x_C"]["difference"]
     assert mesh["y_C"]["difference"] < 30  # [um]
-    assert eta["F_y"]["difference"] < 10
     assert "| F_y | mN |" in module.table(result)
 
 

@@ -109,22 +109,18 @@ def test_the_literal_law(slipping):
         fx, fy, torque, stretch, slips, _ = node(
             p, h, 0.0, 0.0, v / (p.radius - depth), 0.0, -(p.radius - depth), s, slipping
         )
-        ramp, F_N = depth / (depth + p.epsilon), p.K_n * depth
-        e = p.K_t * stretch + p.R_t * ramp * v
+        F_N = p.K_n * depth
+        e = p.K_t * stretch + p.R_t * v
         assert -fy == pytest.approx(F_N)
-        assert stretch == pytest.approx(s + h * ramp * v)
+        assert stretch == pytest.approx(s + h * v)
         assert slips == (abs(e) > p.mu_s * F_N)
-        assert fx == pytest.approx(
-            ramp * (p.mu_k * F_N * v / np.hypot(v, CREEP) if slipping else e)
-        )
+        assert fx == pytest.approx(p.mu_k * F_N * v / np.hypot(v, CREEP) if slipping else e)
         assert torque == pytest.approx(-(p.radius - depth) * fx)
 
 
 OTHERS = (
     {"across": 120, "through": 6},
     {"literal": True},
-    {"ramp_stretch": False},
-    {"epsilon": 1e-7},
     {"x_C0": 60.34e-3},
 )
 

@@ -7,13 +7,13 @@ from test_experiments import experiment
 
 
 def test_the_learned_law_solves_its_own_equation():
-    """(eta + R) v = E - mu(v) F_N, to the fixed-point sweeps' error, and no slip below the cap."""
+    """R v = E - mu(v) F_N, to the fixed-point sweeps' error, and no slip below the cap."""
     module = experiment("learn_dynamics")
     torch.manual_seed(0)
-    law = module.MuNetwork(20.0)
+    law = module.MuNetwork()
     torch.nn.init.normal_(law.net[2].weight, std=0.1)
     E, F_N = times(30.0, 31), f64(20.0).expand(31)
-    v = law(E, F_N, f64(880.0))
+    v = law(E, F_N, f64(900.0))
     stuck = law.mu(f64(0.0)) * F_N  # [N], what sticking can carry
     residual = (E - law.mu(v) * F_N).clamp(min=0.0) - 900.0 * v
     assert float(residual.detach().abs().max()) < 1e-2  # [N], of 20 N

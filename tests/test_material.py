@@ -137,7 +137,7 @@ def punch(
     yet. A dashpot stops the pushed one's hardly any mass from ringing, and carries no force once
     punch and pad move together."""
     mesh, R_n = PadMesh(6e-3, HEIGHT, 6, 2), 0.0 if force is None else 0.2
-    law = SoftContact(STIFFNESS, R_n, STIFFNESS, 1.0, friction=SmoothSlip(0, 0, 1, 1))
+    law = SoftContact(STIFFNESS, R_n, STIFFNESS, 1.0, friction=SmoothSlip(0, 0, 1))
     body = Body(
         1e-7,
         Circle(RADIUS),

@@ -16,7 +16,7 @@ from torchsoft.tables import InvalidTable
 NAN, INF = math.nan, math.inf
 
 NOT_NEGATIVE = [
-    "contact.R_n", "contact.R_t", "contact.mu_s", "contact.mu_k", "contact.eta", "control.K_81",
+    "contact.R_n", "contact.R_t", "contact.mu_s", "contact.mu_k", "control.K_81",
     "control.R_80", "control.K_98", "control.R_99", "scenario.gravity", "scenario.hold_time",
     "scenario.rest_time",
 ]  # fmt: skip
@@ -81,9 +81,9 @@ def test_kinetic_friction_above_static_is_refused():
     )  # equal is Coulomb's law
 
 
-def test_a_slip_element_without_any_viscosity_is_refused():
-    assert "eta + R_t" in refusal({"contact.eta": 0.0, "contact.R_t": 0.0})
-    assert "R_t > 0" in refusal({"contact.friction": "coulomb", "contact.R_t": 0.0})
+def test_a_tangential_spring_without_a_dashpot_is_refused():
+    for friction in ("smooth", "coulomb"):
+        assert "R_t must be positive" in refusal({"contact.friction": friction, "contact.R_t": 0.0})
 
 
 @pytest.mark.parametrize(
@@ -130,14 +130,14 @@ def test_a_trajectory_that_just_stays_on_the_pad_is_accepted():
 
 
 def test_a_slip_law_that_is_not_single_valued_is_warned_about():
-    # (mu_s - mu_k) F_N / v_s = 0.1 * 10 N / 5 mm/s = 200 N.s/m against eta + R_t
+    # (mu_s - mu_k) F_N / v_s = 0.1 * 10 N / 5 mm/s = 200 N.s/m against R_t
     with pytest.warns(UserWarning, match=r"not single-valued.*contact\.v_s"):
-        Parameters().override({"contact.eta": 10.0, "contact.R_t": 189.0})
+        Parameters().override({"contact.R_t": 199.0})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Parameters().override({"contact.eta": 10.0, "contact.R_t": 191.0})
-        Parameters().override({"contact.eta": 10.0, "contact.R_t": 189.0, "contact.v_s": 5.1e-3})
-        Parameters().override({"contact.eta": 10.0, "contact.R_t": 189.0, "contact.mu_k": 0.8})
+        Parameters().override({"contact.R_t": 201.0})
+        Parameters().override({"contact.R_t": 199.0, "contact.v_s": 5.1e-3})
+        Parameters().override({"contact.R_t": 199.0, "contact.mu_k": 0.8})
         Parameters().override({"contact.friction": "coulomb", "contact.R_t": 10.0})  # not its law
 
 

@@ -127,9 +127,7 @@ def hand() -> Rig:
     turns."""
     rubber = KelvinVoigt(1e6, 0.3, 1100.0, 0.05, 0.02)
     mesh = PadMesh(0.06, 0.006, 30, 3)
-    law = SoftContact(
-        5e4, 20.0, 2e4, 5.0, friction=SmoothSlip(0.8, 0.5, 0.05, 10.0), node_spacing=2e-3
-    )
+    law = SoftContact(5e4, 20.0, 2e4, 5.0, friction=SmoothSlip(0.8, 0.5, 0.05), node_spacing=2e-3)
     return Rig(
         bodies={
             "egg": Body(0.2, Ellipse(0.02, 0.014)), "ball": Body(0.1, Circle(0.01)),

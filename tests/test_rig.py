@@ -37,7 +37,7 @@ def test_parameters_have_the_names_of_the_settings():
     table = model.settings.table()
     assert {name for name in NAMES if table[name]["value"] != model.parameter(name).item()} == set()
     own = {own for own, p in model.named_parameters() if p.ndim == 0 and p.requires_grad}
-    assert own == {NAMES[name] for name in NAMES} - {NAMES["contact.epsilon"]}
+    assert own == {NAMES[name] for name in NAMES}
     for name, module_name in NAMES.items():
         assert (
             model.parameter(name)

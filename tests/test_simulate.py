@@ -73,7 +73,7 @@ def test_a_shape_and_a_friction_law_of_ones_own_run_with_gradients():
     """The same circle and the same law written anew: the same run, and the same gradients."""
     built_in = coarse()
     p = built_in.settings.contact
-    mine = SmoothSlip(p.mu_s, p.mu_k, p.v_s, p.eta).requires_grad_(
+    mine = SmoothSlip(p.mu_s, p.mu_k, p.v_s).requires_grad_(
         False
     )  # captured, so a constant of the law
     own = SoftGrasp(

@@ -47,7 +47,7 @@ SENSORS = {
 }
 GRASP = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
 UNKNOWNS = {
-    "contact.R_n": Unknown(per="recording"), "pad.E": Unknown(), "contact.eta": Unknown(),
+    "contact.R_n": Unknown(per="recording"), "pad.E": Unknown(), "contact.v_s": Unknown(),
     "pad.tau": Unknown(prior=Prior(median=0.01, sd=0.3, kind="log-normal")),
 }  # fmt: skip
 
@@ -255,10 +255,10 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path)
 
 
 def test_what_is_not_identifiable_is_named_when_it_is_used(result, path):
-    assert not result["contact.eta"].identifiable
+    assert not result["contact.v_s"].identifiable
     for answer in (result, load_answer(path)):
         with pytest.warns(
-            UserWarning, match=r"only where the search ended: contact\.eta = \S+$"
+            UserWarning, match=r"only where the search ended: contact\.v_s = \S+$"
         ) as caught:
             answer.model("first")
         assert [Path(one.filename).name for one in caught] == [Path(__file__).name]
@@ -274,10 +274,10 @@ def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
     out = [e for e in result.estimates if e.recording != "second"]
     answer = replace(result, estimates=out, coordinates=[left_out(c) for c in result.coordinates])
     with pytest.warns(
-        UserWarning, match=r"only where the search ended: contact\.R_n = \S+, contact\.eta = \S+$"
+        UserWarning, match=r"only where the search ended: contact\.R_n = \S+, contact\.v_s = \S+$"
     ):
         answer.model("second")
-    with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+$"):
+    with pytest.warns(UserWarning, match=r"only where the search ended: contact\.v_s = \S+$"):
         answer.model("first")
 
 
@@ -349,8 +349,8 @@ def test_contributions_are_those_of_the_inverse_matrices(problem, result):
     J = problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3, free).J
     m, k = problem.samples(["first"]), list(problem.coordinates.labels)
     parts = {"first": J[:m], "second": J[m:-2], None: J[-2:]}
-    known = [i for i, label in enumerate(k) if label != "contact.eta"]
-    J[:, k.index("contact.eta")] = 0.0
+    known = [i for i, label in enumerate(k) if label != "contact.v_s"]
+    J[:, k.index("contact.v_s")] = 0.0
     seen = np.array([i in known for i in range(len(k))])
     F = {name: rows[:, known].T @ rows[:, known] for name, rows in parts.items()}
     C = np.linalg.inv(sum(F.values()))

@@ -285,10 +285,10 @@ BAD_CONFIG = {
         r"compare\.coulomb\.without: `laws\.steel_on_rubber\.R_t` is not an unknown",
     ),
     "a law's own mistake": (
-        CONFIG + f'[compare.coulomb.unknowns."{LAW}.friction.eta"]\nlow = -1.0\nscale = "linear"\n'
+        CONFIG + f'[compare.coulomb.unknowns."{LAW}.friction.v_s"]\nlow = -1.0\nscale = "linear"\n'
                  'high = 1.0\n',
-        r"rig\.toml, compare\.coulomb: unknowns\.laws\.steel_on_rubber\.friction\.eta\.low = -1 is "
-        r"beyond what laws\.steel_on_rubber\.friction\.eta may be",
+        r"rig\.toml, compare\.coulomb: unknowns\.laws\.steel_on_rubber\.friction\.v_s\.low = -1 is "
+        r"beyond what laws\.steel_on_rubber\.friction\.v_s may be",
     ),
     "a law of the same name": (
         CONFIG + '[compare."as stated"]\n',
@@ -667,8 +667,8 @@ def test_a_recording_may_begin_anywhere_if_that_is_said(loaded):
 
 def test_competing_laws_have_the_same_data(loaded):
     text = CONFIG + (
-        f'[unknowns."{LAW}.friction.eta"]\n{COULOMB}[compare.coulomb]\nwithout = '
-        f'["{LAW}.friction.eta"]\n[compare.solid]\nsettings.{SOLID}'
+        f'[unknowns."{LAW}.friction.v_s"]\n{COULOMB}[compare.coulomb]\nwithout = '
+        f'["{LAW}.friction.v_s"]\n[compare.solid]\nsettings.{SOLID}'
         'unknowns."materials.rubber.E_instant" = {ratio_to = "materials.rubber.E", low = 1.01, '
         "high = 20.0}\n"
     )
@@ -677,9 +677,9 @@ def test_competing_laws_have_the_same_data(loaded):
     assert made.laws[STATED] is made.problem
     both = [f"{LAW}.K_n", "materials.rubber.E"]
     assert {name: list(law.unknowns) for name, law in made.laws.items()} == {
-        STATED: [*both, f"{LAW}.friction.eta"],
+        STATED: [*both, f"{LAW}.friction.v_s"],
         "coulomb": both,
-        "solid": [*both, f"{LAW}.friction.eta", "materials.rubber.E_instant"],
+        "solid": [*both, f"{LAW}.friction.v_s", "materials.rubber.E_instant"],
     }
     rigs = {name: law.recordings[0].rig for name, law in made.laws.items()}
     assert isinstance(rigs["coulomb"].contacts["L"].law.friction, Coulomb)

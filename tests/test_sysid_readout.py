@@ -68,7 +68,7 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes):
     )
     unknowns = {
         "pad.E": Unknown(prior=Prior(median=8e5, sd=1e5)),
-        "contact.epsilon": Unknown(prior=Prior(median=1e-6, sd=1.0, kind="log-normal")),
+        "contact.v_s": Unknown(prior=Prior(median=5e-3, sd=1.0, kind="log-normal")),
         "contact.R_n": Unknown(per="recording"),
         "contact.mu_s": Unknown(),
         "contact.mu_k": Unknown(ratio_to="contact.mu_s", high=1.0, low=0.3),
@@ -78,7 +78,7 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes):
     problem = Problem([strokes, moved], FAULTY, unknowns)
     c = problem.coordinates
     assert c.labels == (
-        "pad.E", "contact.epsilon", "contact.R_n in strokes", "contact.R_n in moved",
+        "pad.E", "contact.v_s", "contact.R_n in strokes", "contact.R_n in moved",
         "contact.mu_s", "contact.mu_k / contact.mu_s", "disc.mass", "control.R_80",
         "start.disc.x in moved", "gain of x_C", "drift of x_C", "misalignment of y_C",
         "bias of theta in strokes", "bias of theta in moved", "delay of theta in strokes",

@@ -84,7 +84,7 @@ def found():
     unknowns = {
         "contact.K_n": Unknown(),
         "pad.E": Unknown(prior=Prior(median=1e6, sd=0.5, kind="log-normal")),
-        "contact.eta": Unknown(), "contact.R_n": Unknown(per="recording"),
+        "contact.v_s": Unknown(), "contact.R_n": Unknown(per="recording"),
     }  # fmt: skip
     problem = Problem(recordings, sensors, unknowns)
     plan = [Stage("all", (HOSTILE, "shallow"), problem.coordinates.labels, 1e-3, evaluations=4)]
@@ -205,7 +205,7 @@ def test_the_page_holds_what_the_answer_holds(page, full):
     parameters = [e for e in full.estimates if e.kind == "parameter"]
     known = [e for e in full.estimates if e.identifiable]
     assert {e.name for e in known} >= {"pad.E", "start.disc.x", "bias of y_Br"}
-    assert not full["contact.eta"].identifiable
+    assert not full["contact.v_s"].identifiable
     assert (
         f"{sum(e.identifiable for e in parameters)} of {len(parameters)} parameters identifiable"
         in page.text
@@ -215,7 +215,7 @@ def test_the_page_holds_what_the_answer_holds(page, full):
             assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "").replace(
                 "−", "-"
             )
-    assert "\ncontact.eta\nnot identifiable\nnone\nN.s/m\n10\n" in page.text
+    assert "\ncontact.v_s\nnot identifiable\nnone\nm/s\n0.005\n" in page.text
     for channels in full.heldout.values():
         for value in channels.values():
             assert f"{100 * value:.3g} %" in page.text
@@ -236,7 +236,7 @@ def test_warnings_come_first_and_all_of_them(page, full):
 
 def test_starts_and_sensors_are_apart_from_parameters(page):
     order = [
-        "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n",
+        "\nEstimates\n", "\npad.E\n", "\ncontact.v_s\n",
         "\nParameters of which each recording has its own\n",
         f"\ncontact.R_n\n{HOSTILE}\n", "\ncontact.R_n\nshallow\n", "\nWhere the runs began\n",
         "\nstart.disc.x\nshallow\n", "\nWhat the sensors add\n", "\nbias of y_Br\n",
@@ -264,7 +264,7 @@ def test_what_recordings_told_is_in_the_table(page, full):
         in page.text
     )
     weak = [direction_name(d) for d in full.directions if not d.identifiable]
-    assert "contact.eta" in weak
+    assert "contact.v_s" in weak
     for name in weak:
         assert f"\n{name} may change without a trace in the data\n" in page.text
 

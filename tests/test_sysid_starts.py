@@ -152,7 +152,7 @@ def test_what_no_sensor_measures_is_assumed(cut):
 def test_stretches_last_as_long_as_friction_holds_them():
     def contact(mu: float) -> Contact:
         return Contact(
-            "L", "disc", SoftContact(1e5, 4e2, 1e5, 4e2, friction=SmoothSlip(mu, mu, 0.05, 1e-3))
+            "L", "disc", SoftContact(1e5, 4e2, 1e5, 4e2, friction=SmoothSlip(mu, mu, 0.05))
         )
 
     assert lasting_stretch(contact(0.8), 10.0, 0.05) == pytest.approx(0.8 * 10.0 / 1e5, rel=0.1)

@@ -16,17 +16,18 @@ from torchsoft.excitation import CATALOGUE, begin
 
 class Pressed(nn.Module):
     """Slip rate [m/s] of an effort E [N] under a normal force F_N [N] with a dashpot R [N.s/m]:
-    (eta + R) |rate| = E - mu F_N above it, where mu falls with the pressure of the point."""
+    (R + F_N / v_eta) |rate| = E - mu F_N above it. mu falls with the pressure of the point, and
+    friction grows with the slip rate over v_eta [m/s]."""
 
-    def __init__(self, mu: float, fall: float, eta: float = 10.0) -> None:
+    def __init__(self, mu: float, fall: float, v_eta: float = 1.0) -> None:
         super().__init__()
-        self.mu, self.fall, self.eta = (
-            nn.Parameter(torch.tensor(x, dtype=torch.float64)) for x in (mu, fall, eta)
+        self.mu, self.fall, self.v_eta = (
+            nn.Parameter(torch.tensor(x, dtype=torch.float64)) for x in (mu, fall, v_eta)
         )
 
     def forward(self, E: torch.Tensor, F_N: torch.Tensor, R: torch.Tensor) -> torch.Tensor:
         mu = self.mu * torch.exp(-self.fall * F_N)
-        return (E - mu * F_N).clamp(min=0.0) / (R + self.eta)
+        return (E - mu * F_N).clamp(min=0.0) / (R + F_N / self.v_eta)
 
 
 # a motion in which the disc slips: a light grasp, jerked
@@ -37,9 +38,9 @@ run = simulate(model, t, y0=context.y0, reference=context.rig.reference, gradien
 
 loss = run["theta"].square().mean()
 loss.backward()
-for name in ("mu", "fall", "eta"):
+for name in ("mu", "fall", "v_eta"):
     value = model.parameter(f"contact.friction.{name}")
-    print(f"{name:4s} = {float(value.detach()):6.3f}: d(loss)/d({name}) = {float(value.grad):+.3e}")
+    print(f"{name:5s} = {float(value.detach()):6.3f}: d(loss)/d({name}) = {float(value.grad):+.3e}")
 
 _, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 for fall in (0.0, 0.05, 0.2):

@@ -128,8 +128,7 @@ def numbers(settings: Parameters, differs: Mapping[str, Any]) -> Numbers:
     """The stranger's rig: the known numbers, the truth of the unknown ones, and what differs."""
     pad, contact, control = settings.pad, settings.contact, settings.control
     known = {
-        "v_s": contact.v_s, "eta": contact.eta, "epsilon": contact.epsilon,
-        "spacing": contact.node_spacing, "nu": pad.nu, "length": pad.length, "height": pad.height,
+        "v_s": contact.v_s, "spacing": contact.node_spacing, "nu": pad.nu, "length": pad.length, "height": pad.height,
         "depth": pad.depth, "across": pad.elements_x, "through": pad.elements_y,
         "radius": settings.disc.radius, "mass": settings.disc.mass,
         "bracket_mass": settings.bracket.mass, "cm_height": settings.bracket.cm_height,
@@ -247,12 +246,6 @@ CASES = (
     Case("slip at 0.15 m/s", excitations=("deep pressing", "light shaking", "hard shaking")),
     Case("mesh 240 x 6", ("mesh", "element"), differs={"across": 240, "through": 6}),
     Case("literal Coulomb", ("friction", "Coulomb", "slip law"), differs={"literal": True}),
-    Case(
-        "no ramp in the stretch rate",
-        ("ramp", "epsilon", "touch-down"),
-        differs={"ramp_stretch": False},
-    ),
-    Case("epsilon 0.1 um", ("epsilon", "ramp", "touch-down"), differs={"epsilon": 1e-7}),
     Case("x_C0 off by 40 um", ("disc begins",), differs={"x_C0": 60.34e-3}),
     Case("theta zeroed elsewhere", ("theta",), offset={"theta": 0.02}),
     Case("set-points at 200 Hz", ("set-point", "setpoint"), sparse=True),

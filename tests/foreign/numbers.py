@@ -8,8 +8,7 @@ class Numbers(NamedTuple):
 
     `literal` takes Eq. 12-13 of the paper to the letter: a spring and a dashpot from the place of
     first contact until the force in them is above mu_s F_N, then mu_k F_N against the sliding, and
-    the spring goes on stretching. `ramp_stretch` brings the sliding that stretches the spring in
-    with g / (g + epsilon). `senses_disc`: the horizontal loop measures the disc.
+    the spring goes on stretching. `senses_disc`: the horizontal loop measures the disc.
 
     `upper` is the stiffness of the upper pad over that of the lower one; the penalty force grows
     with the depth to a `power`, from the same force at the depth `same`; a part `slow` of the pads'
@@ -25,11 +24,8 @@ class Numbers(NamedTuple):
     mu_s: float = 0.8
     mu_k: float = 0.7
     v_s: float = 0.05
-    eta: float = 10.0
-    epsilon: float = 1e-6
     spacing: float = 1e-3
     literal: bool = False
-    ramp_stretch: bool = True
     E: float = 0.75e6
     nu: float = 0.45
     tau: float = 0.01

@@ -20,7 +20,7 @@ solved for."""
 @njit(cache=True, nogil=True)
 def relaxed(p, h, s):
     """The stretch of a node without contact at the end of a step; the literal law forgets it."""
-    return 0.0 if p.literal else s * (1 - h * p.K_t / (p.eta + p.R_t + h * p.K_t))
+    return 0.0 if p.literal else s * (1 - h * p.K_t / (p.R_t + h * p.K_t))
 
 
 @njit(cache=True, nogil=True)
@@ -38,29 +38,27 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping):
     g, g_dot, v = p.radius - far, -(nx * rx + ny * ry), far * omega - (nx * ry - ny * rx)
     if g <= 0.0:
         return 0.0, 0.0, 0.0, relaxed(p, h, s), False, 0.0
-    ramp = g / (g + p.epsilon)
     spring = p.K_n * g if p.power == 1.0 else p.K_n * p.same * (g / p.same) ** p.power
-    F_N = max(0.0, spring + p.R_n * g_dot * ramp)
-    drive = ramp * v if p.ramp_stretch else v
+    damping = p.R_n * g_dot
+    F_N = spring + damping / (1.0 + abs(damping) / spring)
     if p.literal:
-        stretch = s + h * drive
-        e = p.K_t * stretch + p.R_t * drive
+        stretch = s + h * v
+        e = p.K_t * stretch + p.R_t * v
         slips, rate = abs(e) > p.mu_s * F_N, 0.0
         if slipping:
             e, rate = p.mu_k * F_N * v / np.sqrt(v * v + CREEP * CREEP), abs(v)
     else:
         R = p.R_t + h * p.K_t
-        trial = p.K_t * s + R * drive
-        a, free = p.eta + R, abs(trial)
+        trial = p.K_t * s + R * v
+        a, free = R, abs(trial)
         b, c = a * p.v_s - (free - p.mu_k * F_N), p.v_s * max(0.0, free - p.mu_s * F_N)
         rate = 2 * c / (b + np.sqrt(b * b + 4 * a * c)) if c > 0.0 and b > 0.0 else 0.0
         if c > 0.0 and b <= 0.0:
             rate = (np.sqrt(b * b + 4 * a * c) - b) / (2 * a)
-        stretch = s + h * (drive - np.sign(trial) * rate)
+        stretch = s + h * (v - np.sign(trial) * rate)
         e = p.K_t * stretch + p.R_t * (stretch - s) / h
         slips = False
-    F_T = ramp * e
-    return F_N * nx - F_T * ny, F_N * ny + F_T * nx, -far * F_T, stretch, slips, rate
+    return F_N * nx - e * ny, F_N * ny + e * nx, -far * e, stretch, slips, rate
 
 
 @njit(cache=True, nogil=True)

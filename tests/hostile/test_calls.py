@@ -68,7 +68,7 @@ Attack = tuple[Callable[..., Any], dict[str, Any], dict[str, list[Any]]]
 
 SERIES = RUBBER | {"tau": [1.0, 2.0]}
 SPRINGS = {"K_n": 1e5, "R_n": 400.0, "K_t": 1e5, "R_t": 400.0, "friction": Coulomb(0.5, 0.4)}
-SLIP = {"mu_s": 0.8, "mu_k": 0.7, "v_s": 0.05, "eta": 10.0}
+SLIP = {"mu_s": 0.8, "mu_k": 0.7, "v_s": 0.05}
 MESH = {"length": 0.04, "height": 4e-3, "elements_x": 8, "elements_y": 2}
 PUSH = {"measures": "disc.x", "pushes": "bracket.x", "law": PD(1.0, 1.0), "setpoint": "x_d"}
 

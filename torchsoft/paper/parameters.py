@@ -128,9 +128,7 @@ class ContactParameters(Table):
         """Law of a contact point; `friction` replaces the one of the settings."""
         smooth = self.friction == "smooth"
         slip = (
-            SmoothSlip(self.mu_s, self.mu_k, self.v_s)
-            if smooth
-            else Coulomb(self.mu_s, self.mu_k)
+            SmoothSlip(self.mu_s, self.mu_k, self.v_s) if smooth else Coulomb(self.mu_s, self.mu_k)
         )
         return SoftContact(
             self.K_n,

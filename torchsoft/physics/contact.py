@@ -147,6 +147,7 @@ class Coulomb(Friction):
 REFERENCE_DEPTH = 1e-4
 """Penetration g_0 [m] at which the normal spring's force is K_n g_0, whatever its power."""
 
+
 class SoftContact(nn.Module):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
     R_n, R_t [N.s/m], and a friction law. `weight` scales them to the length of surface that a point
