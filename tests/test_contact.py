@@ -79,7 +79,7 @@ def test_a_slipping_point_solves_the_quadratic(side):
     assert float(got.s_dot) == pytest.approx(-side * x, rel=1e-13)
     mu = 0.5 + 0.3 / (1 + x / 0.02)
     assert float(got.F_T) == pytest.approx(side * mu * 10.0, rel=1e-12)
-    assert got.F_T == got.e
+    assert got.e == got.F_T
 
 
 def test_coulomb_slips_with_kinetic_friction():

@@ -128,7 +128,8 @@ def numbers(settings: Parameters, differs: Mapping[str, Any]) -> Numbers:
     """The stranger's rig: the known numbers, the truth of the unknown ones, and what differs."""
     pad, contact, control = settings.pad, settings.contact, settings.control
     known = {
-        "v_s": contact.v_s, "spacing": contact.node_spacing, "nu": pad.nu, "length": pad.length, "height": pad.height,
+        "v_s": contact.v_s, "spacing": contact.node_spacing, "nu": pad.nu,
+        "length": pad.length, "height": pad.height,
         "depth": pad.depth, "across": pad.elements_x, "through": pad.elements_y,
         "radius": settings.disc.radius, "mass": settings.disc.mass,
         "bracket_mass": settings.bracket.mass, "cm_height": settings.bracket.cm_height,

@@ -5,8 +5,8 @@ Equations of the paper in brackets. Everything else is generated from these func
 law with its Jacobian and its derivatives in every parameter. Two departures from the paper keep
 forces continuous: the normal dashpot never carries more than the spring, so that it begins at zero
 and nothing adheres, and the moving frame follows the point on the body nearest to the pad's instead
-of the first one touched. Neither has a length, a force or a speed of its own: the law is the same at
-every load and size.
+of the first one touched. Neither has a length, a force or a speed of its own: the law is the same
+at every load and size.
 """
 
 from collections.abc import Callable

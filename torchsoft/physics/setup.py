@@ -97,6 +97,13 @@ class PadSetup:
         flat = nodes.reshape(*nodes.shape[:-2], 8)
         return np.einsum("eij,...ej->...ei", strain_operator(self.mesh), flat) * [1.0, 1.0, 0.5]
 
+    def largest_strain(self, u: Array) -> Array:
+        """Largest principal strain (...) at the centres of the elements, by its modulus, of
+        displacements u (..., nodes, 2) [m] as a run records them."""
+        e = self.strain(self.displacement(u))
+        mean, half = 0.5 * (e[..., 0] + e[..., 1]), 0.5 * (e[..., 0] - e[..., 1])
+        return (np.abs(mean) + np.hypot(half, e[..., 2])).max(-1)
+
     def stress(self, strain: Array) -> Array:
         """Elastic stresses (s_xx, s_yy, s_zz, s_xy) [Pa] (..., elements, 4) of the relaxed material
         in plane strain: the part that the dashpots carry is not in them."""

@@ -395,12 +395,19 @@ class RigFile(Group):
         for name, one in self.controllers.items():
             with at_field(f"controllers.{name}"):
                 actuators |= one.build(name, folder)
-        materials, laws = (
-            made(group, lambda one: one.build(folder)) for group in ("materials", "laws")
-        )
+        materials = made("materials", lambda one: one.build(folder))
+        pads = made("pads", lambda one: one.build(materials[one.material], folder))
+        pressed = {
+            name: [pads[one.pad] for one in self.contacts.values() if one.law == name]
+            for name in self.laws
+        }
+        laws = {}
+        for name, table in self.laws.items():
+            with at_field(f"laws.{name}"):
+                laws[name] = sound(table.numbers(pressed[name]).build(folder))
         rig = Rig(
             bodies=made("bodies", lambda one: one.build(folder)),
-            pads=made("pads", lambda one: one.build(materials[one.material], folder)),
+            pads=pads,
             contacts=made("contacts", lambda one: one.build(laws)),
             actuators=actuators,
             gravity=self.gravity,

@@ -18,6 +18,7 @@ from torchsoft.diagnostic import SEVERITIES, Diagnostic
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.motion import Reference, Sampled, hold
 from torchsoft.physics.pads import Pad
+from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, massless, standing
 from torchsoft.rigs.build import RigFile
@@ -25,7 +26,7 @@ from torchsoft.rigs.course import Estimate, signals
 from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.geometry import Scene, at, collision, nodes, tied
 from torchsoft.rigs.motion import CsvTable, ProfileTable
-from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, modes
+from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, modes, strained
 from torchsoft.solve.kernel.arrays import PASSED
 
 # Checks of a rig in static equilibrium at some moments of its motions: room, strains, modes and
@@ -39,6 +40,9 @@ cent."""
 
 MOMENTS = 5
 """Most times at which the rig is brought into equilibrium."""
+
+SOFTENED = 0.05
+"""Part of the give that the springs of a law may take without a note."""
 
 NEAR, GRAZING = 1e-4, 1e-7
 """Gap [m] below which a body is about to touch a pad, and the penetration over the pad's height
@@ -95,7 +99,10 @@ def at_moments(e: Estimate) -> list[Diagnostic]:
                 f"bodies: {reason}; push less, or leave bodies more room",
             )
         )  # fmt: skip
-    return [*found, *presses(there), *strains(there), *swings(e, there), *slips(e, there)]
+    return [
+        *found, *presses(there), *strains(there), *softens(there), *swings(e, there),
+        *slips(e, there),
+    ]  # fmt: skip
 
 
 def fits(time: float, scene: Scene) -> Iterator[Diagnostic]:
@@ -149,20 +156,44 @@ def presses(there: list[Moment]) -> Iterator[Diagnostic]:
 
 
 def strains(there: list[Moment]) -> Iterator[Diagnostic]:
-    """Warnings on pads that are indented beyond linear elasticity."""
+    """Warnings on pads that are indented beyond linear elasticity, and notes on strains that are
+    not small."""
     rig = there[0].scene.rig
-    for name, pad in rig.pads.items():
-        parts = [
-            float(rig.displacement(name, m.state).norm(dim=-1).max()) / pad.mesh.height
-            for m in there
-        ]
-        worst = int(np.argmax(parts))
+    for name, pad in Setup.of(rig).pads.items():
+        u = torch.stack([rig.displacement(name, m.state) for m in there])
+        parts = u.norm(dim=-1).amax(-1) / pad.mesh.height
+        worst = int(parts.argmax())
         if parts[worst] > LINEAR:
             yield Diagnostic(
                 "warning", f"pads.{name}",
                 f"the strain leaves linear elasticity: at t = {there[worst].time:.3g} s it gives "
                 f"way by {parts[worst]:.0%} of its height, and above {LINEAR:.0%} forces are off; "
                 "press less, or take a thicker or stiffer pad",
+            )  # fmt: skip
+            continue
+        largest = pad.largest_strain(u.numpy())
+        worst = int(largest.argmax())
+        if largest[worst] > SMALL_STRAIN:
+            yield Diagnostic("note", f"pads.{name}", strained(largest[worst], there[worst].time))
+
+
+def softens(there: list[Moment]) -> Iterator[Diagnostic]:
+    """Notes on contacts whose springs take a good part of the give under load."""
+    rig = there[0].scene.rig
+    for name, contact in rig.contacts.items():
+        springs, whole = 0.0, 0.0
+        for moment in there:
+            u = rig.displacement(contact.pad, moment.state)
+            g = rig.penetration(name, moment.state, u).clamp(min=0.0)
+            F = rig.weight(name) * contact.law.spring(g)
+            gives = float((F * (g + rig.pads[contact.pad].at_points(u).norm(dim=-1))).sum())
+            if gives > whole:
+                springs, whole = float((F * g).sum()), gives
+        if springs > SOFTENED * whole:
+            yield Diagnostic(
+                "note", f"contacts.{name}",
+                f"the springs of its law take {springs / whole:.0%} of the give under load, so that "
+                'contact is softer than the pad alone; raise K_n, or say K_n = "auto"',
             )  # fmt: skip
 
 

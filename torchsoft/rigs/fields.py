@@ -74,6 +74,28 @@ class NumberOr:
         return {"anyOf": [{"enum": list(self.words)}, {"type": "number", "unit": self.unit}]}
 
 
+AUTO = "auto"
+"""Word for a number that is taken from other parts of the rig."""
+
+
+class OrAuto:
+    """Lets a number be "auto", too."""
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_wrap_validator_function(
+            lambda x, number: x if x == AUTO else number(x),
+            handler(source),
+            serialization=core_schema.plain_serializer_function_ser_schema(lambda x: x),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {"anyOf": [{"const": AUTO}, handler(schema)]}
+
+
 class Group(Table):
     """A table of a rig file."""
 

@@ -2,10 +2,12 @@
 more entry of its union."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
+import torch
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from torchsoft.display import suggestion
@@ -25,7 +27,16 @@ from torchsoft.physics.shapes import (
 )
 from torchsoft.physics.shapes.contour import read_points
 from torchsoft.quantity import Angle, Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
-from torchsoft.rigs.fields import Group, NumberOr, PartTable, at_field, one_of, table_of
+from torchsoft.rigs.fields import (
+    AUTO,
+    Group,
+    NumberOr,
+    OrAuto,
+    PartTable,
+    at_field,
+    one_of,
+    table_of,
+)
 from torchsoft.tables import LISTED, line, read_toml, refusing
 
 
@@ -392,11 +403,58 @@ else:
     ]
 
 
+STIFFER = 10.0
+"""Spring "auto" over the plane-strain stiffness of a pad's surface on the length of one contact
+point (assumed): springs then take about one per cent of the give of a contact of ten points."""
+
+
+class SpringsTable(PartTable):
+    """A law of contact points. A spring "auto" is `STIFFER` times as stiff as the stiffest pad that
+    has the law; a dashpot "auto" gives way within that pad's shortest retardation time."""
+
+    def automatic(self) -> list[str]:
+        """Names of the numbers to be taken from the pads."""
+        return [name for name in signature(self.part).parameters if getattr(self, name) == AUTO]
+
+    def numbers(self, pads: Iterable[Pad]) -> Self:
+        """The table with a number in place of every "auto", for the pads that have the law."""
+        names = self.automatic()
+        if not names:
+            return self
+        stiffness, tau = max(surface(pad) for pad in pads) if pads else (1.0, 1.0)
+        spring = STIFFER * stiffness * self.node_spacing  # pyright: ignore[reportAttributeAccessIssue]
+        given = dict.fromkeys(("K_n", "K_t"), spring)
+        for dashpot, beside in (("R_n", "K_n"), ("R_t", "K_t")):
+            K = getattr(self, beside)
+            given[dashpot] = tau * (spring if K == AUTO else K)
+        return self.model_copy(update={name: given[name] for name in names})
+
+    def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
+        numbers = self.numbers(()) if self.automatic() else self
+        return super(SpringsTable, numbers).arguments(folder)
+
+
+@torch.no_grad()
+def surface(pad: Pad) -> tuple[float, float]:
+    """Plane-strain stiffness of a pad's surface over the length of a contact point [N/m2], and the
+    pad's shortest retardation time [s]."""
+    material = pad.material
+    modulus = material.E / (1 - material.nu**2) * material.depth
+    length = float(pad.point_lengths.mean())
+    return float(modulus) / length, float(material.whole_chain()[1].min())
+
+
 if TYPE_CHECKING:
-    LawTable = PartTable
+    LawTable = SpringsTable
 else:
     LawTable = table_of(
-        SoftContact, friction=one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb"))
+        SoftContact,
+        base=SpringsTable,
+        friction=one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb")),
+        **{
+            name: Annotated[signature(SoftContact).parameters[name].annotation, OrAuto()]
+            for name in ("K_n", "R_n", "K_t", "R_t")
+        },
     )
 
 

@@ -18,7 +18,7 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
-from torchsoft.solve.diagnostics import doubts
+from torchsoft.solve.diagnostics import SMALL_STRAIN, doubts, strained
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
@@ -86,6 +86,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
         if isinstance(stopped, SimulationFailed)
         else "interrupted"
     )
+    largest = largest_strains(run)
     return {
         "title": file.title,
         "stopped": reason,
@@ -103,7 +104,8 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
         "pads": {
             name: {
                 "largest_displacement_over_height": float(u.norm(dim=-1).max())
-                / rig.pads[name].mesh.height
+                / rig.pads[name].mesh.height,
+                "largest_strain": largest[name][0],
             }
             for name, u in run.displacement.items()
         },
@@ -117,11 +119,31 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             "worst_imbalance_over_injected": run.energy_residual_rel,
         },
         "doubts": list(doubts(run, rig).values()),
+        "notes": [str(one) for one in notes(run)],
         "stepping": vars(run.stats) | {"newton_per_step": run.stats.newton_per_step},
         "findings": [one._asdict() for one in found],
         "torchsoft": version("torchsoft"),
         "file": file.model_dump(mode="json", exclude_none=True),
     }
+
+
+def largest_strains(run: Trajectory) -> dict[str, tuple[float, float]]:
+    """The largest strain [1] of each pad, where it gives way most, and its time [s]."""
+    found = {}
+    for name, u in run.displacement.items():
+        k = int(u.detach().norm(dim=-1).amax(-1).argmax())
+        strain = run.setup.pads[name].largest_strain(u[k].detach().numpy())
+        found[name] = float(strain), float(run.t[k])
+    return found
+
+
+def notes(run: Trajectory) -> list[Diagnostic]:
+    """Notes on the strains of a run."""
+    return [
+        Diagnostic("note", f"pads.{name}", strained(strain, time))
+        for name, (strain, time) in largest_strains(run).items()
+        if strain > SMALL_STRAIN
+    ]
 
 
 def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, float]]:

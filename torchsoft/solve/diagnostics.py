@@ -31,6 +31,19 @@ COMPRESSED = 0.5
 """Part of its height by which a pad may be pressed in: linear elasticity ends well below."""
 
 
+SMALL_STRAIN = 0.05
+"""Strain up to which linear elasticity holds without a note."""
+
+
+def strained(strain: float, time: float) -> str:
+    """Sentence on a strain [1] that is not small, at a time [s]."""
+    return (
+        f"strains reach {strain:.0%} at t = {time:.3g} s, and linear pads hold to "
+        f"{SMALL_STRAIN:.0%} or so: rubber is stiffer beyond, by 20 to 40 % in a layer that is "
+        "pressed by a sixth of its height"
+    )
+
+
 def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     """Sentences on the faults of a finished run that has a ledger, by their subject; none if there
     are none."""

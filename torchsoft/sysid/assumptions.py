@@ -5,7 +5,7 @@ A variation changes the recordings or their parameters as if one assumption were
 amount.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +18,6 @@ from torchsoft.physics.extensions import extensions
 from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import SETTLE, Standing
-from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Nuisance, Sensor
 from torchsoft.tables import Number
