@@ -192,8 +192,8 @@ def softens(there: list[Moment]) -> Iterator[Diagnostic]:
         if springs > SOFTENED * whole:
             yield Diagnostic(
                 "note", f"contacts.{name}",
-                f"the springs of its law take {springs / whole:.0%} of the give under load, so that "
-                'contact is softer than the pad alone; raise K_n, or say K_n = "auto"',
+                f"the springs of its law take {springs / whole:.0%} of the give under load, so "
+                'that contact is softer than the pad; raise K_n, or say K_n = "auto"',
             )  # fmt: skip
 
 
