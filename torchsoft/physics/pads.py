@@ -302,14 +302,16 @@ def nodal_forces(
     law: Callable[[Tensor], Tensor],
     tolerance: float,
     iterations: int,
+    first: Tensor | None = None,
 ) -> tuple[Tensor, float]:
     """Forces F = N^T f (..., nodes, 2) [N] of a law f(x) at contact points x = N (free + A F) (...,
     points, 2), and the largest residual that is left of x.
 
     A (2 nodes, 2 nodes) is the pad's compliance or mobility, N (points, nodes) its shape functions
-    at the points. Semi-smooth Newton from no force, in which the force on a point depends on its
-    own x only, so that only the points with a slope are unknowns. The last iteration is taken with
-    the gradient on, which makes the derivative the implicit function theorem's.
+    at the points. Semi-smooth Newton from the forces `first` (..., points, 2), by default none, in
+    which the force on a point depends on its own x only, so that only the points with a slope are
+    unknowns. The last iteration is taken with the gradient on, which makes the derivative the
+    implicit function theorem's.
     """
     relation = A.detach()
 
@@ -341,7 +343,7 @@ def nodal_forces(
         return v.index_add(-2, sloped, (G @ x.unflatten(-2, (-1, 2)))[..., 0])
 
     with torch.no_grad():
-        f = torch.zeros(*free.shape[:-2], len(N), 2, dtype=free.dtype)
+        f = torch.zeros(*free.shape[:-2], len(N), 2, dtype=free.dtype) if first is None else first
         v, r, G = linearise(f)
         for _ in range(iterations):
             size = r.flatten(-2).norm(dim=-1)

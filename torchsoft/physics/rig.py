@@ -501,7 +501,9 @@ class Rig(Shown, nn.Module):
         pad = self.pads[name]
         free, P = free_rates(pad, state.pads[name], 0.0)
         law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
-        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS)
+        with torch.no_grad():  # without rates the springs alone push, which holds the pad nearly
+            first = law(torch.zeros_like(pad.spread @ free))
+        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
         if not left <= 1e3 * RATE_TOLERANCE:
             raise RuntimeError(
                 f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s "
