@@ -177,7 +177,7 @@ class Variables:
         physical = z * torch.from_numpy(self.unit)
         for name, shape in self.shapes.items():
             count = shape.numel()
-            out[name] = physical[..., at : at + count].reshape(*z.shape[:-1], *shape)
+            out[name] = physical[..., at : at + count].reshape((*z.shape[:-1], *shape))
             at += count
         return out
 
