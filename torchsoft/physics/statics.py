@@ -194,10 +194,11 @@ def resting(
     stay as given.
 
     Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a
-    body above its pad comes down to it. Done when a step is below `residual` [m]. `actuators` names
-    those that push, by default all, by `signals` (signals, 2), by default the reference's at t = 0.
-    Differentiable once in the given pose and in the rig's parameters, by the implicit function
-    theorem. Raises `NoEquilibrium` where there is no balance, and as `settled`.
+    body above its pad comes down to it. Done when a step is below `residual` [m], and at once where
+    nothing is free. `actuators` names those that push, by default all, by `signals` (signals, 2),
+    by default the reference's at t = 0. Differentiable once in the given pose and in the rig's
+    parameters, by the implicit function theorem. Raises `NoEquilibrium` where there is no balance,
+    and as `settled`.
     """
     check_points(rig)
     soft = massless(rig)
@@ -206,6 +207,8 @@ def resting(
         for k, axes in (free or soft.layout.free).items()
         if len(axes)
     }
+    if not sought:
+        return dict(pose)
     followed = soft.follow(0.0) if signals is None else signals
     with torch.no_grad():
         masses = {name: torch.stack(soft.bodies[name].masses) for name in sought}

@@ -200,7 +200,7 @@ def softens(there: list[Moment]) -> Iterator[Diagnostic]:
 def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
     """Findings on loops that are unstable or not tied to their measured coordinate, and on steps
     that are too long. Coordinates out of reach of every loop may be unstable: a disc on the top of
-    a node rolls off it."""
+    a node rolls off it. Where nothing is free pads only relax, and no mode swings or grows."""
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = {key: float(rig.penetration(key, moment.state).max()) for key in rig.contacts}
@@ -209,6 +209,8 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             for key, deep in depth.items()
         ):
             continue  # it only just touches, or is about to, which it does not for long
+        if not rig.layout.rigid:
+            continue
         ties = tied(rig, [key for key, deep in depth.items() if deep > 0])
         for one in e.loops:
             (measured, _), (pushed, _) = at(one.measured), at(one.pushes)

@@ -116,7 +116,7 @@ def linearised(
             size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
         elif part in ("rates", "velocity"):
             size[where] = VELOCITY
-    which = torch.arange(len(size)) if only is None else torch.tensor(only)
+    which = torch.arange(len(size)) if only is None else torch.tensor(only, dtype=torch.long)
     columns = []
     for some in which.split(AT_ONCE):
         d = torch.diag(size)[some]
@@ -127,7 +127,7 @@ def linearised(
 
 class Modes(NamedTuple):
     """Eigenvalues [1/s], complex, the least stable first, and the coordinate that moves most in the
-    first of them."""
+    first of them, "" where none is free."""
 
     values: Tensor
     moves: str
@@ -150,7 +150,8 @@ def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
         )
     for name in rig.contacts:
         acting[layout.slices["stretch", name]] = rig.penetration(name, state) > 0
-    only = acting.nonzero()[:, 0].tolist()
+    if not (only := acting.nonzero()[:, 0].tolist()):
+        return Modes(torch.zeros(0, dtype=torch.complex128), "")
     values, vectors = torch.linalg.eig(linearised(rig, y, reference, only))
     order = values.real.argsort(descending=True)
     most, moves = -1.0, ""

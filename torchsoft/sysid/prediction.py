@@ -299,6 +299,14 @@ def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
     """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start. Those
     of touch come from the run; others follow from the sensitivities of the bodies' motion, and from
     the controllers' own parameters."""
+    slopes = {name: slope.numpy() for name, slope in run.touch_sensitivities.items()}
+    if moved := [name for name in names if name not in slopes]:
+        slopes |= dict(zip(moved, by_motion(rig, run, moved).swapaxes(0, 1)))
+    return np.stack([slopes[name] for name in names], 1)
+
+
+def by_motion(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
+    """Derivatives (T, channels, n) of channels that the bodies' motion determines."""
     assert run.sensitivities is not None
     bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
     along = [
@@ -307,15 +315,10 @@ def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
     ]
     q = run.y[:, rig.layout.rigid].detach() + run.sensitivities @ torch.stack(along)
     known = channels(rig, bodies.unpack(q, *rig.held(signals)), signals)
-    moved = [name for name in names if name not in run.touch_sensitivities]
-    measured = torch.stack([known[name] for name in moved], -1)
-    by_motion = directions(measured, along)
-    by_motion[..., : len(run.wrt)] += directions(
-        measured, [rig.parameter(name) for name in run.wrt]
-    )
-    felt = [slope.numpy() for slope in run.touch_sensitivities.values()]
-    every = dict(zip((*moved, *run.touch_sensitivities), (*by_motion.swapaxes(0, 1), *felt)))
-    return np.stack([every[name] for name in names], 1)
+    measured = torch.stack([known[name] for name in names], -1)
+    out = directions(measured, along)
+    out[..., : len(run.wrt)] += directions(measured, [rig.parameter(name) for name in run.wrt])
+    return out
 
 
 def choice(steps: Steps) -> dict[str, Any]:

@@ -1,0 +1,174 @@
+"""Rigs in which nothing is free: a driven indenter, the commonest test of a rubber."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchsoft import hold, simulate
+from torchsoft.cli import main
+from torchsoft.physics.statics import BuiltRig, resting, standing
+from torchsoft.rigs import RigFile
+from torchsoft.rigs.check import check
+from torchsoft.solve.diagnostics import NEUTRAL, modes
+
+RIG = """
+title = "indentation"
+[bodies.indenter]
+x = 0.0
+theta = 0.0
+y = "driven"
+shape = {{kind = "circle", radius = 12.5e-3}}
+[materials.gel]
+kind = "standard_linear_solid"
+E = 40e3
+E_instant = 60e3
+nu = 0.45
+tau = 1.0
+depth = 40e-3
+[pads.gel]
+material = "gel"
+origin = [-30e-3, 0.0]
+length = 60e-3
+height = 20e-3
+elements_x = 20
+elements_y = 4
+[laws.dry]
+K_n = 5e4
+R_n = 20.0
+K_t = 5e4
+R_t = 20.0
+friction = {{kind = "smooth", mu_s = 0.5, mu_k = 0.4, v_s = 50e-3}}
+[contacts.gel]
+pad = "gel"
+body = "indenter"
+law = "dry"
+[motion."indenter.y"]
+kind = "profile"
+times = [0.0, 1.0]
+values = [{start}, 31.5e-3]
+[outputs]
+duration = 2.0
+interval = 0.02
+video = "none"
+figures = false
+"""
+
+FIT = """
+rig = "rig.toml"
+start = {kind = "rest", lead = 0.0}
+[unknowns]
+"materials.gel.tau" = {}
+[sensors]
+"indenter.load_y" = {noise = 0.01}
+"""
+
+GOAL = """
+[free]
+"laws.dry.K_n" = {low = 1e4, high = 1e5}
+[targets.force]
+channel = "indenter.load_y"
+value = 1.4
+tolerance = 0.1
+at = 2.0
+"""
+
+TAU = "pads.gel.material.tau"
+
+
+def written(folder: Path, start: float = 32.5e-3) -> Path:
+    """The rig file, whose indenter begins at `start` [m]; the pad's face is reached at 32.5 mm."""
+    path = folder / "rig.toml"
+    path.write_text(RIG.format(start=start))
+    return path
+
+
+@pytest.fixture
+def built(tmp_path: Path) -> BuiltRig[Any]:
+    """The rig, begun where the indenter touches."""
+    return RigFile.from_toml(written(tmp_path)).build()
+
+
+@pytest.mark.parametrize("start", [32.5e-3, 33e-3])
+def test_the_check_finds_nothing(tmp_path: Path, start: float):
+    """An indenter that begins on the pad, or out of contact, is sound, and its energies balance."""
+    file = RigFile.from_toml(written(tmp_path, start))
+    assert check(file) == []
+    ready = file.build()
+    run = simulate(ready.rig, ready.t, y0=ready.y0)
+    assert float(run["indenter.load_y"][-1]) > 1.0
+    assert run.energy_residual_rel < 1e-3
+
+
+def test_gradients_of_the_force(built: BuiltRig[Any]):
+    """By a material's tau and by the motion: adjoint, sensitivities and differences agree."""
+    rig, y0, t = built
+    tau, places = rig.parameter(TAU), rig.reference["indenter.y"].values
+    tau.requires_grad_(True)
+    places.requires_grad_(True)
+    run = simulate(rig, t, y0=y0, gradient="discrete", rtol=1e-6)
+    by_tau, by_place = torch.autograd.grad(run["indenter.load_y"][60], [tau, places])
+    along = simulate(rig, t, y0=y0, gradient="forward", wrt=[TAU], touch=["indenter.load_y"],
+                     rigid=True, knots=run.knots)  # fmt: skip
+    assert along.sensitivities is not None
+    assert along.sensitivities.shape == (len(t), 0, 1)
+    felt = float(along.touch_sensitivities["indenter.load_y"][60])
+    assert felt == pytest.approx(float(by_tau), rel=1e-6)
+
+    def force(values: torch.Tensor, at: int, step: float) -> float:
+        with torch.no_grad():
+            values.view(-1)[at] += step
+            out = simulate(rig, t, y0=y0, knots=run.knots)["indenter.load_y"][60]
+            values.view(-1)[at] -= step
+        return float(out)
+
+    for values, at, slope, h in ((tau, 0, by_tau, 1e-4), (places, 1, by_place[1], 1e-9)):
+        difference = (force(values, at, h) - force(values, at, -h)) / (2 * h)
+        assert difference == pytest.approx(float(slope), rel=1e-3)
+
+
+def test_modes_without_a_free_coordinate(built: BuiltRig[Any]):
+    """Out of contact there is none; pressed in, pads relax and nothing grows; at rest the body is
+    where it is driven."""
+    rig = built.rig
+    apart = {"indenter": torch.tensor([0.0, 33e-3, 0.0], dtype=torch.float64)}
+    none = modes(rig, standing(rig, apart), hold(**{"indenter.y": 33e-3}))
+    assert not len(none.values)
+    assert not none.moves
+    pressed = {"indenter": torch.tensor([0.0, 31.5e-3, 0.0], dtype=torch.float64)}
+    found = modes(rig, standing(rig, pressed), hold(**{"indenter.y": 31.5e-3}))
+    assert not found.moves
+    assert float(found.values.real.max()) < NEUTRAL
+    assert float(found.values.real.min()) < -NEUTRAL
+    assert torch.equal(resting(rig, pressed)["indenter"], pressed["indenter"])
+
+
+@pytest.mark.filterwarnings("ignore:the run begins:UserWarning")
+def test_identified_from_its_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The force alone is measured; its relaxation tells tau."""
+    ready = RigFile.from_toml(written(tmp_path)).build()
+    run = simulate(ready.rig, ready.t, y0=ready.y0)
+    force = run["indenter.load_y"].numpy() + np.random.default_rng(0).normal(0, 0.01, len(run.t))
+    table = np.stack((run.t.numpy(), 1e3 * run["y_indenter"].numpy(), force), -1)
+    heading = "t [s],indenter.y [mm],indenter.load_y [N]"
+    np.savetxt(tmp_path / "loop.csv", table, "%.6f", ",", header=heading, comments="")
+    (tmp_path / "fit.toml").write_text(FIT)
+    files = [str(tmp_path / name) for name in ("loop.csv", "fit.toml")]
+    assert main(["identify", *files, "--out", str(tmp_path / "out"), "--no-progress"]) == 0
+    assert "1 of 1 parameters identifiable" in capsys.readouterr().out
+    answer = json.loads((tmp_path / "out/answer.json").read_text())
+    low, high = answer["estimates"][0]["ci95"]
+    assert low < 1.0 < high
+    assert high - low < 0.2
+
+
+def test_a_single_number_is_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A number of the rig file may be all that is free in a plan."""
+    rig, goal = written(tmp_path), tmp_path / "goal.toml"
+    goal.write_text(GOAL)
+    out = str(tmp_path / "out")
+    assert main(["plan", str(rig), str(goal), "--out", out, "--no-progress"]) == 0
+    assert "reached" in capsys.readouterr().out
