@@ -243,6 +243,19 @@ class Retimed(Piecewise):
         return self.rate * at + self.shift, self.rate * span, control
 
 
+class Later(nn.Module):
+    """Another signal, of any kind, with its time shifted: the value at t [s] is that at t +
+    shift."""
+
+    def __init__(self, signal: nn.Module, shift: float) -> None:
+        super().__init__()
+        self.signal, self.shift = signal, shift
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Value and rate at t (...)."""
+        return self.signal(t + self.shift)
+
+
 class Sampled(Piecewise):
     """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates
     (k,), or with those of the natural choice, a cubic spline; constant before the first and after
@@ -328,8 +341,11 @@ class Reference(nn.Module):
     """Reference of a rig: named signals of time, setpoints, feed-forward efforts and driven
     coordinates.
 
-    Raises `ValueError` for a signal that is not a module giving (value, rate) at t.
+    Its time counts from `origin` [s]. Raises `ValueError` for a signal that is not a module giving
+    (value, rate) at t.
     """
+
+    origin: float = 0.0
 
     def __init__(self, **signals: nn.Module) -> None:
         super().__init__()
@@ -388,21 +404,53 @@ class Reference(nn.Module):
         """These signals, if all of them are polynomials of this package's and nothing else decides
         their values; else None. Raises `ValueError` for knots that are none."""
         chosen = [self._now(name) for name in names]
-        if (
-            type(self).forward is not Reference.forward
-            or self._forward_hooks
-            or self._forward_pre_hooks
-        ):
+        if self._own_way or not all(map(polynomial, chosen)):
             return None
-        for one in chosen:
-            if not isinstance(one, Piecewise) or not type(one).__module__.startswith("torchsoft."):
-                return None
-            if one._forward_hooks or one._forward_pre_hooks:
-                return None
         return chosen  # pyright: ignore[reportReturnType]
+
+    @property
+    def _own_way(self) -> bool:
+        """Whether anything but its signals decides the values."""
+        changed = type(self).forward is not Reference.forward
+        return bool(changed or self._forward_hooks or self._forward_pre_hooks)
+
+    def since(self, origin: float) -> "Reference":
+        """The same with time counted from `origin` [s]. Knots are shifted themselves, which rounds
+        nothing near the origin; signals of other kinds are asked at origin + t, as float64 resolves
+        it."""
+        if origin == 0:
+            return self
+        if self._own_way:
+            return _Since(self, origin)
+        out = Reference()
+        out.origin = self.origin + origin
+        for key, one in self.signals.items():
+            shift = Retimed(one, shift=-origin) if polynomial(one) else Later(one, origin)  # pyright: ignore[reportArgumentType]
+            out.signals[key] = shift
+        return out
 
     def __getitem__(self, name: str) -> nn.Module:
         return self.signals[name.replace(".", ":")]
+
+
+class _Since(Reference):
+    """A reference that computes its values in its own way, with time counted from an origin [s]."""
+
+    def __init__(self, other: Reference, origin: float) -> None:
+        super().__init__()
+        self.other, self.shift, self.origin = other, origin, other.origin + origin
+        self.signals = other.signals
+
+    def forward(self, t: Tensor, names: Sequence[str]) -> Tensor:
+        """Values and rates (..., names, 2) at t (...) [s]."""
+        return self.other(t + self.shift, names)
+
+
+def polynomial(signal: nn.Module) -> bool:
+    """Whether a signal is made of polynomials of this package's and nothing else decides its
+    values."""
+    own = isinstance(signal, Piecewise) and type(signal).__module__.startswith("torchsoft.")
+    return own and not (signal._forward_hooks or signal._forward_pre_hooks)
 
 
 def hold(**values: float) -> Reference:

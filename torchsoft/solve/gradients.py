@@ -77,7 +77,7 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
     for run in differentiated:
         stepper = run.stepper
         times = [stage_times(segment.plan) for segment in run.segments or []]
-        signals = stepper.compiled.signals(torch.cat([*times, run.t]), stepper.reference)
+        signals = stepper.signals_at(torch.cat([*times, run.t - stepper.origin]))
         at_stages, at_outputs = signals[: -len(run.t)], signals[-len(run.t) :]
         inputs += [run.y0, stepper.compiled.p, at_stages, at_outputs]
     flat = iter(_Solutions.apply(differentiated, threads, *inputs) if differentiated else ())
@@ -152,7 +152,7 @@ def run_adjoint(
         with others_turn():
             call("backward", sweep)
         if failed[0] >= 0:
-            time = plan.starts[failed[0]]
+            time = stepper.origin + plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
     parts = carried, p_bar, np.concatenate(signals_bar), outputs_bar
     return tuple(torch.from_numpy(part) for part in parts)  # pyright: ignore[reportReturnType]

@@ -38,11 +38,14 @@ class Progress:
     refused: int = 0
     starts: list[Array] = field(default_factory=list)
     end: float = 0.0
+    origin: float = 0.0
 
     @property
     def knots(self) -> Array:
-        """Times of the steps' begins and ends [s] (steps + 1,); empty without steps."""
-        return np.concatenate([*self.starts, np.full(min(self.steps, 1), self.end)])
+        """Times of the steps' begins and ends [s] (steps + 1,); empty without steps. Of steps that
+        times so long after zero do not resolve one is left."""
+        since = np.concatenate([*self.starts, np.full(min(self.steps, 1), self.end)])
+        return since if self.origin == 0 else np.unique(self.origin + since)
 
 
 @dataclass

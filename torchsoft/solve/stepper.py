@@ -78,7 +78,8 @@ class ImplicitStepper:
     the largest value so far; no step is longer than `longest` [s] or passes a knot of the
     reference, and with `landing` a step ends at every output.
 
-    Newton stops when the contact law and the linear relations agree to `tolerance` [N] at every
+    Inside, time counts from the `origin` of the last run [s], its first time: steps are as fine
+    after 1.7e9 s as after none. Newton stops when the contact law and the linear relations agree to `tolerance` [N] at every
     node. A given step that it does not solve is taken as two of half the length, and so on up to
     `HALVINGS` times. `window` [m] is how near a point has to be to count as one that may touch
     (checked after every stage; only speed depends on it).
@@ -121,6 +122,7 @@ class ImplicitStepper:
         if landing and step is None and self.compiled.inertial:
             raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
         self.layout, self.integrals = self.compiled.layout, Integrals(rig)
+        self._since(0.0)
         self._cap = 64
         self.still: Any = None
 
@@ -134,7 +136,16 @@ class ImplicitStepper:
         """The same on another reference; the rig stays as it was read."""
         other = copy(self)
         other.reference = reference
+        other._since(0.0)
         return other
+
+    def _since(self, origin: float) -> None:
+        """Count time from `origin` [s]."""
+        self.origin, self._followed = origin, self.reference.since(origin)
+
+    def signals_at(self, times: Tensor) -> Tensor:
+        """The signals at times (...) [s] since the origin (..., signals, 2)."""
+        return self.compiled.signals(times, self._followed)
 
     def _call(
         self, s: Any, now: "RunState", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
@@ -205,6 +216,7 @@ class ImplicitStepper:
         """
         self.check_start(y0)
         check_times(t, self.step)
+        self._since(float(t[0]))
         self.still = self.compiled.system(INSTANT / GAMMA)
         s, names = self.still, self.integrals.names
         out = self._room(len(t))
@@ -213,7 +225,7 @@ class ImplicitStepper:
         y, integrals = y0.numpy().copy(), np.zeros(len(names))
         set_velocities(s, work, y)
         state = RunState(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
-        self._start(t[0], state)
+        self._start(state)
         set_velocities(s, work, y)
         yield from (
             self._by_tolerance(t, state)
@@ -280,10 +292,8 @@ class ImplicitStepper:
 
     def _by_tolerance(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
-        times, out = np.ascontiguousarray(t.numpy()), now.out
-        followed = Followed(
-            lambda x: self.compiled.signals(x, self.reference), self.rig, self.reference
-        )
+        times, out = np.ascontiguousarray(t.numpy() - self.origin), now.out
+        followed = Followed(self.signals_at, self.rig, self._followed)
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > times[0]) & (stops <= times[-1])]
         errors = error_parts(self.rig, now.y, self.atol)
@@ -319,28 +329,26 @@ class ImplicitStepper:
                 worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
                 raise self._failure(status, float(clock[0]), float(clock[1]), worst)
 
-    def _start(self, time: Tensor, now: "RunState") -> None:
+    def _start(self, now: "RunState") -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
         `SimulationFailed`."""
-        signals = self.compiled.signals(time[None], self.reference).numpy()
+        signals = self.signals_at(torch.zeros(1, dtype=torch.float64)).numpy()
         none = np.zeros((0, *signals.shape[1:]))
-        plan = Plan(time[None].numpy(), np.zeros(0), np.zeros(1, np.int64), np.zeros(1))
+        plan = Plan(np.zeros(1), np.zeros(0), np.zeros(1, np.int64), np.zeros(1))
         before, here = now.copy(), slice(0, 1)
         _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping)
         if status != CONVERGED:
-            raise self._failure(status, float(time), INSTANT)
+            raise self._failure(status, 0.0, INSTANT)
         now.keep(plan, none, signals, before, here, tapes)
 
     def signals(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all stages of some plans (stages, signals, 2)."""
-        return self.compiled.signals(
-            torch.cat([stage_times(plan) for plan in todo]), self.reference
-        )
+        return self.signals_at(torch.cat([stage_times(plan) for plan in todo]))
 
     def signals_at_outputs(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all outputs of some plans (outputs, signals, 2)."""
         times = np.concatenate([np.zeros(0), *(plan.output_times for plan in todo)])
-        return self.compiled.signals(torch.from_numpy(times), self.reference)
+        return self.signals_at(torch.from_numpy(times))
 
     def _room(self, rows: int) -> Progress:
         """Room for so many outputs."""
@@ -349,7 +357,7 @@ class ImplicitStepper:
             np.zeros((rows, width))
             for width in (self.layout.size, len(self.integrals.names), recorded_size(s))
         )
-        return Progress(y, integrals, recorded)
+        return Progress(y, integrals, recorded, origin=self.origin)
 
     def system(self, segment: Segment) -> Any:
         """The arrays for the steps of a segment."""
@@ -396,7 +404,9 @@ class ImplicitStepper:
             self._cap *= 2
             now.back(before)
 
-    def _failure(self, status: int, time: float, h: float, worst: str = "") -> SimulationFailed:
+    def _failure(self, status: int, since: float, h: float, worst: str = "") -> SimulationFailed:
+        """The failure at a time `since` the origin [s]."""
+        time = self.origin + since
         tried = (
             f"steps down to {SHORTEST:g} s"
             if worst
@@ -417,7 +427,7 @@ class ImplicitStepper:
 
 
 def stage_times(plan: Plan) -> Tensor:
-    """Times of the stages of a plan (2 steps,) [s]."""
+    """Times of the stages of a plan (2 steps,) [s], counted as its starts."""
     return torch.from_numpy(
         (plan.starts[:, None] + plan.h[:, None] * np.array([GAMMA, 1.0])).ravel()
     )

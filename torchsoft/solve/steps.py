@@ -25,8 +25,8 @@ CHUNK = 500
 
 
 class Plan(NamedTuple):
-    """Steps taken in one compiled call: their starts and lengths h [s], and per output its step and
-    the part of it (0 to 1)."""
+    """Steps taken in one compiled call: their starts, counted from the run's, and lengths h [s],
+    and per output its step and the part of it (0 to 1)."""
 
     starts: NDArray[np.float64]
     h: NDArray[np.float64]
@@ -60,7 +60,7 @@ class Plan(NamedTuple):
 
     @property
     def output_times(self) -> NDArray[np.float64]:
-        """Times of the outputs [s]."""
+        """Times of the outputs since the run's start [s]."""
         return self.starts[self.out_step] + self.out_part * self.h[self.out_step]
 
 
@@ -105,18 +105,25 @@ def check_times(t: Tensor, step: float | None = None) -> None:
                 else " or longer steps"
             )
         )
-    finest = max(SHORTEST, 16 * torch.finfo(torch.float64).eps * float(t.abs().max()))
-    if float(t.diff().min()) < finest or (step is not None and step < finest):
+    rounding = 16 * torch.finfo(torch.float64).eps
+    finest = max(SHORTEST, rounding * float(t.abs().max()))
+    if float(t.diff().min()) < finest:
         raise ValueError(
-            f"`t` and `step` must be further apart than {finest:.1g} s, what times so long after "
-            "zero resolve"
+            f"`t` must be further apart than {finest:.1g} s, what times so long after zero resolve; "
+            "count them from the beginning of the run"
+        )
+    finest = max(SHORTEST, rounding * float(t[-1] - t[0]))
+    if step is not None and step < finest:
+        raise ValueError(
+            f"`step` must be longer than {finest:.1g} s, what times so long after the beginning of "
+            "the run resolve; take a longer one, or a shorter run"
         )
 
 
 def equal_steps(t: Tensor, step: float) -> Iterator[Plan]:
     """Cut the intervals between the times t (T,) [s] into equal steps no longer than `step` [s],
     CHUNK at a time; the steps of one plan have one length."""
-    times = t.numpy()
+    times = t.numpy() - t.numpy()[0]
     spans = np.diff(times)
     counts = np.maximum(1, np.ceil(spans / step * (1 - 1e-9))).astype(int)
     sizes = spans / counts
@@ -156,14 +163,16 @@ def given_steps(t: Tensor, knots: NDArray[np.float64]) -> Iterator[Plan]:
     Raises `ValueError` unless they cover t from its first time on.
     """
     times, h = t.numpy(), np.diff(knots)
-    if knots[0] != times[0] or knots[-1] < times[-1] - 1e-9 * h[-1]:
+    rounding = 4 * np.finfo(np.float64).eps * abs(times[-1])
+    if knots[0] != times[0] or knots[-1] < times[-1] - max(1e-9 * h[-1], rounding):
         raise ValueError(
             f"`knots` must go from t[0] = {times[0]:g} s to t[-1] = {times[-1]:g} s, but go from "
             f"{knots[0]:g} s to {knots[-1]:g} s"
         )
+    times, knots = times - times[0], knots - times[0]
     at = np.minimum(np.searchsorted(knots, times[1:], side="left"), len(h)) - 1
     parts = (times[1:] - knots[at]) / h[at]
-    parts = np.where(np.abs(parts - 1.0) < 1e-9, 1.0, parts)
+    parts = np.where(parts > 1.0 - 1e-9, 1.0, parts)
     whole = Plan(knots[:-1], h, at, parts)
     for k in range(0, len(h), CHUNK):
         yield whole.part(k, min(k + CHUNK, len(h)))

@@ -141,15 +141,14 @@ class Compiled:
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
         """The signals that the kernels follow, fixed coordinates last: values and rates (...,
         signals, 2)."""
-        fixed = self.rig.fixed_values
+        fixed, used = self.rig.fixed_values, self.rig.reference if reference is None else reference
         followed = self.rig.follow(t, reference)
         if not bool(torch.isfinite(followed).all()):
             bad = torch.nonzero(~torch.isfinite(followed))[0].tolist()
-            name, time = self.rig.signals[bad[-2]], float(t[tuple(bad[:-2])])
+            name, time = self.rig.signals[bad[-2]], used.origin + float(t[tuple(bad[:-2])])
             raise ValueError(
-                f"the signal `{name}` of the reference is not finite at t = {time:g} s"
+                f"the signal `{name}` of the reference is not finite at t = {time:.10g} s"
             )
-        used = self.rig.reference if reference is None else reference
         if used.plain(self.rig.signals) is None and not torch.equal(
             followed, self.rig.follow(t, reference)
         ):
