@@ -1,6 +1,6 @@
 """Time has an origin: a run that counts from a Unix clock is the run that counts from zero."""
 
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -72,7 +72,7 @@ def moved(t0: float, kind: str) -> Rig:
 @pytest.mark.parametrize("t0", CLOCKS)
 @pytest.mark.parametrize("kind", ["free", "profile", "sampled", "function"])
 @pytest.mark.parametrize("steps", [{"rtol": 1e-4}, {"step": 1e-4}])
-def test_a_run_from_any_clock(t0: float, kind: str, steps: dict[str, float]):
+def test_a_run_from_any_clock(t0: float, kind: str, steps: dict[str, Any]):
     """A drop, and motions by knots, by samples and by a function of time."""
     runs = []
     for begin in (0.0, t0):
@@ -96,7 +96,7 @@ def test_gradients_from_any_clock(t0: float):
     found = []
     for begin in (0.0, t0):
         one, name = moved(begin, "profile"), "pads.gel.material.E"
-        E, values = one.parameter(name), one.reference["disc.y"].values
+        E, values = one.parameter(name), cast(Profile, one.reference["disc.y"]).values
         E.requires_grad_(True)
         values.requires_grad_(True)
         options: dict[str, Any] = {"y0": one.state().detach(), "rtol": 1e-4}

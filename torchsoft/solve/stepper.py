@@ -79,7 +79,9 @@ class ImplicitStepper:
     reference, and with `landing` a step ends at every output.
 
     Inside, time counts from the `origin` of the last run [s], its first time: steps are as fine
-    after 1.7e9 s as after none. Newton stops when the contact law and the linear relations agree to `tolerance` [N] at every
+    after 1.7e9 s as after none.
+
+    Newton stops when the contact law and the linear relations agree to `tolerance` [N] at every
     node. A given step that it does not solve is taken as two of half the length, and so on up to
     `HALVINGS` times. `window` [m] is how near a point has to be to count as one that may touch
     (checked after every stage; only speed depends on it).

@@ -109,8 +109,8 @@ def check_times(t: Tensor, step: float | None = None) -> None:
     finest = max(SHORTEST, rounding * float(t.abs().max()))
     if float(t.diff().min()) < finest:
         raise ValueError(
-            f"`t` must be further apart than {finest:.1g} s, what times so long after zero resolve; "
-            "count them from the beginning of the run"
+            f"`t` must be further apart than {finest:.1g} s, what times so long after zero "
+            "resolve; count them from the beginning of the run"
         )
     finest = max(SHORTEST, rounding * float(t[-1] - t[0]))
     if step is not None and step < finest:

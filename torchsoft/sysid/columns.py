@@ -55,8 +55,8 @@ class Vocabulary(NamedTuple):
 ROWS = 10
 """A table with set-points has at least as many rows."""
 
-LATE = 1e6
-"""Largest time [s]: later ones lose their last digits."""
+ROUNDED = 16 * np.finfo(np.float64).eps
+"""Least time between two rows over the largest: closer ones have lost their last digits."""
 
 GAP = 0.1
 """Longest time [s] between rows: set-points are interpolated between them."""
@@ -263,9 +263,10 @@ def check_table(table: Columns, known: Vocabulary) -> Columns:
                 "oftener"
             )
         raise ValueError(f"{table.at(i + 1)}, column `t`: {fault}")
-    if (late := np.flatnonzero(np.abs(values["t"]) > LATE)).size:
+    finest = ROUNDED * float(np.abs(values["t"]).max())
+    for i in np.flatnonzero(apart_by < finest)[:1]:
         raise ValueError(
-            f"{table.at(late[0])}, column `t`: {values['t'][late[0]]:.9g} s is too far from zero; "
-            "count times from the start"
+            f"{table.at(i + 1)}, column `t`: {values['t'][i + 1]:.9g} s is too far from zero to be "
+            "told from the time before it; count times from the start"
         )
     return table

@@ -195,7 +195,8 @@ def check_start(
     with torch.no_grad():
         signals = rig.follow(first)
         here = channels(rig, rig.unpack(y0, signals), signals)
-        stated = own(torch.tensor(first, dtype=torch.float64), rig.signals)[:, 0]
+        # a recording at rest begins with the file's motions, whatever its clock counts from
+        stated = own(torch.zeros((), dtype=torch.float64), rig.signals)[:, 0]
     places = {name: [float(value)] for name, value in here.items() if name in made.samples}
     places |= {name: [float(value)] for name, value in zip(rig.signals, stated)}
     for coordinate, setpoint in (pair for one in rig.actuators.values() for pair in one.follows):
@@ -240,7 +241,7 @@ def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[f
     """Largest speed [m/s] at the first sample by the rig file, with its start in `state` and its
     motions; and acceleration [m/s2] of a body that nothing holds."""
     rig, lead = made.rig, made.start.lead
-    around = torch.linspace(first - lead, first + BEGINNING, 51, dtype=torch.float64)
+    around = torch.linspace(-lead, BEGINNING, 51, dtype=torch.float64)
     with torch.no_grad():
         rates = [own(around, (name,))[..., 1].abs().max().item() for name in rig.signals
                  if made.units[name] in ("m", "rad")]  # fmt: skip
