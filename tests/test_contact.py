@@ -48,14 +48,10 @@ def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot):
     assert float(got.gamma_dot) == -float(got.s_dot)
 
 
-def test_the_normal_dashpot_never_carries_more_than_the_spring():
-    """S + D S / (S + |D|): half of the dashpot where it is as strong as the spring."""
-    for D in (1.0, -1.0):
+def test_the_normal_dashpot_carries_at_most_what_the_spring_does():
+    for D, force in ((0.9, 1.9), (-0.9, 0.1), (1.1, 2.0), (-1.1, 0.0), (400.0, 2.0)):
         got = at(law(), g=1e-5, g_dot=D / R, v_T=0.0, s=0.0)
-        assert float(got.F_N) == pytest.approx(1.0 + D / 2, rel=1e-14)
-    weak = at(law(), g=1e-4, g_dot=1e-3 / R, v_T=0.0, s=0.0)
-    assert float(weak.F_N) == pytest.approx(10.0 + 1e-3, abs=1e-7)
-    assert float(at(law(), g=1e-5, g_dot=1e3, v_T=0.0, s=0.0).F_N) == pytest.approx(2.0, rel=1e-4)
+        assert float(got.F_N) == pytest.approx(force, rel=1e-14, abs=1e-15)
 
 
 def test_a_sticking_point_is_a_spring_and_a_dashpot():
@@ -92,10 +88,8 @@ def test_coulomb_slips_with_kinetic_friction():
 
 
 def test_withdrawal_does_not_pull():
-    assert float(at(law(), g=1e-5, g_dot=-0.1, v_T=0.0, s=0.0).F_N) == pytest.approx(1 / 41)
-    assert float(at(law(), g=1e-5, g_dot=-1e-3, v_T=0.0, s=0.0).F_N) == pytest.approx(
-        1.0 - 0.4 / 1.4, rel=1e-14
-    )
+    assert float(at(law(), g=1e-5, g_dot=-0.1, v_T=0.0, s=0.0).F_N) == 0.0
+    assert float(at(law(), g=1e-5, g_dot=-1e-3, v_T=0.0, s=0.0).F_N) == pytest.approx(0.6)
 
 
 def test_a_stage_acts_through_the_stretch_at_its_end():
@@ -174,7 +168,7 @@ def test_smooth_slip_satisfies_its_equation(E, F_N, dashpot, mu_k, extra, v_s):
         assert x == 0.0 or (mu_k + extra) * F_N == E
     else:
         mu = mu_k + extra / (1 + x / v_s)
-        assert dashpot * x == pytest.approx(E - mu * F_N, rel=1e-9, abs=1e-11 * (E + F_N) + 1e-300)
+        assert dashpot * x == pytest.approx(E - mu * F_N, rel=1e-9, abs=1e-9 * (E + F_N) + 1e-300)
 
 
 @pytest.mark.parametrize("friction", [smooth(), Coulomb(0.8, 0.5)], ids=["smooth", "coulomb"])

@@ -3,8 +3,8 @@ stick-slip friction.
 
 Equations of the paper in brackets. Everything else is generated from these functions: the compiled
 law with its Jacobian and its derivatives in every parameter. Two departures from the paper keep
-forces continuous: the normal dashpot never carries more than the spring, so that it begins at zero
-and nothing adheres, and the moving frame follows the point on the body nearest to the pad's instead
+forces continuous: the normal dashpot carries at most what the spring does, so that forces begin at
+zero and nothing adheres, and the moving frame follows the point on the body nearest to the pad's instead
 of the first one touched. Neither has a length, a force or a speed of its own: the law is the same
 at every load and size.
 """
@@ -70,15 +70,10 @@ def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
 
 
 def normal_force(spring: Tensor, dashpot: Tensor) -> Tensor:
-    """F_N = S + D S / (S + |D|) while S > 0, else 0 [N], of the spring's force S = K_n g and the
-    dashpot's D = R_n g' (Eq. 8, 9).
-
-    S + D where the spring is the stronger one, 2 S on approach and 0 on withdrawal where the
-    dashpot is; never negative. Continuous; not smooth at S = 0, once differentiable at D = 0.
-    """
-    pressed = spring > 0
-    S = torch.where(pressed, spring, 1.0)
-    return torch.where(pressed, S + dashpot * S / (S + dashpot.abs()), 0.0)
+    """F_N = S + D [N] of the spring's force S = K_n g while g > 0 and the dashpot's D = R_n g' (Eq.
+    8, 9), where D counts from -S to S: 0 <= F_N <= 2 S. Continuous; not smooth at S = 0 and where
+    D is cut."""
+    return spring + torch.minimum(torch.maximum(dashpot, -spring), spring)
 
 
 StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]

@@ -24,7 +24,7 @@ from torchsoft.quantity import Gravity, Quantity, quantity_of
 
 GROUND = "ground"
 
-RATE_TOLERANCE, RATE_ITERATIONS = 1e-13, 200
+RATE_TOLERANCE, RATE_ITERATIONS = 1e-13, 30
 """Residual [m/s] to which the rates of massless pads are solved, and steps of Newton's method for
 it at the most."""
 
