@@ -242,6 +242,25 @@ def test_rolling_resistance_smoke(tmp_path):
     assert {"rolling_resistance.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
 
 
+@pytest.mark.slow
+def test_contact_theory_smoke(tmp_path):
+    """Sliding, spin, Hertz, partial slip and creep are the textbook's to a percent or less."""
+    _, found = smoke("contact_theory", tmp_path)
+    assert abs(found["slopes"]["20"]["found [m/s2]"]) < 1e-4  # it sticks
+    assert abs(found["slopes"]["45, smooth law"]["off"]) < 1e-3
+    (row,) = found["sizes"]
+    assert max(abs(row[k]) for k in ("stop", "spin's rate", "spin of rolling")) < 3e-3
+    circle, slid = (found[name]["20 elements"] for name in ("hertz", "cattaneo"))
+    assert max(map(abs, circle.values())) < 4e-3
+    assert max(abs(slid[f"c, {part}"]) for part in ("way", "turn", "return")) < 3e-3
+    assert max(abs(slid[f"shear, {part}"]) for part in ("way", "turn", "return")) < 0.02
+    assert found["punch"]["40 elements, springs 400 E*/a"]["pressure"] < 3e-3
+    (roll,) = found["carter"]
+    assert roll["traction"] == pytest.approx(0.5, abs=1e-3)
+    assert abs(roll["off"]) < 5e-3
+    assert {"contact_theory.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
+
+
 def test_compliance_of_a_layer_has_both_limits():
     """Long waves compress a layer uniaxially, short ones see a half-plane."""
     theory = experiment("rolling_resistance")
