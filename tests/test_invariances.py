@@ -35,6 +35,9 @@ class Units(NamedTuple):
     T: float = 1.0
 
 
+SI = Units()
+
+
 def moved_by(
     turn: float, mirror: float, shift: tuple[float, float], x: float, y: float
 ) -> tuple[float, float]:
@@ -50,7 +53,7 @@ def motion(
     shift: tuple[float, float] = (0.0, 0.0),
     reordered: bool = False,
     weighted: bool = True,
-    units: Units = Units(),
+    units: Units = SI,
 ) -> np.ndarray:
     """Two ellipses thrown onto two pads, taken back into the first frame and units: (times, 6)."""
     L, M, T = units

@@ -537,7 +537,7 @@ def figure(found: dict[str, Any]) -> Figure:
     ax.plot(x, root(x, 1.0) - c * root(x - (1 - c), c), "k")
     ax.plot(x, root(x, 1.0), "k:", lw=1)
     ax.plot(row["x"], np.array(row["q"]) / (MU * top), color="C0", **dots)
-    title = f"rolling to the right, Q = {row['traction']:.2f} mu P"
+    title = f"rolling, Q = {row['traction']:.2f} mu P"
     ax.set(title=title, xlabel="x / a", ylabel="q / (mu p_0)", xlim=(-1.2, 1.2))
 
     ax = axes[1, 2]
