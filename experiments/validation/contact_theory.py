@@ -311,7 +311,7 @@ class Tractions(NamedTuple):
 
 def tractions(rig: Rig, forces: Array) -> Tractions:
     """Of the normal and tangential forces (points, 2) [N], the two points of each element together:
-    one by one they alternate where springs are stiffer than an element."""
+    at the edge of a stick zone they lie on either side of theory."""
     pad = rig.pads["pad"]
     pair = lambda points: points.reshape(-1, 2).sum(-1)
     x = 0.5 * pair(pad.point_positions[:, 0].numpy())
