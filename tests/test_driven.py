@@ -96,7 +96,7 @@ def built(tmp_path: Path) -> BuiltRig[Any]:
 def test_the_check_finds_nothing(tmp_path: Path, start: float):
     """An indenter that begins on the pad, or out of contact, is sound, and its energies balance."""
     file = RigFile.from_toml(written(tmp_path, start))
-    assert check(file) == []
+    assert {one.severity for one in check(file)} <= {"note"}
     ready = file.build()
     run = simulate(ready.rig, ready.t, y0=ready.y0)
     assert float(run["indenter.load_y"][-1]) > 1.0

@@ -2,10 +2,10 @@
 stick-slip friction.
 
 Equations of the paper in brackets. Everything else is generated from these functions: the compiled
-law with its Jacobian and its derivatives in every parameter. Two departures from the paper keep
-forces continuous: the normal dashpot carries at most what the spring does, so that forces begin at
-zero and nothing adheres, and the moving frame follows the point on the body nearest to the pad's instead
-of the first one touched. Neither has a length, a force or a speed of its own: the law is the same
+law with its Jacobian and its derivatives in every parameter. Departures from the paper keep forces
+continuous: the normal dashpot carries at most what the spring does, so that forces begin at zero
+and nothing adheres, and the moving frame follows the point on the body nearest to the pad's instead
+of the first one touched. None has a length, a force or a speed of its own: the law is the same
 at every load and size.
 """
 
@@ -71,9 +71,14 @@ def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
 
 def normal_force(spring: Tensor, dashpot: Tensor) -> Tensor:
     """F_N = S + D [N] of the spring's force S = K_n g while g > 0 and the dashpot's D = R_n g' (Eq.
-    8, 9), where D counts from -S to S: 0 <= F_N <= 2 S. Continuous; not smooth at S = 0 and where
-    D is cut."""
-    return spring + torch.minimum(torch.maximum(dashpot, -spring), spring)
+    8, 9); on approach D S / (S + D) in place of D, at most S. Never negative.
+
+    Continuous; not smooth at S = 0 and where D = -S; once differentiable at D = 0.
+    """
+    pressed = spring > 0
+    S, approach = torch.where(pressed, spring, 1.0), dashpot.clamp(min=0.0)
+    damping = torch.where(dashpot > 0, approach * S / (S + approach), dashpot)
+    return torch.where(pressed, (S + damping).clamp(min=0.0), 0.0)
 
 
 StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]
