@@ -27,7 +27,7 @@ class Straight(torch.autograd.Function):
     forward = staticmethod(lambda ctx, x: x.clamp(max=0.5))
     backward = staticmethod(lambda ctx, g: g)
 try:
-    hidden = SoftGrasp(friction=lambda E, F_N, R: Straight.apply(E) / (R + 10.0))
+    hidden = SoftGrasp(friction=lambda E, F_N, R: Straight.apply(E) / R)
     simulate(hidden, t, y0=rest(model).detach())
 except TypeError as error:
     assert "the torch.autograd.Function" in str(error), error

@@ -79,7 +79,7 @@ class NetworkFriction(nn.Module):
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         mu = self.level * (1 + 0.2 * torch.tanh(self.net(0.1 * F_N[..., None])[..., 0]))
-        return (E - mu * F_N).clamp(min=0.0) / (R + 10.0)
+        return (E - mu * F_N).clamp(min=0.0) / R
 
 
 class Saturated(nn.Module):

@@ -12,7 +12,7 @@ import pytest
 import torch
 from foreign import Numbers, Run
 from foreign.pad import compliance
-from foreign.step import CREEP, node
+from foreign.step import CREEP, TAKEN_IN, node
 
 from torchsoft import PadMesh, Parameters, SoftGrasp, Trajectory, simulate
 from torchsoft.excitation import Excitation, MultiSine, begin
@@ -114,7 +114,8 @@ def test_the_literal_law(slipping):
         assert -fy == pytest.approx(F_N)
         assert stretch == pytest.approx(s + h * v)
         assert slips == (abs(e) > p.mu_s * F_N)
-        assert fx == pytest.approx(p.mu_k * F_N * v / np.hypot(v, CREEP) if slipping else e)
+        e = p.mu_k * F_N * v / np.hypot(v, CREEP) if slipping else e
+        assert fx == pytest.approx(e * depth / (depth + TAKEN_IN))
         assert torque == pytest.approx(-(p.radius - depth) * fx)
 
 

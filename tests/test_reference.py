@@ -1,5 +1,5 @@
-"""The paper's manipulation and light shaking as the first edition of the engine computed them, and
-their gradients."""
+"""The paper's manipulation and light shaking as the engine computed them when its friction law
+last changed (`made_by`), and their gradients."""
 
 import json
 from pathlib import Path
@@ -69,7 +69,7 @@ def test_the_manipulation_is_the_reference(manipulation):
         assert float(off) <= OF_RANGE * float(extent), (name, float(off / extent))
     assert run.stats.steps == 15000
     assert run.stats.failed_steps == 0
-    assert run.energy_residual_rel == pytest.approx(2.969e-5, rel=1e-3)
+    assert run.energy_residual_rel == pytest.approx(2.941e-5, rel=1e-3)
     for k in "LU":  # eleven nodes touch where the disc stands
         touching = (run.force[k][rows, :, 0] > 0).sum(1).tolist()
         assert touching == [9, 11, 11 if k == "L" else 10, 10, 11, 11, 11]
@@ -83,7 +83,7 @@ def test_gradients_of_the_manipulation_are_the_references(
     names = list(reference["by"])
     found = torch.autograd.grad(run["theta"][1000], [model.parameter(name) for name in names])
     sure = [name for name in names if reference["uncertainty"][name] <= RELATIVE]
-    assert len(sure) == 18
+    assert len(sure) == 19
     for name, gradient in zip(names, found):
         bound = RELATIVE + 2 * reference["uncertainty"][name]
         assert gradient.item() == pytest.approx(

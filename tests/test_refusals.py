@@ -590,7 +590,7 @@ class Dropping(nn.Module):
         self.dropout = nn.Dropout(0.5)
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        return self.dropout((E - 0.5 * F_N).clamp(min=0.0)) / (R + 10.0)
+        return self.dropout((E - 0.5 * F_N).clamp(min=0.0)) / R
 
 
 def test_a_law_in_training_is_refused_after_it_ran_in_evaluation(

@@ -202,7 +202,7 @@ class Sharing(nn.Module):
     """A slip law that depends on a global number."""
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        return SHARE * (E - 0.3 * F_N).clamp(min=0.0) / (R + 10.0)
+        return (E - SHARE * F_N).clamp(min=0.0) / R
 
 
 def test_a_law_is_what_its_code_is_now():
@@ -387,7 +387,9 @@ def test_a_law_that_turns_nan_never_converges():
     so."""
 
     def broken(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        return torch.where((E > 12.0) & (E < 90.0), torch.nan, torch.zeros_like(E))
+        return torch.where(
+            (E > 12.0) & (E < 90.0) & (F_N > 10.0), torch.nan, (E - 0.8 * F_N).clamp(min=0.0) / R
+        )
 
     model = SoftGrasp(coarse().settings, friction=broken)
     y0 = grasped(model)

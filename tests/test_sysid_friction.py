@@ -27,22 +27,22 @@ JERKS = Excitation(
     grasp_time=0.2,
     settle=0.05,
 )
-TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 60.0}
+TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 12.0}
 
 
 class Viscous(nn.Module):
-    """Slip under what exceeds alpha F_N, against a viscosity beta [N.s/m]."""
+    """Slip under what exceeds alpha F_N, against a viscosity beta F_N, beta in s/m."""
 
     def __init__(self, alpha: float, beta: float) -> None:
         super().__init__()
         self.alpha, self.beta = parameter(alpha), parameter(beta)
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        return (E - self.alpha * F_N).clamp(min=0.0) / (R + self.beta)
+        return (E - self.alpha * F_N).clamp(min=0.0) / (R + self.beta * F_N)
 
 
 def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=Viscous(alpha, 30.0))
+    return SoftGrasp(settings, reference, friction=Viscous(alpha, 6.0))
 
 
 def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGrasp]) -> Recording:

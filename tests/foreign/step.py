@@ -12,9 +12,9 @@ DIFFERENCE, SOLVED, MOST, SHORTEST = 1e-9, 1e-9, 100, 1e-3
 """Change of a speed that derivatives are taken by, the last change of Newton's [m/s], its
 iterations, and its shortest part."""
 
-CREEP = 1e-5
-"""Speed [m/s] below which the literal law's friction does not have its whole size: sgn(v) cannot be
-solved for."""
+CREEP, TAKEN_IN = 1e-5, 1e-6
+"""Speed [m/s] below which the literal law's friction does not have its whole size, and depth [m]
+over which it is taken in at touch-down: jumps cannot be solved for."""
 
 
 @njit(cache=True, nogil=True)
@@ -49,6 +49,7 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping):
         slips, rate = abs(e) > p.mu_s * F_N, 0.0
         if slipping:
             e, rate = p.mu_k * F_N * v / np.sqrt(v * v + CREEP * CREEP), abs(v)
+        e *= g / (g + TAKEN_IN)
     else:
         R = p.R_t + h * p.K_t
         trial = p.K_t * s + R * v

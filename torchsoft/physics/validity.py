@@ -281,9 +281,9 @@ def check_slip(where: str, law: Any, R: float) -> str:
     if len(loose):
         k = int(loose[0])
         return (
-            f"the slip law of `{where}` leaves {left[k]:.3g} N of an effort of {E[k]:g} N where "
-            "nothing presses, so that friction jumps at touch-down and exceeds mu F_N under light "
-            "loads; divide by R alone, or make a viscosity proportional to F_N"
+            f"the slip law of `{where}` leaves {left[k]:.3g} N of an effort of {E[k]:g} N "
+            "where nothing presses, so that friction jumps at touch-down and exceeds mu F_N under "
+            "light loads; divide by R alone, or make a viscosity proportional to F_N"
         )
     return ""
 
