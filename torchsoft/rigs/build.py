@@ -397,14 +397,10 @@ class RigFile(Group):
                 actuators |= one.build(name, folder)
         materials = made("materials", lambda one: one.build(folder))
         pads = made("pads", lambda one: one.build(materials[one.material], folder))
-        pressed = {
-            name: [pads[one.pad] for one in self.contacts.values() if one.law == name]
-            for name in self.laws
-        }
-        laws = {}
-        for name, table in self.laws.items():
-            with at_field(f"laws.{name}"):
-                laws[name] = sound(table.numbers(pressed[name]).build(folder))
+        pressed = lambda law: [
+            pads[c.pad] for c in self.contacts.values() if self.laws[c.law] is law
+        ]
+        laws = made("laws", lambda one: one.numbers(pressed(one)).build(folder))
         rig = Rig(
             bodies=made("bodies", lambda one: one.build(folder)),
             pads=pads,

@@ -423,7 +423,7 @@ class SpringsTable(PartTable):
             return self
         stiffness, tau = max(surface(pad) for pad in pads) if pads else (1.0, 1.0)
         spring = STIFFER * stiffness * self.node_spacing  # pyright: ignore[reportAttributeAccessIssue]
-        given = dict.fromkeys(("K_n", "K_t"), spring)
+        given: dict[str, float] = {"K_n": spring, "K_t": spring}
         for dashpot, beside in (("R_n", "K_n"), ("R_t", "K_t")):
             K = getattr(self, beside)
             given[dashpot] = tau * (spring if K == AUTO else K)

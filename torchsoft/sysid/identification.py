@@ -405,7 +405,7 @@ def identify(
     there: an identification that was interrupted, called again with the same arguments, continues
     where it was.
 
-    At the end the assumptions (mesh, touch-down ramp, place of the disc, numbers that are called
+    At the end the assumptions (mesh, place of the disc, numbers that are called
     known, faults of sensors, the friction law) are tested to first order, a run each, and intervals
     allow for constants of the computation that the data cannot tell. Where no test explains a
     misfit, a notice names the candidates, and `explain` tries them. Before the fit recordings are
