@@ -49,8 +49,7 @@ def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot):
 
 
 def test_the_normal_dashpot_carries_at_most_what_the_spring_does():
-    """Spring and dashpot are in series with each other's limit on approach."""
-    for D, force in ((1e-3, 1.0 + 1e-3 / 1.001), (1.0, 1.5), (3.0, 1.75), (-0.9, 0.1), (-1.1, 0.0)):
+    for D, force in ((0.9, 1.9), (-0.9, 0.1), (1.1, 2.0), (-1.1, 0.0), (400.0, 2.0)):
         got = at(law(), g=1e-5, g_dot=D / R, v_T=0.0, s=0.0)
         assert float(got.F_N) == pytest.approx(force, rel=1e-12, abs=1e-15)
 

@@ -154,7 +154,7 @@ def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch():
 
 def weightless(E: float) -> Rig:
     """A disc under 20 N that nothing turns, on a pad of modulus E [Pa]."""
-    law = SoftContact(1e6, 0.0, 1e6, 0.0, friction=SmoothSlip(0.8, 0.8, 0.05))
+    law = SoftContact(1e6, 0.0, 1e6, 10.0, friction=SmoothSlip(0.8, 0.8, 0.05))
     material = KelvinVoigt(E, 0.45, rho=1e3, tau=0.01, depth=0.02)
     press = Actuator("disc.y", "disc.y", PD(0.0, 0.0), setpoint="y_d", feed_forward="load")
     held = {"disc.x": 20.3e-3, "y_d": 0.0, "load": -20.0}

@@ -486,7 +486,7 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
     monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
     problem = Problem([brief()], SENSORS, {name: Unknown() for name in TRUTH})
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
-    assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.01)
+    assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.02)
     assert any("interrupted, so these were not tried: " in text for text in answer.notices)
     assert answer.made_by["untried"][0] == "mesh phase"
     assert {one.name for one in answer.assumptions} >= {"mesh", "contact points", "disc.radius"}

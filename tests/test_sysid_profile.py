@@ -102,7 +102,7 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     base = Parameters().override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
     sensors = {
-        name: sensor.model_copy(update={"noise": 3 * sensor.noise}) for name, sensor in RIG.items()
+        name: sensor.model_copy(update={"noise": 6 * sensor.noise}) for name, sensor in RIG.items()
     }
     data = record("roll", begin(roll, base), {}, sensors, seed=1)
     problem = Problem([data], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
@@ -118,7 +118,7 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     (E,) = profiles(o, ["pad.E"])
     low, high = E.ci95
     assert low < 0.75e6 < high
-    assert high - E.best > 1.3 * (
+    assert high - E.best > 1.15 * (
         E.best - low
     )  # soft contacts need stiffer pads than stiff contacts need soft ones
     assert any("no parabola" in notice for notice in E.notices)

@@ -233,7 +233,7 @@ def half_width(material: Material, load: float) -> float:
 def rig(material: Material, load: float, element: float, v: float, length: float) -> Rig:
     """The disc, ready to roll at v [m/s] after a ramp, on elements [m] of a pad of a length [m]."""
     mesh = PadMesh(length, HEIGHT, round(length / element), LAYERS)
-    law = SoftContact(STIFFNESS, 0.0, STIFFNESS, 0.0, friction=SmoothSlip(0.8, 0.8, 0.05))
+    law = SoftContact(STIFFNESS, 0.0, STIFFNESS, 10.0, friction=SmoothSlip(0.8, 0.8, 0.05))
     ramped, duration = 2 * RAMP / v, (length - 2 * MARGIN) / v
     way = Sampled(
         [0.0, ramped, ramped + duration],

@@ -40,9 +40,7 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping):
         return 0.0, 0.0, 0.0, relaxed(p, h, s), False, 0.0
     spring = p.K_n * g if p.power == 1.0 else p.K_n * p.same * (g / p.same) ** p.power
     damping = p.R_n * g_dot
-    if damping > 0.0:
-        damping = 1.0 / (1.0 / damping + 1.0 / spring)
-    F_N = max(0.0, spring + damping)
+    F_N = min(max(0.0, spring + damping), 2.0 * spring)
     if p.literal:
         stretch = s + h * v
         e = p.K_t * stretch + p.R_t * v

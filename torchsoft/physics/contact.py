@@ -71,14 +71,9 @@ def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
 
 def normal_force(spring: Tensor, dashpot: Tensor) -> Tensor:
     """F_N = S + D [N] of the spring's force S = K_n g while g > 0 and the dashpot's D = R_n g' (Eq.
-    8, 9); on approach D S / (S + D) in place of D, at most S. Never negative.
-
-    Continuous; not smooth at S = 0 and where D = -S; once differentiable at D = 0.
-    """
-    pressed = spring > 0
-    S, approach = torch.where(pressed, spring, 1.0), dashpot.clamp(min=0.0)
-    damping = torch.where(dashpot > 0, approach * S / (S + approach), dashpot)
-    return torch.where(pressed, (S + damping).clamp(min=0.0), 0.0)
+    8, 9), where D counts from -S to S: 0 <= F_N <= 2 S. Continuous; not smooth at S = 0 and where
+    D is cut."""
+    return spring + torch.minimum(torch.maximum(dashpot, -spring), spring)
 
 
 StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]
