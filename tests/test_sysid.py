@@ -252,7 +252,7 @@ def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking):
     )
     worst = max(coarse.estimates, key=lambda e: abs(e.step_bias_sd))
     error = float(np.log(worst.last / BASE.table()[worst.name]["value"]))
-    assert abs(error) > worst.relative_sd  # so the notice is needed
+    assert abs(error) > 0.5 * worst.relative_sd  # so the notice is needed
     assert worst.step_bias_sd * worst.relative_sd == pytest.approx(
         error, rel=0.5
     )  # and its size is about right

@@ -1,29 +1,13 @@
 """Question: does contact follow the closed forms of mechanics, at every size?
 
-Sliding: a box on a slope, one that slides to a stop, and a spinning disc set down on a pad, which
-slips until it rolls, for masses and sizes over two to four decades. Accelerations are g (sin a - mu
-cos a), the way to a stop v^2 / (2 mu g), the spin falls at 2 mu g / r to a third. Pads, springs and
-speeds are in proportion.
-
-Half-plane, by small strains: a rigid circle pressed onto a thick pad touches over a = sqrt(4 P R /
-(pi E*)), P per depth, under p = p_0 sqrt(1 - x^2 / a^2), p_0 = E* a / (2 R) (Hertz); a flat punch
-under P / (pi sqrt(a^2 - x^2)). Under a growing tangential force Q points stick over c = a sqrt(1 -
-Q / (mu P)); on return slip begins anew outside of a sqrt(1 - (Q_max - Q) / (2 mu P)) (Cattaneo,
-Mindlin).
-
-Rolling (Carter): q = mu p_0 (sqrt(1 - x^2 / a^2) - c / a sqrt(1 - (x - d)^2 / c^2)) with d = a - c
-sticks at the leading edge. A half-plane strains by -(1 - nu) mu p_0 x / (G a) under the first part,
-so by the constant -(1 - nu) mu p_0 d / (G a) where both are: that is the creepage, and with p_0 = G
-a / ((1 - nu) R) it is xi = (mu a / R) (1 - c / a), with Q / (mu P) = 1 - (c / a)^2. Neither G nor
-nu is left, but pressure shears a compressible pad, too: it is counted out by rolls with Q to both
-sides.
+Slopes, stops and spins over two to four decades of size; Hertz's contact and the flat punch;
+Cattaneo's and Mindlin's partial slip; Carter's rolling. The closed forms stand on the page of the
+documentation.
 
 Command: .venv/bin/python experiments/validation/contact_theory.py [--smoke]
-Expected, with springs of 100 E* / a and 20 elements over a: sliding, stops and spin within 0.1 % at
-every mass and size (0.5 % half a degree above the angle of friction, of a tenth of m/s2); Hertz
-within 0.03 % in a, 0.23 % in p_0 (0.1 % with 400 E* / a); the punch's pressure within 0.7 %; c
-within 0.1 % of a, shear within 1.5 % of mu p_0; creep to 0.3 % of the limit, rolled to both sides.
-Fewer than 10 elements over a are too few for the fits. Four minutes of a core.
+Expected: sliding, stops and spin within 0.1 % at every mass and size; Hertz within 0.03 % in a and
+0.23 % in p_0; the punch's pressure within 0.7 %; c within 0.1 % of a; creep to 0.3 % of the limit,
+rolled to both sides. Four minutes of a core.
 """
 
 import math
