@@ -27,7 +27,7 @@ JERKS = Excitation(
     grasp_time=0.2,
     settle=0.05,
 )
-TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 12.0}
+TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 200.0}
 
 
 class Viscous(nn.Module):
@@ -42,7 +42,7 @@ class Viscous(nn.Module):
 
 
 def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=Viscous(alpha, 6.0))
+    return SoftGrasp(settings, reference, friction=Viscous(alpha, 100.0))
 
 
 def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGrasp]) -> Recording:
