@@ -54,7 +54,7 @@ def run_rig(options: argparse.Namespace) -> int:
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
-    from torchsoft.rigs.run import cost, notes, run
+    from torchsoft.rigs.run import cost, largest_strains, notes, run
     from torchsoft.solve.progress import SimulationFailed
 
     out: Path = options.out or Path("out") / options.file.stem
@@ -83,7 +83,7 @@ def run_rig(options: argparse.Namespace) -> int:
         f"injected; written to {out}"
     )
     said = {one.where for one in found}
-    for one in notes(done.trajectory):
+    for one in notes(largest_strains(done.trajectory)):
         if one.where not in said:
             say(one, error=True)
     return 0

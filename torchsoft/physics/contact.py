@@ -178,9 +178,8 @@ class SoftContact(nn.Module):
         self.node_spacing, self.friction = positive("node_spacing", node_spacing), friction
 
     def well_posed(self) -> str:
-        """Conflict between the parameters, or in the friction law; empty where there is none."""
-        R_t = self.R_t.item()
-        if R_t <= 0:
+        """Conflict between the parameters; empty where there is none."""
+        if self.R_t.item() <= 0:
             return "R_t must be positive, since slip relieves the stretch through the dashpot R_t"
         return ""
 

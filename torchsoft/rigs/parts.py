@@ -2,7 +2,7 @@
 more entry of its union."""
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -412,13 +412,10 @@ class SpringsTable(PartTable):
     """A law of contact points. A spring "auto" is `STIFFER` times as stiff as the stiffest pad that
     has the law; a dashpot "auto" gives way within that pad's shortest retardation time."""
 
-    def automatic(self) -> list[str]:
-        """Names of the numbers to be taken from the pads."""
-        return [name for name in signature(self.part).parameters if getattr(self, name) == AUTO]
-
-    def numbers(self, pads: Iterable[Pad]) -> Self:
-        """The table with a number in place of every "auto", for the pads that have the law."""
-        names = self.automatic()
+    def numbers(self, pads: Sequence[Pad]) -> Self:
+        """The table with a number in place of every "auto", for the pads that have the law; without
+        pads, as when a file is read, any."""
+        names = [name for name in signature(self.part).parameters if getattr(self, name) == AUTO]
         if not names:
             return self
         stiffness, tau = max(surface(pad) for pad in pads) if pads else (1.0, 1.0)
@@ -430,8 +427,7 @@ class SpringsTable(PartTable):
         return self.model_copy(update={name: given[name] for name in names})
 
     def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
-        numbers = self.numbers(()) if self.automatic() else self
-        return super(SpringsTable, numbers).arguments(folder)
+        return super(SpringsTable, self.numbers(())).arguments(folder)
 
 
 @torch.no_grad()
