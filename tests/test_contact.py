@@ -48,8 +48,15 @@ def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot):
     assert float(got.gamma_dot) == -float(got.s_dot)
 
 
-def test_the_normal_dashpot_carries_at_most_what_the_spring_does():
-    for D, force in ((0.9, 1.9), (-0.9, 0.1), (1.1, 2.0), (-1.1, 0.0), (400.0, 2.0)):
+def test_the_normal_dashpot_carries_at_most_twice_what_the_spring_does():
+    for D, force in (
+        (0.9, 1.873),
+        (-0.9, 0.1),
+        (2.7, 2.971),
+        (3.1, 3.0),
+        (-1.1, 0.0),
+        (400.0, 3.0),
+    ):
         got = at(law(), g=1e-5, g_dot=D / R, v_T=0.0, s=0.0)
         assert float(got.F_N) == pytest.approx(force, rel=1e-12, abs=1e-15)
 
@@ -113,15 +120,16 @@ def test_forces_are_continuous_at_touch_down(friction, s):
     """They grow from zero with the springs, whatever the speed; friction inside Coulomb's cone."""
     for g in (1e-9, 1e-11, 1e-13):
         got = at(law(friction), g=g, g_dot=0.2, v_T=0.3, s=s)
-        assert K * g < float(got.F_N) <= 2 * K * g
+        assert K * g < float(got.F_N) <= 3 * K * g * (1 + 1e-15)
         assert abs(float(got.F_T)) <= 0.8 * float(got.F_N) * (1 + 1e-9) + 1e-13
         apart = at(law(friction), g=-g, g_dot=0.2, v_T=0.3, s=s)
         assert float(apart.F_N) == 0.0
-        assert abs(float(got.s_dot - apart.s_dot)) <= 0.8 * 2 * K * g / (R / 2) + 1e-15
+        assert abs(float(got.s_dot - apart.s_dot)) <= 0.8 * 3 * K * g / (R / 2) + 1e-15
 
 
-@given(g=st.floats(-1e-4, 1e-3), g_dot=st.floats(-1.0, 1.0), v_T=st.floats(-1.0, 1.0),
-    s=st.floats(-1e-3, 1e-3), scale=st.sampled_from([1e-6, 1.0, 1e6]))  # fmt: skip
+@given(g=st.floats(-1e-4, 0.0) | st.floats(1e-15, 1e-3), g_dot=st.floats(-1.0, 1.0),
+    v_T=st.floats(-1.0, 1.0), s=st.floats(-1e-3, 1e-3),
+    scale=st.sampled_from([1e-6, 1.0, 1e6]))  # fmt: skip
 @pytest.mark.parametrize("friction", [smooth(), Coulomb(0.8, 0.5)])
 def test_friction_is_coulombs_at_any_load(friction, g, g_dot, v_T, s, scale):
     """|F_T| <= mu_s F_N, and mu_k F_N where a Coulomb point slips; springs and dashpots in

@@ -34,7 +34,7 @@ def file(**changes: Any) -> RigFile:
             "gain": [[1e5, 0.0, 400.0, 0.0], [0.0, 1e5, 0.0, 400.0]],
         } | changes
     }  # fmt: skip
-    tree["outputs"] = {"duration": 0.6, "interval": 0.02}
+    tree |= {"outputs": {"duration": 0.6, "interval": 0.02}, "solver": {"rtol": 1e-6}}
     return RigFile.from_tree(tree)
 
 
@@ -44,7 +44,8 @@ def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path):
     read = RigFile.from_toml(tmp_path / "rig.toml")
     assert read.model_dump() == asked.model_dump()
     assert [str(one) for one in check(read) if one.severity != "note"] == []
-    loops = RigFile.from_tree(coarse_tree() | {"outputs": {"duration": 0.6, "interval": 0.02}})
+    timing = {"outputs": {"duration": 0.6, "interval": 0.02}, "solver": {"rtol": 1e-6}}
+    loops = RigFile.from_tree(coarse_tree() | timing)
     runs = [running.carry_out(one).trajectory for one in (read, loops)]
     assert "F_jaw_bracket_x" in runs[0].units
     for name in ("x_disc", "theta_disc", "y_bracket"):

@@ -83,7 +83,7 @@ duration = 0.1
 interval = 0.005
 snapshots = [0.1]
 [solver]
-rtol = 1e-3
+rtol = 1e-5
 """
 
 CONFIG = """
@@ -166,7 +166,7 @@ def test_a_trajectory_is_the_run_of_the_rig_file_with_its_numbers(made, tmp_path
         )
         .build()
     )  # fmt: skip
-    run = simulate(ready.rig, ready.t, y0=ready.y0, rtol=1e-3)
+    run = simulate(ready.rig, ready.t, y0=ready.y0, rtol=1e-5)
     for name in ("x_disc", "y_bracket", "F_x", "F_lift_bracket_y", "x_d_dot", "M_upper"):
         there, here = row[name].values, run[name].numpy()
         assert data[name].attrs["units"] == run.units[name]

@@ -38,7 +38,7 @@ def test_hard_motions_pass_at_the_default_step_and_at_what_is_advised(name):
     begun = begin(excitation, coarse(contact__v_s=5e-3).settings)
     t = times(excitation.duration, 2)
     assert told(begun.rig, t=t, y0=begun.y0) == []
-    begun.rig.reference = towards(begun.rig, Profile([0.6, 0.65, 0.7], [0.06, 0.08, 0.06]))
+    begun.rig.reference = towards(begun.rig, Profile([0.6, 0.68, 0.76], [0.06, 0.08, 0.06]))
     (text,) = told(begun.rig, t=t, y0=begun.y0, step=0.05)
     assert "the energies of the run do not balance" in text
     advised = float(re.search(r"try steps of (\S+) s", text)[1])

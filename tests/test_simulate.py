@@ -383,12 +383,12 @@ def test_parts_replaced_after_a_run_run():
 
 
 def test_a_law_that_turns_nan_never_converges():
-    """The slip rate of an effort from 12 to 90 N is not a number: the run ends there, and says
+    """The slip rate of an effort from 13 to 90 N is not a number: the run ends there, and says
     so."""
 
     def broken(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         return torch.where(
-            (E > 12.0) & (E < 90.0) & (F_N > 10.0), torch.nan, (E - 0.8 * F_N).clamp(min=0.0) / R
+            (E > 13.0) & (E < 90.0) & (F_N > 10.0), torch.nan, (E - 0.8 * F_N).clamp(min=0.0) / R
         )
 
     model = SoftGrasp(coarse().settings, friction=broken)

@@ -244,21 +244,21 @@ def shaking():
 
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking):
     problem = Problem([shaking], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()})
-    plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 8e-3)]
+    plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 2e-2)]
     coarse = identify(problem, plan=plan, tightenings=0, **TRUSTED)
     assert any(
-        "rtol = 0.008 is too coarse" in notice and "take rtol = 0.0008" in notice
+        "rtol = 0.02 is too coarse" in notice and "take rtol = 0.002" in notice
         for notice in coarse.notices
     )
     worst = max(coarse.estimates, key=lambda e: abs(e.step_bias_sd))
     error = float(np.log(worst.last / BASE.table()[worst.name]["value"]))
-    assert abs(error) > 0.5 * worst.relative_sd  # so the notice is needed
+    assert abs(error) > worst.relative_sd  # so the notice is needed
     assert worst.step_bias_sd * worst.relative_sd == pytest.approx(
         error, rel=0.5
     )  # and its size is about right
     better = identify(problem, plan=plan, **TRUSTED)
     assert not any("too coarse" in notice for notice in better.notices)
-    assert better.made_by["rtol"] < 8e-3
+    assert better.made_by["rtol"] < 2e-2
     assert abs(np.log(better[worst.name].last / BASE.table()[worst.name]["value"])) < 0.2 * abs(
         error
     )
@@ -293,7 +293,7 @@ def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes):
     first, anew = (stage["name"] for stage in answer.stages[:2])
     assert (first, anew) == ("all", "steps chosen anew")
     assert {stage["rtol"] for stage in answer.stages[:2]} == {1e-3}
-    assert answer.made_by["rtol"] <= 1e-3
+    assert answer.made_by["rtol"] == 1e-4, "the Jacobian by 1e-3 is too rough"
     assert answer.converged
     for name in FOUR:
         e = answer[name]

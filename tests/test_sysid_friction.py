@@ -19,7 +19,10 @@ from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import RIG, Problem, Recording, Stage, Unknown, identify, record
 
 BASE = Parameters().override(COARSE)
-SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
+SENSORS = {
+    name: RIG[name].model_copy(update={"noise": 0.7 * RIG[name].noise})
+    for name in ("x_C", "theta", "F_x")
+}
 JERKS = Excitation(
     motion=Strokes(travel=30e-3, stroke_time=0.1),
     duration=0.6,

@@ -102,7 +102,7 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     base = Parameters().override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
     sensors = {
-        name: sensor.model_copy(update={"noise": 6 * sensor.noise}) for name, sensor in RIG.items()
+        name: sensor.model_copy(update={"noise": 4 * sensor.noise}) for name, sensor in RIG.items()
     }
     data = record("roll", begin(roll, base), {}, sensors, seed=1)
     problem = Problem([data], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})

@@ -49,7 +49,7 @@ def test_explicit_methods_agree(method):
     slip included."""
     model = coarse()
     y0, t = grasped(model, (0.05, -0.01)), times(4e-4, 3)
-    options = {"step_size": 2e-5} if method == "rk4" else {}
+    options = {"step_size": 1e-5} if method == "rk4" else {}
     end = odeint(model, y0, t, method=method, rtol=1e-7, atol=1e-10, options=options)[-1]
     implicit = simulate(model, t, y0=y0, step=2e-6)
     assert float(implicit.dissipated["slip"][-1]) > 5e-9  # the window does contain slip
@@ -58,7 +58,7 @@ def test_explicit_methods_agree(method):
     parts += [lambda s, k=k: model.displacement(k, s) for k in "LU"]
     for part in parts:
         moved = (part(last) - part(first)).abs().max()
-        assert float((part(explicit) - part(last)).abs().max()) < 5e-4 * float(moved)
+        assert float((part(explicit) - part(last)).abs().max()) < 1e-4 * float(moved)
 
 
 @pytest.fixture
@@ -140,9 +140,9 @@ def test_odeint_adjoint_equals_odeint(rolling):
     model, y0 = rolling
     y0_bar, bars = gradients(model, y0, odeint)
     y0_bar_adjoint, bars_adjoint = gradients(model, y0, odeint_adjoint)
-    assert float((y0_bar - y0_bar_adjoint).abs().max()) < 1e-10 * float(y0_bar.abs().max())
+    assert float((y0_bar - y0_bar_adjoint).abs().max()) < 1e-11 * float(y0_bar.abs().max())
     for name, bar in bars.items():
-        assert float((bar - bars_adjoint[name]).abs().max()) <= 1e-10 * float(bar.abs().max()), name
+        assert float((bar - bars_adjoint[name]).abs().max()) <= 1e-11 * float(bar.abs().max()), name
 
 
 def test_odeint_adjoint_of_a_forgotten_run_says_so(rolling):

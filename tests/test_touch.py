@@ -195,7 +195,7 @@ def test_taxels_are_sensors_of_a_fit():
     assert problem.sensors["skin.normal.20"].noise == 0.02
     assert problem.sensors["skin.normal.19"].noise == 0.01
     assert len(problem.coordinates) == 4
-    check_derivatives(problem, problem.coordinates.start, 1e-4, 1e-4)
+    check_derivatives(problem, problem.coordinates.start, 1e-4, 1e-4, 1e-6)
     with pytest.raises(ValueError, match=r"no recording has samples of `L\.normal\.3`"):
         Problem([data], SENSORS | {"L.normal.3": Sensor(noise=1.0)}, unknowns)
     with pytest.raises(ValueError, match=r"no recording has samples of `skin\.shear`"):

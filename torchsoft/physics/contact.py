@@ -3,10 +3,10 @@ stick-slip friction.
 
 Equations of the paper in brackets. Everything else is generated from these functions: the compiled
 law with its Jacobian and its derivatives in every parameter. Departures from the paper keep forces
-continuous: the normal dashpot carries at most what the spring does, so that forces begin at zero
-and nothing adheres, and the moving frame follows the point on the body nearest to the pad's instead
-of the first one touched. None has a length, a force or a speed of its own: the law is the same
-at every load and size.
+continuous: the normal dashpot carries at most twice what the spring does, so that forces begin at
+zero, and nothing adheres, and the moving frame follows the point on the body nearest to the pad's
+instead of the first one touched. None has a length, a force or a speed of its own: the law is the
+same at every load and size.
 """
 
 from collections.abc import Callable
@@ -70,10 +70,12 @@ def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
 
 
 def normal_force(spring: Tensor, dashpot: Tensor) -> Tensor:
-    """F_N = S + D [N] of the spring's force S = K_n g while g > 0 and the dashpot's D = R_n g' (Eq.
-    8, 9), where D counts from -S to S: 0 <= F_N <= 2 S. Continuous; not smooth at S = 0 and where
-    D is cut."""
-    return spring + torch.minimum(torch.maximum(dashpot, -spring), spring)
+    """F_N [N] of the spring's force S = K_n g while g > 0 and the dashpot's D = R_n g' (Eq. 8, 9):
+    S + D on withdrawal, never below zero, and S + D (1 - D^2 / (27 S^2)) on approach, where D
+    counts up to 3 S, so that F_N <= 3 S. Not smooth at S = 0 and where a withdrawal ends F_N."""
+    share = dashpot / torch.where(spring > 0, spring, 1.0)
+    approach, withdrawal = share.clamp(0.0, 3.0), share.clamp(-1.0, 0.0)
+    return spring * (1 + withdrawal + approach - approach**3 / 27)
 
 
 StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]
@@ -124,7 +126,8 @@ class SmoothSlip(Friction):
         c = (self.v_s * (E - self.mu_s * F_N)).clamp(min=0.0)
         root = torch.sqrt(b * b + 4 * R * c)
         rising = b >= 0  # two forms of the same root, neither of which cancels
-        rate = torch.where(rising, 2 * c / torch.where(rising, b + root, 1.0), (root - b) / (2 * R))
+        down = torch.where(rising & (root > 0), b + root, 1.0)
+        rate = torch.where(rising, 2 * c / down, (root - b) / (2 * R))
         return torch.where(self.mu_s * F_N <= E, rate, 0.0)
 
 

@@ -34,9 +34,9 @@ from torchsoft.solve.kernel.invoke import call_linearise, call_value
 from torchsoft.solve.kernel.linear import add, bounds, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.table import Array
 
-SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
+SEARCH_AFTER, SHORTEST = 2, 2.0**-16
 """After so many iterations a Newton step that does not lessen the mismatch is halved, down to this
-part of it."""
+part of it; before, one whose mismatch is not a number."""
 
 ROUNDED = 10.0
 """Mismatch, in tolerances, that is accepted where rounding stops Newton's iteration: no shorter
@@ -247,7 +247,8 @@ def solve_stage(
         for pad in range(pads):
             worst, total = evaluate(s, w, pad, y, a)
             mismatch, squares = worst if not worst <= mismatch else mismatch, squares + total
-        stuck = iteration > SEARCH_AFTER and not squares < previous
+        most = previous if iteration > SEARCH_AFTER else np.inf
+        stuck = iteration > 0 and not squares < most
         if stuck and part > SHORTEST:
             part *= 0.5
             for pad in range(pads):
