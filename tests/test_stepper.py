@@ -59,7 +59,7 @@ def test_a_step_that_newton_does_not_solve_is_halved():
     """Too few iterations for the hardest steps: those are cut, the others are not, and the run ends
     where it should."""
     model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
-    y0, t = grasped(model, (0.3, 0.0)), times(0.02, 11)
+    y0, t = grasped(model, (0.5, 0.0)), times(0.02, 11)
     runs = []
     for iterations in (40, 12):
         stepper = ImplicitStepper(model, step=2e-3, max_iterations=iterations)
@@ -82,7 +82,7 @@ def test_the_adjoint_follows_halved_steps(monkeypatch):
     """Where steps were cut, the gradient is still that of the run; differences small enough to cut
     the same steps."""
     model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
-    y0, t = grasped(model, (0.3, 0.0)), times(0.01, 6)
+    y0, t = grasped(model, (0.5, 0.0)), times(0.01, 6)
     E = model.pad.E
 
     class Hasty(ImplicitStepper):

@@ -7,7 +7,7 @@ documentation.
 Command: .venv/bin/python experiments/validation/contact_theory.py [--smoke]
 Expected: sliding, stops and spin within 0.1 % at every mass and size; Hertz within 0.03 % in a and
 0.23 % in p_0; the punch's pressure within 0.7 %; c within 0.1 % of a; creep to 0.3 % of the limit,
-rolled to both sides. Four minutes of a core.
+rolled to both sides. A minute of a core.
 """
 
 import math

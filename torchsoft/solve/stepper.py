@@ -54,6 +54,9 @@ from torchsoft.solve.system import Compiled
 HALVINGS = 6
 """Most halvings of a step that Newton does not solve before the run fails."""
 
+START_ITERATIONS = 400
+"""Most Newton iterations of a start, which no step before it has brought near its rates."""
+
 FIRST, SHORTEST = 1e-3, 1e-9
 """Length [s] of the first step that tolerances try, and the shortest that they may choose."""
 
@@ -172,7 +175,8 @@ class ImplicitStepper:
             plan.out_step, plan.out_part, at_outputs, y, out.integrals[rows], out.recorded[rows],
             out_tape,
         )  # fmt: skip
-        limits = Limits(self.tolerance, self.max_iterations, self.window)
+        most = self.max_iterations if steps else START_ITERATIONS
+        limits = Limits(self.tolerance, most, self.window)
         run = Run(
             s, self.still, now.work, now.step, follow, errors, limits, outputs, tape, given,
             now.y, k, clock, stops, times, row, rung, self.rtol, self.longest, SHORTEST,
@@ -409,16 +413,18 @@ class ImplicitStepper:
     def _failure(self, status: int, since: float, h: float, worst: str = "") -> SimulationFailed:
         """The failure at a time `since` the origin [s]."""
         time = self.origin + since
-        tried = (
-            f"steps down to {SHORTEST:g} s"
-            if worst
-            else f"the step of {h:.3g} s, halved {HALVINGS} times"
-        )
+        if h == INSTANT:
+            most, tried, instead = START_ITERATIONS, "at the start", "another start"
+        elif worst:
+            most, tried = self.max_iterations, f"in steps down to {SHORTEST:g} s"
+            instead = "other tolerances"
+        else:
+            most, tried = self.max_iterations, f"in the step of {h:.3g} s, halved {HALVINGS} times"
+            instead = "a smaller step"
         reasons = {
-            NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} "
-            f"iterations in {tried}; try {'other tolerances' if worst else 'a smaller step'}, or a "
-            "larger v_s of the friction law: where friction falls with slip faster than the pads "
-            "damp, massless pads have no unique velocity",
+            NEWTON_FAILED: f"Newton's iteration did not converge within {most} iterations {tried}; "
+            f"try {instead}, or a larger v_s of the friction law: where friction falls with slip "
+            "faster than the pads damp, massless pads have no unique velocity",
             OFF_THE_PAD: "the body was lost: its contact reached the end of a pad",
             LOST: "the body was lost: it left the space over a pad",
             REFUSED: f"the tolerances would need steps below {SHORTEST:g} s for {worst}; loosen "

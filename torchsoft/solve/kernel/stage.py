@@ -34,7 +34,7 @@ from torchsoft.solve.kernel.invoke import call_linearise, call_value
 from torchsoft.solve.kernel.linear import add, bounds, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.table import Array
 
-SEARCH_AFTER, SHORTEST = 2, 2.0**-16
+SEARCH_AFTER, SHORTEST = 2, 2.0**-10
 """After so many iterations a Newton step that does not lessen the mismatch is halved, down to this
 part of it; before, one whose mismatch is not a number."""
 
