@@ -64,6 +64,11 @@ class PadSetup:
         nodes, shares, _ = contact_points(self.mesh, self.points)
         return shape_functions(nodes, shares, len(self.mesh.surface))
 
+    @cached_property
+    def lengths(self) -> Array:
+        """Lengths of surface [m] that the contact points stand for (points,)."""
+        return np.asarray(contact_points(self.mesh, self.points)[2])
+
     def displacement(self, u: Array) -> Array:
         """Displacements of all nodes of the mesh (..., mesh nodes, 2) [m], bonded ones too.
 

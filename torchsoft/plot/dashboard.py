@@ -228,6 +228,12 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
     level = along_surface(run.setup.pads[name], instant.base[name])[0] > 0.999
     axes.set_xlabel("x [mm]" if level else "along the surface [mm]")
     legend_above(axes)
+    pad = run.setup.pads[name]
+    area = pad.depth * pad.lengths[instant.near(contact)]
+    if np.ptp(area) < 1e-6 * area[0]:  # else a force is not the same pressure everywhere
+        scale = 1e-3 / float(area[0])
+        beside = axes.secondary_yaxis("right", functions=(lambda f: scale * f, lambda p: p / scale))
+        beside.set_ylabel("traction [kPa]")
 
 
 def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
