@@ -146,7 +146,6 @@ def test_modes_without_a_free_coordinate(built: BuiltRig[Any]):
     assert torch.equal(resting(rig, pressed)["indenter"], pressed["indenter"])
 
 
-@pytest.mark.filterwarnings("ignore:the run begins:UserWarning")
 @pytest.mark.parametrize("t0", [0.0, 1.7e9])
 def test_identified_from_its_force(tmp_path: Path, capsys: pytest.CaptureFixture[str], t0: float):
     """The force alone is measured; its relaxation tells tau, whatever the clock counts from."""

@@ -13,6 +13,7 @@ from torchsoft.cli import main
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.check import check
 from torchsoft.rigs.written import to_toml
+from torchsoft.tables import InvalidTable
 
 MU_S, MU_K, G = 0.8, 0.7, 9.81
 FRICTION: dict[str, dict[str, Any]] = {
@@ -106,6 +107,8 @@ def test_auto_takes_springs_and_dashpots_from_the_pad():
     assert got["R_n"] == got["R_t"] == pytest.approx(1e-3 * got["K_n"])
     assert not [one for one in check(file) if one.where == "contacts.ground"]
     assert 'K_n = "auto"' in to_toml(file)
+    with pytest.raises(InvalidTable, match=r'K_n: should be "auto" or a number, not \'soft\''):
+        box(20, 0.15, "smooth", K_n="soft")
 
 
 def test_a_dashpot_that_is_auto_follows_a_spring_that_is_given():

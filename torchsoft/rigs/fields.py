@@ -81,11 +81,17 @@ AUTO = "auto"
 class OrAuto:
     """Lets a number be "auto", too."""
 
+    @staticmethod
+    def check(x: Any, number: Callable[[Any], Any]) -> Any:
+        if isinstance(x, str) and x != AUTO:
+            raise ValueError(f'should be "{AUTO}" or a number, not {shown(x)}')
+        return x if x == AUTO else number(x)
+
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         return core_schema.no_info_wrap_validator_function(
-            lambda x, number: x if x == AUTO else number(x),
+            self.check,
             handler(source),
             serialization=core_schema.plain_serializer_function_ser_schema(lambda x: x),
         )

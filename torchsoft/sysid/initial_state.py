@@ -99,7 +99,10 @@ class Standing(NamedTuple):
         rests: Mapping[str, Sequence[int]] | None = None,
         position_sd: Mapping[str, float] | None = None,
     ) -> "Standing":  # fmt: skip
-        """Bodies at the places of the state y0 (size,)."""
+        """Bodies at the places of the state y0 (size,). Warns of pads that do not forget their
+        beginning within the lead."""
+        if lead > 0:
+            warn_of_memory(rig, lead)
         state = rig.unpack(y0.detach())
         pairs = zip(state.pose.items(), state.velocity.values())
         bodies = {k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}
@@ -113,8 +116,6 @@ class Standing(NamedTuple):
         return f"{self.lead:g} s early, bodies at known places, pads settled around them"
 
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
-        if self.lead > 0:
-            warn_of_memory(rig, self.lead)
         known = free_coordinates(rig)[: len(free_coordinates(rig)) // 2]
         for name in self.position_sd:
             if name not in known:
