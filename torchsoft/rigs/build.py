@@ -364,7 +364,10 @@ class RigFile(Group):
             role, coordinate = users[0]
             if name not in self.motion:
                 reason = f"it is the {role} of" if role != "driven" else "it drives"
-                raise ValueError(f"motion.{line(name, 80)} is missing: {reason} {coordinate}")
+                raise ValueError(
+                    f"motion.{line(name, 80)} is missing: {reason} {coordinate}; give a motion, "
+                    'such as {kind = "hold"}'
+                )
             if len({(r == "feed_forward", c.endswith(".theta")) for r, c in users}) > 1:
                 raise ValueError(
                     f"motion.{name} would be in two units: "
