@@ -366,7 +366,7 @@ class RigFile(Group):
                 reason = f"it is the {role} of" if role != "driven" else "it drives"
                 raise ValueError(
                     f"motion.{line(name, 80)} is missing: {reason} {coordinate}; give a motion, "
-                    'such as {kind = "hold"}'
+                    'such as {kind = "hold", value = 0.0}'
                 )
             if len({(r == "feed_forward", c.endswith(".theta")) for r, c in users}) > 1:
                 raise ValueError(
