@@ -377,6 +377,51 @@ def test_a_mesh_from_a_file(tmp_path):
     assert torch.allclose(C, expected, rtol=1e-8, atol=1e-10 * float(expected.abs().max()))
 
 
+UNNAMED = GMSH[: GMSH.index("$PhysicalNames")] + GMSH[GMSH.index("$Entities") :].replace(
+    "0 1 5 0\n", "0 0 1 1\n"
+).replace("0 1 7 0\n", "0 0 1 1\n").replace("0 1 1 0\n", "0 0 2 1 2\n").replace(
+    "0 2 1 0\n", "1 2 1 0\n1 0 0 0 0\n"
+)  # fmt: skip
+"""As gmsh saves it by default, without physical groups: curves have bounding points."""
+
+DECK = """*NODE, NSET=ALL
+1, 0.0, 0.0
+2, 10.0, 0.0
+3, 20.0, 0.0
+4, 0.0, 5.0
+5, 10.0, 5.0
+6, 20.0, 5.0
+*ELEMENT, TYPE={kind}, ELSET=RUBBER
+1, 1, 2, 5, 4
+2, 2, 3, 6, 5
+*NSET, NSET=FACE
+4, 5, 6
+*NSET, NSET=BASE
+1, 2, 3
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "edges"),
+    [
+        ("block.msh", UNNAMED, ("curve 2", "curve 1")),
+        *((f"{kind}.inp", DECK.format(kind=kind), ("FACE", "BASE"))
+          for kind in ("CPE4", "CPE4H", "CPE4RH", "CPS4")),
+    ],
+)  # fmt: skip
+def test_edges_are_named_by_curves_and_sets_of_nodes(tmp_path, name, text, edges):
+    (tmp_path / name).write_text(text, encoding="ascii")
+    mesh = QuadMesh.read(tmp_path / name, unit="mm", face=edges[0], bonded=[edges[1]])
+    assert mesh.nodes[mesh.face].tolist() == [[0.0, 0.005], [0.01, 0.005], [0.02, 0.005]]
+    assert mesh.nodes[mesh.bonded][:, 1].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_an_element_that_is_not_known_is_named(tmp_path):
+    (tmp_path / "block.inp").write_text(DECK.format(kind="CAX4"), encoding="ascii")
+    with pytest.raises(ValueError, match=r"block.inp is not a mesh that can be read: .*CAX4"):
+        QuadMesh.read(tmp_path / "block.inp", unit="mm")
+
+
 def test_files_that_are_no_meshes_are_refused(tmp_path):
     file = tmp_path / "tip.msh"
     tip = FingertipMesh(RADIUS, 8)
@@ -385,10 +430,13 @@ def test_files_that_are_no_meshes_are_refused(tmp_path):
     written(file, tip)
     for options, match in (
         ({"unit": "inch"}, "`unit` must be one of m, cm, mm, but is 'inch'"),
-        ({"unit": "mm"}, "tip.msh: there is no group of lines `face`; there are skin, bone"),
+        (
+            {"unit": "mm"},
+            "tip.msh: there is no edge `face`; there are skin, bone, curve 1, curve 2",
+        ),
         (
             {"unit": "mm", "face": "skin", "bonded": ["rubber"]},
-            "there is no group of lines `rubber`",
+            "there is no edge `rubber`",
         ),
         (
             {"unit": "mm", "face": "skin", "bonded": []},

@@ -52,6 +52,23 @@ def done():
     return manipulated()
 
 
+@pytest.mark.parametrize("count", [2, 7, 8])
+def test_a_pad_of_few_elements_is_drawn(count):
+    pad = Pad(PadMesh(60e-3, 10e-3, count, 1), KelvinVoigt(3e5, 0.45, 1e3, 5e-3, 40e-3), points=2)
+    law = SoftContact(1e5, 100.0, 1e5, 100.0, friction=SmoothSlip(0.5, 0.4, 0.05))
+    rig = Rig(
+        bodies={"disc": Body(0.2, Circle(20e-3))},
+        pads={"pad": pad},
+        contacts={"pad": Contact("pad", "disc", law)},
+    )
+    t = times(0.02, 3)
+    run = simulate(rig, t, y0=rig.state(disc={"x": 30e-3, "y": "rest"}))
+    (instant,) = instants(run, [0.02])
+    near = instant.near("pad", 8)
+    assert 0 < len(near) <= len(instant.points["pad"])
+    figures.snapshots(run, [0.02])
+
+
 def test_a_spoke_ends_on_the_outline():
     square = np.array([[-1.0, -2.0], [3.0, -2.0], [3.0, 1.0], [-1.0, 2.0], [-1.0, -2.0]])
     np.testing.assert_allclose(straight_up(square), [0.0, 1.75], rtol=1e-15)

@@ -232,7 +232,8 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
     area = pad.depth * pad.lengths[instant.near(contact)]
     if np.ptp(area) < 1e-6 * area[0]:  # else a force is not the same pressure everywhere
         scale = 1e-3 / float(area[0])
-        beside = axes.secondary_yaxis("right", functions=(lambda f: scale * f, lambda p: p / scale))
+        both = partial(np.multiply, scale), partial(np.multiply, 1 / scale)
+        beside = axes.secondary_yaxis("right", functions=both)
         beside.set_ylabel("traction [kPa]")
 
 

@@ -15,6 +15,7 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from torchsoft.physics.energy import SEPARATED, SLIPPING, STICKING
 from torchsoft.physics.mesh import Array
@@ -78,8 +79,8 @@ class Instant(NamedTuple):
 
     def near(self, contact: str, margin: int = 1) -> NDArray[np.int64]:
         """Indices of the points under a normal force, and of `margin` neighbours on each side."""
-        around = np.ones(2 * margin + 1)
-        return np.flatnonzero(np.convolve(self.force[contact][:, 0] > 0, around, "same") > 0)
+        pressed = self.force[contact][:, 0] > 0
+        return np.flatnonzero(binary_dilation(pressed, iterations=margin))
 
 
 def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:

@@ -1,7 +1,5 @@
 """Any mesh of quadrilaterals, from numbers or from a file."""
 
-import contextlib
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,8 +11,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from torchsoft.files import check_file
-from torchsoft.physics.arguments import LENGTHS, places
+from torchsoft.display import suggestion
+from torchsoft.physics.arguments import places
+from torchsoft.physics.mesh.files import read_quads
 from torchsoft.physics.mesh.mesh import (
     CORNERS,
     Array,
@@ -27,15 +26,6 @@ from torchsoft.physics.mesh.mesh import (
     in_band,
     quads,
 )
-
-IGNORED = {"line", "vertex"}
-"""Kinds of cells beside the quadrilaterals."""
-
-FLAT = 1e-9
-"""Largest distance of the points from one plane, over the size of the mesh."""
-
-LARGEST = 2e9
-"""Size [B] of a mesh file at the most."""
 
 Numbers = tuple[tuple[int, ...], ...]
 
@@ -68,14 +58,17 @@ class QuadMesh(FreeMesh):
         cls, path: str | Path, *, unit: str, face: str = "face", bonded: Iterable[str] = ("base",)
     ) -> Self:
         """From a file that meshio reads, with coordinates in `unit` (m, cm or mm): its
-        quadrilaterals, and its groups of lines (in gmsh physical curves) with the names of the face
-        and of the bonded edges. Raises `ValueError` naming the file."""
+        quadrilaterals, and the names of the face and of the bonded edges among its groups of lines
+        (in gmsh physical curves), sets of nodes, and curves. Raises `ValueError` naming the
+        file."""
         points, quads, groups = read_quads(path, unit)
         try:
             for name in (face, *bonded):
                 if name not in groups:
-                    known = ", ".join(groups) or "none"
-                    raise ValueError(f"there is no group of lines `{name}`; there are {known}")
+                    raise ValueError(
+                        f"there is no edge `{name}`; {suggestion(name, groups, 'there are')}; name "
+                        "a group of lines or a set of nodes"
+                    )
             return cls.of(
                 points,
                 quads,
@@ -212,58 +205,3 @@ class QuadMesh(FreeMesh):
             for old in (self.face_sides, self.bonded_sides)
         ]
         return QuadMesh.of(np.array(points), np.concatenate(divided), *sides)
-
-
-def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Index]]:
-    """Points (n, 2) [m], quadrilaterals (m, 4) and, by their names, groups of lines (., 2) of a
-    file that meshio reads.
-
-    Raises `ValueError` naming the file for one that it cannot read, another unit, cells of another
-    kind, and points that are not in a plane of constant z, and `OSError`.
-    """
-    import meshio  # takes half a second, and few need it
-
-    if unit not in LENGTHS:
-        raise ValueError(f"`unit` must be one of {', '.join(LENGTHS)}, but is {unit!r}")
-    with check_file(path, LARGEST).open("rb"):  # a missing or unreadable file is an OSError
-        pass
-    try:
-        with (
-            contextlib.redirect_stdout(io.StringIO()),
-            contextlib.redirect_stderr(io.StringIO()),
-        ):  # it prints, and exits
-            mesh: Any = meshio.read(path)
-    except (Exception, SystemExit) as error:
-        raise ValueError(
-            f"{path} is not a mesh that can be read: {error or 'its format is not known'}"
-        ) from None
-    kinds = {block.type for block in mesh.cells} - IGNORED
-    if kinds != {"quad"}:
-        raise ValueError(
-            f"{path} must be a mesh of quadrilaterals with four points, but has "
-            f"{', '.join(sorted(kinds)) or 'none'}; in gmsh recombine the triangles"
-        )
-    x = np.asarray(mesh.points, np.float64)
-    if not np.isfinite(x).all() or (x.shape[1] > 2 and np.ptp(x[:, 2]) > FLAT * np.ptp(x[:, :2])):
-        raise ValueError(f"{path} must have finite points in a plane of constant z")
-    quads = np.concatenate([block.data for block in mesh.cells if block.type == "quad"])
-    return LENGTHS[unit] * x[:, :2], quads, groups_of_lines(mesh)
-
-
-def groups_of_lines(mesh: Any) -> dict[str, Index]:
-    """Sides (., 2) by the names of their groups: meshio's cell sets, and gmsh's physical curves of
-    older files."""
-    groups: dict[str, list[Index]] = {}
-    tags = mesh.cell_data.get("gmsh:physical", [None] * len(mesh.cells))
-    curves = {name: tag for name, (tag, dimension) in mesh.field_data.items() if dimension == 1}
-    for k, block in enumerate(mesh.cells):
-        if block.type != "line":
-            continue
-        for name, chosen in mesh.cell_sets.items():
-            if chosen[k] is not None and len(chosen[k]):
-                groups.setdefault(name, []).append(block.data[chosen[k]])
-        for name, tag in curves.items():
-            if tags[k] is not None and name not in mesh.cell_sets and (tags[k] == tag).any():
-                groups.setdefault(name, []).append(block.data[tags[k] == tag])
-    groups.pop("gmsh:bounding_entities", None)
-    return {name: np.concatenate(sides) for name, sides in groups.items()}
