@@ -41,8 +41,8 @@ NOMINAL = Parameters().override(
 RTOL = 1e-4
 DATA_RTOL = 1e-6
 FALLS = 0.9
-"""Largest kinetic over static friction of the smooth law: with any it would contain the other law
-but for eta."""
+"""Largest kinetic over static friction of the smooth law: with any it would contain the other
+law."""
 
 STIFFER = (1.3, 4.0)
 """Bounds of instantaneous over relaxed modulus of the standard linear solid: with any it would

@@ -360,4 +360,4 @@ def test_law_comparison_smoke(tmp_path):
     _, summary = smoke("law_comparison", tmp_path)
     *near, far, other = summary["cases"]
     assert [case["answer"] for case in (*near, far, other)] == ["right"] * 2 + ["cannot tell"] * 2
-    assert min(case["D"] for case in near) > 20 > 1 > max(far["D"], other["D"])
+    assert min(case["D"] for case in near) > 7.3 > 1 > max(far["D"], other["D"])

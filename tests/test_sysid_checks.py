@@ -241,7 +241,7 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     as_stated, again = (
         refit(problem, end, tried, "linear", lambda chi2: None) for tried in ((), [law])
     )
-    assert as_stated.fit.chi2 > 1e3  # nothing can be done with smooth friction
+    assert as_stated.fit.chi2 > 20  # nothing can be done with smooth friction
     assert again.fit.chi2 < 2  # on steps as coarse as those of the checks
     for name, value in TRUTH.items():
         assert again.of(name) == pytest.approx(np.log(value), abs=0.1)
