@@ -23,7 +23,7 @@ FLOWS = {
         validity rig summary extensions energy statics setup .
     """,
     "paper": "parameters rig equilibrium .",
-    "physics.mesh": "mesh block quads .",
+    "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour .",
     "solve": """
         kernel laws steps progress system stepper trajectory gradients formats

@@ -256,15 +256,13 @@ def test_the_graph_has_the_fields_of_the_chain(material):
 
 def test_a_recording_that_begins_before_the_pads_forget_is_named():
     model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
-    samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
-    at_rest = Standing.of(model, rest(model))
     with pytest.warns(
         UserWarning,
         match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s",
     ) as said:
-        _ = Recording("slow", model, samples, at_rest).start_coordinates
+        Standing.of(model, rest(model))
     assert len(said) == 2
-    _ = Recording("slow", model, samples, at_rest._replace(lead=20.0)).start_coordinates
+    Standing.of(model, rest(model), lead=20.0)
 
 
 def test_every_material_has_a_name_in_files():

@@ -271,7 +271,7 @@ def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="no relaxed modulus remains, or nothing changes in time"):
         fit(Measured(made.path, "relaxation", T, made.strain, 1e5 * made.strain))
     with pytest.raises(
-        ValueError, match="`terms` must be from 1 to 8 for what made resolves, but is 9"
+        ValueError, match="`terms` must be from 1 to 7 for what made resolves, but is 9"
     ):
         fit(made, terms=9)
 

@@ -2,8 +2,8 @@
 of times, then the times themselves.
 
 A relaxation test gives a relaxation series (`Prony`), a creep test a chain of Kelvin elements
-(`GeneralisedKelvin`), in how many terms Schwarz's criterion (BIC) says. The residuals count alike
-at all rows.
+(`GeneralisedKelvin`), in how many terms Schwarz's criterion (BIC) says. Residuals count relative to
+the largest response, or to the response of each row (`Measured.relative`).
 """
 
 import math
@@ -51,6 +51,12 @@ KNOWN: dict[str, csvfile.Units] = {
 LEAST = 8
 """Rows that a file needs."""
 
+DECADE = 10.0
+"""Ratio of the largest to the smallest response above which residuals count relative to each."""
+
+FLOWING = 0.8
+"""Power of time above which creep at the end of a test is a flow: 1 is a dashpot's."""
+
 SMALL_STRAIN = 0.1
 """Strain up to which a linear material is taken at its word."""
 
@@ -84,10 +90,32 @@ class Measured:
 
     @property
     def window(self) -> tuple[float, float]:
-        """The shortest and the longest time [s] that the rows resolve: the shortest interval, and
-        all of the test."""
+        """The shortest and the longest time [s] that the rows resolve: that of two neighbouring
+        intervals, so that one odd row counts for nothing, and all of the test."""
         intervals = np.diff(self.t, prepend=0.0)
-        return float(intervals[intervals > 0].min()), float(self.t[-1])
+        intervals = intervals[intervals > 0]
+        return float(np.maximum(intervals[1:], intervals[:-1]).min()), float(self.t[-1])
+
+    @property
+    def relative(self) -> bool:
+        """Whether residuals count relative to the response at each row: of a modulus or a
+        compliance that spans more than a decade, so that the series is as good at all times."""
+        least, most = self.answer.min(), self.answer.max()
+        return self.per_load and bool(most > DECADE * least > 0)
+
+    @property
+    def size(self) -> Array:
+        """Response (n,) that residuals are relative to."""
+        size = np.abs(self.answer)
+        return size if self.relative else np.full_like(size, size.max())
+
+    @property
+    def flows(self) -> bool:
+        """Whether strain goes on in proportion to time under a held stress at the end."""
+        if self.test == "relaxation" or np.ptp(self.stress[len(self.t) // 2 :]) > 0:
+            return False
+        half = np.interp(0.5 * self.t[-1], self.t, self.strain)
+        return bool(self.strain[-1] > 2**FLOWING * half)
 
 
 def read(
@@ -208,6 +236,9 @@ GRID = 10
 STEP = 1e-5
 """Change of a time's logarithm by which its slopes are taken."""
 
+PASSES = 100
+"""Iterations of the nonnegative fit for each time of the grid, at the most."""
+
 MOST = 12
 """Terms that are tried at the most; at the most one for every decade that the rows resolve, and one
 more."""
@@ -270,8 +301,13 @@ class Fit:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residual, over the largest answer."""
-        return float(np.sqrt(np.mean(self.residual**2)) / np.abs(self.measured.answer).max())
+        """Root mean square of the residual relative to `Measured.size`."""
+        return float(np.sqrt(np.mean((self.residual / self.measured.size) ** 2)))
+
+    @property
+    def residual_of(self) -> str:
+        """The response that `rms` is a part of."""
+        return "of each row" if self.measured.relative else "of the largest"
 
     def table(self) -> dict[str, Any]:
         """The arguments of the material's constructor that the test tells, and tau_instant."""
@@ -351,33 +387,31 @@ def beginnings(measured: Measured, count: int) -> list[Array]:
 
 def coefficients(measured: Measured, tau: Array) -> Array:
     """Nonnegative coefficients (1 + terms,) of the series with given times."""
-    A, size = (
-        responses(measured.test, measured.t, measured.driven, tau),
-        np.abs(measured.answer).max(),
-    )
+    size = measured.size
+    A = responses(measured.test, measured.t, measured.driven, tau) / size[:, None]
     scale = np.abs(A).max(0)
-    return nnls(A / scale, measured.answer / size)[0] * size / scale
+    return nnls(A / scale, measured.answer / size, maxiter=PASSES * len(scale))[0] / scale
 
 
 def refined(measured: Measured, tau: Array) -> Trial | None:
     """The least-squares fit from these times on, within what the rows resolve; None where a term,
     or the modulus that remains, vanishes."""
-    size, (low, high) = float(np.abs(measured.answer).max()), measured.window
-    c = coefficients(measured, tau)
-    scale = size / np.abs(responses(measured.test, measured.t, measured.driven, tau)).max(0)
-    count = len(tau)
+    size, (low, high) = measured.size, measured.window
+    c, count = coefficients(measured, tau), len(tau)
+
+    def weighted(tau: Array) -> Array:
+        return responses(measured.test, measured.t, measured.driven, tau) / size[:, None]
+
+    scale = 1.0 / np.abs(weighted(tau)).max(0)
 
     def residuals(z: Array) -> Array:
-        A = responses(measured.test, measured.t, measured.driven, np.exp(z[count + 1 :]))
-        return (A @ (z[: count + 1] * scale) - measured.answer) / size
+        A = weighted(np.exp(z[count + 1 :]))
+        return A @ (z[: count + 1] * scale) - measured.answer / size
 
     def slopes(z: Array) -> Array:
-        A, later, sooner = (
-            responses(measured.test, measured.t, measured.driven, np.exp(z[count + 1 :] + by))
-            for by in (0.0, STEP, -STEP)
-        )
+        A, later, sooner = (weighted(np.exp(z[count + 1 :] + by)) for by in (0.0, STEP, -STEP))
         by_tau = (later - sooner)[:, 1:] / (2 * STEP) * (z[1 : count + 1] * scale[1:])
-        return np.column_stack((A * scale, by_tau)) / size
+        return np.column_stack((A * scale, by_tau))
 
     z = np.concatenate((np.maximum(c / scale, 1e-6), np.log(tau)))
     bounds = (
@@ -407,7 +441,7 @@ def concluded(measured: Measured, best: Trial, scores: Mapping[int, float]) -> F
     _, s, V = np.linalg.svd(best.J, full_matrices=False)
     root = G @ (V.T / np.maximum(s, 1e-300))
     sd = np.sqrt((root**2).sum(1) * float(best.r @ best.r) / ((n - parameters) * independent))
-    fitted = measured.answer + best.r * np.abs(measured.answer).max()
+    fitted = measured.answer + best.r * measured.size
     made = dict(zip(names, values.tolist())), dict(zip(names, sd.tolist()))
     return Fit(
         measured,
@@ -464,6 +498,12 @@ def notices(
     if len(scores) > 1 and terms == max(scores):
         sentences.append(
             f"more terms than {terms} might fit better still: the criterion was falling up to there"
+        )
+    if measured.flows:
+        sentences.append(
+            "the creep flows: under a held stress the strain still grows in proportion to time at "
+            "the end, so that no E remains; the slowest term stands for a dashpot, and holds up to "
+            "the end of the test only"
         )
     if correlation > COLOURED:
         sentences.append(

@@ -83,7 +83,8 @@ def summary(
         "coefficients": {name: finite({"value": x, "sd": fit.sd[name]}) for name,
         x in fit.values.items()}, "assumed": dict(assumed),
         "criterion": {str(count): score for count, score in fit.scores.items()},
-        "residual_rms_over_largest": fit.rms,
+        "residual_rms": fit.rms,
+        "residual_of": fit.residual_of,
         "residual_correlation": fit.correlation,
         "notices": list(fit.notices),
     }  # fmt: skip
@@ -98,7 +99,7 @@ def printed(fit: Fit) -> str:
     ]
     head = (
         f"{fit.measured.path.name}: {fit.measured.test} test, {fit.kind} of {fit.terms} terms, "
-        f"residual {fit.rms:.2%}"
+        f"residual {fit.rms:.2%} {fit.residual_of}"
     )
     return "\n".join([head, *rows, *(f"note: {notice}" for notice in fit.notices)])
 
@@ -125,7 +126,7 @@ def fitted(fit: Fit) -> Figure:
         m.t[seen],
         scale * fit.fitted[seen],
         color=OTHER,
-        label=f"fitted, residual {fit.rms:.2%} of the largest",
+        label=f"fitted, residual {fit.rms:.2%} {fit.residual_of}",
     )
     data.set(ylabel=f"{quantity} [{per}]", title=f"a) {quantity}")
     data.legend()

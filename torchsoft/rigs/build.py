@@ -30,7 +30,7 @@ from torchsoft.physics.statics import (
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import Gravity, Quantity, Time
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
-from torchsoft.rigs.fields import Group, at_field
+from torchsoft.rigs.fields import Group, at_field, with_entry
 from torchsoft.rigs.geometry import AWAY, Scene, above, at, upon
 from torchsoft.rigs.motion import HELD, MotionContext, MotionTable, flattened
 from torchsoft.rigs.parts import (
@@ -576,15 +576,6 @@ class RigFile(Group):
                 f"none: {error}"
             ) from None
         return -float(net_loads(soft, soft.unpack(y, still), still, ())[body][axis])
-
-
-def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any]:
-    """A copy of a list with another entry at `places`, counted from one. Raises `ValueError`."""
-    if not isinstance(values, list | tuple) or not 1 <= places[0] <= len(values):
-        raise ValueError(f"{key}: there is no such entry")
-    out, (first, *rest) = list(values), places
-    out[first - 1] = with_entry(key, values[first - 1], rest, value) if rest else value
-    return out
 
 
 def too_stiff(file: RigFile, rig: Rig) -> str:

@@ -188,3 +188,12 @@ def listed(hint: Any) -> Any:
 def one_of(*tables: type[PartTable] | type[Group]) -> Any:
     """A union of tables, told apart by their `kind`."""
     return Annotated[reduce(or_, tables), Field(discriminator="kind")]
+
+
+def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any]:
+    """A copy of a list with another entry at `places`, counted from one. Raises `ValueError`."""
+    if not isinstance(values, list | tuple) or not 1 <= places[0] <= len(values):
+        raise ValueError(f"{key}: there is no such entry")
+    out, (first, *rest) = list(values), places
+    out[first - 1] = with_entry(key, values[first - 1], rest, value) if rest else value
+    return out
