@@ -170,6 +170,36 @@ def test_what_the_rows_do_not_tell_is_said():
     )
 
 
+def test_one_odd_row_at_the_end_changes_nothing():
+    """A row written twice, a microsecond apart: no term relaxes within it."""
+    made = relaxing(1e-3)
+    t = np.append(made.t, made.t[-1] + 1e-6)
+    strain, stress = np.append(made.strain, 0.05), np.append(made.stress, 1.02 * made.stress[-1])
+    odd = Measured(made.path, "relaxation", t, strain, stress)
+    assert odd.window[0] == pytest.approx(made.window[0])
+    regular, found = fit(made), fit(odd)
+    assert found.terms == regular.terms
+    assert found.values == pytest.approx(regular.values, rel=0.1)
+
+
+def test_a_compliance_over_decades_counts_row_by_row():
+    """A power law over twelve decades of time: the series is as good at the first row."""
+    t = np.geomspace(1e-8, 1e4, 121)
+    measured = Measured(Path("made"), "creep", t, 1e-6 * t**0.4, np.ones_like(t), per_load=True)
+    found = fit(measured)
+    assert found.residual_of == "of each row"
+    assert np.abs(found.residual / measured.answer).max() < 0.2
+    assert found.rms < 0.05
+    assert fit(relaxing()).residual_of == "of the largest"
+
+
+def test_creep_that_flows_is_named():
+    """Under a held stress a Maxwell element's strain grows for ever; a solid's does not."""
+    flowing = Measured(Path("made"), "creep", T, 1e-2 + 1e-3 * T, np.full_like(T, 1e4))
+    assert any("the creep flows" in notice for notice in fit(flowing).notices)
+    assert not any("the creep flows" in notice for notice in fit(creeping()).notices)
+
+
 # --- files
 # ----------------------------------------------------------------------
 
