@@ -98,9 +98,9 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     "no data": (["identify", "rig.toml"], "there is nothing to identify from"),
     "not a table": (
         ["identify", "picture.csv", "rig.toml"],
-        "picture.csv is not a CSV file in UTF-8",
+        "picture.csv is not a table of text in UTF-8, UTF-16 or Windows-1252",
     ),
-    "empty": (["identify", "empty.csv", "rig.toml"], "empty.csv has no column `t`"),
+    "empty": (["identify", "empty.csv", "rig.toml"], "empty.csv is empty"),
     "rtol": (
         ["identify", "data.csv", "rig.toml", "--rtol", "-1"],
         "rtol should be greater than or equal to 1e-08, not -1.0",

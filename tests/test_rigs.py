@@ -300,7 +300,7 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         ),
         (
             "Time (s),x_d (m)\n0,0\n1,1\n",
-            r"x\.csv has no column `t \[s\]`, .*; it has `Time`, `x_d`; say which one in `time`",
+            r"x\.csv has no column `t \[s\]`, .*; it has `x_d`, `Time`; say which one in `time`",
         ),
         (
             "t [s],x_d [N]\n0,0\n1,1\n",

@@ -422,7 +422,7 @@ def test_a_contour_from_a_file(tmp_path):
     assert torch.allclose(shape.control, Contour(points).control, rtol=0, atol=1e-12)
     assert shape.residual < 1e-6
     for text, match in (
-        ("", "row 1: the columns must be `x .mm.` and `y .mm.`, in m, cm or mm, but are none"),
+        ("", "is empty: the columns must be `x .mm.` and `y .mm.`, in m, cm or mm"),
         ("x [mm],y [in]\n1,2\n", "column `y` cannot be in 'in'; it can be in m, cm, mm"),
         ("x [mm],y [mm],z [mm]\n1,2,3\n", "column `z` is not known: the columns must be"),
         ("x [mm],y [mm]\n1,\n", "row 2 has an empty cell"),

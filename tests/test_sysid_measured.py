@@ -155,10 +155,6 @@ BAD: dict[str, tuple[Change, str]] = {
     "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
     "no sensor": (put(1, X_C, "v_x [um/s]"),
         r"rig\.toml: sensors: no recording has samples of `x_C`"),
-    "semicolons": (
-        lambda table: table.__setitem__(slice(None), [[";".join(cells)] for cells in table]),
-        "row 1.*separate columns with commas",
-    ),
     "a cell too many": (lambda table: table[6].append("1"),
         r"row 7 has 13 cells, but there are 12 columns"),
     "text": (put(9, X_C, "n/a"), r"data\.csv, row 9, column `x_C`: 'n/a' is not a finite number; "

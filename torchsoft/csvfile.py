@@ -1,7 +1,10 @@
-"""CSV files of numbers under headings `name [unit]` or `name (unit)`, read in SI units, or written.
+"""Tables of numbers under headings `name [unit]` or `name (unit)`, as laboratories' programs write
+them, read in SI units, or written.
 
-Every error is a `ValueError` in a sentence that names the file, the row (the heading is row 1) and
-the column.
+Read are CSV with commas, semicolons or tabs, in UTF-8, UTF-16 or Windows-1252, and Excel workbooks;
+rows of text before the heading; units in the heading or in the row below it; decimal points, and
+decimal commas where these separate no columns. Every error is a `ValueError` in a sentence that
+names the file, the row (as an editor counts them) and the column.
 """
 
 import csv
@@ -14,11 +17,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchsoft.extras import needed
 from torchsoft.files import check_file, replacing
 from torchsoft.tables import line, shown
 
 LARGEST = 2e9
-"""Size [B] of a CSV file at the most."""
+"""Size [B] of a file at the most."""
+
+PREAMBLE = 200
+"""Rows that may stand before the heading."""
+
+SEPARATORS = ",;\t"
+"""Separators of columns."""
+
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+CONTROL = r"[\x00-\x08\x0e-\x1f]"
+"""Characters that no text has."""
 
 Units = Mapping[str, float]
 """Units that a column may have, and what they are in SI."""
@@ -26,46 +41,149 @@ Units = Mapping[str, float]
 Hint = Callable[[str, int], str]
 """Remedy for an unknown column, from its name and the number of columns of the table."""
 
+Rows = list[tuple[int, list[str]]]
+"""Number in the file and cells of every row that is not empty."""
+
 
 class Numbers(NamedTuple):
-    """Values (n,) by column, NaN where a cell is empty, the number of every row in the file, and
-    the columns left out."""
+    """Values (n,) by column, NaN where a cell is empty, the number of every row in the file, the
+    columns left out, and the row of the heading."""
 
     values: dict[str, NDArray[np.float64]]
     rows: list[int]
     ignored: tuple[str, ...]
+    heading: int
 
 
 def read(
-    path: Path, known: Mapping[str, Units], hint: Hint, ignore: Collection[str] = ()
+    path: Path,
+    known: Mapping[str, Units],
+    hint: Hint,
+    ignore: Collection[str] | None = (),
+    headings: Mapping[str, str] | None = None,
 ) -> Numbers:
-    """The columns `known` of a file, without those that are to be ignored. Raises `ValueError`, and
-    `OSError`."""
+    """The columns `known` of a file, without those that are to be ignored; None ignores all others.
+    `headings` are names of columns in the file in place of those that are known. Raises `ValueError`, and `OSError`."""
+    headings = headings or {}
+    names = {name: name for name in known.keys() - headings.values()} | dict(headings)
+    places, comma = table(path, {*names, *(ignore or ())})
+    if not places:
+        raise ValueError(f"{path} is empty{hint('', 1)}")
+    (first, cells), *places = places
+    if places and unit_row(cells, [cell.strip() for cell in places[0][1]]):
+        units = (cell.strip().strip("[]()") for cell in places.pop(0)[1])
+        cells = [f"{cell.strip()} [{unit}]" if unit else cell for cell, unit in zip(cells, units)]
+    head = heading(f"{path}, row {first}", cells, known, names, hint, ignore)
     values: list[list[float]] = []
-    rows: list[int] = []
+    marks: set[str] = set()
+    for row, others in places:
+        if len(others) != len(head):
+            raise ValueError(
+                f"{path}, row {row} has {len(others)} cells, but there are {len(head)} columns"
+            )
+        used = [(*one, cell) for one, cell in zip(head, others) if one]
+        values.append([number(path, row, name, cell, comma) * unit for name, unit, cell in used])
+        if comma and len(marks) < 2:
+            marks.update(mark for _, _, cell in used for mark in ",." if mark in cell)
+    if len(marks) > 1:
+        raise ValueError(f"{path} has decimal commas and decimal points: write all with points")
+    columns = np.array(values).reshape(len(places), sum(one is not None for one in head)).T
+    left_out = tuple(name_and_unit(cell)[0] for cell, one in zip(cells, head) if one is None)
+    by_name = dict(zip((one[0] for one in head if one), columns))
+    return Numbers(by_name, [row for row, _ in places], left_out, first)
+
+
+def table(path: Path, names: Collection[str]) -> tuple[Rows, bool]:
+    """The rows of a file from its heading on, which is the row with most of the `names`, and
+    whether commas are decimal. Raises `ValueError` for numbers before the heading."""
+    check_file(path, LARGEST)
+    if path.suffix.lower() in (".xlsx", ".xlsm"):
+        rows, separator = sheet(path, names), ""
+    elif path.suffix.lower() == ".xls":
+        raise ValueError(f"{path} is a workbook of an old Excel: save it as .xlsx or as CSV")
+    else:
+        lines = decoded(path).splitlines(keepends=True)
+        heads = {one: separated(path, lines[:PREAMBLE], one) for one in SEPARATORS}
+        separator = max(
+            SEPARATORS, key=lambda one: (begin(heads[one], names)[0], widest(heads[one]))
+        )
+        rows = separated(path, lines, separator)
+    at = begin(rows, names)[1]
+    for row, cells in rows[:at]:
+        if len(cells) == len(rows[at][1]) > 1 and all(numeric(cell) for cell in cells):
+            raise ValueError(
+                f"{path}, row {row} is of numbers, but stands before the heading in row "
+                f"{rows[at][0]}"
+            )
+    return rows[at:], separator in (";", "\t")
+
+
+def begin(rows: Rows, names: Collection[str]) -> tuple[int, int]:
+    """Number of the columns that the heading names, and its place among the rows."""
+    counts = [
+        sum(name_and_unit(cell)[0] in names for cell in cells) for _, cells in rows[:PREAMBLE]
+    ]
+    return (max(counts), counts.index(max(counts))) if counts else (0, 0)
+
+
+def widest(rows: Rows) -> int:
+    """Number of cells of the first row."""
+    return len(rows[0][1]) if rows else 0
+
+
+def decoded(path: Path) -> str:
+    """The text of a file. Raises `ValueError` where it is none."""
+    raw = path.read_bytes()
+    utf16 = raw[:2] in (b"\xff\xfe", b"\xfe\xff")
+    for encoding in ("utf-16",) if utf16 else ("utf-8-sig", "cp1252"):
+        try:
+            text = raw.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        if not re.search(CONTROL, text):
+            return text
+    raise ValueError(f"{path} is not a table of text in UTF-8, UTF-16 or Windows-1252")
+
+
+def separated(path: Path, lines: Sequence[str], separator: str) -> Rows:
+    """Rows of a text. Raises `ValueError` where it is no CSV."""
+    reader = csv.reader(lines, delimiter=separator)
     try:
-        with check_file(path, LARGEST).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            first = next(reader, [])
-            head = heading(path, first, known, hint, ignore)
-            for cells in reader:
-                if not any(cell.strip() for cell in cells):
-                    continue
-                row = reader.line_num
-                if len(cells) != len(head):
-                    raise ValueError(
-                        f"{path}, row {row} has {len(cells)} cells, but there are {len(head)} "
-                        "columns"
-                    )
-                rows.append(row)
-                used = [(*one, cell) for one, cell in zip(head, cells) if one]
-                values.append([number(path, row, name, cell) * unit for name, unit, cell in used])
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None
-    names = [one[0] for one in head if one]
-    columns = np.array(values).reshape(len(rows), len(names)).T
-    left_out = tuple(name_and_unit(cell)[0] for cell, one in zip(first, head) if one is None)
-    return Numbers(dict(zip(names, columns)), rows, left_out)
+        return [(reader.line_num, cells) for cells in reader if any(x.strip() for x in cells)]
+    except csv.Error as error:
+        raise ValueError(f"{path} is not a CSV file: {line(error)}") from None
+
+
+def sheet(path: Path, names: Collection[str]) -> Rows:
+    """Rows of the sheet of an Excel workbook with the heading. Raises `ValueError`."""
+    try:
+        book = needed("openpyxl", "excel").load_workbook(path, read_only=True, data_only=True)
+        sheets = {
+            one.title: [
+                (i, ["" if x is None else str(x) for x in cells])
+                for i, cells in enumerate(one.iter_rows(values_only=True), 1)
+                if any(x is not None for x in cells)
+            ]
+            for one in book.worksheets
+        }
+    except ModuleNotFoundError as missing:
+        raise ValueError(f"{path} is an Excel workbook: {missing}, or save it as CSV") from None
+    except Exception as error:  # of zip files, of XML, of whatever is in them
+        raise ValueError(f"{path} is not an Excel workbook: {line(error)}") from None
+    counts = {name: begin(rows, names)[0] for name, rows in sheets.items()}
+    best = [name for name, count in counts.items() if count == max(counts.values())]
+    if len(best) > 1 and counts[best[0]]:
+        raise ValueError(f"{path} has a table in each of the sheets {', '.join(best)}: keep one")
+    return sheets[best[0]]
+
+
+def unit_row(cells: Sequence[str], below: Sequence[str]) -> bool:
+    """Whether the row below a heading without units has them."""
+    return (
+        all(name_and_unit(cell)[1] is None for cell in cells)
+        and len(below) == len(cells)
+        and not any(numeric(cell) for cell in below)
+    )
 
 
 def write(path: Path, columns: Mapping[str, NDArray[np.float64]], units: Mapping[str, str]) -> None:
@@ -83,25 +201,27 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
 
 
 def heading(
-    path: Path,
+    row: str,
     cells: Sequence[str],
     known: Mapping[str, Units],
+    names: Mapping[str, str],
     hint: Hint,
-    ignore: Collection[str],
+    ignore: Collection[str] | None,
 ) -> list[tuple[str, float] | None]:
     """Name of each column, and what its unit is in SI; None for those left out. Raises `ValueError`
     naming the column."""
     out: list[tuple[str, float] | None] = []
     for cell in cells:
-        name, unit = name_and_unit(cell)
-        where = f"{path}, row 1, column `{line(name, 80)}`"
-        if name in ignore:
+        written, unit = name_and_unit(cell)
+        where = f"{row}, column `{line(written, 80)}`"
+        name = names.get(written)
+        if ignore is None and name is None or ignore is not None and written in ignore:
             out.append(None)
             continue
-        if name not in known:
-            raise ValueError(f"{where} is not known{hint(name, len(cells))}")
+        if name is None:
+            raise ValueError(f"{where} is not known{hint(written, len(cells))}")
         if unit is None:
-            raise ValueError(f"{where} has no unit: write `{name} [{next(iter(known[name]))}]`")
+            raise ValueError(f"{where} has no unit: write `{written} [{next(iter(known[name]))}]`")
         if unit not in known[name]:
             raise ValueError(
                 f"{where} cannot be in {shown(unit)}; it can be in {', '.join(known[name])}"
@@ -112,12 +232,22 @@ def heading(
     return out
 
 
-def number(path: Path, row: int, column: str, cell: str) -> float:
+def numeric(cell: str) -> bool:
+    """Whether a cell is of a number, its decimals after a point or a comma."""
+    try:
+        float(cell.replace(",", ".", 1))
+    except ValueError:
+        return False
+    return True
+
+
+def number(path: Path, row: int, column: str, cell: str, comma: bool = False) -> float:
     """A finite number, or NaN for an empty cell."""
     if not (text := cell.strip()):
         return math.nan
+    plain = text.replace(",", ".") if comma and DECIMAL_COMMA.fullmatch(text) else text
     try:
-        value = float(text) if text.isascii() and "_" not in text else math.nan
+        value = float(plain) if plain.isascii() and "_" not in plain else math.nan
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

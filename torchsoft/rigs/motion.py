@@ -1,7 +1,6 @@
 """Motions of a rig file as functions of time: set-points of loops, feed-forward efforts and driven
 coordinates."""
 
-import csv
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +12,6 @@ from scipy.interpolate import CubicSpline
 
 from torchsoft import csvfile
 from torchsoft.channels import UNITS
-from torchsoft.files import check_file
 from torchsoft.physics.motion import FADE, PERIODS, Piecewise, Profile, Sampled, Waves, wave
 from torchsoft.quantity import Quantity, Time
 from torchsoft.rigs.fields import Group, NumberOr
@@ -291,22 +289,20 @@ def read_column(
     """Times [s], from the column `time`, and values, in SI units, from a column in `unit` or one
     that converts to it. Raises `ValueError` naming the file, the row (the heading is row 1) and the
     column."""
+    known = {time: UNITS["s"], column: UNITS[unit]}
     try:
-        there = names(path)
-        for name in (time, column):
-            if name not in there:
-                shown = ", ".join(f"`{line(one, 40)}`" for one in there) or "nothing"
-                raise ValueError(
-                    f"{path} has no column `{name} [{'s' if name == time else unit}]`, in this "
-                    f"unit or one like it; it has {shown}; say which one in "
-                    f"`{'time' if name == time else 'column'}`"
-                )
-        known = {time: UNITS["s"], column: UNITS[unit]}
-        table = csvfile.read(
-            path, known, lambda *_: "", [name for name in there if name not in known]
-        )
+        table = csvfile.read(path, known, lambda *_: "", None)
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from None
+    for name in (time, column):
+        if name not in table.values:
+            there = [*table.values, *table.ignored]
+            shown = ", ".join(f"`{line(one, 40)}`" for one in there) or "nothing"
+            raise ValueError(
+                f"{path} has no column `{name} [{'s' if name == time else unit}]`, in this "
+                f"unit or one like it; it has {shown}; say which one in "
+                f"`{'time' if name == time else 'column'}`"
+            )
     times, values = table.values[time], table.values[column]
     if len(times) < 2:
         raise ValueError(
@@ -322,15 +318,6 @@ def read_column(
             f"{times[i]:g} s; times must increase"
         )
     return times.tolist(), values.tolist()
-
-
-def names(path: Path) -> list[str]:
-    """Names in the heading of a CSV file, without their units."""
-    try:
-        with check_file(path, csvfile.LARGEST).open(newline="", encoding="utf-8-sig") as file:
-            return [csvfile.name_and_unit(cell)[0] for cell in next(csv.reader(file), [])]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None
 
 
 MotionTable = Annotated[

@@ -177,7 +177,7 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
     """Remedy for an unknown column: the nearest name, and how to leave the column out."""
     known = f"columns are {enumerated(names)}, each with its unit in brackets"
     if columns == 1:
-        return f"; separate columns with commas; {known}"
+        return f"; separate columns with commas, semicolons or tabs; {known}"
     plain = {re.sub(r"[^a-z]", "", one.lower()): one for one in names} | {"time": "t"}
     near = nearest(re.sub(r"[^a-z]", "", name.lower()), plain)
     meant = f": did you mean `{plain[near]}`? If" if near else "; if"
@@ -188,13 +188,10 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
 
 
 def read_csv(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
-    """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is
-    row 1) and the column."""
-    renamed = {of: heading for heading, of in known.headings.items()}
-    units = {renamed.get(name, name): UNITS[unit] for name, unit in known.units.items()}
-    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore)
-    values = {known.headings.get(heading, heading): x for heading, x in table.values.items()}
-    return check_table(Columns(path, values, table.rows, ignored=table.ignored), known)
+    """A table of numbers under `name [unit]`. Raises `ValueError` naming the row and the column."""
+    units = {name: UNITS[unit] for name, unit in known.units.items()}
+    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore, known.headings)
+    return check_table(Columns(path, table.values, table.rows, ignored=table.ignored), known)
 
 
 def read_trajectory(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:

@@ -1,0 +1,111 @@
+"""Tables of numbers as laboratories' programs write them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchsoft import csvfile
+from torchsoft.channels import UNITS
+
+KNOWN = {"t": UNITS["s"], "force": UNITS["N"], "x": UNITS["m"]}
+T, FORCE, X = [0.0, 0.5, 1.25], [1.5, -2.0, 3e3], [1e-3, 2e-3, 4e-3]
+
+PLAIN = "t [s],force [N],x [mm]\n0,1.5,1\n0.5,-2,2\n1.25,3e3,4\n"
+COMMAS = "t [s];force [kN];x [mm]\n0;0,0015;1\n0,5;-0,002;2\n1,25;3,0;4\n"
+SAME = {
+    "commas": (PLAIN, "utf-8"),
+    "a byte-order mark": (PLAIN, "utf-8-sig"),
+    "UTF-16": (PLAIN, "utf-16"),
+    "Windows": (PLAIN.replace("x [mm]", "x [µm]").replace(",1\n", ",1000\n")
+        .replace(",2\n", ",2000\n").replace(",4\n", ",4000\n"), "cp1252"),
+    "other ends of lines": (PLAIN.replace("\n", "\r\n"), "utf-8"),
+    "semicolons and decimal commas": (COMMAS, "utf-8"),
+    "tabs and decimal commas": (COMMAS.replace(";", "\t"), "utf-8"),
+    "semicolons and decimal points": (PLAIN.replace(",", ";"), "utf-8"),
+    "a preamble": ("Machine;Zwick\nDate: 2024-01-02, 3 rows\n\nOperator, x, y\n" + PLAIN, "utf-8"),
+    "a row of units": (PLAIN.replace("t [s],force [N],x [mm]", "t,force,x\ns,N,mm"), "utf-8"),
+    "a row of units in brackets":
+        (COMMAS.replace("t [s];force [kN];x [mm]", "t;force;x\n[s];[kN];(mm)"), "utf-8"),
+    "units of other names": (PLAIN.replace("t [s]", "t [sec]"), "utf-8"),
+    "quotes": ('"t [s]","force [N]","x [mm]"\n"0","1.5","1"\n0.5,-2,2\n1.25,3e3,4\n', "utf-8"),
+    "empty rows": (PLAIN.replace("\n0.5", "\n,,\n\n0.5"), "utf-8"),
+}  # fmt: skip
+
+
+def read(path: Path, **options) -> csvfile.Numbers:
+    return csvfile.read(path, KNOWN, lambda name, columns: f"; {columns} columns", **options)
+
+
+@pytest.mark.parametrize("form", SAME)
+def test_every_form_reads_the_same(form, tmp_path):
+    text, encoding = SAME[form]
+    path = tmp_path / "test.csv"
+    path.write_bytes(text.encode(encoding))
+    table = read(path)
+    for name, expected in (("t", T), ("force", FORCE), ("x", X)):
+        assert np.allclose(table.values[name], expected, rtol=1e-14)
+    lines = text.replace("\r\n", "\n").split("\n")
+    assert all(lines[row - 1].strip('"')[0].isdigit() for row in table.rows)
+
+
+def test_other_headings_and_columns_to_ignore(tmp_path):
+    path = tmp_path / "test.csv"
+    path.write_text("Zeit [s],Kraft [N],Temp,Weg [mm]\n0,1.5,20,1\n0.5,-2,x,2\n1.25,3e3,,4\n")
+    headings = {"Zeit": "t", "Kraft": "force", "Weg": "x"}
+    table = read(path, headings=headings, ignore=["Temp"])
+    assert table.ignored == ("Temp",)
+    assert np.allclose(table.values["x"], X)
+    assert read(path, headings={"Zeit": "t"}, ignore=None).ignored == ("Kraft", "Temp", "Weg")
+
+
+def test_workbooks(tmp_path):
+    from openpyxl import Workbook
+
+    path, book = tmp_path / "test.xlsx", Workbook()
+    sheet = book.create_sheet("Data")
+    for row in (["made by", None, None], ["t", "force", "x"], ["s", "N", "mm"], [None] * 3):
+        sheet.append(row)
+    for row in zip(T, FORCE, (1, 2, 4)):
+        sheet.append(row)
+    book.save(path)
+    table = read(path)
+    assert np.allclose(table.values["force"], FORCE)
+    assert (table.heading, table.rows) == (2, [5, 6, 7])
+    book.copy_worksheet(sheet)
+    book.save(path)
+    with pytest.raises(ValueError, match="a table in each of the sheets Data, Data Copy: keep one"):
+        read(path)
+
+
+BAD = {
+    "numbers before the heading": ("1,2,3\n" + PLAIN,
+        r"row 1 is of numbers, but stands before the heading in row 2"),
+    "both decimals": (COMMAS.replace("0,0015", "0.0015"), "decimal commas and decimal points"),
+    "thousands": (COMMAS.replace("3,0", "3.000,0"), r"row 4, column `force`: '3\.000,0' is not a"),
+    "no heading": ("0,1,2\n3,4,5\n", r"row 1, column `0` is not known; 3 columns"),
+    "an unknown unit": (PLAIN.replace("t [s],force [N],x [mm]", "t,force,x\ns,N,furlong"),
+        r"row 1, column `x` cannot be in 'furlong'; it can be in m, cm, mm"),
+    "no unit": (PLAIN.replace("x [mm]", "x"), r"row 1, column `x` has no unit: write `x \[m\]`"),
+    "nothing": ("", "test.csv is empty"),
+    "zeros": ("t [s]\0", "is not a table of text in UTF-8, UTF-16 or Windows-1252"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_told_is_refused(name, tmp_path):
+    text, message = BAD[name]
+    path = tmp_path / "test.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        read(path)
+
+
+def test_other_workbooks_are_refused(tmp_path):
+    for name, message in (
+        ("old.xls", "a workbook of an old Excel: save it as .xlsx or as CSV"),
+        ("no.xlsx", "no.xlsx is not an Excel workbook"),
+    ):
+        (tmp_path / name).write_bytes(b"\xd0\xcf\x11\xe0")
+        with pytest.raises(ValueError, match=message):
+            read(tmp_path / name)
