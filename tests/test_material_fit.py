@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from torchsoft.cli import main
-from torchsoft.materials.fit import Fit, Measured, faded, fit, read, responses
+from torchsoft.materials.fit import Fit, fit
+from torchsoft.materials.measured import Measured, faded, read, responses
 from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.materials.written import FILES
 from torchsoft.physics.material import KINDS, GeneralisedKelvin, Prony
@@ -245,8 +246,8 @@ REFUSED: dict[str, tuple[dict[str, Array], dict[str, Any], str]] = {
         "but has strain and stretch"
     ),
     "no time": ({"strain_[1]": ONES, "stress_[Pa]": ONES}, {}, "has no column `t`"),
-    "another unit": ({"t_[s]": COUNT, "modulus_[psi]": ONES}, {},
-        "column `modulus` cannot be in 'psi'; it can be in Pa, kPa"),
+    "another unit": ({"t_[s]": COUNT, "modulus_[bar]": ONES}, {},
+        "column `modulus` cannot be in 'bar'; it can be in Pa, kPa"),
     "unknown column": ({"t_[s]": COUNT, "E_[Pa]": ONES}, {},
         "row 1, column `E` is not known; columns and their units"),
     "negative time": ({"t_[s]": COUNT - 1, "modulus_[Pa]": ONES}, {},
@@ -320,7 +321,9 @@ def test_the_command_writes_a_table_a_summary_and_a_figure(make, tmp_path, capsy
     text, err = capsys.readouterr()
     assert err == ""
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
-    found: Fit = fit(read(file))
+    test = read(file)
+    assert isinstance(test, Measured)
+    found: Fit = fit(test)
     made = tomllib.loads((out / "material.toml").read_text(encoding="utf-8"))["materials"][
         "my rubber"
     ]

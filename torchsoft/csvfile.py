@@ -63,8 +63,15 @@ def read(
     headings: Mapping[str, str] | None = None,
 ) -> Numbers:
     """The columns `known` of a file, without those that are to be ignored; None ignores all others.
-    `headings` are names of columns in the file in place of those that are known. Raises `ValueError`, and `OSError`."""
+    `headings` are names of columns in the file in place of those that are known. Raises
+    `ValueError`, and `OSError`."""
     headings = headings or {}
+    for written, name in headings.items():
+        if name not in known:
+            raise ValueError(
+                f"{path}: the column {shown(written)} stands for `{line(name, 80)}`, which is not "
+                f"known{hint(written, 2)}"
+            )
     names = {name: name for name in known.keys() - headings.values()} | dict(headings)
     places, comma = table(path, {*names, *(ignore or ())})
     if not places:
@@ -215,7 +222,7 @@ def heading(
         written, unit = name_and_unit(cell)
         where = f"{row}, column `{line(written, 80)}`"
         name = names.get(written)
-        if ignore is None and name is None or ignore is not None and written in ignore:
+        if name is None if ignore is None else written in ignore:
             out.append(None)
             continue
         if name is None:

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from torchsoft import Parameters, Profile, Prony, Reference, SoftGrasp, rest, simulate
-from torchsoft.materials.fit import fit, read
+from torchsoft.materials.fit import fit
+from torchsoft.materials.measured import Measured, read
 
 # a file as a laboratory writes it: 2 % of strain held from t = 0 on, stress with 0.5 % of noise
 rng, seconds = np.random.default_rng(1), np.geomspace(1e-2, 30.0, 200)
@@ -24,7 +25,9 @@ path = Path(tempfile.mkdtemp()) / "relaxation.csv"
 rows = [f"{a:.6g},2,{1e-3 * b:.6g}" for a, b in zip(seconds, stress)]
 path.write_text("\n".join(["t [s],strain [%],stress [kPa]", *rows]), encoding="utf-8")
 
-found = fit(read(path))
+test = read(path)
+assert isinstance(test, Measured)
+found = fit(test)
 for name, value in found.values.items():
     print(f"{name:6s} = {value:10.4g}  +- {found.sd[name] / value:.1%}")
 rubber = found.material(nu=0.45, rho=1100.0, depth=44e-3)

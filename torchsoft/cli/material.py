@@ -2,21 +2,29 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchsoft.cli.results import add_command, add_out, say, try_folder
 
-MATERIAL_FIT = """\
-Which material relaxes, or creeps, as this one did?
+if TYPE_CHECKING:
+    from torchsoft.materials.deck import Deck
+    from torchsoft.materials.fit import Fit
+    from torchsoft.materials.modulus import Modulus
 
-FILE.csv has the column `t` [s, ms, min, h], counted from when the load was put on, and one pair
-of these, each with its unit in the heading: `strain` [1, %], `stretch` [1] or `elongation` [m,
-mm, ...] with `stress` [Pa, kPa, MPa] or `force` [N, ...], nominal and along the one direction of
-the test; or alone `modulus` [Pa, ...], of a strain put on at t = 0 and held, or `compliance`
-[1/Pa, ...], of such a stress. The whole history counts: ramps need not be cut off. Fits a
-relaxation series (prony) to a relaxation test, a generalised Kelvin chain to a creep test, and
-says what the rows do not tell. Writes material.toml, with the names of the constructor's
-arguments, summary.json and fit.png."""
+MATERIAL_FIT = """\
+Which material did this, in a test or in a deck of finite elements?
+
+FILE is a table (CSV, or an Excel workbook) whose headings have units, `stress [MPa]`, in any
+order: over time `t` with one of `strain`, `stretch`, `elongation` and one of `stress`, `force`,
+nominal and along the one direction of the test; or `t` with `modulus` or `compliance` alone, of a
+strain or a stress put on at t = 0 and held; a frequency sweep `frequency` with `storage_modulus`
+and `loss_modulus`, or `storage_shear_modulus` and `loss_shear_modulus`, or `tan_delta` as the
+second; a pull without `t`, of which --range says the strains that its modulus is of. Or a deck,
+FILE.inp, with *VISCOELASTIC, TIME=PRONY. The whole history counts: ramps need not be cut off.
+
+A relaxation test and a sweep give a relaxation series (prony), a creep test a generalised Kelvin
+chain, a pull a modulus (kelvin_voigt). Says what the rows do not tell. Writes material.toml, with
+the names of the constructor's arguments, summary.json and fit.png."""
 
 PRESETS = """\
 Rubbers from the literature, every coefficient marked `published`, with where, or `assumed`."""
@@ -28,57 +36,123 @@ def add_commands(commands: Any) -> None:
         "material", help="fit a material to a test, or list some", description="Materials of pads."
     )
     commands = material.add_subparsers(required=True, metavar="COMMAND")
-    help = "fit a material to a relaxation or creep test"
+    help = "fit a material to a test"
     one = add_command(commands, "fit", fit_material, help, MATERIAL_FIT)
-    one.add_argument("file", type=Path, metavar="FILE.csv", help="the test")
+    one.add_argument("file", type=Path, metavar="FILE", help="the test, or the deck")
     add_out(one, "material")
     one.add_argument(
         "--test",
-        choices=("relaxation", "creep"),
-        help="what was put on: strain, or stress (what was held)",
+        choices=("relaxation", "creep", "tension", "compression", "sweep"),
+        help="what was put on: strain, or stress, a pull or a compression, frequencies (by the "
+        "columns, and by what was held)",
     )
     one.add_argument("--terms", type=int, help="terms of the series (as many as the data call for)")
+    for name, meaning in SIZES.items():
+        one.add_argument(f"--{name}", type=float, help=meaning)
     one.add_argument(
-        "--length", type=float, help="gauge length [m], which `elongation` is divided by"
-    )
+        "--range", type=float, nargs=2, metavar=("LOW", "HIGH"),
+        help="strains [1] between which the modulus of a pull is taken",
+    )  # fmt: skip
     one.add_argument(
-        "--area", type=float, help="cross-section before the test [m2], which `force` is divided by"
+        "--column", action="append", default=[], metavar="NAME=HEADING",
+        help="the heading in the file of a column, as force=Standardkraft; again for others",
+    )  # fmt: skip
+    one.add_argument(
+        "--ignore", action="append", default=[], metavar="HEADING",
+        help="a column to leave out; again for others",
+    )  # fmt: skip
+    one.add_argument(
+        "--unit", choices=("Pa", "kPa", "MPa", "GPa", "psi"), help="unit of a deck's stresses"
     )
-    for name, meaning in (
-        ("nu", "Poisson's ratio [1]"),
-        ("rho", "density [kg/m3]"),
-        ("depth", "depth of the pads [m]"),
-    ):
-        one.add_argument(
-            f"--{name}",
-            type=float,
-            help=f"{meaning}, which the test does not tell (as the paper's pads)",
-        )
+    one.add_argument("--name", help="which material of a deck")
+    for name, meaning in ASSUMED.items():
+        one.add_argument(f"--{name}", type=float, help=f"{meaning} (as the paper's pads)")
     add_command(commands, "presets", list_presets, "list rubbers from the literature", PRESETS)
 
 
+SIZES = {
+    "length": "gauge length [m], which `elongation` is divided by",
+    "area": "cross-section before the test [m2], which `force` is divided by",
+}
+ASSUMED = {
+    "nu": "Poisson's ratio [1], which no test in one dimension tells",
+    "rho": "density [kg/m3], which no test tells",
+    "depth": "depth of the pads [m]",
+    "tau": "retardation time [s], which a pull does not tell",
+}
+
+
 def fit_material(options: argparse.Namespace) -> int:
-    """Fit a material to a test, and write the result."""
-    from torchsoft.materials.fit import fit, read
+    """Read a material from a test or a deck, and write it."""
     from torchsoft.materials.written import FILES, printed, write
     from torchsoft.paper.parameters import Parameters
 
-    settings = {name: getattr(options, name) for name in ("test", "length", "area")}
-    given = {name: getattr(options, name) for name in ("nu", "rho", "depth")}
-    pad = (
-        Parameters().override({f"pad.{name}": x for name, x in given.items() if x is not None}).pad
-    )
-    found = fit(read(options.file, **settings), terms=options.terms)
+    given = {name: getattr(options, name) for name in ASSUMED}
+    changes = {f"pad.{name}": x for name, x in given.items() if x is not None}
+    pad = Parameters().override(changes).pad
+    found = deck(options) if options.file.suffix.lower() == ".inp" else tested(options, pad.nu)
+    assumed = {
+        name: getattr(pad, name)
+        for name in ASSUMED
+        if name not in found.table() and (name != "tau" or found.kind == "kelvin_voigt")
+    }
+    for name, value in given.items():
+        if value is not None and name not in assumed:
+            raise ValueError(f"{options.file}: it tells {name} itself: leave --{name} out")
     try_folder(options.out, options.force)
-    write(
-        found,
-        options.out,
-        {name: getattr(pad, name) for name in given},
-        {**settings, "terms": options.terms, **given},
-    )
+    told = {name: x for name, x in vars(options).items() if name in OPTIONS}
+    write(found, options.out, assumed, told)
     say(printed(found))
     say(f"written to {', '.join(str(options.out / name) for name in FILES)}")
     return 0
+
+
+OPTIONS = ("test", "terms", *SIZES, "range", "column", "ignore", "unit", "name", *ASSUMED)
+"""Options that say how a file is read."""
+
+
+def deck(options: argparse.Namespace) -> "Deck":
+    """The material of a deck. Raises `ValueError`."""
+    from torchsoft.materials.deck import read_deck
+    from torchsoft.materials.measured import PRESSURE
+
+    for name in ("test", "terms", *SIZES, "range", "column", "ignore"):
+        if getattr(options, name):
+            raise ValueError(f"{options.file}: a deck needs no --{name}")
+    if options.unit is None:
+        raise ValueError(
+            f"{options.file}: a deck has no units: say that of its stresses, --unit MPa"
+        )
+    return read_deck(options.file, unit=PRESSURE[options.unit], name=options.name)
+
+
+def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus":
+    """The material of a test. Raises `ValueError`."""
+    from torchsoft.materials.fit import fit
+    from torchsoft.materials.measured import Pull, read
+    from torchsoft.materials.modulus import modulus
+
+    for name in ("unit", "name"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"{options.file}: --{name} is of decks, FILE.inp")
+    pairs = [one.partition("=")[::2] for one in options.column]
+    if not all(name and heading for name, heading in pairs):
+        raise ValueError("--column must be NAME=HEADING, as force=Standardkraft")
+    test = read(
+        options.file,
+        test=options.test,
+        length=options.length,
+        area=options.area,
+        nu=nu,
+        strains=None if options.range is None else tuple(options.range),
+        headings={heading: name for name, heading in pairs},
+        ignore=options.ignore,
+    )
+    if not isinstance(test, Pull):
+        return fit(test, terms=options.terms)
+    if options.terms is not None:
+        raise ValueError(f"{options.file}: a pull gives a modulus, and no --terms")
+    return modulus(test)
 
 
 def list_presets(options: argparse.Namespace) -> int:

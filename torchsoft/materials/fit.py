@@ -1,234 +1,21 @@
-"""Relaxation and creep tests, and the materials fitted to them: nonnegative least squares on a grid
-of times, then the times themselves.
+"""Relaxation series and chains of Kelvin elements fitted to tests: nonnegative least squares on a
+grid of times, then the times themselves.
 
-A relaxation test gives a relaxation series (`Prony`), a creep test a chain of Kelvin elements
-(`GeneralisedKelvin`), in how many terms Schwarz's criterion (BIC) says. Residuals count relative to
-the largest response, or to the response of each row (`Measured.relative`).
+A relaxation test and a frequency sweep give a relaxation series (`Prony`), a creep test a chain of
+Kelvin elements (`GeneralisedKelvin`), in how many terms Schwarz's criterion (BIC) says. Residuals
+count relative to the largest response, or to the response of each row (`Measured.relative`).
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
-from torchsoft import csvfile
-from torchsoft.channels import UNITS
-from torchsoft.physics.arguments import positive
+from torchsoft.materials.measured import SMALL_STRAIN, Array, Measured, Spectrum
 from torchsoft.physics.material import INSTANT, KINDS, Material
-
-# Relaxation and creep tests in one dimension: strain and nominal stress over time, read from CSV
-# files in SI units.
-#
-# A file has the column `t` and one pair of these, each with its unit in the heading: `strain`,
-# `stretch` or `elongation` with `stress` or `force`; or `modulus` alone, the stress over a strain
-# put on at t = 0 and held; or `compliance` alone, the strain over a stress held so.
-
-
-Array = NDArray[np.float64]
-
-Test = Literal["relaxation", "creep"]
-"""The controlled quantity: strain, so that the stress relaxes; or stress, so that the strain
-creeps."""
-
-PRESSURE = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9}
-KNOWN: dict[str, csvfile.Units] = {
-    "t": {**UNITS["s"], "min": 60.0, "h": 3600.0},
-    "strain": {"1": 1.0, "%": 1e-2},
-    "stretch": {"1": 1.0},
-    "elongation": UNITS["m"],
-    "stress": PRESSURE,
-    "force": UNITS["N"],
-    "modulus": PRESSURE,
-    "compliance": {f"1/{unit}": 1 / size for unit, size in PRESSURE.items()},
-}
-"""Columns, and the units that each may have."""
-
-LEAST = 8
-"""Rows that a file needs."""
-
-DECADE = 10.0
-"""Ratio of the largest to the smallest response above which residuals count relative to each."""
-
-FLOWING = 0.8
-"""Power of time above which creep at the end of a test is a flow: 1 is a dashpot's."""
-
-SMALL_STRAIN = 0.1
-"""Strain up to which a linear material is taken at its word."""
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A test: times t (n,) [s] since the load was put on, strain (n,) [1], nominal stress (n,)
-    [Pa], and which of them was controlled.
-
-    Between rows the controlled quantity is linear in time; it begins at t = 0 with a step to its
-    value in the first row. Both may be `per_load`, divided by a controlled quantity that is
-    unknown.
-    """
-
-    path: Path
-    test: Test
-    t: Array
-    strain: Array
-    stress: Array
-    per_load: bool = False
-
-    @property
-    def driven(self) -> Array:
-        """Controlled quantity (n,)."""
-        return self.strain if self.test == "relaxation" else self.stress
-
-    @property
-    def answer(self) -> Array:
-        """Measured response (n,)."""
-        return self.stress if self.test == "relaxation" else self.strain
-
-    @property
-    def window(self) -> tuple[float, float]:
-        """The shortest and the longest time [s] that the rows resolve: that of two neighbouring
-        intervals, so that one odd row counts for nothing, and all of the test."""
-        intervals = np.diff(self.t, prepend=0.0)
-        intervals = intervals[intervals > 0]
-        return float(np.maximum(intervals[1:], intervals[:-1]).min()), float(self.t[-1])
-
-    @property
-    def relative(self) -> bool:
-        """Whether residuals count relative to the response at each row: of a modulus or a
-        compliance that spans more than a decade, so that the series is as good at all times."""
-        least, most = self.answer.min(), self.answer.max()
-        return self.per_load and bool(most > DECADE * least > 0)
-
-    @property
-    def size(self) -> Array:
-        """Response (n,) that residuals are relative to."""
-        size = np.abs(self.answer)
-        return size if self.relative else np.full_like(size, size.max())
-
-    @property
-    def flows(self) -> bool:
-        """Whether strain goes on in proportion to time under a held stress at the end."""
-        if self.test == "relaxation" or np.ptp(self.stress[len(self.t) // 2 :]) > 0:
-            return False
-        half = np.interp(0.5 * self.t[-1], self.t, self.strain)
-        return bool(self.strain[-1] > 2**FLOWING * half)
-
-
-def read(
-    path: str | Path,
-    *,
-    test: Test | None = None,
-    length: float | None = None,
-    area: float | None = None,
-) -> Measured:
-    """The test in a CSV file. `length` [m] is the gauge length, which elongations are divided by,
-    `area` [m2] the cross-section before the test, for forces. Without `test`, the controlled one of
-    strain and stress is that which changes less over the second half of the rows. Raises
-    `ValueError` naming file, row and column, and `OSError`.
-    """
-    path = Path(path)
-    table = csvfile.read(path, KNOWN, hint)
-    values = table.values
-    check_rows(path, table)
-    if (alone := {"modulus", "compliance"} & values.keys()) and len(values) > 2:
-        raise ValueError(
-            f"{path}: `{min(alone)}` stands alone beside `t`, but there is {', '.join(values)}"
-        )
-    one = np.ones_like(values["t"])
-    if alone:
-        own: Test = "relaxation" if alone == {"modulus"} else "creep"
-        if test not in (None, own):
-            raise ValueError(f"{path}: `{min(alone)}` is of a {own} test, not of a {test} test")
-        for name, given in (("length", length), ("area", area)):
-            if given is not None:
-                raise ValueError(f"{path}: nothing is to be divided by the `{name}`")
-        strain, stress = (
-            (one, values["modulus"]) if own == "relaxation" else (values["compliance"], one)
-        )
-        return Measured(path, own, values["t"], strain, stress, per_load=True)
-    gauge = "an elongation needs the gauge length, `length` [m]"
-    section = "a force needs the cross-section, `area` [m2]"
-    strain = nominal(path, values, ("strain", "stretch", "elongation"), "length", length, gauge)
-    stress = nominal(path, values, ("stress", "force"), "area", area, section)
-    for name, x in (("strain", strain), ("stress", stress)):
-        if not np.abs(x).max() > 0:
-            raise ValueError(f"{path}: the {name} is zero throughout")
-    if float(strain @ stress) <= 0:
-        raise ValueError(
-            f"{path}: strain and stress are opposite; is one of them positive in compression?"
-        )
-    return Measured(path, test or held(strain, stress), values["t"], strain, stress)
-
-
-def held(strain: Array, stress: Array) -> Test:
-    """The test, by the quantity that changes less, relative to its largest value, in the second
-    half of the rows."""
-    late = slice(len(strain) // 2, None)
-    change = [np.ptp(x[late]) / np.abs(x).max() for x in (strain, stress)]
-    return "relaxation" if change[0] <= change[1] else "creep"
-
-
-def nominal(
-    path: Path,
-    values: dict[str, Array],
-    names: tuple[str, ...],
-    option: str,
-    size: float | None,
-    needs: str,
-) -> Array:
-    """Nominal strain [1] or stress [Pa] (n,) from the one of the columns `names` that is there, the
-    last over `size`. Raises `ValueError` unless it is given in one way."""
-    there = [name for name in names if name in values]
-    if len(there) != 1:
-        found = f"has {' and '.join(there)}" if there else "has none of them"
-        raise ValueError(f"{path} needs one of the columns {', '.join(names)}, but {found}")
-    (name,), divided = there, there[0] == names[-1]
-    if (size is not None) != divided:
-        raise ValueError(f"{path}: {needs if size is None else f'`{name}` needs no `{option}`'}")
-    if divided:
-        return values[name] / positive(option, size)
-    return values[name] - 1.0 if name == "stretch" else values[name]
-
-
-def check_rows(path: Path, table: csvfile.Numbers) -> None:
-    """Raises `ValueError` for too few rows, empty cells, and times that do not grow from zero."""
-    if "t" not in table.values:
-        raise ValueError(f"{path} has no column `t`{hint('t', 2)}")
-    if len(table.rows) < LEAST:
-        raise ValueError(
-            f"{path} has {len(table.rows)} rows of numbers, but needs at least {LEAST}"
-        )
-    for name, column in table.values.items():
-        if (empty := np.flatnonzero(np.isnan(column))).size:
-            raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
-    t = table.values["t"]
-    if t[0] < 0:
-        raise ValueError(
-            f"{path}, row {table.rows[0]}, column `t`: {t[0]:g} s is before the load; count times "
-            "from it"
-        )
-    if (back := np.flatnonzero(np.diff(t) <= 0)).size:
-        i = back[0] + 1
-        raise ValueError(
-            f"{path}, row {table.rows[i]}, column `t`: {t[i]:g} s is not after {t[i - 1]:g} s"
-        )
-
-
-def hint(name: str, columns: int) -> str:
-    """Remedy for an unknown column."""
-    known = "; ".join(f"{column} [{', '.join(units)}]" for column, units in KNOWN.items())
-    return (
-        f"{'; separate columns with commas' if columns == 1 else ''}; columns and their units are "
-        f"{known}"
-    )
-
-
-# Fit
-
 
 GRID = 10
 """Times a decade of the grid that fits begin on."""
@@ -266,6 +53,9 @@ ROUNDING = 1e-12
 INSTANT_PART = 0.1
 """Largest retardation time of the instantaneous spring, over the shortest time of the series."""
 
+SWEPT_PART = 0.01
+"""That time over the shortest one of a sweep."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -277,7 +67,7 @@ class Fit:
     correlation leaves.
     """
 
-    measured: Measured
+    measured: Measured | Spectrum
     values: Mapping[str, float]
     sd: Mapping[str, float]
     fitted: Array
@@ -288,7 +78,7 @@ class Fit:
     @property
     def kind(self) -> str:
         """Kind of the material in files."""
-        return "prony" if self.measured.test == "relaxation" else "generalised_kelvin"
+        return "generalised_kelvin" if self.measured.test == "creep" else "prony"
 
     @property
     def terms(self) -> int:
@@ -316,6 +106,8 @@ class Fit:
         tau = [self.values[f"tau_{k}"] for k in numbers]
         strengths = [self.values[f"{symbol}_{k}"] for k in numbers]
         instant = min(INSTANT, INSTANT_PART * min(tau))
+        if isinstance(self.measured, Spectrum):  # its dashpot adds omega tau_instant to the loss
+            instant = min(instant, SWEPT_PART * self.measured.window[0])
         return {"E": self.values["E"], argument: strengths, "tau": tau, "tau_instant": instant}
 
     def material(self, *, nu: float, rho: float, depth: float) -> Material:
@@ -340,11 +132,11 @@ class Trial(NamedTuple):
         return n * math.log(max(float(self.r @ self.r) / n, ROUNDING**2)) + parameters * math.log(n)
 
 
-def fit(measured: Measured, *, terms: int | None = None) -> Fit:
+def fit(measured: Measured | Spectrum, *, terms: int | None = None) -> Fit:
     """The series with the least criterion, or with as many `terms` as asked for. Raises
     `ValueError` where the rows are too few for these, or tell no modulus that remains."""
     shortest, longest = measured.window
-    most = min(MOST, 2 + int(math.log10(longest / shortest)), (len(measured.t) - 2) // 2)
+    most = min(MOST, 2 + int(math.log10(longest / shortest)), (len(measured.answer) - 2) // 2)
     if terms is not None and not 1 <= terms <= most:
         raise ValueError(
             f"`terms` must be from 1 to {most} for what {measured.path} resolves, but is {terms}"
@@ -369,7 +161,7 @@ def fit(measured: Measured, *, terms: int | None = None) -> Fit:
     return concluded(measured, tried[best], {count: trial.score for count, trial in tried.items()})
 
 
-def beginnings(measured: Measured, count: int) -> list[Array]:
+def beginnings(measured: Measured | Spectrum, count: int) -> list[Array]:
     """Times [s] that a fit may begin with: spread evenly over the decades, and where nonnegative
     least squares on the grid finds them, neighbours put together until so many are left."""
     low, high = (math.log(x) for x in measured.window)
@@ -385,22 +177,22 @@ def beginnings(measured: Measured, count: int) -> list[Array]:
     return [np.exp(x) for x in (even, *own)]
 
 
-def coefficients(measured: Measured, tau: Array) -> Array:
+def coefficients(measured: Measured | Spectrum, tau: Array) -> Array:
     """Nonnegative coefficients (1 + terms,) of the series with given times."""
     size = measured.size
-    A = responses(measured.test, measured.t, measured.driven, tau) / size[:, None]
+    A = measured.responses(tau) / size[:, None]
     scale = np.abs(A).max(0)
     return nnls(A / scale, measured.answer / size, maxiter=PASSES * len(scale))[0] / scale
 
 
-def refined(measured: Measured, tau: Array) -> Trial | None:
+def refined(measured: Measured | Spectrum, tau: Array) -> Trial | None:
     """The least-squares fit from these times on, within what the rows resolve; None where a term,
     or the modulus that remains, vanishes."""
     size, (low, high) = measured.size, measured.window
     c, count = coefficients(measured, tau), len(tau)
 
     def weighted(tau: Array) -> Array:
-        return responses(measured.test, measured.t, measured.driven, tau) / size[:, None]
+        return measured.responses(tau) / size[:, None]
 
     scale = 1.0 / np.abs(weighted(tau)).max(0)
 
@@ -422,7 +214,7 @@ def refined(measured: Measured, tau: Array) -> Trial | None:
     close: Any = {"xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-12, "max_nfev": 300, "x_scale": "jac"}
     done = least_squares(residuals, z, slopes, bounds, **close)  # pyright: ignore[reportArgumentType]
     c, tau = done.x[: count + 1] * scale, np.exp(done.x[count + 1 :])
-    needed = c if measured.test == "relaxation" else c[1:]  # what creeps may have no spring
+    needed = c[1:] if measured.test == "creep" else c  # what creeps may have no spring
     if not (needed > VANISHED * c.sum()).all() or not done.success:
         return None
     order = np.argsort(tau)
@@ -430,7 +222,7 @@ def refined(measured: Measured, tau: Array) -> Trial | None:
     return Trial(c[own], scale[own], tau[order], done.fun, done.jac[:, every])
 
 
-def concluded(measured: Measured, best: Trial, scores: Mapping[int, float]) -> Fit:
+def concluded(measured: Measured | Spectrum, best: Trial, scores: Mapping[int, float]) -> Fit:
     """Values and standard deviations, and the combinations that the data cannot constrain."""
     names, values, G = named(measured, best)
     correlation = (
@@ -453,12 +245,12 @@ def concluded(measured: Measured, best: Trial, scores: Mapping[int, float]) -> F
     )
 
 
-def named(measured: Measured, best: Trial) -> tuple[list[str], Array, Array]:
+def named(measured: Measured | Spectrum, best: Trial) -> tuple[list[str], Array, Array]:
     """Names and values of the material's coefficients, and their slopes by those of the trial."""
     count = len(best.tau)
     G = np.zeros((1 + 2 * count, 1 + 2 * count))
     G[1 + count :, 1 + count :] = np.diag(best.tau)
-    if measured.test == "relaxation":
+    if measured.test != "creep":
         symbol, strengths = "E", best.c
         G[: 1 + count, : 1 + count] = np.diag(best.unit)
     else:  # E = 1 / sum of c, and J_k = c_k E
@@ -472,12 +264,12 @@ def named(measured: Measured, best: Trial) -> tuple[list[str], Array, Array]:
 
 
 def notices(
-    measured: Measured, values: Mapping[str, float], sd: Mapping[str, float],
+    measured: Measured | Spectrum, values: Mapping[str, float], sd: Mapping[str, float],
     scores: Mapping[int, float], correlation: float
 ) -> list[str]:  # fmt: skip
     """Sentences on unidentifiable coefficients, and on assumptions."""
     (shortest, longest), terms = measured.window, (len(values) - 1) // 2
-    verb = "relaxes" if measured.test == "relaxation" else "creeps"
+    verb = "creeps" if measured.test == "creep" else "relaxes"
     sentences = [
         f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not tell what "
         f"{verb} faster, and what {verb} slower counts to the relaxed modulus E, which may be "
@@ -511,8 +303,8 @@ def notices(
             "series, or the theory, misses something; the standard deviations count as many rows "
             "as that leaves independent, and are too small still"
         )
-    largest = float(np.abs(measured.strain).max())
-    if measured.per_load:
+    largest = measured.largest_strain
+    if largest is None:
         sentences.append(
             "the file does not say how large the strain was: the material is linear, and holds for "
             "small ones"
@@ -523,27 +315,3 @@ def notices(
             "at that strain, and rubber that is stretched less is another one"
         )
     return sentences
-
-
-def faded(t: Array, x: Array, tau: Array) -> Array:
-    """The integral of exp(-(t - s) / tau) x'(s) over the past s, (n, terms), at times t (n,) [s] >=
-    0 of a history x (n,) that steps to x[0] at t = 0, for times tau (terms,) [s]."""
-    intervals = np.diff(t, prepend=0.0)[:, None] / tau
-    a = np.exp(-intervals)
-    slow = np.where(
-        intervals > 0, -np.expm1(-intervals) / np.where(intervals > 0, intervals, 1.0), 1.0
-    )
-    b = np.diff(x, prepend=x[0])[:, None] * slow
-    b[0] = x[0] * a[0]
-    step = 1  # h_i = a_i h_{i-1} + b_i, twice as many terms summed in every pass
-    while step < len(t):
-        b[step:], a[step:] = b[step:] + a[step:] * b[:-step], a[step:] * a[:-step]
-        step *= 2
-    return b
-
-
-def responses(test: str, t: Array, x: Array, tau: Array) -> Array:
-    """Response to each coefficient (n, 1 + terms): of a relaxation series E, E_i [Pa] to the stress
-    under the strain x; of a creep series J_0, J_i [1/Pa] to the strain under the stress x."""
-    h = faded(t, x, tau)
-    return np.column_stack((x, h if test == "relaxation" else x[:, None] - h))

@@ -12,7 +12,10 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from torchsoft.files import finite, save_text, write_json
+from torchsoft.materials.deck import Deck
 from torchsoft.materials.fit import Fit
+from torchsoft.materials.measured import Spectrum
+from torchsoft.materials.modulus import Modulus
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, new_figure, save
 from torchsoft.plot.scene import INK
 from torchsoft.tables import toml_row
@@ -34,74 +37,146 @@ FILES = ("material.toml", "summary.json", "fit.png")
 """Files that are written."""
 
 
+Found = Fit | Modulus | Deck
+"""A material that a file tells."""
+
+
 def write(
-    fit: Fit, folder: Path, assumed: Mapping[str, float], options: Mapping[str, object]
+    found: Found, folder: Path, assumed: Mapping[str, float], options: Mapping[str, object]
 ) -> None:
-    """Write `FILES`. `assumed` are nu, rho and depth, which a test in one dimension does not tell;
-    `options` are those of the command. Each file appears whole or not at all."""
-    save_text(folder / "material.toml", toml(fit, assumed))
-    write_json(folder / "summary.json", summary(fit, assumed, options))
-    save(fitted(fit), folder / "fit.png")
+    """Write `FILES`. `assumed` are coefficients that the file does not tell; `options` are those of
+    the command. Each file appears whole or not at all."""
+    save_text(folder / "material.toml", toml(found, assumed))
+    write_json(folder / "summary.json", summary(found, assumed, options))
+    save(drawn(found), folder / "fit.png")
 
 
-def toml(fit: Fit, assumed: Mapping[str, float]) -> str:
+def source(found: Found) -> tuple[Path, str]:
+    """File, and kind of test."""
+    of = found if isinstance(found, Deck) else found.measured
+    return of.path, of.test
+
+
+def toml(found: Found, assumed: Mapping[str, float]) -> str:
     """The material as a table with the names of the constructor's arguments, with its origin and
     its limits in comments."""
-    name = fit.measured.path.stem
-    key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-    rows = [f"[materials.{key}]", f'kind = "{fit.kind}"']
-    for argument, value in fit.table().items():
+    path, test = source(found)
+    key = path.stem if re.fullmatch(r"[A-Za-z0-9_-]+", path.stem) else json.dumps(path.stem)
+    rows = [f"[materials.{key}]", f'kind = "{found.kind}"']
+    for argument, value in found.table().items():
         note = ", small: the instantaneous spring's" if argument == "tau_instant" else ""
         rows.append(toml_row(argument, value, f"[{UNITS[argument]}]{note}"))
     rows += [
-        toml_row(name, value, f"[{UNITS[name]}] not of this test: assumed")
+        toml_row(name, value, f"[{UNITS[name]}] not of this {test}: assumed")
         for name, value in assumed.items()
     ]
-    head = [
-        f"Fitted to {fit.measured.path.name} ({fit.measured.test} test) by torchsoft "
-        f"{version('torchsoft')}.",
-        *fit.notices,
-    ]
+    head = [f"From {path.name} ({test}) by torchsoft {version('torchsoft')}.", *found.notices]
     return "\n".join([*(f"# {' '.join(text.split())}" for text in head), "", *rows]) + "\n"
 
 
 def summary(
-    fit: Fit, assumed: Mapping[str, float], options: Mapping[str, object]
+    found: Found, assumed: Mapping[str, float], options: Mapping[str, object]
 ) -> dict[str, object]:
     """Coefficients, their origin and the method, in SI units."""
-    m = fit.measured
+    path, test = source(found)
+    sd = {} if isinstance(found, Deck) else found.sd
     return {
         "made_by": {"torchsoft": version("torchsoft"), "command": "torchsoft material fit",
-        "options": dict(options)}, "data": {
-            "file": m.path.name, "sha256": sha256(m.path.read_bytes()).hexdigest(),
-            "rows": len(m.t), "test": m.test, "resolved_s": list(m.window),
-            "largest_strain": None if m.per_load else float(abs(m.strain).max()),
+        "options": dict(options)},
+        "data": {"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest(), "test": test},
+        "kind": found.kind,
+        "coefficients": {
+            name: finite({"value": x, **({"sd": sd[name]} if name in sd else {})})
+            for name, x in found.values.items()
         },
-        "method": "nonnegative least squares on a logarithmic grid of times, then least squares in "
-                  "strengths and times together; the number of terms by Schwarz's criterion (BIC)",
-        "kind": fit.kind,
-        "coefficients": {name: finite({"value": x, "sd": fit.sd[name]}) for name,
-        x in fit.values.items()}, "assumed": dict(assumed),
-        "criterion": {str(count): score for count, score in fit.scores.items()},
-        "residual_rms": fit.rms,
-        "residual_of": fit.residual_of,
-        "residual_correlation": fit.correlation,
-        "notices": list(fit.notices),
+        "assumed": dict(assumed),
+        "notices": list(found.notices),
+        **method(found),
     }  # fmt: skip
 
 
-def printed(fit: Fit) -> str:
+def method(found: Found) -> dict[str, object]:
+    """How the coefficients were found, and how well they fit."""
+    if isinstance(found, Deck):
+        return {"method": "as the deck has them", "material": found.name}
+    if isinstance(found, Modulus):
+        return {
+            "method": "slope of a straight line by least squares", "rows": len(found.fitted),
+            "strains": list(found.measured.strains), "slopes_at_ends": list(found.ends),
+            "residual_rms": found.rms, "residual_of": "of the largest",
+        }  # fmt: skip
+    m = found.measured
+    return {
+        "method": "nonnegative least squares on a logarithmic grid of times, then least squares in "
+                  "strengths and times together; the number of terms by Schwarz's criterion (BIC)",
+        "rows": len(m.t), "resolved_s": list(m.window), "largest_strain": m.largest_strain,
+        "criterion": {str(count): score for count, score in found.scores.items()},
+        "residual_rms": found.rms, "residual_of": found.residual_of,
+        "residual_correlation": found.correlation,
+    }  # fmt: skip
+
+
+def printed(found: Found) -> str:
     """The coefficients with 95 % intervals, and the notices."""
-    units = {"E": "Pa", "t": "s", "J": "1"}
+    units = {"E": "Pa", "t": "s", "J": "1", "n": "1"}
+    path, test = source(found)
+    if isinstance(found, Deck):
+        head, sd = f"material {found.name}, {found.kind} of {found.terms} terms", {}
+    elif isinstance(found, Modulus):
+        low, high = found.measured.strains
+        head = f"strains from {low:g} to {high:g}, residual {found.rms:.2%} of the largest"
+        sd = found.sd
+    else:
+        head = f"{found.kind} of {found.terms} terms, residual {found.rms:.2%} {found.residual_of}"
+        sd = found.sd
     rows = [
-        f"{name:<7}{value:<12.5g}{units[name[0]]:<3}+- {196 * fit.sd[name] / value:.2g} %"
-        for name, value in fit.values.items()
+        f"{name:<7}{value:<12.5g}{units[name[0]]:<3}"
+        + (f"+- {196 * sd[name] / value:.2g} %" if name in sd else "")
+        for name, value in found.values.items()
     ]
-    head = (
-        f"{fit.measured.path.name}: {fit.measured.test} test, {fit.kind} of {fit.terms} terms, "
-        f"residual {fit.rms:.2%} {fit.residual_of}"
+    notes = (f"note: {notice}" for notice in found.notices)
+    return "\n".join([f"{path.name}: {test}, {head}", *(row.rstrip() for row in rows), *notes])
+
+
+def drawn(found: Found) -> Figure:
+    """The figure of a material."""
+    if isinstance(found, Deck):
+        return series(found)
+    return line_of(found) if isinstance(found, Modulus) else fitted(found)
+
+
+@rc_context(STYLE)
+def series(deck: Deck) -> Figure:
+    """The relaxation modulus of a deck over time."""
+    tau = deck.listed("tau")
+    t = np.geomspace(min(tau) / 100, 100 * max(tau), 400)
+    figure = new_figure(f"{deck.path.name}: material {deck.name}, {deck.terms} terms", 9, 4)
+    axes = figure.subplots()
+    axes.plot(t, MPA * deck.relaxation(t), color=OTHER)
+    axes.plot(tau, MPA * deck.relaxation(np.array(tau)), "o", color=ACTUAL, label="times of terms")
+    axes.axhline(MPA * deck.values["E"], color=INK, lw=0.8, ls="--", label="relaxed")
+    axes.set(xscale="log", xlabel="time [s]", ylabel="relaxation modulus [MPa]", ylim=(0, None))
+    axes.legend()
+    return figure
+
+
+@rc_context(STYLE)
+def line_of(found: Modulus) -> Figure:
+    """Stress over strain with its line, and their difference."""
+    m, E = found.measured, found.values["E"]
+    figure = new_figure(f"{m.path.name}: {m.test}, E = {MPA * E:.4g} MPa", 9, 5.4)
+    data, left = figure.subplots(2, 1, height_ratios=(3, 1.4), sharex=True)
+    data.plot(
+        m.strain, MPA * m.stress, ".", color=INK, ms=4, label=f"measured, {len(m.strain)} rows"
     )
-    return "\n".join([head, *rows, *(f"note: {notice}" for notice in fit.notices)])
+    data.plot(m.strain, MPA * found.fitted, color=OTHER, label=f"line, residual {found.rms:.2%}")
+    data.set(ylabel="nominal stress [MPa]", title="a) stress")
+    data.legend()
+    left.axhline(0.0, color=OTHER)
+    left.plot(m.strain, MPA * (m.stress - found.fitted), ".", color=INK, ms=4)
+    left.set(xlabel="strain [1]", ylabel="residual [MPa]", title="b) measured less line")
+    figure.align_ylabels()
+    return figure
 
 
 @rc_context(STYLE)
@@ -110,28 +185,31 @@ def fitted(fit: Fit) -> Figure:
     intervals; times that the rows do not resolve are grey. The time axis is logarithmic: a row at t
     = 0 is left out."""
     m, relaxes = fit.measured, fit.kind == "prony"
-    seen = m.t > 0
+    swept = isinstance(m, Spectrum)
     quantity, per, scale = ("stress", "MPa", MPA) if relaxes else ("strain", "1", 1.0)
     if m.per_load:
         quantity, per, scale = (
             ("modulus", "MPa", MPA) if relaxes else ("compliance", "1/MPa", 1 / MPA)
         )
-    series = "relaxation series" if relaxes else "generalised Kelvin chain"
-    figure = new_figure(f"{m.path.name}: {m.test}, {series} of {fit.terms} terms", 9, 7.2)
+    name = "relaxation series" if relaxes else "generalised Kelvin chain"
+    figure = new_figure(f"{m.path.name}: {m.test}, {name} of {fit.terms} terms", 9, 7.2)
     data, left, spectrum = figure.subplots(3, 1, height_ratios=(3, 1.4, 2), sharex=True)
-    data.plot(
-        m.t[seen], scale * m.answer[seen], ".", color=INK, ms=4, label=f"measured, {len(m.t)} rows"
+    parts = ("storage", "loss") if swept else ("measured",)
+    rows = zip(
+        parts, ".x", *(np.split(x, len(parts)) for x in (m.answer, fit.fitted, fit.residual))
     )
-    data.plot(
-        m.t[seen],
-        scale * fit.fitted[seen],
-        color=OTHER,
-        label=f"fitted, residual {fit.rms:.2%} {fit.residual_of}",
-    )
+    for part, mark, answer, curve, residual in rows:
+        seen = m.t > 0
+        label = f"{part}, {len(m.t)} rows"
+        data.plot(m.t[seen], scale * answer[seen], mark, color=INK, ms=4, label=label)
+        label = f"fitted, residual {fit.rms:.2%} {fit.residual_of}" if part == parts[0] else None
+        data.plot(m.t[seen], scale * curve[seen], color=OTHER, label=label)
+        left.plot(m.t[seen], scale * residual[seen], mark, color=INK, ms=4)
     data.set(ylabel=f"{quantity} [{per}]", title=f"a) {quantity}")
+    if m.relative:
+        data.set(yscale="log")
     data.legend()
     left.axhline(0.0, color=OTHER)
-    left.plot(m.t[seen], scale * fit.residual[seen], ".", color=INK, ms=4)
     left.set(
         ylabel=f"residual [{per}]",
         title=f"b) measured less fitted, neighbours correlate by {fit.correlation:.2f}",
@@ -152,7 +230,7 @@ def fitted(fit: Fit) -> Figure:
     spectrum.set(
         xscale="log",
         yscale="log",
-        xlabel="time [s]",
+        xlabel="1 / circular frequency [s]" if swept else "time [s]",
         ylabel=f"${symbol}_i${unit}",
         title=f"c) terms; {kept}, relaxed",
     )

@@ -1,0 +1,412 @@
+"""Tests of rubber in one dimension, read from tables in SI units: relaxation and creep over time,
+frequency sweeps, pulls and compressions.
+
+A table has `t` with one of `strain`, `stretch` and `elongation` and one of `stress` and `force`; or
+with `modulus` alone, the stress over a strain put on at t = 0 and held, or `compliance` alone, the
+strain over a stress held so. A frequency sweep has `frequency` with storage and loss moduli, of
+tension or of shear; a pull needs no `t`.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchsoft import csvfile
+from torchsoft.channels import UNITS
+from torchsoft.physics.arguments import positive
+
+Array = NDArray[np.float64]
+
+Test = Literal["relaxation", "creep", "tension", "compression", "sweep"]
+"""The controlled quantity over time: strain, so that the stress relaxes; or stress, so that the
+strain creeps; a pull or a compression for a modulus; or a sweep over frequencies."""
+
+PRESSURE = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "psi": 6894.757293168}
+SWEPT = {"storage_modulus": "loss_modulus", "storage_shear_modulus": "loss_shear_modulus"}
+"""Storage modulus and loss modulus of a sweep, in tension or in shear."""
+
+KNOWN: dict[str, csvfile.Units] = {
+    "t": {**UNITS["s"], "h": 3600.0},
+    "strain": {"1": 1.0, "%": 1e-2},
+    "stretch": {"1": 1.0},
+    "elongation": UNITS["m"],
+    "stress": PRESSURE,
+    "force": UNITS["N"],
+    "modulus": PRESSURE,
+    "compliance": {f"1/{unit}": 1 / size for unit, size in PRESSURE.items()},
+    "frequency": {"Hz": 2 * np.pi, "kHz": 2e3 * np.pi, "rad/s": 1.0, "1/s": 1.0},
+    **dict.fromkeys((*SWEPT, *SWEPT.values()), PRESSURE),
+    "tan_delta": {"1": 1.0},
+}
+"""Columns, and the units that each may have."""
+
+LEAST = 8
+"""Rows that a file needs; of a sweep, which has two numbers in each, half as many."""
+
+HELD = 0.05
+"""Change over the second half of a test, relative to the largest value, up to which a quantity was
+held."""
+
+DECADE = 10.0
+"""Ratio of the largest to the smallest response above which residuals count relative to each."""
+
+FLOWING = 0.8
+"""Power of time above which creep at the end of a test is a flow: 1 is a dashpot's."""
+
+SMALL_STRAIN = 0.1
+"""Strain up to which a linear material is taken at its word."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A test: times t (n,) [s] since the load was put on, strain (n,) [1], nominal stress (n,)
+    [Pa], and which of them was controlled.
+
+    Between rows the controlled quantity is linear in time; it begins at t = 0 with a step to its
+    value in the first row. Both may be `per_load`, divided by a controlled quantity that is
+    unknown.
+    """
+
+    path: Path
+    test: Literal["relaxation", "creep"]
+    t: Array
+    strain: Array
+    stress: Array
+    per_load: bool = False
+
+    @property
+    def driven(self) -> Array:
+        """Controlled quantity (n,)."""
+        return self.strain if self.test == "relaxation" else self.stress
+
+    @property
+    def answer(self) -> Array:
+        """Measured response (n,)."""
+        return self.stress if self.test == "relaxation" else self.strain
+
+    @property
+    def largest_strain(self) -> float | None:
+        """Largest strain [1]; None where the table does not tell it."""
+        return None if self.per_load else float(np.abs(self.strain).max())
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """The shortest and the longest time [s] that the rows resolve: that of two neighbouring
+        intervals, so that one odd row counts for nothing, and all of the test."""
+        intervals = np.diff(self.t, prepend=0.0)
+        intervals = intervals[intervals > 0]
+        return float(np.maximum(intervals[1:], intervals[:-1]).min()), float(self.t[-1])
+
+    @property
+    def relative(self) -> bool:
+        """Whether residuals count relative to the response at each row: of a modulus or a
+        compliance that spans more than a decade, so that the series is as good at all times."""
+        least, most = self.answer.min(), self.answer.max()
+        return self.per_load and bool(most > DECADE * least > 0)
+
+    @property
+    def size(self) -> Array:
+        """Response (n,) that residuals are relative to."""
+        size = np.abs(self.answer)
+        return size if self.relative else np.full_like(size, size.max())
+
+    @property
+    def flows(self) -> bool:
+        """Whether strain goes on in proportion to time under a held stress at the end."""
+        if self.test == "relaxation" or np.ptp(self.stress[len(self.t) // 2 :]) > 0:
+            return False
+        half = np.interp(0.5 * self.t[-1], self.t, self.strain)
+        return bool(self.strain[-1] > 2**FLOWING * half)
+
+    def responses(self, tau: Array) -> Array:
+        """Response to each coefficient of a series of times tau (terms,) [s], (n, 1 + terms)."""
+        return responses(self.test, self.t, self.driven, tau)
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A frequency sweep: storage and loss modulus E', E'' (n,) [Pa] at circular frequencies (n,)
+    [1/s] that grow. `answer` (2n,) is of the one, then of the other; residuals are relative to
+    their absolute value |E*|."""
+
+    path: Path
+    omega: Array
+    storage: Array
+    loss: Array
+    test: Literal["sweep"] = "sweep"
+    per_load: bool = True
+    largest_strain: None = None
+    relative: bool = True
+    flows: bool = False
+
+    @property
+    def t(self) -> Array:
+        """Times (n,) [s] that the frequencies stand for."""
+        return 1.0 / self.omega
+
+    @property
+    def answer(self) -> Array:
+        return np.concatenate((self.storage, self.loss))
+
+    @property
+    def size(self) -> Array:
+        return np.tile(np.hypot(self.storage, self.loss), 2)
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """The shortest and the longest time [s], of the highest and the lowest frequency."""
+        return float(self.t.min()), float(self.t.max())
+
+    def responses(self, tau: Array) -> Array:
+        """Response to each coefficient of a series of times tau (terms,) [s], (2n, 1 + terms): i
+        omega tau / (1 + i omega tau) of E_i, its real part over its imaginary one."""
+        z = 1j * self.omega[:, None] * tau
+        z = np.column_stack((np.ones_like(self.omega, complex), z / (1 + z)))
+        return np.concatenate((z.real, z.imag))
+
+
+@dataclass(frozen=True)
+class Pull:
+    """A pull or a compression up to its largest strain: strain (n,) [1] and nominal stress (n,)
+    [Pa] in the direction of the load, the strains between which the modulus is asked for, and how
+    many rows after the largest strain are left out."""
+
+    path: Path
+    test: Literal["tension", "compression"]
+    strain: Array
+    stress: Array
+    strains: tuple[float, float]
+    unloading: int
+
+
+def read(
+    path: str | Path,
+    *,
+    test: Test | None = None,
+    length: float | None = None,
+    area: float | None = None,
+    nu: float | None = None,
+    strains: tuple[float, float] | None = None,
+    headings: Mapping[str, str] | None = None,
+    ignore: Collection[str] = (),
+) -> Measured | Spectrum | Pull:
+    """The test in a table. `length` [m] is the gauge length, which elongations are divided by,
+    `area` [m2] the cross-section before the test, for forces, `nu` Poisson's ratio, for moduli of
+    shear, `strains` [1] the range of a pull. `headings` are columns of other names, `ignore` those
+    to leave out.
+
+    Without `test` a table with `frequency` is a sweep, one without `t` a pull, and one over time
+    controls what it holds over the second half. Raises `ValueError` naming file, row and column,
+    or where none was held, and `OSError`.
+    """
+    path = Path(path)
+    table = csvfile.read(path, KNOWN, hint, ignore, headings)
+    values = table.values
+    check_rows(path, table)
+    if "frequency" in values:
+        for name, given in (("length", length), ("area", area), ("strains", strains)):
+            if given is not None:
+                raise ValueError(f"{path}: a sweep needs no `{name}`")
+        if test not in (None, "sweep"):
+            raise ValueError(f"{path}: `frequency` is of a sweep, not of a {test} test")
+        return sweep(path, values, nu)
+    if test == "sweep":
+        raise ValueError(f"{path} has no column `frequency`{hint('frequency', 2)}")
+    if alone := {"modulus", "compliance"} & values.keys():
+        if len(values) != 2 or "t" not in values:
+            raise ValueError(
+                f"{path}: `{min(alone)}` stands alone beside `t`, but there is {', '.join(values)}"
+            )
+        own: Test = "relaxation" if alone == {"modulus"} else "creep"
+        if test not in (None, own):
+            raise ValueError(f"{path}: `{min(alone)}` is of a {own} test, not of a {test} test")
+        for name, given in (("length", length), ("area", area)):
+            if given is not None:
+                raise ValueError(f"{path}: nothing is to be divided by the `{name}`")
+        one = np.ones_like(values["t"])
+        if own == "relaxation":
+            return Measured(path, "relaxation", values["t"], one, values["modulus"], True)
+        return Measured(path, "creep", values["t"], values["compliance"], one, True)
+    gauge = "an elongation needs the gauge length, `length` [m]"
+    section = "a force needs the cross-section, `area` [m2]"
+    strain = nominal(path, values, ("strain", "stretch", "elongation"), "length", length, gauge)
+    stress = nominal(path, values, ("stress", "force"), "area", area, section)
+    for name, x in (("strain", strain), ("stress", stress)):
+        if not np.abs(x).max() > 0:
+            raise ValueError(f"{path}: the {name} is zero throughout")
+    if float(strain @ stress) <= 0:
+        raise ValueError(
+            f"{path}: strain and stress are opposite; is one of them positive in compression?"
+        )
+    if test in ("tension", "compression"):
+        return pulled(path, test, strain, stress, strains)
+    if "t" not in values:
+        raise ValueError(
+            f"{path} has no column `t`: over time it would be a relaxation or a creep test; for a "
+            "modulus say test = tension or compression, and the range of strains"
+        )
+    if strains is not None:
+        raise ValueError(f"{path}: a range of strains is of a tension or a compression test")
+    return Measured(path, test or held(path, strain, stress), values["t"], strain, stress)
+
+
+def held(path: Path, strain: Array, stress: Array) -> Literal["relaxation", "creep"]:
+    """The test, by the quantity that changes less, relative to its largest value, in the second
+    half of the rows. Raises `ValueError` where both change."""
+    late = slice(len(strain) // 2, None)
+    change = [float(np.ptp(x[late]) / np.abs(x).max()) for x in (strain, stress)]
+    if min(change) > HELD:
+        raise ValueError(
+            f"{path}: neither strain nor stress was held, they change by {change[0]:.0%} and "
+            f"{change[1]:.0%} over the second half; say test = relaxation where the strain was "
+            "controlled, creep where the stress was, tension or compression for a modulus"
+        )
+    return "relaxation" if change[0] <= change[1] else "creep"
+
+
+def sweep(path: Path, values: Mapping[str, Array], nu: float | None) -> Spectrum:
+    """A frequency sweep, from moduli of tension, or of shear with Poisson's ratio. Raises
+    `ValueError` for other columns."""
+    ways = {
+        frozenset((one, loss)): one for one, own in SWEPT.items() for loss in (own, "tan_delta")
+    }
+    there = frozenset(values) - {"frequency"}
+    if there not in ways:
+        raise ValueError(
+            f"{path}: beside `frequency` stand storage_modulus and loss_modulus, of tension, or "
+            "storage_shear_modulus and loss_shear_modulus; tan_delta may stand for the second; but "
+            f"there is {', '.join(sorted(there)) or 'none'}"
+        )
+    one = ways[there]
+    shear = "shear" in one
+    if shear and nu is None:
+        raise ValueError(f"{path}: moduli of shear need Poisson's ratio: E = 2 (1 + nu) G")
+    factor = 2 * (1 + nu) if shear and nu is not None else 1.0
+    storage = factor * values[one]
+    lost = values[min(there - {one})]
+    loss = storage * lost if "tan_delta" in there else factor * lost
+    order = np.argsort(values["frequency"])
+    for name, x in (("frequency", values["frequency"]), ("storage", storage), ("loss", loss)):
+        if not (x > 0).all():
+            raise ValueError(f"{path}: column of {name}: all must be above zero")
+    return Spectrum(path, values["frequency"][order], storage[order], loss[order])
+
+
+def pulled(
+    path: Path,
+    test: Literal["tension", "compression"],
+    strain: Array,
+    stress: Array,
+    strains: tuple[float, float] | None,
+) -> Pull:
+    """A pull up to its largest strain. Raises `ValueError` without a range that the rows cover, for
+    loads in the other direction, and where the strain goes back."""
+    largest = int(np.argmax(np.abs(strain)))
+    sign = -1.0 if strain[largest] < 0 else 1.0
+    if test == "tension" and sign < 0:
+        raise ValueError(f"{path}: the strain is negative: a compression test?")
+    up, load = sign * strain[: largest + 1], sign * stress[: largest + 1]
+    if strains is None:
+        raise ValueError(
+            f"{path}: a modulus is of a range of strains, which must be given; strains go from "
+            f"{up[0]:.3g} to {up[-1]:.3g}"
+        )
+    low, high = strains
+    back = float((np.maximum.accumulate(up) - up).max())
+    if back > HELD * up[-1]:
+        raise ValueError(
+            f"{path}: the strain goes back by {back:.2g} on its way to the largest one, "
+            f"{up[-1]:.2g}: keep the rows of one loading"
+        )
+    inside = (up >= low) & (up <= high)
+    if not low < high or inside.sum() < LEAST:
+        raise ValueError(
+            f"{path} has {inside.sum()} rows with strains from {low:g} to {high:g}, but needs at "
+            f"least {LEAST}; strains go from {up[0]:.3g} to {up[-1]:.3g}"
+        )
+    return Pull(path, test, up[inside], load[inside], (low, high), len(strain) - largest - 1)
+
+
+def nominal(
+    path: Path,
+    values: dict[str, Array],
+    names: tuple[str, ...],
+    option: str,
+    size: float | None,
+    needs: str,
+) -> Array:
+    """Nominal strain [1] or stress [Pa] (n,) from the one of the columns `names` that is there, the
+    last over `size`. Raises `ValueError` unless it is given in one way."""
+    there = [name for name in names if name in values]
+    if len(there) != 1:
+        found = f"has {' and '.join(there)}" if there else "has none of them"
+        raise ValueError(f"{path} needs one of the columns {', '.join(names)}, but {found}")
+    (name,), divided = there, there[0] == names[-1]
+    if (size is not None) != divided:
+        raise ValueError(f"{path}: {needs if size is None else f'`{name}` needs no `{option}`'}")
+    if divided:
+        return values[name] / positive(option, size)
+    return values[name] - 1.0 if name == "stretch" else values[name]
+
+
+def check_rows(path: Path, table: csvfile.Numbers) -> None:
+    """Raises `ValueError` for too few rows, empty cells, and times that do not grow from zero."""
+    least = LEAST // 2 if "frequency" in table.values else LEAST
+    if len(table.rows) < least:
+        raise ValueError(
+            f"{path} has {len(table.rows)} rows of numbers, but needs at least {least}"
+        )
+    for name, column in table.values.items():
+        if (empty := np.flatnonzero(np.isnan(column))).size:
+            raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
+    if "t" not in table.values:
+        return
+    t = table.values["t"]
+    if t[0] < 0:
+        raise ValueError(
+            f"{path}, row {table.rows[0]}, column `t`: {t[0]:g} s is before the load; count times "
+            "from it"
+        )
+    if (back := np.flatnonzero(np.diff(t) <= 0)).size:
+        i = back[0] + 1
+        raise ValueError(
+            f"{path}, row {table.rows[i]}, column `t`: {t[i]:g} s is not after {t[i - 1]:g} s"
+        )
+
+
+def hint(name: str, columns: int) -> str:
+    """Remedy for an unknown column."""
+    known = "; ".join(f"{column} [{', '.join(units)}]" for column, units in KNOWN.items())
+    return (
+        f"{'; separate columns with commas, semicolons or tabs' if columns == 1 else ''}; columns "
+        f"and their units are {known}; one of another name is told by --column NAME={name or 'ITS'}"
+        f", others are left out by --ignore"
+    )
+
+
+def faded(t: Array, x: Array, tau: Array) -> Array:
+    """The integral of exp(-(t - s) / tau) x'(s) over the past s, (n, terms), at times t (n,) [s] >=
+    0 of a history x (n,) that steps to x[0] at t = 0, for times tau (terms,) [s]."""
+    intervals = np.diff(t, prepend=0.0)[:, None] / tau
+    a = np.exp(-intervals)
+    slow = np.where(
+        intervals > 0, -np.expm1(-intervals) / np.where(intervals > 0, intervals, 1.0), 1.0
+    )
+    b = np.diff(x, prepend=x[0])[:, None] * slow
+    b[0] = x[0] * a[0]
+    step = 1  # h_i = a_i h_{i-1} + b_i, twice as many terms summed in every pass
+    while step < len(t):
+        b[step:], a[step:] = b[step:] + a[step:] * b[:-step], a[step:] * a[:-step]
+        step *= 2
+    return b
+
+
+def responses(test: str, t: Array, x: Array, tau: Array) -> Array:
+    """Response to each coefficient (n, 1 + terms): of a relaxation series E, E_i [Pa] to the stress
+    under the strain x; of a creep series J_0, J_i [1/Pa] to the strain under the stress x."""
+    h = faded(t, x, tau)
+    return np.column_stack((x, h if test == "relaxation" else x[:, None] - h))
