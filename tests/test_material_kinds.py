@@ -184,7 +184,7 @@ def test_a_deck_gives_its_series(tmp_path):
     found = read_deck(path, unit=1e6)
     assert found.values["E"] == pytest.approx(0.7e6)
     assert found.values["E_1"] == pytest.approx(0.2 * 1.4e6)
-    assert "long term" in found.notices[0]
+    assert "of the long term, since MODULI is not said" in found.notices[0]
 
 
 def test_a_hyperelastic_deck_whose_bulk_does_not_relax(tmp_path):

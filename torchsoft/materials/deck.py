@@ -46,7 +46,6 @@ class Deck:
     values: Mapping[str, float]
     notices: tuple[str, ...]
     kind: str = "prony"
-    test: str = "deck"
 
     @property
     def terms(self) -> int:
@@ -113,9 +112,8 @@ def prony(path: Path, name: str, keywords: list[Keyword], unit: float) -> Deck:
             f"{path}, material {name}: every g_i and tau_i must be above zero, and the g_i below "
             f"one in sum, which is {g.sum():.4g}"
         )
-    notices = [
-        f"G and nu are of {stated or 'the long term, as decks mean where MODULI is not said'}"
-    ]
+    meant = {"INSTANTANEOUS": "instantaneous", "": "of the long term, since MODULI is not said"}
+    notices = [f"the deck's elasticity is {meant.get(stated, 'of the long term')}"]
     E = 2 * (1 + nu) * G * unit
     instant = E if stated == "INSTANTANEOUS" else E / (1 - g.sum())
     if not np.array_equal(g, k):

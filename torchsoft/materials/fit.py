@@ -47,6 +47,9 @@ edge."""
 VANISHED = 1e-6
 """Strength over the sum of all below which a term is none."""
 
+FLOW = 100.0
+"""Longest time of a chain that stands for a flow, over that of the test."""
+
 ROUNDING = 1e-12
 """Residual over the largest answer below which a fit is exact."""
 
@@ -189,6 +192,7 @@ def refined(measured: Measured | Spectrum, tau: Array) -> Trial | None:
     """The least-squares fit from these times on, within what the rows resolve; None where a term,
     or the modulus that remains, vanishes."""
     size, (low, high) = measured.size, measured.window
+    high *= FLOW if measured.flows else 1.0
     c, count = coefficients(measured, tau), len(tau)
 
     def weighted(tau: Array) -> Array:

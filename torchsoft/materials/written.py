@@ -53,8 +53,9 @@ def write(
 
 def source(found: Found) -> tuple[Path, str]:
     """File, and kind of test."""
-    of = found if isinstance(found, Deck) else found.measured
-    return of.path, of.test
+    if isinstance(found, Deck):
+        return found.path, "deck"
+    return found.measured.path, f"{found.measured.test} test"
 
 
 def toml(found: Found, assumed: Mapping[str, float]) -> str:
@@ -164,7 +165,7 @@ def series(deck: Deck) -> Figure:
 def line_of(found: Modulus) -> Figure:
     """Stress over strain with its line, and their difference."""
     m, E = found.measured, found.values["E"]
-    figure = new_figure(f"{m.path.name}: {m.test}, E = {MPA * E:.4g} MPa", 9, 5.4)
+    figure = new_figure(f"{m.path.name}: {m.test} test, E = {MPA * E:.4g} MPa", 9, 5.4)
     data, left = figure.subplots(2, 1, height_ratios=(3, 1.4), sharex=True)
     data.plot(
         m.strain, MPA * m.stress, ".", color=INK, ms=4, label=f"measured, {len(m.strain)} rows"
@@ -192,7 +193,7 @@ def fitted(fit: Fit) -> Figure:
             ("modulus", "MPa", MPA) if relaxes else ("compliance", "1/MPa", 1 / MPA)
         )
     name = "relaxation series" if relaxes else "generalised Kelvin chain"
-    figure = new_figure(f"{m.path.name}: {m.test}, {name} of {fit.terms} terms", 9, 7.2)
+    figure = new_figure(f"{m.path.name}: {m.test} test, {name} of {fit.terms} terms", 9, 7.2)
     data, left, spectrum = figure.subplots(3, 1, height_ratios=(3, 1.4, 2), sharex=True)
     parts = ("storage", "loss") if swept else ("measured",)
     rows = zip(
