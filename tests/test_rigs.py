@@ -270,6 +270,9 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         "\ufefft [ms], note [mm], x_d [mm]\n0,7,1\n500,,2\n1000,7,4\n", encoding="utf-8"
     )
     (tmp_path / "y.csv").write_text("Time (ms),Stage x (mm)\n0,1\n500,2\n1000,4\n")
+    (tmp_path / "clock.csv").write_text(
+        "t [ms],x_d [mm]\n1700000000000,1\n1700000000500,2\n1700000001000,4\n"
+    )
     knots = {"times": (0.2, 1.0), "values": ("start", 5e-3)}
     for table, expected in (
         ({"kind": "hold"}, {0.0: 0.0, 1.0: 0.0}),
@@ -284,6 +287,8 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         {0.0: 2e-3, 0.5: 3e-3, 1.0: 5e-3, 2.0: 5e-3}),
         ({"kind": "csv", "file": "y.csv", "column": "Stage x", "time": "Time"},
         {0.0: 1e-3, 0.5: 2e-3, 1.0: 4e-3}),
+        ({"kind": "csv", "file": "clock.csv", "column": "x_d", "from_first": True, "scale": -2.0,
+          "offset": 1e-3}, {0.0: -1e-3, 0.5: -3e-3, 1.0: -7e-3}),
     ):  # fmt: skip
         x = motion(table, tmp_path)
         for time, value in expected.items():
@@ -309,6 +314,11 @@ def test_motions_go_through_what_they_are_given(tmp_path):
         ("t [s],x_d [mm]\n0,0\n1,\n", r"row 3, column `x_d` is empty"),
         ("t [s],x_d [mm]\n1,0\n0,1\n", r"row 3, column `t`: 0 s follows 1 s; times must increase"),
         ("t [s],x_d [mm]\n0,0\n", r"has 1 rows of numbers"),
+        (
+            "t [s],x_d [mm]\n1.7e9,0\n1.7000001e9,1\n",
+            r"begins at 1\.7e\+09 s, and the run ends at 2 s: where its times are of a clock, say "
+            r"from_first = true",
+        ),
     ],
 )
 def test_a_recorded_motion_that_cannot_be_is_named(tmp_path, text, sentence):
@@ -326,6 +336,11 @@ def test_a_recorded_motion_that_cannot_be_is_named(tmp_path, text, sentence):
 @pytest.mark.parametrize(
     ("text", "where", "sentence"),
     [
+        (
+            "t [s],x_d [mm]\n" + "".join(f"{0.01 * i},{round(0.03 * i, 1)}\n" for i in range(250)),
+            "motion.x_d.file",
+            r"in steps of 0\.0001 m, as of an encoder: rates .* by 0\.01 m/s",
+        ),
         ("t [s],x_d [m]\n0,0\n1000,1e-3\n2000,0\n", "motion.x_d.file", r"lasts 2000 s.*millisec"),
         ("t [s],x_d [m]\n0,0\n1,12\n2,0\n", "motion.x_d", r"goes 12 m, .* is it in millimetres"),
     ],

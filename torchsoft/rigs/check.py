@@ -25,7 +25,7 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, signals
 from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.geometry import Scene, at, collision, nodes, tied
-from torchsoft.rigs.motion import CsvTable, ProfileTable
+from torchsoft.rigs.motion import CsvTable, ProfileTable, quantum
 from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, modes, strained
 from torchsoft.solve.kernel.arrays import PASSED
 
@@ -389,6 +389,30 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
         one, fastest = e.rig.reference[name], motion.fastest()
         if isinstance(motion, CsvTable) and isinstance(one, Sampled):
             first, last = float(one.times[0]), float(one.times[-1])
+            if first >= e.file.outputs.duration:
+                yield Diagnostic(
+                    "error", f"motion.{name}.file",
+                    f"{motion.file} begins at {first:g} s, and the run ends at "
+                    f"{e.file.outputs.duration:g} s: where its times are of a clock, say "
+                    "from_first = true",
+                )  # fmt: skip
+            elif last > LONGER * e.file.outputs.duration:
+                yield Diagnostic(
+                    "warning", f"motion.{name}.file",
+                    f"{motion.file} lasts {last:g} s, and the run shows "
+                    f"{e.file.outputs.duration:g} s of it: are its times in milliseconds?",
+                )  # fmt: skip
+            elif first > 0:
+                sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
+                yield Diagnostic("warning", f"motion.{name}.file", sentence)
+            if step := quantum(one.values.detach().numpy()):
+                each = float(one.times.diff().median())
+                yield Diagnostic(
+                    "warning", f"motion.{name}.file",
+                    f"{motion.file} is in steps of {step:.3g} {e.file.unit(name)}, as of an "
+                    f"encoder: rates of the set-point jump by {step / each:.2g} "
+                    f"{e.file.unit(name)}/s from row to row; smooth the column",
+                )  # fmt: skip
             if last < e.file.outputs.duration * (1 - 1e-9):
                 yield Diagnostic(
                     "error", f"motion.{name}.file",
@@ -396,15 +420,6 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
                     f"{e.file.outputs.duration:g} s: nothing says what is wanted then; shorten "
                     f"outputs.duration to {last:g}, or record longer",
                 )  # fmt: skip
-            if last > LONGER * e.file.outputs.duration:
-                yield Diagnostic(
-                    "warning", f"motion.{name}.file",
-                    f"{motion.file} lasts {last:g} s, and the run shows "
-                    f"{e.file.outputs.duration:g} s of it: are its times in milliseconds?",
-                )  # fmt: skip
-            if first > 0:
-                sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
-                yield Diagnostic("warning", f"motion.{name}.file", sentence)
         if fastest * interval * OUTPUTS_PER_PERIOD > 1:
             yield Diagnostic(
                 "warning", "outputs.interval",

@@ -23,6 +23,12 @@ START = "start"
 HELD = "held"
 """The word for the feed-forward effort that holds a coordinate in place."""
 
+TURNS, TURNS_PART = 10, 0.05
+"""Fewest turns between rest and jump of a column that was digitised, and their part of its rows."""
+
+ROUNDED = 0.01
+"""Largest distance of such a jump from a multiple of the step, over the step."""
+
 STROKES = 10_000
 """Most strokes of one motion."""
 
@@ -261,26 +267,49 @@ class ChirpTable(ModulatedMotion):
 
 
 class CsvTable(Motion):
-    """A recorded motion: a cubic spline through a column of a CSV file, with units in its heading:
+    """A recorded motion: a cubic spline through a column of a table, with units in its heading:
     `t [s], x_d [mm]`."""
 
     kind: Literal["csv"] = "csv"
     file: str = Field(description="the file, from the folder of this one")
     column: str = Field(description="the column's name, without its unit")
     time: str = Field(default="t", description="the name of the column of times, without its unit")
+    from_first: bool = Field(
+        default=False, description="whether times count from the first row, as of a clock's"
+    )
+    scale: Annotated[float, Quantity("1", -1e6, 1e6)] = Field(
+        default=1.0, description="the factor of the column, -1 for one of the opposite sign"
+    )
     offset: Value = Field(
         default=0.0,
-        description=f'what is added; "{START}": where the coordinate that follows starts',
+        description=f'what is added then; "{START}": where the coordinate that follows starts',
     )
 
     def build(self, context: MotionContext) -> Piecewise:
+        if self.scale == 0:
+            raise ValueError(f"motion.{context.name}.scale: it must not be zero")
         try:
             path = context.folder / self.file
             times, values = read_column(path, self.column, context.unit, self.time)
         except ValueError as error:
             raise ValueError(f"motion.{context.name}.file: {error}") from None
         offset = context.value("offset", self.offset)
-        return Sampled(times, [offset + value for value in values])
+        since = times[0] if self.from_first else 0.0
+        return Sampled(
+            [time - since for time in times], [offset + self.scale * value for value in values]
+        )
+
+
+def quantum(values: np.ndarray) -> float:
+    """The step in which values (k,) were digitised, as by an encoder: they rest and jump by it in
+    turn; zero where they do not."""
+    jumps = np.abs(np.diff(values))
+    rests = jumps == 0
+    turns = int((rests[1:] != rests[:-1]).sum())
+    if turns < max(TURNS, TURNS_PART * len(jumps)):
+        return 0.0
+    step = float(jumps[~rests].min())
+    return step if (np.abs(jumps / step - np.rint(jumps / step)) < ROUNDED).all() else 0.0
 
 
 def read_column(
