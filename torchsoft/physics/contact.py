@@ -108,6 +108,10 @@ class SmoothSlip(Friction):
 
     A quadratic in |gamma'|, with one positive root when E > mu_s F_N. Continuous, not smooth at
     slip onset; continuous only if R >= (mu_s - mu_k) F_N / v_s.
+
+    A pad without mass has one velocity only where its dashpots outweigh the fall of friction with
+    slip. With the dashpot `R_pad` of a point of the pad's surface [N.s/m] friction falls no faster
+    than that: over (mu_s - mu_k) F_N (1 / R + 1 / R_pad) where this is above v_s.
     """
 
     def __init__(
@@ -117,13 +121,31 @@ class SmoothSlip(Friction):
         v_s: Annotated[
             float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")
         ] = 5e-3,
-    ) -> None:
+        R_pad: Annotated[
+            float,
+            Quantity(
+                "N.s/m", 1e-9, 1e9,
+                "instantaneous dashpot of the pad's surface at a point, which bounds the fall of "
+                "friction with slip; no bound without one",
+            ),
+        ]
+        | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(mu_s, mu_k)
         self.v_s = parameter(v_s)
+        self.R_pad = None if R_pad is None else parameter(R_pad, trained=False)
+
+    def range(self, F_N: Tensor, R: Tensor) -> Tensor:
+        """Slip speed [m/s] over which mu falls under F_N [N]."""
+        if self.R_pad is None:
+            return self.v_s
+        least = (self.mu_s - self.mu_k) * F_N * (1 / R + 1 / self.R_pad)
+        return torch.maximum(self.v_s, least)
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        b = R * self.v_s - (E - self.mu_k * F_N)
-        c = (self.v_s * (E - self.mu_s * F_N)).clamp(min=0.0)
+        v_s = self.range(F_N, R)
+        b = R * v_s - (E - self.mu_k * F_N)
+        c = (v_s * (E - self.mu_s * F_N)).clamp(min=0.0)
         root = torch.sqrt(b * b + 4 * R * c)
         rising = b >= 0  # two forms of the same root, neither of which cancels
         down = torch.where(rising & (root > 0), b + root, 1.0)
@@ -202,10 +224,8 @@ class SoftContact(nn.Module):
         slip = self.friction
         if not isinstance(slip, SmoothSlip):
             return ""
-        falls, damps = (
-            ((slip.mu_s - slip.mu_k) * F_N / slip.v_s).item(),
-            self.R_t.item(),
-        )
+        over = slip.range(torch.tensor(F_N, dtype=torch.float64), self.R_t)
+        falls, damps = ((slip.mu_s - slip.mu_k) * F_N / over).item(), self.R_t.item()
         if damps >= falls:
             return ""
         return (

@@ -410,11 +410,19 @@ point (assumed): springs then take about one per cent of the give of a contact o
 
 class SpringsTable(PartTable):
     """A law of contact points. A spring "auto" is `STIFFER` times as stiff as the stiffest pad that
-    has the law; a dashpot "auto" gives way within that pad's shortest retardation time."""
+    has the law; a dashpot "auto" gives way within that pad's shortest retardation time. Smooth
+    friction on a pad whose instantaneous dashpot is that of `tau_instant`, a regularisation, falls
+    with slip no faster than this dashpot balances (`SmoothSlip.R_pad`)."""
 
     def numbers(self, pads: Sequence[Pad]) -> Self:
         """The table with a number in place of every "auto", for the pads that have the law; without
         pads, as when a file is read, any."""
+        friction = self.friction  # pyright: ignore[reportAttributeAccessIssue]
+        soft = [surface_dashpot(pad) for pad in pads if hasattr(pad.material, "tau_instant")]
+        if soft and friction.kind == "smooth" and friction.R_pad is None:
+            per_spacing = min(soft) * self.node_spacing  # pyright: ignore[reportAttributeAccessIssue]
+            friction = friction.model_copy(update={"R_pad": per_spacing})
+            return self.model_copy(update={"friction": friction}).numbers(pads)
         names = [name for name in signature(self.part).parameters if getattr(self, name) == AUTO]
         if not names:
             return self
@@ -438,6 +446,15 @@ def surface(pad: Pad) -> tuple[float, float]:
     modulus = material.E / (1 - material.nu**2) * material.depth
     length = float(pad.point_lengths.mean())
     return float(modulus) / length, float(material.whole_chain()[1].min())
+
+
+@torch.no_grad()
+def surface_dashpot(pad: Pad) -> float:
+    """Instantaneous dashpot of a pad's surface at one node over the length of a contact point
+    [N.s/m2]: the median of the nodes, along the surface."""
+    J, tau = pad.material.whole_chain()
+    mobility = pad.compliance().diagonal()[::2].median() * (J / tau).sum()
+    return float(1 / mobility) / float(pad.point_lengths.mean())
 
 
 if TYPE_CHECKING:
