@@ -32,7 +32,7 @@ FLOWS = {
     "sysid": """
         initial_state recording unknowns prediction noise runs problem first_samples
         synthetic fit plan prechecks
-        residual_tests assumptions refits sensitivity suspects profile posterior estimate
+        residual_tests colour assumptions refits sensitivity suspects profile posterior estimate
         result identification compare
         planner columns configuration measured design figures report .
     """,

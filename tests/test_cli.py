@@ -56,7 +56,7 @@ def test_help_names_every_command_argument_and_option(capsys):
         (["material", "--help"], ("fit", "presets")),
         (
             ["material", "fit", "--help"],
-            ("FILE.csv", "--out", "--test", "--terms", "--length", "--area", "--nu", "compliance"),
+            ("FILE", "--out", "--test", "--terms", "--length", "--range", "--nu", "compliance"),
         ),
         (["material", "presets", "--help"], ("published",)),
         (["identify", "--help"], ("DATA.csv", "CONFIG.toml", *OPTIONS)),
@@ -77,7 +77,7 @@ def test_help_names_every_command_argument_and_option(capsys):
     [
         ([], "COMMAND"),
         (["identify"], "DATA.csv"),
-        (["material", "fit"], "FILE.csv"),
+        (["material", "fit"], "required: FILE"),
         (["identify", "rig.toml", "--rtol", "fast"], "invalid float value: 'fast'"),
     ],
 )

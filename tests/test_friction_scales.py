@@ -2,6 +2,7 @@
 cone holds at every point; numbers that a rig file takes from its pads."""
 
 import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -145,3 +146,36 @@ def test_a_law_with_a_viscosity_of_its_own_is_warned_about():
     law.friction = viscous
     with pytest.warns(UserWarning, match="where nothing presses"):
         simulate(built.rig, built.t[:2], y0=built.y0)
+
+
+SERIES = {"kind": "prony", "E": 0.15e6, "moduli": [0.15e6], "tau": [1.0], "nu": 0.45, "depth": 0.04}
+
+
+@pytest.mark.parametrize("degrees", [10, 30, 45])
+def test_friction_may_fall_on_a_pad_of_little_damping(degrees):
+    """The instantaneous spring of a series has a dashpot of 0.1 ms only: friction falls with slip
+    no faster than it balances, which is said where points slip."""
+    tree = box(degrees, 0.15, "smooth").model_dump(exclude_unset=True)
+    tree["materials"]["gel"] = SERIES
+    built = RigFile.from_tree(tree).build()
+    law = built.rig.contacts["ground"].law
+    rested = law.friction.range(torch.tensor(0.15 * 9.81 / 20), law.R_t)
+    assert rested > 2 * law.friction.v_s
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        run = simulate(built.rig, built.t, y0=built.y0)
+    falls = [one for one in said if "over a larger slip speed than v_s" in str(one.message)]
+    assert degrees != 45 or falls
+    assert degrees != 10 or not said
+    slope = math.radians(degrees)
+    x, y = (run[f"{axis}_box"] - run[f"{axis}_box"][0] for axis in "xy")
+    down = -(x * math.cos(slope) + y * math.sin(slope)).numpy()
+    late = run.t.numpy() > 0.125
+    acceleration = 2 * np.polyfit(run.t.numpy()[late], down[late], 2)[0]
+    expected = 9.81 * (math.sin(slope) - MU_S * math.cos(slope)) if degrees == 45 else 0.0
+    slowest = 0.0 if degrees < 45 else 0.98 * expected
+    assert slowest - 0.02 <= acceleration <= 1.6 * expected + 0.02
+
+
+def test_a_pad_with_a_dashpot_of_its_own_bounds_nothing():
+    assert box(30, 0.15, "smooth").build().rig.contacts["ground"].law.friction.R_pad is None

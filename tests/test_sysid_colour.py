@@ -11,8 +11,9 @@ from test_sysid_noise import made
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid.colour import rewhitened
 from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.residual_tests import parts, rewhitened
+from torchsoft.sysid.residual_tests import parts
 from torchsoft.sysid.runs import Runner
 
 BASE = Parameters().override(COARSE)

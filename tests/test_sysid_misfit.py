@@ -8,15 +8,13 @@ import pytest
 from scipy import signal, stats
 from test_sysid_noise import made
 
+from torchsoft.sysid.colour import colour_notices, colours, correlation
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import (
     LEVEL,
     Part,
     Verdict,
     autocorrelation,
-    colour_notices,
-    colours,
-    correlation,
     holm,
     judge_residuals,
     residual_notices,

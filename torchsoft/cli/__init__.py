@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 
@@ -55,6 +55,18 @@ def interruptible() -> Iterator[None]:
         os.close(write)
 
 
+def note_once() -> Callable[..., None]:
+    """A `warnings.showwarning` that prints a sentence once: a fit makes hundreds of runs."""
+    said = set[str]()
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        if (sentence := f"torchsoft: note: {message}") not in said:
+            said.add(sentence)
+            say(sentence, error=True)
+
+    return show
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command. The exit status is 0, 2 for an error that the user can fix, 130 for an
     interruption."""
@@ -76,9 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ["torchsoft", *(os.fsencode(one).decode("utf-8", "replace") for one in given)]
     )
     with warnings.catch_warnings(), interruptible():
-        warnings.showwarning = lambda message, *_, **__: say(
-            f"torchsoft: note: {message}", error=True
-        )
+        warnings.showwarning = note_once()
         try:
             return options.run(options)
         except (ValueError, RuntimeError, ModuleNotFoundError) as error:

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from torchsoft.paper.equilibrium import holding_force, press
 from torchsoft.paper.rig import SoftGrasp
+from torchsoft.physics.contact import SmoothSlip
+from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -30,6 +32,9 @@ SUPPLIED = 1e-9
 COMPRESSED = 0.5
 """Part of its height by which a pad may be pressed in: linear elasticity ends well below."""
 
+
+LATER = 0.005
+"""Part of a contact's largest friction by which the bound of its fall raises it without a word."""
 
 SMALL_STRAIN = 0.05
 """Strain up to which linear elasticity holds without a note."""
@@ -68,10 +73,13 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
             )
     if run.stats.failed_steps and "knots" in run.made_by["steps"]:
         found["knots"] = (
-            f"Newton did not converge in {run.stats.failed_steps} of the steps between the given "
-            "`knots`, which were halved: the run is not one of the same steps; its own `knots` are "
+            "Newton did not converge in some steps between the given `knots`, which were halved "
+            "(`stats.failed_steps`): the run is not one of the same steps; its own `knots` are "
             "those that it took"
         )
+    for name in rig.contacts:
+        if bounded := softened(run, rig, name):
+            found[f"friction {name}"] = f"contact `{name}`: {bounded}"
     for name, u in run.displacement.items():
         deepest, height = float(u.detach().norm(dim=-1).max()), rig.pads[name].mesh.height
         if not deepest <= COMPRESSED * height:
@@ -80,6 +88,32 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
                 "linear elasticity"
             )
     return found
+
+
+@torch.no_grad()
+def softened(run: Trajectory, rig: Rig, name: str) -> str:
+    """Sentence on smooth friction that falls with slip later than by its v_s, where that makes a
+    contact's friction larger by more than `LATER`; empty where it does not."""
+    law = rig.contacts[name].law
+    slip = law.friction
+    if not isinstance(slip, SmoothSlip) or slip.R_pad is None:
+        return ""
+    F_N, F_T = run.force[name].detach().abs().unbind(-1)
+    over = slip.range(F_N / rig.weight(name), law.R_t)
+    if not (over > slip.v_s).any():
+        return ""
+    mu, fall = F_T / F_N.clamp(min=1e-300), slip.mu_s - slip.mu_k
+    speed = over * (fall / (mu - slip.mu_k).clamp(min=1e-12) - 1).clamp(min=0.0)
+    later = (mu - slip.mu_k - fall / (1 + speed / slip.v_s)).clamp(min=0.0)
+    slips = run.contact_state[name] == SLIPPING
+    extra = torch.where(slips, later * F_N, 0.0).sum(-1)
+    if extra.max() <= LATER * slip.mu_s * F_N.sum(-1).max():
+        return ""
+    return (
+        "friction falls from mu_s to mu_k over a larger slip speed than v_s, since a pad of that "
+        "little damping has no single velocity otherwise (`SmoothSlip.R_pad`); where that matters "
+        "take mu_k = mu_s, or a pad with a larger tau_instant"
+    )
 
 
 # Stability of the closed loop: the linearised modes of any rig about a state of rest, of the

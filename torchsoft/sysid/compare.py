@@ -34,6 +34,7 @@ from scipy.sparse.linalg import spsolve_triangular
 
 from torchsoft.display import suggestion
 from torchsoft.files import write_json
+from torchsoft.sysid.colour import allow_for_colour
 from torchsoft.sysid.fit import Fit, Unreachable, gauss_newton
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
@@ -42,7 +43,6 @@ from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.residual_tests import (
     Part,
-    allow_for_colour,
     judge_residuals,
     parts,
     residual_notices,

@@ -15,6 +15,17 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
+from torchsoft.sysid.colour import (
+    WORSE,
+    Coloured,
+    Refit,
+    allow_for_colour,
+    colour_notices,
+    refusal,
+    rewhitened,
+    spread,
+    without,
+)
 from torchsoft.sysid.estimate import contributions, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.fit import (
     Fit,
@@ -43,15 +54,7 @@ from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import ended
-from torchsoft.sysid.residual_tests import (
-    Coloured,
-    allow_for_colour,
-    colour_notices,
-    judge_residuals,
-    parts,
-    residual_notices,
-    rewhitened,
-)
+from torchsoft.sysid.residual_tests import judge_residuals, parts, residual_notices
 from torchsoft.sysid.result import (
     ChannelNoise,
     IdentificationResult,
@@ -147,11 +150,19 @@ def conclude(
     if coloured.found and end.fits:  # its noise was that of the residuals before
         stage, start = replace(stage, rtol=end.rtol), clock.perf_counter()
         with progress_bar("colour of the noise", progress) as notify:
-            coloured = with_its_noise(
-                coloured.problem, runner, stage, end.fits[-1][1], context.loss,
-                context.settings.method, notify,
-            )  # fmt: skip
+            last = end.fits[-1][1]
+            refit = refitting(runner, stage, last, context.loss, context.settings.method, notify)
+            coloured = allow_for_colour(
+                coloured.problem, last, free, stage.recordings, refit
+            )._replace(before=coloured.before)
         stages += noise_entries(coloured, stage, start)
+        end = at_rest()
+    if (worse := coloured.grown(end.at.r, stage.recordings)) > WORSE:
+        with progress_bar("fit without the colour of the noise", progress) as notify:
+            refit = refitting(
+                runner, stage, coloured.before[1], context.loss, context.settings.method, notify
+            )
+            coloured = without(coloured, worse, free, stage.recordings, refit)
         end = at_rest()
     problem, x, at, rtol = coloured.problem, end.x, end.at, end.rtol
     J = at.J[:, free]
@@ -165,7 +176,8 @@ def conclude(
         priors=[c.labels[i] for i, _ in c.priors] if end.at_rest else (),
     )  # fmt: skip
     declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
-    colour, bound = bool(coloured.found.keys() - set(declared)), bool((free & c.at_bound(x)).any())
+    own = {*coloured.found, *coloured.refused} - {*declared}
+    colour, bound = bool(own), bool((free & c.at_bound(x)).any())
     larger = any(one.alarming and not (one.test == "level" and one.size < 1) for one in verdicts)
     doubtful = not end.at_rest or colour or bound or larger
     checked = None
@@ -179,6 +191,7 @@ def conclude(
         if context.loss == "linear"
         else covariance(J, at.r, context.loss, len(c.priors), exact)
     )
+    C_fit = C_fit + spread(J, C_free, left, coloured.refused)
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
     labels = [one.label for one in c.within(free)]
     found = estimates(problem, x, free, C, shift)
@@ -208,7 +221,7 @@ def conclude(
     notices += residual_notices(
         verdicts, max(1.0, chi2) ** 0.5 if context.loss == "linear" else 1.0
     )
-    notices += colour_notices(coloured.found, declared)
+    notices += refusal(coloured) + colour_notices(coloured.found, declared)
     return IdentificationResult(
         estimates=found,
         labels=labels,
@@ -458,7 +471,9 @@ def identify(
         raise Unreachable(error.failed, findings) from None
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
-        coloured = with_its_noise(problem, runner, end.stage, end.fit, loss, method, bar)
+        free = np.isin(problem.coordinates.labels, end.stage.free)
+        refit = refitting(runner, end.stage, end.fit, loss, method, bar)
+        coloured = allow_for_colour(problem, end.fit, free, end.stage.recordings, refit)
     stages = end.entries + noise_entries(coloured, end.stage, before)
     context = FitContext(fitted, tuple(heldout), tuple(acknowledged), settings)
     findings += end.notices
@@ -479,23 +494,17 @@ def explain(problem: Problem, **options: Any) -> IdentificationResult:
     return identify(problem, **options, assumptions="explained")
 
 
-def with_its_noise(
-    problem: Problem,
-    runner: Runner,
-    stage: Stage,
-    fit: Fit,
-    loss: Loss,
-    method: Method,
-    notify: Notify,
-) -> Coloured:
-    """The fit of the last stage, continued with the noise estimated from its residuals: with a new
-    Jacobian first, then with the last one."""
-    free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
+def refitting(
+    runner: Runner, stage: Stage, fit: Fit, loss: Loss, method: Method, notify: Notify
+) -> Refit:
+    """The fit of a stage continued with other noise: with a new Jacobian first, then with the last
+    one."""
 
     def refit(one: Problem, last: Fit, number: int) -> Fit:
         if number > 0 and loss == "linear":
-            common: dict[str, Any] = {"which": which, "free": free, "notify": notify}
-            return chord(one, runner, last.x, last.at, steps=fit.steps, **common)
+            common: dict[str, Any] = {"which": stage.recordings, "notify": notify}
+            free = np.isin(one.coordinates.labels, stage.free)
+            return chord(one, runner, last.x, last.at, steps=fit.steps, free=free, **common)
         return on_steps(one, runner, stage, last.x, fit.steps, loss, method, notify, last.at)
 
-    return allow_for_colour(problem, fit, free, which, refit)
+    return refit

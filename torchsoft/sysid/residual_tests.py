@@ -16,8 +16,7 @@ p-values are adjusted by Holm's method: with a right model, the probability that
 although intervals allow for it: it may come from a sensor, or from a wrong model.
 """
 
-import time as clock
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, NamedTuple
@@ -29,9 +28,8 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import spsolve_triangular
 from scipy.special import ndtri_exp
 
-from torchsoft.sysid.fit import Fit, settled
-from torchsoft.sysid.noise import Autoregression, NoiseFit, fit_noise
-from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.unknowns import Sensor
 
@@ -420,122 +418,3 @@ def named(words: Sequence[str]) -> str:
     """The first `MOST` words, and the number of others."""
     more = len(words) - MOST
     return ", ".join(words[:MOST]) + (f" and {more} more" if more > 0 else "")
-
-
-# Coloured noise
-
-
-ROUNDS = 2
-"""Most estimates of the noise: from the residuals of the fit, and from those of the fit with that
-noise."""
-
-
-class Coloured(NamedTuple):
-    """A problem with estimated noise, its fit, the noise by channel with the scores of every order,
-    and the fits on the way with their ends on the clock [s]."""
-
-    problem: Problem
-    fit: Fit
-    found: dict[str, NoiseFit]
-    fits: list[tuple[Fit, float]]
-
-
-def allow_for_colour(
-    problem: Problem,
-    fit: Fit,
-    free: NDArray[np.bool_],
-    which: Sequence[str],
-    refit: Callable[[Problem, Fit, int], Fit],
-    undeclared: bool = True,
-) -> Coloured:
-    """Estimate the noise from a fit's residuals in the recordings `which`, and continue the fit
-    with it by `refit(problem, fit, round)`, while coordinates that are `free` (n,) move.
-
-    Nothing changes where all noise is white. Without `undeclared`, only declared colour is
-    estimated, and that of other channels stays as it is in the problem.
-    """
-    declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
-    given = {} if undeclared else problem.noise
-    found, fits = dict[str, NoiseFit](), list[tuple[Fit, float]]()
-    for number in range(ROUNDS):
-        now = parts(problem, fit.at.r, which)
-        found = colours(now, fit.at.J[:, free], declared)
-        if not undeclared:
-            found = {channel: found[channel] for channel in declared if channel in found}
-        if not found and not problem.noise:
-            break
-        problem = problem.with_noise(given | {name: one.noise for name, one in found.items()})
-        at = rewhitened(problem, fit.at, now)
-        fit = fit._replace(at=at, chi2=float(np.mean(at.r**2)))
-        if settled(problem, fit.x, at, free):
-            break
-        fit = refit(problem, fit, number)
-        fits.append((fit, clock.perf_counter()))
-    return Coloured(problem, fit, found, fits)
-
-
-def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residuals:
-    """Residuals and their Jacobian, whitened with the noise of the problem in place of that of the
-    parts."""
-    r, J = at.r.copy(), at.J.copy()
-    recordings = {recording.name: recording for recording in problem.recordings}
-    for part in now:
-        rows = (
-            J[part.rows]
-            if part.noise is None
-            else spsolve_triangular(part.noise.whitener(part.t), J[part.rows])
-        )
-        r[part.rows] = problem.whitened(recordings[part.recording], part.channel, part.raw)
-        J[part.rows] = problem.whitened(recordings[part.recording], part.channel, rows)
-    return Residuals(r, J, at.failed)
-
-
-def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> dict[str, NoiseFit]:
-    """Coloured noise by channel, of channels whose residuals, all recordings together, are not
-    white; J (m, n) is the Jacobian.
-
-    White noise is rejected by a likelihood-ratio test, at `LEVEL` for all channels and orders
-    together; for `declared` channels by the Bayesian information criterion alone. The noise is at
-    least as large as stated. That of channels with saturated samples stays white: colour of their
-    residuals is a verdict, with its sentence.
-    """
-    Q, out = np.linalg.qr(J)[0], {}
-    channels = list(dict.fromkeys(part.channel for part in parts))
-    for channel in channels:
-        mine = [part for part in parts if part.channel == channel]
-        if any(part.saturated for part in mine):
-            continue
-        if float(np.mean(np.concatenate([part.raw for part in mine]) ** 2)) < FAINT**2:
-            continue
-        fitted = sum(float(np.sum(Q[part.rows] ** 2)) for part in mine)
-        found = fit_noise([(part.t, part.raw) for part in mine], fitted)
-        p, ratio = (
-            found.noise.order,
-            found.scores[0].deviance - found.scores[found.noise.order].deviance,
-        )
-        tests = len(channels) * max(len(found.scores) - 1, 1)
-        if p > 0 and (channel in declared or tests * stats.chi2.sf(ratio, p) < LEVEL):
-            out[channel] = found._replace(noise=found.noise.at_least(1.0))
-    return out
-
-
-def colour_notices(found: Mapping[str, NoiseFit], declared: Sequence[str] = ()) -> list[str]:
-    """Sentences on undeclared colour, which intervals allow for."""
-    names = [
-        f"{channel} (order {fit.noise.order}, neighbouring samples correlate by "
-        f"{correlation(fit.noise):.2f})"
-        for channel, fit in found.items() if channel not in declared
-    ]  # fmt: skip
-    if not names:
-        return []
-    return [
-        f"what the fit left is coloured in {named(names)}, which nobody has declared: intervals "
-        "allow for it as noise, but a wrong model leaves such residuals too; where it is the "
-        "sensor, declare its `colour`"
-    ]
-
-
-def correlation(noise: Autoregression) -> float:
-    """Correlation of neighbouring samples."""
-    gamma = noise.autocovariance(2)
-    return float(gamma[1] / gamma[0])
