@@ -261,9 +261,9 @@ REFUSED: dict[str, tuple[dict[str, Array], dict[str, Any], str]] = {
     "opposite": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": -ONES}, {},
     "strain and stress are opposite"),
     "no length": ({"t_[s]": COUNT, "elongation_[m]": ONES, "stress_[Pa]": ONES}, {},
-    "needs the gauge length, `length` [m]"),
+    "needs the gauge length, `length` (--length) [m]"),
     "no area": ({"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {},
-        "a force needs the cross-section, `area` [m2]"),
+        "a force needs the cross-section, `area` (--area) [m2]"),
     "a length": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": ONES}, {"length": 1.0},
     "`strain` needs no `length`"), "negative area": (
         {"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {"area": -1.0},

@@ -231,8 +231,8 @@ def read(
         if own == "relaxation":
             return Measured(path, "relaxation", values["t"], one, values["modulus"], True)
         return Measured(path, "creep", values["t"], values["compliance"], one, True)
-    gauge = "an elongation needs the gauge length, `length` [m]"
-    section = "a force needs the cross-section, `area` [m2]"
+    gauge = "an elongation needs the gauge length, `length` (--length) [m]"
+    section = "a force needs the cross-section, `area` (--area) [m2]"
     strain = nominal(path, values, ("strain", "stretch", "elongation"), "length", length, gauge)
     stress = nominal(path, values, ("stress", "force"), "area", area, section)
     for name, x in (("strain", strain), ("stress", stress)):

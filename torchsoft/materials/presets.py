@@ -44,7 +44,9 @@ def from_shore_a(hardness: float) -> float:
     low, high = SHORE_A
     if not low <= hardness <= high:
         raise ValueError(
-            f"the hardness must be from {low:g} to {high:g} Shore A, but is {hardness:g}"
+            f"the hardness must be from {low:g} to {high:g} Shore A, but is {hardness:g}; for softer "
+            "rubbers, also those of the scale 00, no relation holds: pull a strip, and take the "
+            "modulus of `torchsoft material fit PULL.csv --test tension --range 0 0.1`"
         )
     return 1e6 * 0.0981 * (56 + 7.62336 * hardness) / (0.137505 * (254 - 2.54 * hardness))
 
@@ -90,10 +92,15 @@ def preset(name: str, E: float, origin: str) -> Preset:
     )
 
 
-def silicone(name: str, hardness: float, sheet: str) -> Preset:
-    """A silicone by the Shore A hardness in its data sheet."""
+def silicone(name: str, hardness: float, secant: float, sheet: str) -> Preset:
+    """A silicone by the Shore A hardness in its data sheet, whose modulus at 100 % strain is a
+    `secant` [Pa]."""
     return preset(
-        name, from_shore_a(hardness), f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}"
+        name,
+        from_shore_a(hardness),
+        f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}: of small strains, good to some "
+        f"tens of per cent; the sheet's secant at 100 % strain is {1e-6 * secant:.2g} MPa, and "
+        "strips of it that were pulled so far are as soft",
     )
 
 
@@ -107,8 +114,8 @@ def natural_rubber(hardness: int, E: float) -> Preset:
 PRESETS: Mapping[str, Preset] = {
     one.name: one
     for one in (
-        silicone("Dragon Skin 20", 20.0, SMOOTH_ON),
-        silicone("Dragon Skin 30", 30.0, SMOOTH_ON),
+        silicone("Dragon Skin 20", 20.0, 0.34e6, SMOOTH_ON),
+        silicone("Dragon Skin 30", 30.0, 0.59e6, SMOOTH_ON),
         preset(
             "Sylgard 184, softest",
             1.32e6,
