@@ -14,6 +14,7 @@ from tqdm import tqdm
 from torchsoft import simulate
 from torchsoft.cli import main
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
+from torchsoft.plan.knots import knots
 from torchsoft.plan.problem import Evaluator, Free, Terms, Variables
 from torchsoft.plan.search import Search
 from torchsoft.rigs import RigFile
@@ -284,6 +285,35 @@ def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     (tmp_path / "goal.toml").write_text(document(GOAL | {"drws": 3}), encoding="utf-8")
     assert main(["plan", *files, "--out", str(tmp_path / "out"), "--force"]) == 2
     assert "drws" in capsys.readouterr().err
+
+
+def test_a_motion_with_an_offset_is_written_as_it_was_found():
+    """Values that were found are whole: the file's own offset must not come on top."""
+    shifted = {
+        name: {"times": [0.2, 0.5], "values": [0.0, 0.0], "offset": "start"}
+        for name in ("left_y", "right_y")
+    }
+    file = FILE.override(motion=shifted)
+    found, written = plan_file(file, Goal.model_validate(GOAL))
+    assert found.reached
+    built = written.build()
+    for name in FREE:
+        own, planned = (rig.reference[name] for rig in (built.rig, found.rig))
+        assert torch.equal(own(torch.tensor(0.4)), planned(torch.tensor(0.4)))
+    run = simulate(built.rig, built.t, y0=built.y0, rtol=1e-5)
+    assert abs(float(run["theta_object"][-1]) - TURN.value) < TURN.tolerance
+
+
+def test_a_plan_that_its_file_does_not_repeat_is_not_reached(monkeypatch):
+    monkeypatch.setattr(
+        "torchsoft.rigs.goal.knots",
+        lambda reference, names: {
+            name: one | {"offset": 1e-3} for name, one in knots(reference, names).items()
+        },
+    )
+    found, _ = plan_file(FILE, Goal.model_validate(GOAL))
+    assert not found.reached
+    assert "the written file, run from its own start, does not keep targets." in found.reasons[-1]
 
 
 def test_draws_begin_with_the_stated_numbers_and_those_of_an_identification_with_its_estimates():

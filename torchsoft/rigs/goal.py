@@ -1,6 +1,7 @@
 """Goal of a rig file's motion, from a TOML file, and the plan that reaches it."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -14,10 +15,12 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
-from torchsoft.plan.planning import RTOL, Method, Robust
-from torchsoft.plan.problem import Free
+from torchsoft.plan.planning import RTOL, SLACK, Method, Robust
+from torchsoft.plan.problem import Free, evaluated
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.simulate import simulate
 from torchsoft.tables import SEED, Table, from_toml
 
 Name = Annotated[str, Field(min_length=1)]
@@ -127,4 +130,28 @@ def plan_file(
     moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
     numbers = {name: value.tolist() for name, value in found.parameters.items()}
     written = file.override(motion=knots(found.reference, moved), **nested(numbers))
-    return Planned(found, written)
+    return Planned(repeated(found, written, goal), written)
+
+
+def repeated(found: Plan, written: RigFile, goal: Goal) -> Plan:
+    """The plan with what a run of the written file says of it: not reached where that misses a
+    target or a limit."""
+    if not found.reached:
+        return found
+    missed = []
+    try:
+        built = written.build()
+        run = simulate(built.rig, built.t, y0=built.y0, rtol=found.made_by["checked_rtol"])
+        off = evaluated(goal.targets, run, "targets")
+        missed += [f"targets.{name}" for name, e in off.items() if float(e.abs().max()) > 1]
+        over = evaluated(goal.limits, run, "limits")
+        missed += [f"limits.{name}" for name, e in over.items() if float(e.max()) > SLACK]
+    except (ValueError, SimulationFailed) as error:
+        missed.append(str(error))
+    if not missed:
+        return found
+    reason = (
+        f"the written file, run from its own start, does not keep {', '.join(missed)}: its free "
+        "parameters change where it rests, or the limits are kept by less than the tolerance"
+    )
+    return replace(found, reached=False, reasons=(*found.reasons, reason))
