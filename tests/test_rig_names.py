@@ -59,7 +59,8 @@ def test_every_number_that_a_rig_is_made_with_has_its_name(rig):
             continue
         other = file.override(**nested(name, 1.01 * value or 1e-3))
         after = values(other.assemble())
-        changed = {key for key in before if after[key] != before[key]}
+        own = (key for key in before if not key.endswith(".R_pad"))  # follows the pad
+        changed = {key for key in own if after[key] != before[key]}
         if ".start." in name:
             assert not changed
         elif name.rpartition(".")[2] in MASS and group == "bodies":

@@ -44,9 +44,9 @@ def from_shore_a(hardness: float) -> float:
     low, high = SHORE_A
     if not low <= hardness <= high:
         raise ValueError(
-            f"the hardness must be from {low:g} to {high:g} Shore A, but is {hardness:g}; for softer "
-            "rubbers, also those of the scale 00, no relation holds: pull a strip, and take the "
-            "modulus of `torchsoft material fit PULL.csv --test tension --range 0 0.1`"
+            f"the hardness must be from {low:g} to {high:g} Shore A, but is {hardness:g}; for "
+            "softer rubbers, also those of the scale 00, no relation holds: pull a strip, and take "
+            "the modulus of `torchsoft material fit PULL.csv --test tension --range 0 0.1`"
         )
     return 1e6 * 0.0981 * (56 + 7.62336 * hardness) / (0.137505 * (254 - 2.54 * hardness))
 
@@ -98,8 +98,8 @@ def silicone(name: str, hardness: float, secant: float, sheet: str) -> Preset:
     return preset(
         name,
         from_shore_a(hardness),
-        f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}: of small strains, good to some "
-        f"tens of per cent; the sheet's secant at 100 % strain is {1e-6 * secant:.2g} MPa, and "
+        f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}: of small strains, good to "
+        f"some tens of per cent; the sheet's secant at 100 % strain is {1e-6 * secant:.2g} MPa, and "
         "strips of it that were pulled so far are as soft",
     )
 
