@@ -99,8 +99,8 @@ def silicone(name: str, hardness: float, secant: float, sheet: str) -> Preset:
         name,
         from_shore_a(hardness),
         f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}: of small strains, good to "
-        f"some tens of per cent; the sheet's secant at 100 % strain is {1e-6 * secant:.2g} MPa, and "
-        "strips of it that were pulled so far are as soft",
+        f"some tens of per cent; the sheet's secant at 100 % strain is {1e-6 * secant:.2g} MPa, "
+        "and strips of it that were pulled so far are as soft",
     )
 
 
