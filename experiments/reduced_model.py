@@ -19,9 +19,9 @@ signal's range, worst of the six states.
 Command: .venv/bin/python experiments/reduced_model.py [--smoke]
 Expected: stick: 8 terms, the very ones above; held-out error 0.3 % of range (node transitions in
 the spin), more than 100 times faster than the full model; k, c and the masses within 10 % of the
-expectation but for the spin's k (-11 %) and c_r (-16 %). Slip: 12 terms, 1 % up to 40 m/s2, 2 to 4 %
-up to 320 m/s2, where a model without saturation is off by the whole range; 22 % in a grasp of another
-depth, which is another mode. Half a minute on one core.
+expectation but for the spin's k (-11 %) and c_r (-16 %). Slip: 12 terms, 1 % up to 40 m/s2, 2 to
+4 % up to 320 m/s2, where a model without saturation is off by the whole range; 22 % in a grasp of
+another depth, which is another mode. Half a minute on one core.
 """
 
 from collections.abc import Sequence

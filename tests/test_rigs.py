@@ -617,3 +617,15 @@ def test_a_failure_keeps_what_was_simulated(small, tmp_path, capsys):
         "the body was lost"
         in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
     )
+
+
+def test_pads_that_let_go_are_noted():
+    """A set-point that was right for another body lifts the upper pad off this one."""
+    file = changed(template("t"), motion__y_d__values=("start", 72e-3))
+    (note,) = (one for one in check(file) if "let go" in one.message or "never" in one.message)
+    assert note.where == "contacts.upper"
+    knots = {"kind": "profile", "times": (0.0, 0.4, 1.0), "values": ("start", 49e-3, 72e-3)}
+    pressed = changed(template("t"), motion__y_d=knots)
+    (note,) = (one for one in check(pressed) if "let go" in one.message)
+    assert (note.severity, note.where) == ("note", "contacts.upper")
+    assert re.search(r"at t = .* s they are 2\d\.\d mm apart from it", note.message)

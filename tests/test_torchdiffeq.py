@@ -42,6 +42,18 @@ def test_torchdiffeq_runs_the_stepper():
     assert torch.equal(solution[:, 1].detach(), simulate(model, t, y0=y0[1], step=2e-3).y)
 
 
+def test_an_explicit_integration_backwards_is_warned_about_once():
+    """Pads decay, and backwards they grow; forwards, with a graph or without, nothing is said."""
+    model = coarse()
+    y0, t = grasped(model, (0.05, -0.01)), times(4e-5, 3)
+    options = {"step_size": 1e-5}
+    odeint(model, y0, t, method="rk4", options=options)[-1].sum().backward()
+    end = odeint_adjoint(model, y0, t, method="rk4", options=options)[-1].sum()
+    with pytest.warns(UserWarning, match='integrated backwards.*method="sdirk2"'):
+        end.backward()
+    odeint_adjoint(model, y0, t, method="rk4", options=options)[-1].sum().backward()
+
+
 @pytest.mark.parametrize("method", ["rk4", pytest.param("dopri5", marks=pytest.mark.slow)])
 @torch.no_grad()
 def test_explicit_methods_agree(method):
@@ -155,6 +167,7 @@ def test_odeint_adjoint_of_a_forgotten_run_says_so(rolling):
         y.sum().backward()
 
 
+@pytest.mark.filterwarnings("ignore:the rig is integrated backwards")
 def test_continuous_adjoint_agrees_on_a_short_window(rolling):
     """0.2 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the
     discrete adjoint."""

@@ -20,6 +20,7 @@ from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal,
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import Layout, State
+from torchsoft.physics.validity import Backwards
 from torchsoft.quantity import Gravity, Quantity, quantity_of
 
 GROUND = "ground"
@@ -92,6 +93,7 @@ class Rig(Shown, nn.Module):
         self.reference = reference or Reference()
         self.taxels = dict(taxels or {})
         self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}
+        self.watch = Backwards()
         self.check_names()
 
     bodies: Mapping[str, Body]
@@ -356,6 +358,7 @@ class Rig(Shown, nn.Module):
     def forward(self, t: Tensor | float, y: Tensor, reference: Reference | None = None) -> Tensor:
         """dy/dt, shaped like y. Raises `ValueError` for a state of another length or dtype."""
         self.layout.check(y)
+        self.watch.see(t)
         signals = self.follow(
             torch.as_tensor(t, dtype=torch.float64).expand(y.shape[:-1]), reference
         )

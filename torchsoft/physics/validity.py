@@ -4,6 +4,7 @@ take no more than the effort. Every refusal is one sentence that names the fault
 """
 
 import math
+import warnings
 from typing import Any, TypeVar
 
 import numpy as np
@@ -35,6 +36,10 @@ size."""
 ALIKE_POINTS = 1e-9
 """Largest relative difference, by rounding, between slip rates of all points at once and of each
 alone."""
+
+FALLS = 8
+"""Evaluations one after the other at earlier and earlier times that only an integration backwards
+makes: a step that is refused goes back once."""
 
 EFFORTS, NORMALS = (1e-3, 0.1, 1.0, 10.0, 100.0), (0.0, 0.1, 1.0, 10.0)
 """Trial efforts and normal forces [N] at which a slip law is tried."""
@@ -306,3 +311,32 @@ def slip_rates(where: str, law: Any, E: Tensor, F_N: Tensor, R: float) -> Tensor
             f"{given}"
         )
     return rate
+
+
+class Backwards:
+    """Watch of a rig's right-hand side: warns once where a solver integrates it backwards while a
+    graph is recorded, as `odeint_adjoint` does with an explicit method: pads decay, and backwards
+    they grow."""
+
+    def __init__(self) -> None:
+        self.last, self.falls, self.said = -math.inf, 0, False
+
+    def see(self, t: Tensor | float) -> None:
+        """An evaluation at a time [s]."""
+        if self.said or not torch.is_grad_enabled():
+            return
+        if isinstance(t, Tensor):
+            if t.ndim or is_functorch_wrapped_tensor(t):
+                return
+            t = t.item()
+        self.falls = self.falls + 1 if t < self.last else self.falls if t == self.last else 0
+        self.last = t
+        if self.falls >= FALLS:
+            self.said = True
+            warnings.warn(
+                "the rig is integrated backwards, where its stiff pads grow: gradients of "
+                "`odeint_adjoint` with an explicit method may be wrong by any factor; say "
+                'method="sdirk2" (after `torchsoft.register_method()`), or use `odeint` or '
+                "`torchsoft.simulate`",
+                stacklevel=2,
+            )

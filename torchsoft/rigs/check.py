@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsoft.diagnostic import SEVERITIES, Diagnostic
 from torchsoft.parallel import single_threaded
-from torchsoft.physics.motion import Reference, Sampled, hold
+from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import State
@@ -25,7 +25,8 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, signals
 from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.geometry import Scene, at, collision, nodes, tied
-from torchsoft.rigs.motion import CsvTable, ProfileTable, quantum
+from torchsoft.rigs.motion import ProfileTable
+from torchsoft.rigs.recorded import recordings
 from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, modes, strained
 from torchsoft.solve.kernel.arrays import PASSED
 
@@ -146,12 +147,19 @@ def presses(there: list[Moment]) -> Iterator[Diagnostic]:
             for pair in moment.scene.facing(body)
         }
     ):
-        nearest = max(room(moment.scene, pair) for moment in there)
-        if nearest <= 0:
+        rooms = [room(moment.scene, pair) for moment in there]
+        body = scene.rig.contacts[pair[0]].body
+        if max(rooms) <= 0:
             yield Diagnostic(
                 "warning", f"contacts.{pair[-1]}",
-                f"{named(scene, pair)} never press `{scene.rig.contacts[pair[0]].body}`: at the "
-                f"motions' knots they come no nearer than {-1e3 * nearest:.3g} mm",
+                f"{named(scene, pair)} never press `{body}`: at the motions' knots they come no "
+                f"nearer than {-1e3 * max(rooms):.3g} mm",
+            )  # fmt: skip
+        elif rooms[-1] <= 0:
+            yield Diagnostic(
+                "note", f"contacts.{pair[-1]}",
+                f"{named(scene, pair)} let go of `{body}`: at t = {there[-1].time:.3g} s they are "
+                f"{-1e3 * rooms[-1]:.3g} mm apart from it",
             )  # fmt: skip
 
 
@@ -336,12 +344,9 @@ JUMP = {"m": 1e-4, "rad": 1e-2}
 TOUCH = 1e-6
 """Depth [m] up to which touching things do not count as overlapping."""
 
-LONGER, FARTHER, TURNED = 100.0, 10.0, 20 * np.pi
-"""Thresholds of doubt in units: duration of a recorded motion over that of the run, range of a
-set-point over the size of the rig, and turn of a set-point [rad]."""
-
-OUTPUTS_PER_PERIOD = 4
-"""Fewest outputs in a period of a motion."""
+FARTHER, TURNED = 10.0, 20 * np.pi
+"""Thresholds of doubt in units: range of a set-point over the size of the rig, and turn of a
+set-point [rad]."""
 
 
 @single_threaded()
@@ -378,53 +383,6 @@ def ties(e: Estimate) -> Iterator[Diagnostic]:
                 f"it measures {', '.join(measured)} and pushes {pushed}, but no pad and contact "
                 f"tie `{at(pushed)[0]}` to `{'`, `'.join(bodies)}`: whatever it does, it moves "
                 f"nothing that it sees; add a contact, or measure {pushed}",
-            )  # fmt: skip
-
-
-def recordings(e: Estimate) -> Iterator[Diagnostic]:
-    """Findings on recorded motions that do not cover the run, and on waves too fast for the
-    outputs."""
-    interval = e.file.outputs.interval
-    for name, motion in e.file.motion.items():
-        one, fastest = e.rig.reference[name], motion.fastest()
-        if isinstance(motion, CsvTable) and isinstance(one, Sampled):
-            first, last = float(one.times[0]), float(one.times[-1])
-            if first >= e.file.outputs.duration:
-                yield Diagnostic(
-                    "error", f"motion.{name}.file",
-                    f"{motion.file} begins at {first:g} s, and the run ends at "
-                    f"{e.file.outputs.duration:g} s: where its times are of a clock, say "
-                    "from_first = true",
-                )  # fmt: skip
-            elif last > LONGER * e.file.outputs.duration:
-                yield Diagnostic(
-                    "warning", f"motion.{name}.file",
-                    f"{motion.file} lasts {last:g} s, and the run shows "
-                    f"{e.file.outputs.duration:g} s of it: are its times in milliseconds?",
-                )  # fmt: skip
-            elif first > 0:
-                sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
-                yield Diagnostic("warning", f"motion.{name}.file", sentence)
-            if step := quantum(one.values.detach().numpy()):
-                each = float(one.times.diff().median())
-                yield Diagnostic(
-                    "warning", f"motion.{name}.file",
-                    f"{motion.file} is in steps of {step:.3g} {e.file.unit(name)}, as of an "
-                    f"encoder: rates of the set-point jump by {step / each:.2g} "
-                    f"{e.file.unit(name)}/s from row to row; smooth the column",
-                )  # fmt: skip
-            if last < e.file.outputs.duration * (1 - 1e-9):
-                yield Diagnostic(
-                    "error", f"motion.{name}.file",
-                    f"{motion.file} ends at {last:g} s, but the run lasts until "
-                    f"{e.file.outputs.duration:g} s: nothing says what is wanted then; shorten "
-                    f"outputs.duration to {last:g}, or record longer",
-                )  # fmt: skip
-        if fastest * interval * OUTPUTS_PER_PERIOD > 1:
-            yield Diagnostic(
-                "warning", "outputs.interval",
-                f"outputs every {interval:g} s do not show motion.{name}, which goes up to "
-                f"{fastest:g} Hz; take {1 / (OUTPUTS_PER_PERIOD * fastest):.2g} s or less",
             )  # fmt: skip
 
 
