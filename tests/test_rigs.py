@@ -629,3 +629,12 @@ def test_pads_that_let_go_are_noted():
     (note,) = (one for one in check(pressed) if "let go" in one.message)
     assert (note.severity, note.where) == ("note", "contacts.upper")
     assert re.search(r"at t = .* s they are 2\d\.\d mm apart from it", note.message)
+
+
+def test_a_part_that_is_called_alike_is_asked_about():
+    with pytest.raises(
+        ValueError, match=r"materials\.rubbr\.kind is missing; did you mean mat.*er"
+    ):
+        template("t").override(materials={"rubbr": {"E": 1e6}})
+    with pytest.raises(ValueError, match=r"bodies\.disk: .*; did you mean bodies\.disc\?"):
+        template("t").override(bodies={"disk": {"mass": 1.0}})

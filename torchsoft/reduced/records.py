@@ -134,6 +134,7 @@ def _of_run(run: Trajectory, disc: str, bracket: str) -> tuple[dict[str, np.ndar
                 f"`{field}` = {name!r} is no body of the run; "
                 f"{suggestion(name, setup.bodies, 'its bodies are')}: give the name of the body "
                 + ("that rolls" if field == "disc" else "that carries the other pad")
+                + f" (--{field})"
             )
     out = {
         "x_C": state.pose[disc][:, 0],

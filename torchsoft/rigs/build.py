@@ -30,7 +30,7 @@ from torchsoft.physics.statics import (
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import Gravity, Quantity, Time
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
-from torchsoft.rigs.fields import Group, at_field, with_entry
+from torchsoft.rigs.fields import Group, at_field, misnamed, with_entry
 from torchsoft.rigs.geometry import AWAY, Scene, above, at, upon
 from torchsoft.rigs.motion import HELD, MotionContext, MotionTable, flattened
 from torchsoft.rigs.parts import (
@@ -44,7 +44,7 @@ from torchsoft.rigs.parts import (
     TaxelsTable,
 )
 from torchsoft.solve.trajectory import units
-from torchsoft.tables import LISTED, from_toml, line
+from torchsoft.tables import LISTED, InvalidTable, from_toml, line
 
 M = TypeVar("M")
 
@@ -210,7 +210,11 @@ class RigFile(Group):
                     out[key] = merged(old.get(key), value)
             return out
 
-        file = type(self).model_validate(merged(self.model_dump(exclude_unset=True), groups))
+        own = self.model_dump(exclude_unset=True)
+        try:
+            file = type(self).model_validate(merged(own, groups))
+        except InvalidTable as error:
+            raise InvalidTable(f"{error}{misnamed(str(error), own, groups)}") from None
         file._folder = self._folder
         return file
 

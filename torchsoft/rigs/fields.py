@@ -2,7 +2,7 @@
 word."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import lru_cache, reduce
@@ -20,6 +20,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
+from torchsoft.display import nearest
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import metadata, quantity
 from torchsoft.tables import LISTED, Table, shown
@@ -197,3 +198,15 @@ def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any
     out, (first, *rest) = list(values), places
     out[first - 1] = with_entry(key, values[first - 1], rest, value) if rest else value
     return out
+
+
+def misnamed(error: str, own: Mapping[str, Any], given: Mapping[str, Any]) -> str:
+    """Question after the parts of a file that an error names and that were given but are not its
+    `own`, where one of these is called alike."""
+    return "".join(
+        f"; did you mean {group}.{near}?"
+        for group, parts in given.items()
+        if isinstance(parts, Mapping) and isinstance(own.get(group), Mapping)
+        for name in parts.keys() - own[group].keys()
+        if f"{group}.{name}" in error and (near := nearest(name, own[group])) is not None
+    )
