@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import line
+from torchsoft.physics.names import check_names
 
 FADE = 0.15
 """Time [s] over which waves come and go."""
@@ -341,14 +342,15 @@ class Reference(nn.Module):
     """Reference of a rig: named signals of time, setpoints, feed-forward efforts and driven
     coordinates.
 
-    Its time counts from `origin` [s]. Raises `ValueError` for a signal that is not a module giving
-    (value, rate) at t.
+    Its time counts from `origin` [s]. Raises `ValueError` for a name that a signal cannot have, and
+    for a signal that is not a module giving (value, rate) at t.
     """
 
     origin: float = 0.0
 
-    def __init__(self, **signals: nn.Module) -> None:
+    def __init__(self, /, **signals: nn.Module) -> None:
         super().__init__()
+        check_names("motion", signals, dotted=True)
         for name, signal in signals.items():
             if not isinstance(signal, nn.Module):
                 raise ValueError(
