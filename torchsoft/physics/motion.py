@@ -16,6 +16,10 @@ from torchsoft.physics.names import check_names
 FADE = 0.15
 """Time [s] over which waves come and go."""
 
+CLOSEST = 1e-9
+"""Time [s] between two different values of a signal at the least: no step by tolerance is shorter,
+and a rate that lasts for less would act on nothing."""
+
 Knotted = tuple[list[float], list[float]]
 """Times [s] and values."""
 
@@ -59,6 +63,14 @@ class Piecewise(nn.Module):
             return (
                 f"`values` must hold one number per time ({len(t)}), but have shape "
                 f"{tuple(self.values.shape)}"
+            )
+        for i in np.flatnonzero(np.diff(t) < CLOSEST):
+            if bool(self.values[i] == self.values[i + 1]):
+                continue
+            return (
+                f"`times` of different values must be {CLOSEST:g} s apart or more, no step is "
+                f"shorter, but {t[i]:g} s and {t[i + 1]:g} s are {t[i + 1] - t[i]:.2g} s apart; "
+                "let the signal take longer from one to the other"
             )
         return ""
 
