@@ -84,5 +84,5 @@ def fit_material(options: argparse.Namespace) -> int:
 def list_presets(options: argparse.Namespace) -> int:
     from torchsoft.materials.presets import PRESETS as presets
 
-    say("\n".join(one.described() for one in presets.values()))
+    say("\n".join(one.described() for one in presets.values()), needed=True)
     return 0
