@@ -17,6 +17,7 @@ from torchsoft.datasets.files import (
     MANIFEST,
     Manifest,
     StoreError,
+    check_apart,
     filesystem,
     keys,
     listed,
@@ -254,7 +255,10 @@ def moving(data: xr.Dataset, config: Config) -> list[str]:
 
 
 def report(url: str, picture: Path | None = None, say: Callable[[str], None] = print) -> int:
-    """Say every finding, sizes and counts; how many findings there are."""
+    """Say every finding, sizes and counts; how many findings there are.
+    Raises `ValueError` for a picture in the dataset itself."""
+    if picture is not None:
+        check_apart(url, "--picture", picture)
     found = list[str]()
     for finding in check(url):
         say(finding)
