@@ -19,7 +19,7 @@ FLOWS = {
     """,
     "codegen": "graph operations trace emit .",
     "physics": """
-        arguments mesh shapes contact material pads motion multibond state parts
+        arguments mesh shapes contact material pads multibond state parts names motion
         validity rig summary extensions energy statics setup .
     """,
     "paper": "parameters rig equilibrium .",

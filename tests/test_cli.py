@@ -6,15 +6,20 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from test_material_fit import plain, relaxing
 from test_sysid_measured import CONFIG, EXAMPLE, F_Y, X_C, X_D, Table, scale, write
 
+from torchsoft import files
 from torchsoft.cli import main
+from torchsoft.rigs import RigFile
+from torchsoft.solve import stepper
 from torchsoft.sysid import Unreachable
 from torchsoft.sysid.measured import load, unreachable
 from torchsoft.sysid.prediction import FailedRun
@@ -288,3 +293,103 @@ def test_competing_laws_are_compared(folder, capsys):
         "comparison.json",
         "report.html",
     ]
+
+
+# streams, signals and names
+# ----------------------------------------------------------------------
+
+
+def test_what_nobody_reads_does_not_undo_the_work(monkeypatch, tmp_path, capsys):
+    """`... | true` and `>/dev/full` ended in 2 after the work was complete."""
+    read, write_end = os.pipe()
+    os.close(read)
+    for number, handle in enumerate((write_end, os.open("/dev/full", os.O_WRONLY))):
+        with os.fdopen(handle, "w") as stream:
+            monkeypatch.setattr(sys, "stdout", stream)
+            assert main(["init", str(tmp_path / f"rig{number}")]) == 0
+            assert main(["material", "presets"]) == 0 if number == 0 else 2
+    monkeypatch.undo()
+    assert "the output cannot be written: No space left on device" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["stdin", "stdout", "stderr"])
+def test_a_closed_stream_is_no_reason_to_do_nothing(name, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, name, None)
+    assert main(["init", str(tmp_path / "rig")]) == 0
+    assert (tmp_path / "rig.toml").is_file()
+    assert main(["check", str(tmp_path / "none.toml")]) == 2
+    getattr(sys, name).close()
+
+
+def test_a_file_to_start_from_is_whole_or_not_there(monkeypatch, tmp_path, capsys):
+    """On a full disk an empty one was left, which was "there already" the next time."""
+    path = tmp_path / "rig.toml"
+    with monkeypatch.context() as full:
+        full.setattr(Path, "write_text", lambda *_, **__: raised(OSError(28, "No space left")))
+        assert main(["init", str(path)]) == 2
+        assert f"{path}: No space left" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert main(["init", os.fsdecode(bytes(tmp_path) + b"/r\xff")]) == 0
+    assert RigFile.from_toml(os.fsdecode(bytes(tmp_path) + b"/r\xff.toml")).title == "r\ufffd"
+    with monkeypatch.context() as ascii_only:
+        ascii_only.setattr(files, "hold", lambda _: "\xf6".encode("ascii"))
+        assert main(["init", str(tmp_path / "m\xf6bel")]) == 2
+        assert "cannot be a file's name in this locale" in capsys.readouterr().err
+    assert main(["init", str(path)]) == 0
+
+
+def raised(error: Exception) -> None:
+    raise error
+
+
+def test_a_line_break_in_a_name_is_refused(tmp_path, capsys):
+    assert main(["init", str(tmp_path / "a\nb")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert "has a line break in it; leave it out" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_is_told_to_end_keeps_what_is_simulated(sign, tmp_path, monkeypatch):
+    """SIGTERM, by which schedulers end a job, lost it."""
+    file, integrate = tmp_path / "rig.toml", stepper.ImplicitStepper.integrate
+    assert main(["init", str(file)]) == 0
+
+    def told(self, *arguments, **options):
+        for number, out in enumerate(integrate(self, *arguments, **options)):
+            yield out
+            if number == 1:
+                os.kill(os.getpid(), sign)
+
+    monkeypatch.setattr(stepper.ImplicitStepper, "integrate", told)
+    monkeypatch.setattr(stepper, "CHUNK", 50)
+    assert main(["run", str(file), "--out", str(tmp_path / "out")]) == 130
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["stopped"] == "interrupted"
+    assert 0 < summary["simulated_s"] < RigFile.from_toml(file).outputs.duration
+
+
+def test_a_window_system_that_is_not_there_is_not_asked(tmp_path):
+    """Files are drawn; an unknown MPLBACKEND failed after the run."""
+    code = "import sys; from torchsoft.cli import main; sys.exit(main(['version']))"
+    code = code.replace("sys.exit(", "main(['version']); import matplotlib; sys.exit(0 * ")
+    env = os.environ | {"MPLBACKEND": "nonsense"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=env, stdout=subprocess.DEVNULL)
+
+
+def test_an_interrupt_among_the_assumptions_draws_nothing(folder, monkeypatch, capsys):
+    """Ctrl-C took 5 s, in which figures of a report were drawn."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
+    write(folder / "data.csv", rows(42))
+    assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 130
+    assert sorted(os.listdir("out")) == ["answer.json", "unfinished"]
+    out, err = capsys.readouterr()
+    assert "interrupted; the same command continues" in err
+    assert "report.html" not in out
+    monkeypatch.undo()

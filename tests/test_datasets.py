@@ -451,6 +451,24 @@ def test_whoever_lays_a_folder_out_later_changes_nothing(made, tmp_path):
     assert contents(folder) == contents(made[0])
 
 
+def test_the_bar_of_a_finished_set_counts_simulated_seconds(made, capsys):
+    """It said "-188155.69 simulated s/s" and "1.2000000000000002"."""
+    generate(made[1], str(made[0]), Serial())
+    err = capsys.readouterr().err
+    total = 5 * made[1].duration
+    assert f" {total:.1f}/{total:.1f} simulated s [" in err
+    assert "-" not in err
+
+
+def test_nothing_is_written_into_a_dataset(made, tmp_path):
+    for part, words in (
+        ("export", ["--to", "mcap", "--out", str(made[0] / "logs")]),
+        ("check", ["--picture", str(made[0] / "picture.png")]),
+    ):
+        assert main(["dataset", part, str(made[0]), *words]) == 2
+    assert list(check(str(made[0]))) == []
+
+
 def test_check_draws_its_picture(made, tmp_path, capsys):
     picture = str(tmp_path / "coverage.png")
     assert main(["dataset", "check", str(made[0]), "--picture", picture]) == 0
@@ -477,9 +495,12 @@ def test_a_failed_simulation_is_recorded(tmp_path, monkeypatch):
     assert found == "1 of 1 trajectories failed, most often: the disc was lost at t = 0.1 s"
 
 
-def test_only_unfinished_shards_are_made_again(made, tmp_path):
+@pytest.mark.parametrize("recorded", [False, True])
+def test_only_unfinished_shards_are_made_again(made, tmp_path, recorded):
+    """A shard that lacks a file counts as unfinished, whatever its record says."""
     folder, config = copy(made[0], tmp_path / "set"), made[1]
-    remove("finished/1.sha256")(folder)
+    if not recorded:
+        remove("finished/1.sha256")(folder)
     (folder / "theta/c/1/0").unlink()
     (folder / "theta/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("c/**/*") if p.is_file()}

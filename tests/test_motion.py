@@ -160,3 +160,19 @@ def test_a_signal_at_other_times(signal):
     torch.testing.assert_close(rate * slope_there, slope, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(moved.stops, rate * signal.stops + shift, rtol=0, atol=0)
     assert not moved.ill_posed()
+
+
+@pytest.mark.parametrize("kind", [Profile, Lines, Sampled])
+def test_a_jump_within_less_than_the_shortest_step_is_refused(kind):
+    """Its rate acted on nothing: a step of 20 mm gave a bracket 3.4 m/s where one within 10 us
+    gives 18 m/s."""
+    for gap in (1e-16, 1e-12, 9e-10):
+        with pytest.raises(ValueError, match="`times` of different values must be 1e-09 s apart"):
+            kind([0.0, gap], [0.0, 20e-3])
+        assert len(kind([0.0, gap, 1.0], [0.0, 0.0, 1.0]).times) == 3
+    assert float(kind([0.0, 1.1e-9], [0.0, 20e-3])(torch.tensor(1.0).double())[0]) == 20e-3
+    changed = Profile([0.0, 1e-12, 1.0], [0.0, 0.0, 1.0])
+    with torch.no_grad():
+        changed.values[1] = 1.0
+    with pytest.raises(ValueError, match="the signal `x_d` of the reference is none any more"):
+        Reference(x_d=changed)(f64(0.0), ["x_d"])

@@ -1,16 +1,19 @@
 """Numbers of a rig file have their names in that file, whatever asks for them."""
 
+import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import nested
+import torch
+from conftest import coarse, nested
 from test_controllers import file as controlled
 from torch import nn
 
-from torchsoft import Rig
+from torchsoft import Body, Profile, Reference, Rig
 from torchsoft.rigs import RigFile
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
@@ -119,3 +122,63 @@ def test_weights_of_a_network_are_tensors_by_name(tmp_path):
 def test_an_entry_that_is_not_there_is_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         controlled().override(controllers={"jaw": settings})
+
+
+TREE = RIGS[0].with_name("two_fingers.toml")
+
+
+def renamed(old: str, new: str) -> RigFile:
+    """A ready rig with another name in every place."""
+    tree = json.dumps(RigFile.from_toml(TREE).model_dump(exclude_unset=True))
+    assert f'"{old}"' in tree
+    return RigFile.from_tree(json.loads(tree.replace(f'"{old}"', json.dumps(new))))
+
+
+MOTION = next(iter(RigFile.from_toml(TREE).motion))
+
+
+@pytest.mark.parametrize("name", ["a/b", ".", "", "forward", "training", "a.b.c", "1", "a\nb"])
+def test_motions_have_names_by_the_rule_of_the_others(name):
+    words = "taken by torch" if name in ("forward", "training") else "letters, digits and"
+    with pytest.raises(ValueError, match=f"motion\\..*: the name .*{words}"):
+        renamed(MOTION, name)
+    with pytest.raises(ValueError, match=f"motion\\..*: the name .*{words}"):
+        Reference(**{name: Profile([0.0], [0.0])})
+    assert "self" in renamed(MOTION, "self").assemble().signals
+    assert Reference(self=Profile([0.0], [1.0]))(torch.zeros(1).double(), ["self"])[0, 0, 0] == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "owner"),
+    [
+        ("x_{body}", "{body}.x"),
+        ("v_x_{body}", "the rate of {body}.x"),
+        ("L_{body}", "the angular momentum of the body `{body}`"),
+        ("M_{pad}", "the moment on the pad `{pad}`"),
+        ("F_{actuator}", "the effort of the actuator `{actuator}`"),
+        ("time", "an array `time` of files"),
+        ("pose", "an array `pose` of files"),
+        ("stretch_{contact}", "`stretch_{contact}` of the contact"),
+        ("{contact}.centre", "`{contact}.centre` of the contact"),
+    ],
+)
+def test_two_channels_of_one_name_are_refused_with_both_owners(name, owner):
+    """A motion that was called `x_disc` was read in place of the disc's x."""
+    rig = renamed(MOTION, MOTION).assemble()
+    parts = {k: next(iter(getattr(rig, f"{k}s"))) for k in ("pad", "actuator", "contact")}
+    parts["body"] = next(iter(rig.bodies))
+    name, owner = name.format(**parts), owner.format(**parts)
+    with pytest.raises(ValueError, match=re.escape(f"the channel `{name}`")) as refused:
+        renamed(MOTION, name).assemble()
+    assert owner in str(refused.value)
+    assert f"the motion `{name}`" in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["ground", "disc_spin", "pad_L", "a/b", "keys"])
+def test_bodies_cannot_have_names_of_other_junctions(name):
+    """One called "ground" did not settle in one rig and ran in others."""
+    model = coarse()
+    parts = {"pads": dict(model.pads), "contacts": dict(model.contacts)}
+    bodies = dict(model.bodies) | {name: Body(0.1, theta=0.0)}
+    with pytest.raises(ValueError, match=f"the junction `{name}`|bodies.{name}: the name"):
+        Rig(bodies=bodies, **parts)

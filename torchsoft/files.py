@@ -6,6 +6,7 @@ import os
 import re
 import secrets
 import stat
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -44,15 +45,21 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
     Missing folders are made. The partial file is removed when writing it fails; one that a killed
     process left is removed by the next that writes the same file. Its writer holds a lock on it, so
-    that nobody removes it before. Raises `IsADirectoryError` before anything is written where
-    `path` is a folder.
+    that nobody removes it before. Raises, before anything is written, `IsADirectoryError` where
+    `path` is a folder, and `ValueError` for a name that the locale cannot write.
     """
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; name a file, perhaps one in it")
     remove_partials(path.parent.glob(f"{escape(path.name)}.*.partial"))
     partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
-    handle = hold(partial)
+    try:
+        handle = hold(partial)
+    except UnicodeEncodeError:
+        raise ValueError(
+            f"{str(path)!r} cannot be a file's name in this locale, whose names are in "
+            f"{sys.getfilesystemencoding()}; take another name, or set LC_ALL=C.UTF-8"
+        ) from None
     assert handle is not None  # of a name of its own
     try:
         yield partial

@@ -13,19 +13,23 @@ from contextlib import contextmanager
 from importlib.metadata import version
 
 from torchsoft.cli import dataset, design, identify, material, plan, plot, reduce, rigs
-from torchsoft.cli.results import failed, say
+from torchsoft.cli.results import failed, open_streams, say
 
 GRACE = 1.5
 """Time [s] from Ctrl-C to the forced end of the process, for a long library call that cannot be
 interrupted."""
 
+ENDS = signal.SIGINT, signal.SIGTERM
+"""Signals that interrupt the work, which keeps what is done: Ctrl-C, and the one of a scheduler."""
+
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """End the process `GRACE` after a Ctrl-C that Python has not handled, because it is inside a
-    library's long call."""
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not ours or threading.current_thread() is not threading.main_thread():
+    """Turn the signals `ENDS` into `KeyboardInterrupt`, and end the process `GRACE` after one that
+    Python has not handled, because it is inside a library's long call."""
+    default = signal.default_int_handler, signal.SIG_DFL
+    before = {one: how for one in ENDS for how in [signal.getsignal(one)] if how in default}
+    if not before or threading.current_thread() is not threading.main_thread():
         yield
         return
     heard, (read, write) = threading.Event(), os.pipe()
@@ -36,19 +40,21 @@ def interruptible() -> Iterator[None]:
         raise KeyboardInterrupt
 
     def watch() -> None:
-        if os.read(read, 1) == bytes([signal.SIGINT]) and not heard.wait(GRACE):
+        if os.read(read, 1)[0] in before and not heard.wait(GRACE):
             os.write(2, b"\ninterrupted\n")
             os._exit(130)
 
     watcher = threading.Thread(target=watch, daemon=True)
-    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-    signal.signal(signal.SIGINT, hear)
+    wakeup = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    for one in before:
+        signal.signal(one, hear)
     watcher.start()
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.set_wakeup_fd(before)
+        for one, handler in before.items():
+            signal.signal(one, handler)
+        signal.set_wakeup_fd(wakeup)
         os.write(write, b"\0")
         watcher.join()
         os.close(read)
@@ -70,6 +76,7 @@ def note_once() -> Callable[..., None]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command. The exit status is 0, 2 for an error that the user can fix, 130 for an
     interruption."""
+    open_streams()
     parser = argparse.ArgumentParser(
         prog="torchsoft", description="A differentiable simulator of soft contact manipulation."
     )
@@ -82,8 +89,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     # before torch is imported: its threads wait for each other where a core is busy
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever windows are configured
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(given)
+    if broken := [one for one in given if "\n" in one]:
+        return failed(f"{broken[0]!r} has a line break in it; leave it out")
     options.command = shlex.join(
         ["torchsoft", *(os.fsencode(one).decode("utf-8", "replace") for one in given)]
     )
@@ -96,5 +106,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except OSError as error:
             return failed(f"{error.filename}: {error.strerror}" if error.filename else str(error))
         except KeyboardInterrupt:
-            print("\ninterrupted", file=sys.stderr)
+            say("\ninterrupted", error=True)
             return 130

@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +123,7 @@ def make(options: argparse.Namespace) -> int:
         return 3
     except KeyboardInterrupt:
         message = "interrupted: finished shards are kept; start again to make what is missing"
-        print(message, file=sys.stderr)
+        say(message, error=True)
         return 130
     made = sum(len(config.rows(shard)) for shard in mine.shards(config))
     left = generate.unfinished(config, options.out)
@@ -147,7 +146,7 @@ def slurm(options: argparse.Namespace) -> int:
     from torchsoft.datasets.generate import job_array
 
     script, price = job_array(options.config, options.out, options.parts)
-    say(script.rstrip())
+    say(script.rstrip(), needed=True)
     say(price, error=True)
     return 0
 
@@ -156,7 +155,7 @@ def check(options: argparse.Namespace) -> int:
     """Print the defects of a dataset; the exit status is 1 for any finding."""
     from torchsoft.datasets.check import report
 
-    return int(report(options.store, options.picture) > 0)
+    return int(report(options.store, options.picture, say) > 0)
 
 
 def export(options: argparse.Namespace) -> int:

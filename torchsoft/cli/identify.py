@@ -121,10 +121,12 @@ def identify(options: argparse.Namespace) -> int:
             )  # fmt: skip
             result = replace(result, command=options.command)
             result.save(options.out / "answer.json")
-            report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
-            if not result.made_by["untried"]:
+            written, verdict = [options.out / "answer.json"], ""
+            if not result.made_by["untried"]:  # interrupted, nobody waits for pictures
+                written.append(options.out / "report.html")
+                report(result, case.problem, written[-1], checkpoint=unfinished)
                 forget(unfinished)
-            verdict = compared(case, fit, options) if case.laws else ""
+                verdict = compared(case, fit, options) if case.laws else ""
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
     except KeyboardInterrupt:
@@ -141,10 +143,7 @@ def identify(options: argparse.Namespace) -> int:
         say(verdict)
     if result.made_by["untried"]:
         say(f"\ninterrupted; the same command continues with what is in {unfinished}", error=True)
-    say(
-        f"fitted in {result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and "
-        f"{options.out / 'report.html'}"
-    )
+    say(f"fitted in {result.cost['wall_s']:.0f} s; written to {' and '.join(map(str, written))}")
     return 130 if result.made_by["untried"] else 0
 
 

@@ -158,5 +158,5 @@ def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus":
 def list_presets(options: argparse.Namespace) -> int:
     from torchsoft.materials.presets import PRESETS as presets
 
-    say("\n".join(one.described() for one in presets.values()))
+    say("\n".join(one.described() for one in presets.values()), needed=True)
     return 0

@@ -76,5 +76,6 @@ def versions(options: argparse.Namespace) -> int:
     """Print the versions of torchsoft and its main dependencies."""
     names = ("torchsoft", "torch", "numpy", "numba")
     listed = ", ".join(f"{name} {version(name)}" for name in names)
-    say(f"{listed}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")
+    system = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    say(f"{listed}, {system}", needed=True)
     return 0

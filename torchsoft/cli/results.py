@@ -1,6 +1,7 @@
 """Shared parts of commands: arguments, the folder of results, and messages on the terminal."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -46,14 +47,34 @@ def add_progress(command: Any) -> None:
     )  # fmt: skip
 
 
-def say(*text: object, error: bool = False) -> None:
-    """Print text without control characters."""
-    print(plain(" ".join(map(str, text))), file=sys.stderr if error else sys.stdout)
+def open_streams() -> None:
+    """Open the standard streams that are closed, on nothing."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            nothing = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(nothing, "r" if name == "stdin" else "w"))
+
+
+def say(*text: object, error: bool = False, needed: bool = False) -> None:
+    """Print text without control characters. Where nobody reads it, or it cannot be written, the
+    work goes on; raises `OSError` for text that is the work itself, which is `needed`."""
+    stream = sys.stderr if error else sys.stdout
+    try:
+        print(plain(" ".join(map(str, text))), file=stream, flush=True)
+    except OSError as cause:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())  # which takes what is left in the buffer
+        os.close(nowhere)
+        if error or isinstance(cause, BrokenPipeError):
+            return
+        if needed:
+            raise
+        say(f"torchsoft: note: the output cannot be written: {cause.strerror}", error=True)
 
 
 def failed(reason: str) -> int:
     """Print the reason of a failure; returns the exit status."""
-    print(f"torchsoft: error: {line(reason, 2000)}", file=sys.stderr)
+    say(f"torchsoft: error: {line(reason, 2000)}", error=True)
     return 2
 
 

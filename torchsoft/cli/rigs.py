@@ -1,6 +1,7 @@
 """The commands `run`, `check` and `init` on rig files."""
 
 import argparse
+import os
 import shlex
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,7 @@ def check_rig(options: argparse.Namespace) -> int:
 
 def init_rig(options: argparse.Namespace) -> int:
     """Write a rig file to start from."""
+    from torchsoft.files import save_text
     from torchsoft.rigs.written import template, to_toml
 
     path = Path(options.name.removesuffix(".toml") + ".toml")
@@ -115,16 +117,13 @@ def init_rig(options: argparse.Namespace) -> int:
         return failed(
             f"NAME should be the name of a file, such as mine or mine.toml, not {options.name!r}"
         )
-    rig = template(path.stem)
+    if os.path.lexists(path):
+        return failed(f"{path} is there already; take another name")
+    rig = template(os.fsencode(path.stem).decode("utf-8", "replace"))
     if options.material is not None:
         rubber = {"kind": "preset", "name": options.material, "depth": 44e-3}
         rig = rig.override(materials={"rubber": rubber})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(to_toml(rig))
-    except FileExistsError:
-        return failed(f"{path} is there already; take another name")
+    save_text(path, to_toml(rig))
     check, run = (shlex.join(["torchsoft", command, str(path)]) for command in ("check", "run"))
     say(f"written to {path}; {check} looks it over, {run} simulates it")
     return 0

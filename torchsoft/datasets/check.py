@@ -1,7 +1,7 @@
 """Validation of a dataset: read it again, list its defects, and draw its coverage."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from torchsoft.datasets.files import (
     MANIFEST,
     Manifest,
     StoreError,
+    check_apart,
     filesystem,
     keys,
     listed,
@@ -253,24 +254,27 @@ def moving(data: xr.Dataset, config: Config) -> list[str]:
     return sorted(names, key=lambda name: -spread[name])[:3]
 
 
-def report(url: str, picture: Path | None = None) -> int:
-    """Print every finding, sizes and counts; how many findings there are."""
+def report(url: str, picture: Path | None = None, say: Callable[[str], None] = print) -> int:
+    """Say every finding, sizes and counts; how many findings there are.
+    Raises `ValueError` for a picture in the dataset itself."""
+    if picture is not None:
+        check_apart(url, "--picture", picture)
     found = list[str]()
     for finding in check(url):
-        print(finding)
+        say(finding)
         found.append(finding)
     try:
         data = open_dataset(url, unfinished=True)
-        print(summary(url, data))
+        say(summary(url, data))
         if picture is not None:
             config = Config.model_validate(Manifest.read(url).config)
             save(figure(data, config), picture, dpi=120)
-            print(f"picture in {picture}")
+            say(f"picture in {picture}")
     except (
         Exception
     ) as error:  # a damaged store has been reported above; the picture must not hide it
         if str(error) not in found:
             found.append(line(f"no summary or picture: {type(error).__name__}: {error}"))
-            print(found[-1])
-    print(f"{len(found)} finding{'s' * (len(found) > 1)}" if found else "sound")
+            say(found[-1])
+    say(f"{len(found)} finding{'s' * (len(found) > 1)}" if found else "sound")
     return len(found)

@@ -148,6 +148,11 @@ class Layout(Table):
         """The shards that have a record."""
         return {shard for key in keys(url, FINISHED) if (shard := self.shard(key)) is not None}
 
+    def whole(self, url: str) -> set[int]:
+        """The shards that have a record and all their files."""
+        there = set(keys(url))
+        return {shard for shard in self.finished(url) if there.issuperset(self.of(shard))}
+
     def vouch(self, url: str, key: str, content: T | None, sound: bool) -> T:
         """The content of a file. Raises `StoreError` with the remedy where it is missing or not
         `sound`."""
@@ -219,6 +224,12 @@ def listed(shards: Iterable[int]) -> str:
             spans.append([shard])
     some = ["-".join(map(str, one)) for one in spans]
     return ", ".join(some if len(some) <= MOST else [*some[:MOST], "..."])
+
+
+def check_apart(url: str, field: str, path: Path) -> None:
+    """Raises `ValueError` for a path within a dataset, which holds its own files only."""
+    if (here := folder(url)) and path.resolve().is_relative_to(here.resolve()):
+        raise ValueError(f"{field}: {path} lies in the dataset {url}; name a place outside of it")
 
 
 def record_key(shard: int) -> str:

@@ -127,6 +127,10 @@ SURE = 2.0
 """Half width of the estimated range of times, in standard errors of the mean."""
 
 
+BAR = "{l_bar}{bar}| {n:.1f}/{total:.1f}{unit} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
+"""What a bar in simulated seconds says."""
+
+
 class Part(NamedTuple):
     """Every `of`-th shard, from number - 1 on. Parts are disjoint."""
 
@@ -150,7 +154,7 @@ WHOLE = Part()
 def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
     """Unfinished shards of a part, all of them where no dataset is begun."""
     begun = read_bytes(url, MANIFEST) is not None
-    finished = Manifest.read(url).layout.finished(url) if begun else set[int]()
+    finished = Manifest.read(url).layout.whole(url) if begun else set[int]()
     return [shard for shard in part.shards(config) if shard not in finished]
 
 
@@ -257,13 +261,14 @@ def generate(
     total = sum(len(config.rows(shard)) for shard in mine)
     finished = total - sum(len(config.rows(shard)) for shard in left)
     options: Any = {
+        "bar_format": BAR,
         "unit": " simulated s",
-        "unit_scale": config.duration,
         "disable": not progress,
         "smoothing": 0.05,
         "mininterval": 0.1 if sys.stderr.isatty() else 30.0,  # [s], a line each in a log
     }
-    with tqdm(total=total, initial=finished, **options) as bar:
+    each = config.duration
+    with tqdm(total=total * each, initial=finished * each, **options) as bar:
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):
@@ -276,7 +281,8 @@ def generate(
                     finished, failed = finished + count, failed + bad
                     del running[future]
                 bar.set_postfix_str(f"{failed} failed", refresh=False)
-                bar.update(max(finished + sum(map(store.simulated, running.values())) - bar.n, 0))
+                simulated = finished + sum(map(store.simulated, running.values()))
+                bar.update(max(simulated * each - bar.n, 0.0))
         finally:
             for future in running:
                 future.cancel()

@@ -55,12 +55,14 @@ class Store:
         self.manifest = Manifest.read(url)
 
     def unfinished(self) -> list[int]:
-        """Shards that have no record."""
-        return sorted(set(range(self.config.shards)) - self.manifest.layout.finished(self.url))
+        """Shards that have no record, or lack a file."""
+        return sorted(set(range(self.config.shards)) - self.manifest.layout.whole(self.url))
 
     def finished(self, shard: int) -> bool:
-        """Whether a shard has a record."""
-        return read_bytes(self.url, record_key(shard)) is not None
+        """Whether a shard has a record and all its files."""
+        fs, root = filesystem(self.url)
+        needed = record_key(shard), *self.manifest.layout.of(shard)
+        return all(fs.exists(f"{root}/{key}") for key in needed)
 
     @contextmanager
     def claim(self, shard: int) -> Iterator[Callable[[], object] | None]:

@@ -11,9 +11,14 @@ from torch import Tensor, nn
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import line
+from torchsoft.physics.names import check_names
 
 FADE = 0.15
 """Time [s] over which waves come and go."""
+
+CLOSEST = 1e-9
+"""Time [s] between two different values of a signal at the least: no step by tolerance is shorter,
+and a rate that lasts for less would act on nothing."""
 
 Knotted = tuple[list[float], list[float]]
 """Times [s] and values."""
@@ -58,6 +63,14 @@ class Piecewise(nn.Module):
             return (
                 f"`values` must hold one number per time ({len(t)}), but have shape "
                 f"{tuple(self.values.shape)}"
+            )
+        for i in np.flatnonzero(np.diff(t) < CLOSEST):
+            if bool(self.values[i] == self.values[i + 1]):
+                continue
+            return (
+                f"`times` of different values must be {CLOSEST:g} s apart or more, no step is "
+                f"shorter, but {t[i]:g} s and {t[i + 1]:g} s are {t[i + 1] - t[i]:.2g} s apart; "
+                "let the signal take longer from one to the other"
             )
         return ""
 
@@ -341,14 +354,15 @@ class Reference(nn.Module):
     """Reference of a rig: named signals of time, setpoints, feed-forward efforts and driven
     coordinates.
 
-    Its time counts from `origin` [s]. Raises `ValueError` for a signal that is not a module giving
-    (value, rate) at t.
+    Its time counts from `origin` [s]. Raises `ValueError` for a name that a signal cannot have, and
+    for a signal that is not a module giving (value, rate) at t.
     """
 
     origin: float = 0.0
 
-    def __init__(self, **signals: nn.Module) -> None:
+    def __init__(self, /, **signals: nn.Module) -> None:
         super().__init__()
+        check_names("motion", signals, dotted=True)
         for name, signal in signals.items():
             if not isinstance(signal, nn.Module):
                 raise ValueError(

@@ -16,14 +16,13 @@ from torchsoft.display import Shown, suggestion
 from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, net_efforts
+from torchsoft.physics.names import GROUND, check_names, check_unique
 from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import Layout, State
 from torchsoft.physics.validity import Backwards
 from torchsoft.quantity import Gravity, Quantity, quantity_of
-
-GROUND = "ground"
 
 RATE_TOLERANCE, RATE_ITERATIONS = 1e-13, 30
 """Residual [m/s] to which the rates of massless pads are solved, and steps of Newton's method for
@@ -88,6 +87,7 @@ class Rig(Shown, nn.Module):
         )
         lists: Any = bodies, pads, {name: contacts[name] for name in order}, actuators or {}
         for name, parts in zip(("bodies", "pads", "contacts", "actuators"), lists):
+            check_names(name, parts)
             self.add_module(name, nn.ModuleDict(parts))
         self.gravity = parameter(gravity)
         self.reference = reference or Reference()
@@ -139,10 +139,14 @@ class Rig(Shown, nn.Module):
                     f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
                     f"`{contact.body}` itself"
                 )
+        check_names("taxels", self.taxels)
+        check_names("symbols", self.symbols.values())
         check_taxels(self.taxels, self.pads, self.contacts)
         for name, actuator in self.actuators.items():
             for coordinate in (*actuator.measures, actuator.pushes):
                 self.coordinate(coordinate, f"actuator `{name}`")
+        check_names("motion", self.signals, dotted=True)
+        check_unique(self)
 
     def coordinate(self, name: str, owner: str = "`name`") -> int:
         """Number of a coordinate such as "disc.x" among those of all bodies. Raises

@@ -10,13 +10,14 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 import torch
 from pydantic import Field, PrivateAttr, model_validator
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchsoft.display import suggestion
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.material import Series
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
+from torchsoft.physics.names import check_names, check_unique
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import (
@@ -48,12 +49,8 @@ from torchsoft.tables import LISTED, InvalidTable, from_toml, line
 
 M = TypeVar("M")
 
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 ENTRY = re.compile(r"(.+?)((?:_\d+)+)")
 """Name of an entry of a list, such as tau_2."""
-
-TAKEN = frozenset(dir(nn.ModuleDict()))
-"""Names that parts of a torch module cannot have."""
 
 ROWS = 1_000_000
 """Most outputs of one run."""
@@ -61,6 +58,11 @@ ROWS = 1_000_000
 STIFF = 100.0
 """Largest stiffness of a contact, over that of a point of its pad, at which a failed equilibrium is
 not blamed on the contact."""
+
+PARTS = (
+    "bodies", "materials", "pads", "laws", "contacts", "taxels", "actuators", "controllers",
+)  # fmt: skip
+"""Tables of parts, by name."""
 
 REFERENCES = (
     ("pads", "material", "materials"), ("pads", "base", "bodies"), ("contacts", "pad", "pads"),
@@ -264,26 +266,12 @@ class RigFile(Group):
 
     @model_validator(mode="after")
     def _names_are_names(self) -> Self:
-        for group in (
-            "bodies",
-            "materials",
-            "pads",
-            "laws",
-            "contacts",
-            "taxels",
-            "actuators",
-            "controllers",
-        ):
-            for name in getattr(self, group):
-                if name in TAKEN:
-                    raise ValueError(
-                        f"{group}.{line(name, 80)}: the name is taken by torch; take another one"
-                    )
-                if not NAME.fullmatch(name):
-                    raise ValueError(
-                        f"{group}.{line(name, 80)}: the name should be letters, digits and "
-                        "underscores"
-                    )
+        for group in (*PARTS, "motion"):
+            check_names(group, getattr(self, group), dotted=group == "motion")
+        for name, body in self.bodies.items():
+            check_names(f"bodies.{name}.symbol", [body.symbol] if body.symbol else [])
+        for name, new in self.channels.items():
+            check_names(f"channels.{name}", [new], dotted=True)
         return self
 
     @model_validator(mode="after")
@@ -337,12 +325,15 @@ class RigFile(Group):
                     given = getattr(one, field) or ()
                     for coordinate in (given,) if isinstance(given, str) else given:
                         self._check_coordinate(f"{group}.{name}.{field}", coordinate)
+        efforts = dict.fromkeys(self.actuators, "an actuator")
         for name, one in self.controllers.items():
-            for taken in sorted(one.actuators(name).keys() & self.actuators.keys()):
-                raise ValueError(
-                    f"controllers.{name}: one of its efforts would be called `{taken}`, as an "
-                    "actuator is"
-                )
+            for made in one.actuators(name):
+                if made in efforts:
+                    raise ValueError(
+                        f"controllers.{name}: one of its efforts would be called `{made}`, as "
+                        f"{efforts[made]} is"
+                    )
+                efforts[made] = f"one of controllers.{name}"
         return self
 
     def _check_coordinate(self, field: str, coordinate: str) -> None:
@@ -425,8 +416,7 @@ class RigFile(Group):
                     f"{suggestion(name, known)}"
                 )
         rig.renamed = dict(self.channels)
-        if len(units(rig)) < len(known):
-            raise ValueError("channels: two would have the same name; call one otherwise")
+        check_unique(rig)
         named = {self._own_name(rig, *name.split(".")): name for name, _ in rig.named_parameters()}
         rig.aliases = {alias: name for alias, name in named.items() if alias != name}
         return rig

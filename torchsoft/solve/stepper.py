@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsoft.parallel import others_turn
 from torchsoft.physics.arguments import positive, whole
-from torchsoft.physics.motion import Reference
+from torchsoft.physics.motion import CLOSEST, Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.kernel.arrays import (
@@ -57,7 +57,7 @@ HALVINGS = 6
 START_ITERATIONS = 400
 """Most Newton iterations of a start, which no step before it has brought near its rates."""
 
-FIRST, SHORTEST = 1e-3, 1e-9
+FIRST, SHORTEST = 1e-3, CLOSEST
 """Length [s] of the first step that tolerances try, and the shortest that they may choose."""
 
 SMALLEST_TOLERANCE = 1e-10

@@ -16,7 +16,8 @@ from torch import Tensor
 from torchsoft.display import Shown, amount, suggestion
 from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.energy import contact_states
-from torchsoft.physics.parts import COORDINATES, coordinate_unit
+from torchsoft.physics.names import FORCES, ON_BODY, declared, rate_channel
+from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import Layout, State
@@ -308,28 +309,8 @@ def channels(
 
 
 def units(rig: Rig) -> dict[str, str]:
-    """SI unit of every channel, by its key; a signal's follows from its use."""
-    out: dict[str, str] = {}
-
-    def signal(name: str, unit: str) -> None:
-        out[name], out[f"{name}_dot"] = unit, f"{unit}/s"
-
-    for name, symbol in rig.symbols.items():
-        for i, axis in enumerate(COORDINATES):
-            unit = coordinate_unit(axis)
-            key = f"{axis}_{symbol}"
-            out[key], out[rate_channel(key)] = unit, f"{unit}/s"
-            if rig.bodies[name].freedom[axis] == "driven":
-                signal(f"{name}.{axis}", unit)
-        out[f"L_{symbol}"] = "kg.m2/s"
-    for name, actuator in rig.actuators.items():
-        for coordinate, setpoint in actuator.follows:
-            signal(setpoint, coordinate_unit(coordinate))
-        if actuator.feed_forward is not None:
-            signal(actuator.feed_forward, actuator.effort_unit)
-        out[f"F_{name}"] = actuator.effort_unit
-    out |= {f"M_{name}": "N.m" for name in rig.pads}
-    return {rig.renamed.get(key, key): unit for key, unit in out.items()}
+    """SI unit of every channel, by its key."""
+    return {rig.renamed.get(key, key): unit for key, unit, _ in declared(rig)}
 
 
 def measurable(rig: Rig) -> tuple[str, ...]:
@@ -344,11 +325,6 @@ def measurable(rig: Rig) -> tuple[str, ...]:
     return tuple(rig.renamed.get(key, key) for key in keys)
 
 
-def rate_channel(key: str) -> str:
-    """The key of a coordinate's rate by the coordinate's own, before a rig renames either."""
-    return f"omega{key.removeprefix('theta')}" if key.startswith("theta") else f"v_{key}"
-
-
 # Channels of touch: recorded forces of a run as read by sensors on pads, under them and at
 # bodies.
 #
@@ -361,8 +337,6 @@ def rate_channel(key: str) -> str:
 LIGHT = 1e-3
 """Force [N] that a centre of pressure counts besides the normal forces, at coordinate zero: there
 it lies without contact, and with 10 N it is off by a ten-thousandth."""
-
-KINDS = ("normal", "shear")
 
 
 class Felt(NamedTuple):
@@ -434,9 +408,9 @@ class Touch:
                 (rig.renamed.get(f"M_{name}", f"M_{name}"), "N.m"),
             )
         ] + [
-            (f"{name}.load_{axis}", unit)
+            (f"{name}.{key}", unit)
             for name in rig.bodies
-            for axis, unit in (("x", "N"), ("y", "N"), ("theta", "N.m"))
+            for key, unit in zip(ON_BODY, ("N", "N", "N.m"))
         ]
         return out | {
             name: (unit, Felt(np.array([at + i]), np.ones(1)))
@@ -447,7 +421,7 @@ class Touch:
     def arrays(self) -> dict[str, int]:
         """Arrays of forces [N], and how many there are in each."""
         sizes = {name: len(places) for name, (_, places) in self._arrays.items()}
-        return {f"{name}.{kind}": size for name, size in sizes.items() for kind in KINDS}
+        return {f"{name}.{kind}": size for name, size in sizes.items() for kind in FORCES}
 
     def __iter__(self) -> Iterator[str]:
         yield from self.single
@@ -471,7 +445,7 @@ class Touch:
             return self.single[name][1]
         owner, kind, number = name.rsplit(".", 2)
         row = self._arrays[owner][0][[int(number)]]
-        return Felt(2 * row.indices.astype(np.int64) + KINDS.index(kind), row.data)
+        return Felt(2 * row.indices.astype(np.int64) + FORCES.index(kind), row.data)
 
     def unit(self, name: str) -> str:
         """SI unit of a channel."""

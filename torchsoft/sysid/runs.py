@@ -20,7 +20,15 @@ import numpy as np
 from torch import Tensor
 
 from torchsoft.cost import steps_per_second
-from torchsoft.files import CHECKPOINT, SEALED, check_file, make_folder, remove_partials, replacing
+from torchsoft.files import (
+    CHECKPOINT,
+    SEALED,
+    check_file,
+    make_folder,
+    remove_partials,
+    replacing,
+    save_text,
+)
 from torchsoft.parallel import parallel_map, single_threaded
 from torchsoft.solve.kernel.objects import digest
 from torchsoft.solve.progress import SimulationFailed
@@ -104,7 +112,7 @@ class Journal:
                 raise ValueError(
                     f"the checkpoint {self.folder} holds other files; give a new or an empty folder"
                 )
-            (self.folder / CHECKPOINT).write_text(MEANING, encoding="utf-8")
+            save_text(self.folder / CHECKPOINT, MEANING)
 
     def _place(self, run: object) -> tuple[bytes, Path]:
         """Prefix of the checksum of a run's file, and the file."""

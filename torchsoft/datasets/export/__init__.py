@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import Manifest, store_errors
+from torchsoft.datasets.files import Manifest, check_apart, store_errors
 from torchsoft.datasets.reader import Vouched
 from torchsoft.datasets.subject import SPLITS
 from torchsoft.files import make_folder
@@ -30,6 +30,7 @@ def export(url: str, to: str, out: Path) -> str:
     sound = np.flatnonzero(data.failed.values == 0)
     if not len(sound):
         raise ValueError(f"{url}: every trajectory failed; there is nothing to be exported")
+    check_apart(url, "--out", out)
     if out.is_dir() and any(out.iterdir()):
         raise ValueError(f"--out: {out} is not empty; name a new folder")
     write = importlib.import_module(f"torchsoft.datasets.export.{WRITERS[to]}").write
