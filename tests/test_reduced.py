@@ -222,6 +222,7 @@ BAD: list[tuple[Callable[[Record, dict[str, list[Term]]], object], str]] = [
      "the shortest record is 10 samples"),
     (lambda one, terms: assemble([one], terms, replace(RECIPE, width=3 * one.step)),
      r"a sample every .* ms is too seldom for the weak form's test functions"),
+    (lambda one, terms: assemble([], terms, RECIPE), "no records to fit: give one"),
     (lambda one, terms: assemble([one, Record(2 * one.t, one.series)], terms, RECIPE),
     "one time step"),
     (lambda one, terms: assemble([Record(one.t, {k: v for k,
@@ -231,6 +232,31 @@ BAD: list[tuple[Callable[[Record, dict[str, list[Term]]], object], str]] = [
     "needs the variable 'F_y'"),
     (lambda one, terms: truth()(0.0, torch.zeros(6, dtype=torch.float64)), "set `signal`"),
 ]  # fmt: skip
+
+
+UNEVEN: list[tuple[Callable[[np.ndarray], np.ndarray], str]] = [
+    (
+        lambda t: np.r_[t[:400], t[520:]],
+        r"after t = 0\.0399 s a step is 12\.1 ms, and others are 0\.1",
+    ),
+    (lambda t: np.r_[t[:1], t[500:]], r"after t = 0 s a step is 50 ms, and others are 0\.1 ms"),
+    (lambda t: t + 1e-6 * np.sin(9 * t), "not equally spaced"),
+    (lambda t: t[::-1], "times that rise"),
+    (lambda t: t[:2], "at least three"),
+]
+
+
+@pytest.mark.parametrize(("kept", "sentence"), UNEVEN)
+def test_a_gap_is_no_equal_spacing(motions, kept, sentence):
+    """Of a record that is made by hand, as of one of a run."""
+    one, t = motions[0], kept(motions[0].t)
+    series = {name: x[: len(t)] for name, x in one.series.items()}
+    with pytest.raises(ValueError, match=sentence):
+        Record(t, series)
+    with pytest.raises(ValueError, match=sentence):
+        record(series, t)
+    with pytest.raises(ValueError, match=r"series 'x_C' has shape \(3001,\), but `t` \(9,\)"):
+        Record(one.t[:9], one.series)
 
 
 @pytest.mark.parametrize(("call", "sentence"), BAD)

@@ -123,6 +123,40 @@ def test_friction_coefficients_may_both_be_free_where_they_cannot_cross():
     assert (ends(found, "contact.mu_k")[1], ends(found, "contact.mu_s")[0]) == (0.75, 0.75)
 
 
+def test_a_tied_ratio_leaves_its_base_free():
+    """The file's own number of a tied parameter is no limit of what it is tied to."""
+    for more in ({}, {"nominal": 0.9}):
+        tie = {"ratio_to": "contact.mu_s", "fixed": True, **more}
+        found = coordinates(contact__mu_k=tie, contact__mu_s={"low": 0.1, "high": 2.0})
+        assert ends(found, "contact.mu_s") == (0.1, 2.0)
+        values = found.values(found.start, "one", GIVEN)
+        assert values["contact.mu_k"] == pytest.approx(more.get("nominal", 0.7 / 0.8) * 0.8)
+    found = coordinates(contact__mu_s={"ratio_to": "contact.mu_k"}, contact__mu_k={})
+    assert ends(found, "contact.mu_s")[0] == 1.0
+    assert ends(found, "contact.mu_k") == pytest.approx((0.07, 7.0))
+    known = {"ratio_to": "contact.mu_s", "fixed": True, "nominal": 0.5}  # of a number that is known
+    assert ends(coordinates(contact__mu_k=known), "contact.mu_k")[1] == 1.0
+
+
+def test_two_ratios_to_one_number_are_compared_as_ratios():
+    def tied(mu_k: float, mu_s: float) -> Coordinates:
+        both = {"ratio_to": "contact.friction.alpha", "fixed": True}
+        mu = {"contact__mu_k": both | {"nominal": mu_k}, "contact__mu_s": both | {"nominal": mu_s}}
+        return coordinates(**mu, contact__friction__alpha={})
+
+    assert len(tied(0.3, 0.4)) == 3
+    with pytest.raises(ValueError, match=r"mu_k must not exceed .*, but may be up to 0\.4 "):
+        tied(0.4, 0.3)
+
+
+def test_a_tie_that_may_cross_a_known_number_is_refused():
+    tie = {"ratio_to": "contact.friction.alpha", "fixed": True, "nominal": 0.3}
+    with pytest.raises(
+        ValueError, match=r"mu_k must not exceed .*, but may be up to 6 .* to 0\.8: give"
+    ):
+        coordinates(contact__mu_k=tie, contact__friction__alpha={})
+
+
 def test_every_fault_of_a_sensor_has_a_unit():
     problem: Any = SimpleNamespace(unit=lambda channel: "rad")
     found = {

@@ -105,7 +105,9 @@ def assemble(
     """
     states = tuple(name for name in STATES if name not in inputs)
     steps = [one.step for one in records]
-    if not steps or max(steps) > min(steps) * (1 + 1e-6):
+    if not steps:
+        raise ValueError("there are no records to fit: give one at least, as `record(run)`")
+    if max(steps) > min(steps) * (1 + 1e-6):
         raise ValueError(f"the records must have one time step, but have {sorted(set(steps))} s")
     names, kinematics = (*states, *inputs), {k: v for k, v in KINEMATICS.items() if k in states}
     every = {target: [(term, 1.0) for term in terms] for target, terms in candidates.items()}

@@ -16,6 +16,9 @@ KINEMATICS = {"x_C": "v_C", "theta": "omega", "x_Br": "v_Br"}
 VARIABLES = (*STATES, "F_x", "x_d", "x_d_dot")
 """Series of a record."""
 
+EVEN = 1e-6
+"""Largest difference between equal steps, over their size."""
+
 ALIKE = 1e-9
 """Largest difference [m] between starts that count as equal."""
 
@@ -27,6 +30,24 @@ class Record(Shown):
 
     t: np.ndarray
     series: dict[str, np.ndarray]
+
+    def __post_init__(self) -> None:
+        """Raises `ValueError` for times that are not equally spaced, and for series of another
+        length."""
+        steps = np.diff(self.t)
+        if len(steps) < 2 or not np.isfinite(steps).all() or not steps.min() > 0:
+            raise ValueError("`t` must hold at least three equally spaced times that rise")
+        usual = float(np.median(steps))
+        if not np.allclose(steps, usual, rtol=EVEN, atol=0):
+            i = int(np.argmax(np.abs(steps - usual)))
+            raise ValueError(
+                f"the times of a record are not equally spaced: after t = {self.t[i]:g} s a step "
+                f"is {1e3 * steps[i]:.4g} ms, and others are {1e3 * usual:.4g} ms; make a record "
+                "of each part without a gap, or interpolate to equal steps"
+            )
+        for name, x in self.series.items():
+            if x.shape != self.t.shape:
+                raise ValueError(f"series {name!r} has shape {x.shape}, but `t` {self.t.shape}")
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         title = (
@@ -78,8 +99,6 @@ def record(
     keep = times >= (times[0] if begin is None else begin)
     if not keep.any():
         raise ValueError(f"`begin` = {begin:g} s is after the last sample, at {times[-1]:g} s")
-    if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
-        raise ValueError("`t` must hold at least three equally spaced times")
     series = {}
     channels = {name: ALIASES.get(name, name) for name in VARIABLES}
     for name, channel in channels.items():

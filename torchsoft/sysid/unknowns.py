@@ -214,24 +214,37 @@ class Coordinate:
 def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> tuple[float, float]:
     """Bounds of an unknown, or of its ratio, from the declaration of its part's constructor and
     from fixed parameters."""
-    given, ordered, ratio_to = recording.parameters, recording.rig.ordered, unknowns[name].ratio_to
+    ordered, ratio_to = recording.rig.ordered, unknowns[name].ratio_to
     if ratio_to is not None:
-        return (0.0, 1.0) if ordered.get(name) == ratio_to else (-math.inf, math.inf)
+        return (
+            1.0 if ordered.get(ratio_to) == name else -math.inf,
+            1.0 if ordered.get(name) == ratio_to else math.inf,
+        )
     declared = None if name.startswith(PREFIX) else recording.rig.quantity(name)
     if declared is None:
         return -math.inf, math.inf
     least, most = declared.low, declared.high
-    known = {
-        **given,
-        **{other: u.nominal for other, u in unknowns.items() if u.fixed and u.nominal is not None},
-    }
-    free = {other for other, u in unknowns.items() if not u.fixed}
     for lower, upper in ordered.items():
-        if name == lower and upper in known and upper not in free:
-            most = min(most, known[upper])
-        if name == upper and lower in known and lower not in free:
-            least = max(least, known[lower])
+        if name == lower and (known := known_value(upper, unknowns, recording)) is not None:
+            most = min(most, known)
+        if name == upper and (known := known_value(lower, unknowns, recording)) is not None:
+            least = max(least, known)
     return least, most
+
+
+def known_value(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> float | None:
+    """Value of a parameter in all fits of a recording, and None where a search moves it, or what
+    it is tied to."""
+    given, u = recording.parameters, unknowns.get(name)
+    if u is None or name not in given:
+        return given.get(name)
+    if not u.fixed:
+        return None
+    if u.ratio_to is None:
+        return given[name] if u.nominal is None else u.nominal
+    base = known_value(u.ratio_to, unknowns, recording)
+    ratio = given[name] / given[u.ratio_to] if u.nominal is None else u.nominal
+    return None if base is None else ratio * base
 
 
 def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
@@ -247,6 +260,20 @@ def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
                 f"and {value:g} in that of `{r.name}`: say by `nominal` where the search starts"
             )
     return own[0]
+
+
+def reach(
+    name: str, of: Mapping[str, Coordinate], given: Mapping[str, float]
+) -> tuple[float, float]:
+    """Least and largest value of a parameter in a search; of a ratio, that of the ratio itself
+    where nothing is `given`."""
+    if (one := of.get(name)) is None:
+        return given[name], given[name]
+    low, high = (one.nominal, one.nominal) if one.fixed else (one.low, one.high)
+    if one.ratio_to is None or not given:
+        return low, high
+    ends = [end * base for end in (low, high) for base in reach(one.ratio_to, of, given)]
+    return min(ends), max(ends)
 
 
 AT_BOUND = 1e-4
@@ -346,8 +373,9 @@ class Coordinates:
                         u.prior,
                     )
                 )
-        for pair in dict.fromkeys(pair for r in recordings for pair in r.rig.ordered.items()):
-            self._check_order(*pair)
+        for r in recordings:
+            for pair in r.rig.ordered.items():
+                self._check_order(*pair, r.parameters)
         for r in recordings:
             for name, mean, sd in r.start_coordinates:
                 low, high = mean - BOUNDS * sd, mean + BOUNDS * sd
@@ -363,15 +391,23 @@ class Coordinates:
                 self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 
-    def _check_order(self, *names: str) -> None:
+    def _check_order(self, lower: str, upper: str, given: Mapping[str, float]) -> None:
         """Raises `ValueError` where a search could move the first of two ordered parameters above
         the second."""
-        lower, upper = ({c.name: c for c in self.all if not c.fixed}.get(name) for name in names)
-        if lower and upper and not lower.ratio_to and lower.high > upper.low:
+        of = {c.name: c for c in self.all}
+        bases = [of[name].ratio_to if name in of else None for name in (lower, upper)]
+        if bases[0] == upper or bases[1] == lower or not of.keys() & {lower, upper}:
+            return
+        if not {lower, upper} <= of.keys() | given.keys():
+            return
+        together = bases[0] is not None and bases[0] == bases[1]
+        (_, most), (least, _) = (
+            reach(name, of, {} if together else given) for name in (lower, upper)
+        )
+        if most > least * (1 + 1e-9):
             raise ValueError(
-                f"unknowns.{lower.name} must not exceed {upper.name}, but may be up to "
-                f"{lower.high:g} and the other down to {upper.low:g}: give "
-                f"unknowns.{lower.name}.ratio_to = '{upper.name}'"
+                f"unknowns.{lower} must not exceed {upper}, but may be up to {most:g} and the "
+                f"other down to {least:g}: give unknowns.{lower}.ratio_to = '{upper}'"
             )
 
     def __len__(self) -> int:
