@@ -19,7 +19,7 @@ Command: .venv/bin/python experiments/orientation.py [--smoke]
 Expected: the disc within 0.009 mm and 0.09 degrees, 0.0005 mm and 0.003 degrees at rest; by
 kinematics 2.1 degrees off. Beyond the tolerance: the disc four times as fast (inertia); by loops
 alone the ellipse of 1.1 and all that is farther from a disc, which efforts fed forward mend for
-1.1, 1.3 and the box; the ellipse of 1.3 with mu near its friction cone of 0.29 or below; the
+1.1, 1.3 and the box; the ellipse of 1.3 with mu below its friction cone of 0.29; the
 ellipse of 2, which asks for 0.82 and has 0.8, and is lost. Little more than a minute on one core.
 """
 

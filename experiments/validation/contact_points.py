@@ -10,7 +10,7 @@ and 0.5 mm elements; a ripple is half of the peak-to-peak.
             energy residual
 
 Command: .venv/bin/python experiments/validation/contact_points.py [--smoke]
-Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN. Nodes 0.5 mm
+Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 122 / 51 / 24 / 19 mN. Nodes 0.5 mm
 apart: 16 mN. Some three minutes on one core.
 """
 

@@ -7,7 +7,7 @@ integrates an explicit method backwards, where the pads' decay of 1/tau and fast
 
 Command: .venv/bin/python experiments/validation/torchdiffeq_methods.py [--smoke]
 Expected: the stepper is right to its tolerance with both verbs, explicit methods with `odeint`
-only. Two minutes on one core.
+only. Seven minutes on one core.
 """
 
 import warnings

@@ -136,3 +136,27 @@ def check_unique(rig: "Rig") -> None:
                     f"two would be the {what} `{key}`: {other} and {owner}; call one of them "
                     "otherwise"
                 )
+
+
+def check_pairs(rig: "Rig") -> None:
+    """Raises `ValueError` for contacts of parts that are not there, cannot touch, or are twins."""
+    between = {(contact.pad, contact.body): name for name, contact in rig.contacts.items()}
+    for name, contact in rig.contacts.items():
+        if (twin := between[contact.pad, contact.body]) != name:
+            raise ValueError(
+                f"contacts.{twin}: it is between the same pad and body as `{name}`; leave one out"
+            )
+        if contact.pad not in rig.pads or contact.body not in rig.bodies:
+            raise ValueError(
+                f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are "
+                "not both there"
+            )
+        if rig.bodies[contact.body].shape is None:
+            raise ValueError(
+                f"contact `{name}` needs a shape, but the body `{contact.body}` has none"
+            )
+        if rig.pads[contact.pad].base == contact.body:
+            raise ValueError(
+                f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
+                f"`{contact.body}` itself"
+            )

@@ -16,7 +16,7 @@ from torchsoft.display import Shown, suggestion
 from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, net_efforts
-from torchsoft.physics.names import GROUND, check_names, check_unique
+from torchsoft.physics.names import GROUND, check_names, check_pairs, check_unique
 from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
 from torchsoft.physics.shapes import Shape, parameter
@@ -118,27 +118,7 @@ class Rig(Shown, nn.Module):
                     "accelerations in a turning frame are not modelled; fix the base's theta or "
                     "take a massless pad"
                 )
-        between = {(contact.pad, contact.body): name for name, contact in self.contacts.items()}
-        for name, contact in self.contacts.items():
-            if (twin := between[contact.pad, contact.body]) != name:
-                raise ValueError(
-                    f"contacts.{twin}: it is between the same pad and body as `{name}`; leave one "
-                    "out"
-                )
-            if contact.pad not in self.pads or contact.body not in self.bodies:
-                raise ValueError(
-                    f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are "
-                    "not both there"
-                )
-            if self.bodies[contact.body].shape is None:
-                raise ValueError(
-                    f"contact `{name}` needs a shape, but the body `{contact.body}` has none"
-                )
-            if self.pads[contact.pad].base == contact.body:
-                raise ValueError(
-                    f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
-                    f"`{contact.body}` itself"
-                )
+        check_pairs(self)
         check_names("taxels", self.taxels)
         check_names("symbols", self.symbols.values())
         check_taxels(self.taxels, self.pads, self.contacts)
