@@ -12,7 +12,8 @@ import torch
 from torchsoft import Parameters, simulate
 from torchsoft.excitation import CATALOGUE, begin
 
-context = begin(CATALOGUE["deep pressing"], Parameters())
+# where points slip under 25 N each, friction must fall slowly: see Limits
+context = begin(CATALOGUE["deep pressing"], Parameters().override({"contact.v_s": 0.05}))
 names = ["contact.K_n", "contact.R_n", "pad.E", "pad.tau"]
 t = torch.linspace(0, 1.5, 601, dtype=torch.float64)
 run = simulate(context.rig, t, y0=context.y0, gradient="forward", wrt=names, rigid=True)

@@ -2,7 +2,7 @@
 system, backward Euler.
 
 It shares no code with torchsoft, so that recordings made by it are a stranger's, and it can be told
-to differ in what a fit takes for granted: the mesh, the friction law, the ramps, where the disc was
+to differ in what a fit takes for granted: the mesh, the friction law, where the disc was
 put down.
 """
 

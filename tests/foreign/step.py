@@ -40,7 +40,10 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping):
         return 0.0, 0.0, 0.0, relaxed(p, h, s), False, 0.0
     spring = p.K_n * g if p.power == 1.0 else p.K_n * p.same * (g / p.same) ** p.power
     damping = p.R_n * g_dot
-    F_N = min(max(0.0, spring + damping), 2.0 * spring)
+    F_N = max(0.0, spring + damping)
+    if damping > 0.0:
+        damping = min(damping, 3.0 * spring)
+        F_N = spring + damping - damping**3 / (27.0 * spring * spring)
     if p.literal:
         stretch = s + h * v
         e = p.K_t * stretch + p.R_t * v
