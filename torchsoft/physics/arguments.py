@@ -8,12 +8,22 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch._C._functorch import peek_interpreter_stack  # private, and the only way to tell
 
 Numbers = Tensor | np.ndarray[Any, Any] | Sequence[Any]
 """Numbers in any usual form."""
 
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Units [m] in which files may give lengths."""
+
+
+def check_transforms() -> None:
+    """Raises `ValueError` inside a transform of torch.func, whose tensors have no numbers."""
+    if peek_interpreter_stack() is not None:
+        raise ValueError(
+            "a run cannot be inside a transform of torch.func, such as grad, vmap or jvp; use "
+            "gradient='discrete' with backward(), or simulate_batch"
+        )
 
 
 def number(name: str, value: Any) -> float:
@@ -40,6 +50,7 @@ def whole(name: str, value: Any, least: int) -> int:
 def tensor(name: str, value: Any) -> Tensor:
     """Numbers as a float64 tensor: a tensor with its graph, numpy's arrays, lists. Raises
     `ValueError` for other values; tensors that no run can take stay as they are."""
+    check_transforms()
     if isinstance(value, Tensor):
         usual = value.device.type == "cpu" and value.layout == torch.strided
         real = not value.dtype.is_complex and value.dtype != torch.bool

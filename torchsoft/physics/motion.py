@@ -10,7 +10,7 @@ from scipy.linalg import solve_banded
 from torch import Tensor, nn
 
 from torchsoft.display import suggestion
-from torchsoft.physics.arguments import line
+from torchsoft.physics.arguments import check_transforms, line
 from torchsoft.physics.names import check_names
 
 FADE = 0.15
@@ -35,6 +35,7 @@ class Piecewise(nn.Module):
 
     def __init__(self, times: Sequence[float] | Tensor, values: Sequence[float] | Tensor) -> None:
         super().__init__()
+        check_transforms()
         knots = torch.as_tensor(times, dtype=torch.float64).contiguous()
         many = values
         if not isinstance(many, Tensor):
