@@ -404,6 +404,29 @@ PARTS: list[tuple[Call, str]] = [
 ]  # fmt: skip
 
 
+HUGE = 10**400
+"""An integer that no float holds, which ended in an OverflowError."""
+INTEGERS: dict[str, Callable[[], Any]] = {
+    "parameter": lambda: Body(HUGE),
+    "coordinate": lambda: Body(1.0, theta=HUGE),
+    "length": lambda: PadMesh(HUGE, 1e-2, 10, 2),
+    "values": lambda: Profile([0, 1], [0, HUGE]),
+    "times": lambda: Profile([0, HUGE], [0, 1]),
+    "origin": lambda: Pad(PadMesh(0.1, 1e-2, 10, 2), KelvinVoigt(tau=1e-2, **RUBBER),
+                          origin=(HUGE, 0)),
+    "rtol": lambda: simulate(coarse(), T, rtol=HUGE),
+    "atol": lambda: simulate(coarse(), T, atol=HUGE),
+    "t": lambda: simulate(coarse(), [0, HUGE]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", INTEGERS)
+def test_integers_of_400_digits_are_refused_in_a_short_sentence(what):
+    with pytest.raises(ValueError, match=r"`.*must be") as refused:
+        INTEGERS[what]()
+    assert len(str(refused.value)) < 200
+
+
 class Simulated(nn.Module):
     """A run by its modulus, start or times."""
 

@@ -29,15 +29,20 @@ def check_transforms() -> None:
 def number(name: str, value: Any) -> float:
     """Raises `ValueError` unless a value is a real number; text and truth values are not."""
     if not isinstance(value, Real) or isinstance(value, bool):
-        raise ValueError(f"`{name}` must be a number, but is {value!r}")
-    return float(value)
+        raise ValueError(f"`{name}` must be a number, but is {line(value)}")
+    try:
+        return float(value)
+    except OverflowError:  # of integers, or fractions of them
+        raise ValueError(f"`{name}` must be below 1.8e308, but is {line(value)}") from None
 
 
 def positive(name: str, value: Any) -> float:
     """Raises `ValueError` unless a value is a positive, finite number."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
-        raise ValueError(f"`{name}` must be positive and finite, but is {value!r}")
-    return float(value)
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    found = number(name, value) if real else math.nan
+    if not 0 < found < math.inf:
+        raise ValueError(f"`{name}` must be positive and finite, but is {line(value)}")
+    return found
 
 
 def whole(name: str, value: Any, least: int) -> int:
