@@ -32,6 +32,16 @@ def run():
     return simulate(model, times(0.5, 51), y0=start.y0)
 
 
+def test_a_title_does_not_hold_the_script_open(run, tmp_path):
+    """A comment that begins a script lasts to the end of the page, which stayed empty."""
+    title = "<!--<script> & friends"
+    run.animate(tmp_path / "run.html", frames=2, title=title)
+    text = (tmp_path / "run.html").read_text(encoding="utf-8")
+    found = re.search(r"const data = (\{.*\});\n", text)[1]
+    assert "<" not in found
+    assert json.loads(found)["title"] == title
+
+
 @pytest.fixture(scope="module")
 def page(run, tmp_path_factory):
     if MISSING:

@@ -404,6 +404,60 @@ PARTS: list[tuple[Call, str]] = [
 ]  # fmt: skip
 
 
+HUGE = 10**400
+"""An integer that no float holds, which ended in an OverflowError."""
+INTEGERS: dict[str, Callable[[], Any]] = {
+    "parameter": lambda: Body(HUGE),
+    "coordinate": lambda: Body(1.0, theta=HUGE),
+    "length": lambda: PadMesh(HUGE, 1e-2, 10, 2),
+    "values": lambda: Profile([0, 1], [0, HUGE]),
+    "times": lambda: Profile([0, HUGE], [0, 1]),
+    "origin": lambda: Pad(PadMesh(0.1, 1e-2, 10, 2), KelvinVoigt(tau=1e-2, **RUBBER),
+                          origin=(HUGE, 0)),
+    "rtol": lambda: simulate(coarse(), T, rtol=HUGE),
+    "atol": lambda: simulate(coarse(), T, atol=HUGE),
+    "t": lambda: simulate(coarse(), [0, HUGE]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", INTEGERS)
+def test_integers_of_400_digits_are_refused_in_a_short_sentence(what):
+    with pytest.raises(ValueError, match=r"`.*must be") as refused:
+        INTEGERS[what]()
+    assert len(str(refused.value)) < 200
+
+
+class Simulated(nn.Module):
+    """A run by its modulus, start or times."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = coarse()
+        self.y0 = rest(self.model).detach()
+
+    def forward(self, *, y0: Any = None, t: Any = T) -> Tensor:
+        start = rest(self.model) if y0 is None else y0
+        return simulate(self.model, t, y0=start, gradient="discrete")["x_C"][-1]
+
+
+TRANSFORMED: dict[str, Any] = {
+    "E": lambda run, E: torch.func.functional_call(run, {"model.pad.E": E}),
+    "y0": lambda run, E: run(y0=run.y0 * E),
+    "list": lambda run, E: run(y0=list(run.y0 * E)),
+    "t": lambda run, E: run(y0=run.y0, t=T * E),
+    "knots": lambda run, E: Profile([0.0, 1.0], torch.stack([E, E])),
+}
+
+
+@pytest.mark.parametrize("by", TRANSFORMED)
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev, torch.func.vmap])
+def test_a_run_in_a_transform_of_torch_func_is_refused_in_a_sentence(by, transform):
+    """grad ended in "Cannot access data pointer of Tensor that doesn't have storage"."""
+    run, E = Simulated(), f64(1.0)
+    with pytest.raises(ValueError, match=r"inside a transform of torch\.func.*gradient='discrete'"):
+        transform(lambda x: TRANSFORMED[by](run, x))(E if transform is torch.func.vmap else E[0])
+
+
 @pytest.mark.parametrize("row", range(len(PARTS)))
 def test_a_part_or_call_that_is_none_is_refused(row):
     call, sentence = PARTS[row]

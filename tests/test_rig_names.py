@@ -1,6 +1,7 @@
 """Numbers of a rig file have their names in that file, whatever asks for them."""
 
 import json
+import pickle
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -182,3 +183,34 @@ def test_bodies_cannot_have_names_of_other_junctions(name):
     bodies = dict(model.bodies) | {name: Body(0.1, theta=0.0)}
     with pytest.raises(ValueError, match=f"the junction `{name}`|bodies.{name}: the name"):
         Rig(bodies=bodies, **parts)
+
+
+def places(tree: Any) -> Iterator[tuple[Any, Any]]:
+    """Every number in tables and lists, as its container and key."""
+    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
+        if isinstance(value, dict | list):
+            yield from places(value)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield tree, key
+
+
+def test_integers_of_400_digits_in_a_file_are_refused():
+    """In bounds of all kinds: some of them ended in an OverflowError."""
+    tree = json.loads(RigFile.from_toml(TREE).model_dump_json(exclude_none=True))
+    count = 0
+    for table, key in places(tree):
+        before, table[key] = table[key], 10**400
+        with pytest.raises(ValueError, match="should be") as refused:
+            RigFile.from_tree(tree)
+        assert len(str(refused.value)) < 300
+        table[key], count = before, count + 1
+    assert count > 50
+
+
+@pytest.mark.parametrize("name", [path.stem for path in RIGS])
+def test_rig_files_are_pickled(name):
+    file = opened(name)
+    again = pickle.loads(pickle.dumps(file))
+    assert again == file
+    assert again.folder == file.folder
+    assert again.model_fields_set == file.model_fields_set

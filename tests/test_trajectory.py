@@ -1,5 +1,7 @@
 """What a run shows of itself, gives to other libraries, and keeps in files."""
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,6 +10,7 @@ import meshio
 import numpy as np
 import pytest
 import torch
+import xarray as xr
 from conftest import coarse, f64, times
 from torch import Tensor
 
@@ -25,7 +28,7 @@ from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.rigs.written import template
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.simulate import SharedStart
-from torchsoft.solve.trajectory import load, save
+from torchsoft.solve.trajectory import Stats, load, save
 
 T = times(0.1, 11)
 
@@ -88,6 +91,58 @@ def test_a_file_that_lacks_something_is_no_whole_run(done, tmp_path, gone):
     assert "F_x" in load(tmp_path / "run.nc")
     with pytest.raises(ValueError, match=rf"run\.nc is no whole run: it has no `{gone}`"):
         Trajectory.load(tmp_path / "run.nc")
+
+
+def text(data, name):
+    return data.assign({name: ("time", ["fast"] * len(T))})
+
+
+def about(name, value):
+    return lambda data: data.assign_attrs({name: json.dumps(value)})
+
+
+CHANGED = {
+    "text": (lambda data: text(data, "x_C"), "`x_C` must be finite numbers"),
+    "text of forces": (lambda data: data.assign(normal_force_L=data.normal_force_L.astype(str)),
+        "`normal_force_L` must be finite numbers"),
+    "nan": (lambda data: data.assign(y_C=data.y_C * np.nan), "`y_C` must be finite numbers"),
+    "three samples": (lambda data: data.assign(x_C=("i", np.zeros(3), data.x_C.attrs)),
+        "length 3 on {'time': 'x_C'}"),
+    "over another": (lambda data: data.assign(x_C=("i", data.x_C.values, data.x_C.attrs)),
+        "`x_C` must be over ('time',), not ('i',)"),
+    "three poses": (lambda data: data.assign(pose=("i", np.zeros(3))), "do not fit together"),
+    "furlong": (lambda data: data.assign(F_x=data.F_x.assign_attrs(units="furlong")),
+        "the unit of `F_x` must be `N`, not 'furlong'"),
+    "furlong of another": (lambda data: data.assign(L=data.x_d.assign_attrs(units="m")).assign(
+        x_d=data.x_d.assign_attrs(units="furlong")), "the unit of `x_d` must be `N`"),
+    "turned": (lambda data: data.assign(x_C=data.x_C.assign_attrs(units="rad")),
+        "the unit of `x_C` must be `m`, not 'rad'"),
+    "no unit": (lambda data: data.assign(pose=data.pose * 1.0).assign(
+        pose=lambda d: d.pose.drop_attrs()), "the unit of `pose` must be `m, m, rad`, not None"),
+    "time goes back": (lambda data: data.assign_coords(time=data.time[::-1].values),
+        "`time` must increase strictly"),
+    "stats": (about("stats", {"steps": 3}), "do not fit together"),
+    "stats in words": (about("stats", dict.fromkeys(vars(Stats(0, 0, 0, 0, 0.0)), "3")),
+        "do not fit together"),
+    "wrt as a word": (about("wrt", "pad.E"), "do not fit together"),
+    "stats as a number": (about("stats", 3), "do not fit together"),
+    "setup": (about("setup", {"bodies": {"disc": {"colour": "red"}}}), "do not fit together"),
+    "parts": (about("parts", {"channels": [3]}), "it has no `3`"),
+    **{name: (lambda data, name=name: data.drop_attrs().assign_attrs(
+        {k: x for k, x in data.attrs.items() if k != name}), f"it has no `{name}`")
+        for name in ("stats", "wrt", "touch", "parts")},
+}  # fmt: skip
+"""Files that were edited and sealed again, which were taken or ended in a traceback."""
+
+
+@pytest.mark.parametrize("kind", CHANGED)
+def test_a_file_that_was_edited_is_refused_in_a_sentence(done, tmp_path, kind):
+    change, message = CHANGED[kind]
+    with xr.set_options(keep_attrs=True):
+        save(change(done[1].to_xarray()), tmp_path / "run.nc")
+    with pytest.raises(ValueError, match=re.escape(message)) as refused:
+        Trajectory.load(tmp_path / "run.nc")
+    assert str(refused.value).startswith(f"{tmp_path / 'run.nc'} is no whole run: ")
 
 
 def test_a_channel_with_the_name_of_another_array_is_not_saved(
@@ -302,6 +357,13 @@ def test_a_second_backward_through_a_shared_start_is_explained():
 
 # the package
 # ----------------------------------------------------------------------
+
+
+def test_a_star_imports_what_help_names():
+    names: dict[str, Any] = {}
+    exec("from torchsoft import *", names)
+    assert {"SoftGrasp", "simulate", "Rig", "Trajectory"} <= names.keys()
+    assert "torch" not in names
 
 
 def test_help_is_one_page():

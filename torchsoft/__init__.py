@@ -26,10 +26,11 @@ beyond      torchsoft.sysid (identification), torchsoft.reduced, torchsoft.datas
 The command `torchsoft --help` runs rig files. Names are imported when they are first used.
 """
 
+import sys
+
 import lazy_loader
 
-_lazy, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
-# there is no __all__: with one, help() would print the pages of all of its names
+_lazy, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
@@ -37,4 +38,6 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("torchsoft")
+    if name == "__all__" and sys._getframe(1).f_globals.get("__name__") != "pydoc":
+        return _names  # which help() is not told: it would print the pages of all of them
     return _lazy(name)

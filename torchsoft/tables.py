@@ -36,6 +36,9 @@ SHOWN = 3
 SEED = 2**63 - 1
 """Largest seed: the largest integer of TOML."""
 
+HUGE = 1e300
+"""Integers from which on formulas leave the range of floats."""
+
 LARGEST = 10e6
 """Size [B] of a TOML file at the most."""
 
@@ -87,6 +90,9 @@ class Table(BaseModel):
             raise ValueError(
                 f"`{strange[0]}` is not known here{more}; {suggestion(strange[0], known)}"
             )
+        if large := [key for key, value in given.items() if is_huge(value)]:
+            number = shown(given[large[0]])
+            raise ValueError(f"{large[0]} should be a valid number, not {number}")
         return data
 
     @classmethod
@@ -98,6 +104,13 @@ class Table(BaseModel):
     def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Self:
         with refusing():
             return super().model_validate_json(json_data, **options)
+
+
+def is_huge(value: Any) -> bool:
+    """Whether a value is an integer that no float holds, or a list with one."""
+    if isinstance(value, list | tuple):
+        return any(map(is_huge, value))
+    return isinstance(value, int) and abs(value) >= HUGE
 
 
 def findings(error: ValidationError, data: Any = None, within: str = "") -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch._C._functorch import peek_interpreter_stack  # private, and the only way to tell
 
 Numbers = Tensor | np.ndarray[Any, Any] | Sequence[Any]
 """Numbers in any usual form."""
@@ -16,18 +17,32 @@ LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Units [m] in which files may give lengths."""
 
 
+def check_transforms() -> None:
+    """Raises `ValueError` inside a transform of torch.func, whose tensors have no numbers."""
+    if peek_interpreter_stack() is not None:
+        raise ValueError(
+            "a run cannot be inside a transform of torch.func, such as grad, vmap or jvp; use "
+            "gradient='discrete' with backward(), or simulate_batch"
+        )
+
+
 def number(name: str, value: Any) -> float:
     """Raises `ValueError` unless a value is a real number; text and truth values are not."""
     if not isinstance(value, Real) or isinstance(value, bool):
-        raise ValueError(f"`{name}` must be a number, but is {value!r}")
-    return float(value)
+        raise ValueError(f"`{name}` must be a number, but is {line(value)}")
+    try:
+        return float(value)
+    except OverflowError:  # of integers, or fractions of them
+        raise ValueError(f"`{name}` must be below 1.8e308, but is {line(value)}") from None
 
 
 def positive(name: str, value: Any) -> float:
     """Raises `ValueError` unless a value is a positive, finite number."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
-        raise ValueError(f"`{name}` must be positive and finite, but is {value!r}")
-    return float(value)
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    found = number(name, value) if real else math.nan
+    if not 0 < found < math.inf:
+        raise ValueError(f"`{name}` must be positive and finite, but is {line(value)}")
+    return found
 
 
 def whole(name: str, value: Any, least: int) -> int:
@@ -40,6 +55,7 @@ def whole(name: str, value: Any, least: int) -> int:
 def tensor(name: str, value: Any) -> Tensor:
     """Numbers as a float64 tensor: a tensor with its graph, numpy's arrays, lists. Raises
     `ValueError` for other values; tensors that no run can take stay as they are."""
+    check_transforms()
     if isinstance(value, Tensor):
         usual = value.device.type == "cpu" and value.layout == torch.strided
         real = not value.dtype.is_complex and value.dtype != torch.bool

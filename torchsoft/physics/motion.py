@@ -10,7 +10,7 @@ from scipy.linalg import solve_banded
 from torch import Tensor, nn
 
 from torchsoft.display import suggestion
-from torchsoft.physics.arguments import line
+from torchsoft.physics.arguments import check_transforms, line
 from torchsoft.physics.names import check_names
 
 FADE = 0.15
@@ -35,11 +35,15 @@ class Piecewise(nn.Module):
 
     def __init__(self, times: Sequence[float] | Tensor, values: Sequence[float] | Tensor) -> None:
         super().__init__()
-        knots = torch.as_tensor(times, dtype=torch.float64).contiguous()
+        check_transforms()
         many = values
-        if not isinstance(many, Tensor):
-            listed = [torch.as_tensor(v, dtype=torch.float64) for v in many]
-            many = torch.stack(listed) if listed else torch.zeros(0)
+        try:
+            knots = torch.as_tensor(times, dtype=torch.float64).contiguous()
+            if not isinstance(many, Tensor):
+                listed = [torch.as_tensor(v, dtype=torch.float64) for v in many]
+                many = torch.stack(listed) if listed else torch.zeros(0)
+        except OverflowError as error:
+            raise ValueError(f"`times` and `values` must be finite: {error}") from None
         self.register_buffer("times", knots)
         # a tensor with a graph keeps it; anything else becomes a parameter that is not trained
         # unless asked for

@@ -18,7 +18,7 @@ from scipy.special import ndtr
 from torch import Tensor, nn
 
 from torchsoft.display import suggestion
-from torchsoft.physics.arguments import whole
+from torchsoft.physics.arguments import tensor, whole
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import (
     Array,
@@ -85,7 +85,7 @@ class Pad(nn.Module):
         c, s = np.cos(angle), np.sin(angle)
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
         self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
-        self.register_buffer("origin", torch.tensor(origin, dtype=torch.float64), persistent=False)
+        self.register_buffer("origin", tensor("origin", origin).detach().clone(), persistent=False)
         self.register_buffer(
             "positions",
             torch.from_numpy(self.placed(mesh.nodes[mesh.free][kept])),

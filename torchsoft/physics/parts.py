@@ -53,7 +53,10 @@ class Body(nn.Module):
             self.freedom[name] = value if isinstance(value, str) else "fixed"
         fixed = {k: v for k, v in zip(COORDINATES, (x, y, theta)) if not isinstance(v, str)}
         self.fixed = nn.ParameterDict(
-            {name: parameter(float(value), trained=False) for name, value in fixed.items()}
+            {
+                name: parameter(x if isinstance(x, int) else float(x), trained=False)
+                for name, x in fixed.items()
+            }
         )
         self.mass, self.shape, self.weighted = parameter(mass), shape, weighted
         self.own_inertia = None if inertia is None else parameter(inertia)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the only way to tell
 
+from torchsoft.physics.arguments import check_transforms
 from torchsoft.physics.material import Material
 from torchsoft.physics.shapes import Shape
 from torchsoft.quantity import quantities, quantity_of
@@ -76,7 +77,9 @@ def check_array(name: str, x: Any) -> None:
 
 
 def check_place() -> None:
-    """Raises `ValueError` where torch makes its tensors elsewhere than on the CPU."""
+    """Raises `ValueError` where torch makes its tensors elsewhere than on the CPU, or in a
+    transform of torch.func."""
+    check_transforms()
     if torch.get_default_device().type != "cpu":
         raise ValueError(
             f"torch's default device is {torch.get_default_device()}, but rigs are computed on the "

@@ -339,6 +339,6 @@ def player(
         "t": first["t"], "charts": curves_, "note": RIPPLE if ripples(run) else "",
         "made": {k: str(v) for k, v in run.made_by.items() if isinstance(v, str)},
     }  # fmt: skip
-    data = json.dumps(about, allow_nan=False).replace("</", "<\\/")
+    data = json.dumps(about, allow_nan=False).replace("<", "\\u003c")  # or it may end the script
     page = TEMPLATE.read_text(encoding="utf-8").replace("/*DATA*/null", data)
     save_text(path, page)

@@ -220,6 +220,9 @@ class RigFile(Group):
         file._folder = self._folder
         return file
 
+    def __reduce__(self) -> Any:  # since tables of parts are no attributes of a module
+        return _again, (type(self), self.model_dump(exclude_unset=True), self._folder)
+
     @property
     def folder(self) -> Path:
         """Base of relative file names: the folder of the rig file, or the working directory."""
@@ -570,6 +573,11 @@ class RigFile(Group):
                 f"none: {error}"
             ) from None
         return -float(net_loads(soft, soft.unpack(y, still), still, ())[body][axis])
+
+
+def _again(kind: type[RigFile], tree: Any, folder: Path) -> RigFile:
+    """The rig file that was pickled."""
+    return kind.from_tree(tree, folder)
 
 
 def too_stiff(file: RigFile, rig: Rig) -> str:

@@ -16,7 +16,7 @@ from torchsoft.channels import CHANNELS
 from torchsoft.extras import needed
 from torchsoft.files import check_file, replacing
 from torchsoft.physics.mesh import Array, StoredMesh
-from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.setup import Setup, von_mises
 from torchsoft.physics.state import Layout, State
 from torchsoft.solve.trajectory import Stats, Trajectory, load
@@ -35,6 +35,9 @@ MESH = {
 """Arrays of a mesh: dimensions after its own, unit and meaning."""
 
 PARTS = ("channels", "energy", "dissipated", "supplied")
+
+ABOUT = ("stats", "setup", "wrt", "parts", "touch")
+"""What is said about the arrays, in JSON."""
 
 Add = Callable[[str, Sequence[str], Any, str, str], None]
 """Adds an array: name, dimensions, values, unit and meaning."""
@@ -133,31 +136,80 @@ def add_setup(setup: Setup, add: Add) -> None:
             add(f"outline_{name}", dims, body.outline, "m", meaning)
 
 
+class NoWholeRun(ValueError):
+    """A file or dataset that is not all of a run; the message says what is wrong."""
+
+
 def from_xarray(data: xr.Dataset, source: str = "the dataset") -> Trajectory:
-    """The run of `to_xarray`. Raises `ValueError` naming a missing array."""
-    about = {}
+    """The run of `to_xarray`. Raises `NoWholeRun` naming an array that is missing, not of finite
+    numbers, or of other dimensions or another unit than that of a run."""
+    about: dict[str, Any] = {}
     for name, value in data.attrs.items():
         try:
-            about[name] = json.loads(value)
+            about[str(name)] = json.loads(value)
         except (TypeError, ValueError):
-            about[name] = value
-    if "setup" not in about or "parts" not in about:
-        raise ValueError(
-            f"{source} is no whole run: it has no `setup`; simulate it again, or read its arrays "
-            "with torchsoft.solve.trajectory.load"
+            about[str(name)] = value
+
+    def refused(what: str) -> NoWholeRun:
+        return NoWholeRun(
+            f"{source} is no whole run: {what}; simulate it again, or read its arrays with "
+            "torchsoft.solve.trajectory.load"
         )
 
     def of(name: str) -> Tensor:
         if name not in data:
-            raise ValueError(f"{source} is no whole run: it has no `{name}`")
-        return torch.from_numpy(np.array(data[name].values))
+            raise refused(f"it has no `{name}`")
+        values = np.array(data[name].values)
+        if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+            raise refused(f"`{name}` must be finite numbers")
+        return torch.from_numpy(values)
+
+    if lacking := [name for name in ABOUT if name not in about]:
+        raise refused(f"it has no `{lacking[0]}`")
+    made_by = line(about.get("torchsoft", "nobody"), 40)
+    try:
+        run = _assembled(data, about, of)
+        whole = to_xarray(run)
+    except NoWholeRun:
+        raise
+    except Exception as error:  # whatever parts that do not fit together raise
+        raise refused(
+            f"its parts do not fit together ({line(repr(error), 160)}), since it was changed, or "
+            f"written by a version with another form, torchsoft {made_by}"
+        ) from error
+    if not bool((run.t.diff() > 0).all()):
+        raise refused("`time` must increase strictly")
+    for name, one in whole.variables.items():
+        if (found := data[name]).dims != one.dims:
+            raise refused(f"`{name}` must be over {one.dims}, not {found.dims}")
+        units = {one.attrs.get("units")}
+        if name in run.channels:
+            units = _channel_units(run, str(name))
+        if (unit := found.attrs.get("units")) not in units:
+            listed = " or ".join(f"`{one}`" for one in sorted(map(str, units)))
+            raise refused(f"the unit of `{name}` must be {listed}, not {line(repr(unit), 40)}")
+    return run
+
+
+def _channel_units(run: Trajectory, name: str) -> set[str | None]:
+    """Units that a channel may have: its own, where the setup tells it, or that of any."""
+    known: dict[str, str] = {one.channel: one.unit for one in run.setup.actuators.values()}
+    for body in run.setup.bodies.values():
+        known |= {channel: coordinate_unit(axis) for axis, channel in body.channels.items()}
+    plain = ("m", "rad", "N", "N.m")
+    return {known[name]} if name in known else {*plain, *(f"{x}/s" for x in plain), "kg.m2/s"}
+
+
+def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tensor]) -> Trajectory:
+    """The run of arrays and of what is said about them."""
 
     def by(prefix: str, names: list[str]) -> dict[str, Tensor]:
         return {name: of(f"{prefix}_{name}") for name in names}
 
-    stats, plain, wrt, parts, touch = (
-        about.pop(name) for name in ("stats", "setup", "wrt", "parts", "touch")
-    )
+    stats, plain, wrt, parts, touch = (about.pop(name) for name in ABOUT)
+    words = isinstance(wrt, list) and isinstance(touch, list) and {*map(type, wrt + touch)} <= {str}
+    if not words or not all(isinstance(x, int | float) for x in stats.values()):
+        raise TypeError("stats, wrt or touch")
     bodies, contacts = list(plain["bodies"]), list(plain["contacts"])
     setup = Setup.again(
         plain,

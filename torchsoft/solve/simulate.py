@@ -14,7 +14,7 @@ from tqdm import tqdm
 from torchsoft.paper.equilibrium import rest
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.parallel import one_torch_thread
-from torchsoft.physics.arguments import Numbers, tensor
+from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.energy import stored
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
@@ -131,13 +131,13 @@ def prepare(
     if len(given) > 1:
         raise ValueError(f"{' and '.join(given)} each say which steps to take; give one of them")
     if rtol is None:
-        rtol = RTOL if atol is None else 10 * atol
+        rtol = RTOL if atol is None else 10 * positive("atol", atol)
     stepper = ImplicitStepper(
         rig,
         reference,
         step=step,
         rtol=rtol,
-        atol=0.1 * rtol if atol is None else atol,
+        atol=0.1 * positive("rtol", rtol) if atol is None else atol,
         knots=knots,
         tolerance=tolerance,
     )
