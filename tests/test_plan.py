@@ -18,6 +18,7 @@ from torchsoft.plan.problem import Evaluator, Free, Terms, Variables
 from torchsoft.plan.search import Search
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.goal import Goal, drawn, plan_file
+from torchsoft.rigs.written import template
 
 ROOT = Path(__file__).parents[1]
 FILE = RigFile.from_toml(ROOT / "experiments" / "reorient.toml").override(
@@ -284,6 +285,32 @@ def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     (tmp_path / "goal.toml").write_text(document(GOAL | {"drws": 3}), encoding="utf-8")
     assert main(["plan", *files, "--out", str(tmp_path / "out"), "--force"]) == 2
     assert "drws" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("press", "reached"), [([0.0, -20.0], True), (["held", "held"], False)])
+def test_the_written_file_is_run_again(press, reached):
+    """The file's own run is told: an offset is not added twice, and an effort that is held anew
+    with the planned set-points is named."""
+    few = {"elements_x": 40, "elements_y": 2}
+    file = template("press").override(
+        pads={"lower": few, "upper": few}, outputs={"duration": 0.3},
+        motion={
+            "x_d": {"kind": "hold"},
+            "y_d": {"times": [0.0, 0.2], "values": [0.0, -0.9e-3], "offset": "start"},
+            "press": {"times": [0.0, 0.2], "values": press},
+        },
+    )  # fmt: skip
+    goal = Goal.model_validate({
+        "free": {"y_d": {"low": 45e-3, "high": 52e-3, "speed": 0.1, "after": 0.1}}, "rtol": 1e-3,
+        "targets": {"down": {"channel": "y_bracket", "value": 48.7e-3, "tolerance": 1e-5}},
+    })  # fmt: skip
+    found, written = plan_file(file, goal)
+    built = written.build()
+    again = simulate(built.rig, built.t, y0=built.y0, rtol=1e-5)
+    off = (float(again["y_bracket"][-1]) - 48.7e-3) / 1e-5
+    assert float(found.errors["down"][0]) == pytest.approx(off, abs=0.01)
+    assert found.reached == (abs(off) < 1) == reached
+    assert any("anew with what was planned" in reason for reason in found.reasons) != reached
 
 
 def test_draws_begin_with_the_stated_numbers_and_those_of_an_identification_with_its_estimates():

@@ -65,13 +65,14 @@ def profile(reference: Reference, name: str) -> Profile:
 
 
 def knots(reference: Reference, names: Iterable[str]) -> dict[str, Any]:
-    """Profiles of some signals, as tables of a rig file."""
+    """Profiles of some signals, as whole tables of a rig file, which keep nothing of those before."""
     signals = {name: profile(reference, name) for name in names}
     return {
         name: {
             "kind": "profile",
             "times": one.times.detach().tolist(),
             "values": one.values.detach().tolist(),
+            "offset": 0.0,
         }
         for name, one in signals.items()
     }

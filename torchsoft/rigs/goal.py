@@ -1,6 +1,7 @@
 """Goal of a rig file's motion, from a TOML file, and the plan that reaches it."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -15,9 +16,12 @@ from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
 from torchsoft.plan.planning import RTOL, Method, Robust
-from torchsoft.plan.problem import Free
+from torchsoft.plan.problem import Free, Terms
+from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.simulate import simulate
 from torchsoft.tables import SEED, Table, from_toml
 
 Name = Annotated[str, Field(min_length=1)]
@@ -127,4 +131,40 @@ def plan_file(
     moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
     numbers = {name: value.tolist() for name, value in found.parameters.items()}
     written = file.override(motion=knots(found.reference, moved), **nested(numbers))
-    return Planned(found, written)
+    return Planned(run_again(found, written, goal), written)
+
+
+SAME = 0.01
+"""Largest difference between the plan's run and that of its file, in tolerances of targets and
+scales of limits, that needs no word."""
+
+
+def run_again(found: Plan, written: RigFile, goal: Goal) -> Plan:
+    """The plan, its first draw judged by a run of the file that carries it out.
+
+    That run differs where the file makes something anew with the planned values: "rest", "held" and
+    "auto".
+    """
+    try:
+        built = written.build()
+        run = simulate(built.rig, built.t, y0=built.y0, rtol=found.made_by["checked_rtol"])
+        terms = Terms(None, goal.targets, goal.limits)
+        _, errors, excess = (part.detach() for part in terms.of(run))
+    except (ValueError, SimulationFailed) as failure:
+        reason = f"the written file cannot be run: {failure}"
+        return replace(found, reached=False, reasons=(*found.reasons, reason))
+    said = list[str]()
+    for numbers, values, off in (
+        (found.errors, errors, "tolerances off"), (found.excess, excess, "of its scale beyond"),
+    ):  # fmt: skip
+        for (name, one), now in zip(numbers.items(), values):
+            if not abs(float(now - one[0])) <= SAME:
+                said.append(
+                    f"{name} is {float(now):+.3g} {off} in the run of the written file, and "
+                    f'{float(one[0]):+.3g} in the plan\'s: the file makes "rest", "held" or '
+                    '"auto" anew with what was planned; give numbers in their place'
+                )
+            one[0] = now
+    kept = bool((errors.abs() <= 1).all() and (excess <= SLACK).all())
+    parts = {"notices": (*found.notices, *said)} if kept else {"reasons": (*found.reasons, *said)}
+    return replace(found, trajectory=run, reached=found.reached and kept, **parts)
