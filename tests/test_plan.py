@@ -14,11 +14,11 @@ from tqdm import tqdm
 from torchsoft import simulate
 from torchsoft.cli import main
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
-from torchsoft.plan.knots import knots
 from torchsoft.plan.problem import Evaluator, Free, Terms, Variables
 from torchsoft.plan.search import Search
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.goal import Goal, drawn, plan_file
+from torchsoft.rigs.written import template
 
 ROOT = Path(__file__).parents[1]
 FILE = RigFile.from_toml(ROOT / "experiments" / "reorient.toml").override(
@@ -287,34 +287,30 @@ def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     assert "drws" in capsys.readouterr().err
 
 
-def test_a_motion_with_an_offset_is_written_as_it_was_found():
-    """Values that were found are whole: the file's own offset must not come on top."""
-    shifted = {
-        name: {"times": [0.2, 0.5], "values": [0.0, 0.0], "offset": "start"}
-        for name in ("left_y", "right_y")
-    }
-    file = FILE.override(motion=shifted)
-    found, written = plan_file(file, Goal.model_validate(GOAL))
-    assert found.reached
-    built = written.build()
-    for name in FREE:
-        own, planned = (rig.reference[name] for rig in (built.rig, found.rig))
-        at = torch.tensor(0.4).double()
-        assert all(torch.equal(a, b) for a, b in zip(own(at), planned(at)))
-    run = simulate(built.rig, built.t, y0=built.y0, rtol=1e-5)
-    assert abs(float(run["theta_object"][-1]) - TURN.value) < TURN.tolerance
-
-
-def test_a_plan_that_its_file_does_not_repeat_is_not_reached(monkeypatch):
-    monkeypatch.setattr(
-        "torchsoft.rigs.goal.knots",
-        lambda reference, names: {
-            name: one | {"offset": 1e-3} for name, one in knots(reference, names).items()
+@pytest.mark.parametrize(("press", "reached"), [([0.0, -20.0], True), (["held", "held"], False)])
+def test_the_written_file_is_run_again(press, reached):
+    """The file's own run is told: an offset is not added twice, and an effort that is held anew
+    with the planned set-points is named."""
+    few = {"elements_x": 40, "elements_y": 2}
+    file = template("press").override(
+        pads={"lower": few, "upper": few}, outputs={"duration": 0.3},
+        motion={
+            "x_d": {"kind": "hold"},
+            "y_d": {"times": [0.0, 0.2], "values": [0.0, -0.9e-3], "offset": "start"},
+            "press": {"times": [0.0, 0.2], "values": press},
         },
-    )
-    found, _ = plan_file(FILE, Goal.model_validate(GOAL))
-    assert not found.reached
-    assert "the written file, run from its own start, does not keep targets." in found.reasons[-1]
+    )  # fmt: skip
+    goal = Goal.model_validate({
+        "free": {"y_d": {"low": 45e-3, "high": 52e-3, "speed": 0.1, "after": 0.1}}, "rtol": 1e-3,
+        "targets": {"down": {"channel": "y_bracket", "value": 48.7e-3, "tolerance": 1e-5}},
+    })  # fmt: skip
+    found, written = plan_file(file, goal)
+    built = written.build()
+    again = simulate(built.rig, built.t, y0=built.y0, rtol=1e-5)
+    off = (float(again["y_bracket"][-1]) - 48.7e-3) / 1e-5
+    assert float(found.errors["down"][0]) == pytest.approx(off, abs=0.01)
+    assert found.reached == (abs(off) < 1) == reached
+    assert any("anew with what was planned" in reason for reason in found.reasons) != reached
 
 
 def test_draws_begin_with_the_stated_numbers_and_those_of_an_identification_with_its_estimates():

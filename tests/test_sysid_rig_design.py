@@ -12,9 +12,10 @@ from test_sysid_rigs import replaced
 
 from torchsoft import simulate
 from torchsoft.cli import main
+from torchsoft.plan.knots import knots
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.written import located
-from torchsoft.sysid import Problem
+from torchsoft.sysid import Problem, design
 from torchsoft.sysid.configuration import read_config
 from torchsoft.sysid.design import AS_STATED, planned
 from torchsoft.sysid.runs import Runner
@@ -28,7 +29,7 @@ outputs = {{duration = 0.8, snapshots = []}}
 pads.lower = {{elements_x = 35, elements_y = 2}}
 pads.upper = {{elements_x = 35, elements_y = 2}}
 [settings.motion]
-theta_d = {{times = [0.4, 0.6, 0.7], values = [0.0, 0.2, 0.0]}}
+theta_d = {{times = [0.4, 0.6, 0.7], values = [-0.1, 0.1, -0.1], offset = 0.1}}
 x_d.kind = "hold"
 y_d.kind = "hold"
 y_rate.kind = "hold"
@@ -46,8 +47,8 @@ iterations = 4
 rtol = 1e-3
 limits.x_upper = [-0.03, 0.05]
 [design.candidates]
-twist.motion.theta_d = {{times = [0.4, 0.5, 0.6, 0.7], values = [0.0, 0.4, -0.4, 0.0]}}
-far.motion.theta_d = {{times = [0.4, 0.7], values = [0.0, 3.0]}}
+twist.motion.theta_d = {{times = [0.4, 0.5, 0.6, 0.7], values = [-0.1, 0.3, -0.5, -0.1]}}
+far.motion.theta_d = {{times = [0.4, 0.7], values = [-0.1, 2.9]}}
 [design.bounds]
 theta_d = {{low = -0.5, high = 0.5, speed = 30.0, after = 0.4}}
 """
@@ -86,7 +87,8 @@ def test_the_designed_motion_is_a_rig_file_that_runs(out):
     motion: Any = file.motion["theta_d"]
     assert motion.kind == "profile"
     assert motion.times == (0.4, 0.5, 0.6, 0.7)
-    assert motion.values[0] == 0.0
+    assert motion.values[0] + motion.offset == 0.0
+    assert written["confirmed"]
     assert 0 < max(abs(np.array(motion.values) - [0.0, 0.4, -0.4, 0.0])) < 0.2
     assert max(map(abs, motion.values)) <= 0.5 + 1e-9
     assert written["made_by"]["iterations"] == 4
@@ -108,6 +110,18 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
     assert whole.file == str(tmp_path / "x.csv")
 
 
+def test_a_file_that_moves_otherwise_than_the_search_is_named(monkeypatch, tmp_path, capsys):
+    def other(reference, names):
+        return knots(reference, names) | {"bear": {"times": [0.0], "values": [9.0]}}
+
+    monkeypatch.setattr(design, "knots", other)
+    (tmp_path / "fit.toml").write_text(PLAN, encoding="utf-8")
+    asked = ["design", str(tmp_path / "fit.toml"), "--out", str(tmp_path / "out"), "--no-progress"]
+    assert main(asked) == 1
+    assert "motion.bear of the written file is up to 3 off" in capsys.readouterr().out
+    assert not json.loads((tmp_path / "out" / "design.json").read_text())["confirmed"]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -116,7 +130,7 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
         (replaced("twist.motion", "twist.motions"), "design.candidates.twist: `motions` is not"),
         (replaced("theta_d = {low", "theta = {low"), "no Profile called `theta`"),
         (
-            lambda text: text.replace("0.4, -0.4", "9.0, -9.0").replace("0.2, 0.0", "9.0, 0.0"),
+            lambda text: text.replace("0.3, -0.5", "9.0, -9.0").replace("0.1, -0.1]", "9.0, 0.0]"),
             "no candidate can be made: .* the body was lost",
         ),
     ],

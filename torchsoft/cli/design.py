@@ -12,8 +12,9 @@ Which motion of the rig should be recorded?
 CONFIG.toml plans an identification (a rig file, unknowns, sensors with their noise), and has in
 [design] candidates for the motion, and bounds within which the knots of profiles may move. Ranks
 the candidates by what identifies the unknowns best, moves the knots of the best one by gradient,
-and writes it as motion.toml, a rig file that runs, with design.json. DATA are recordings that
-there are already."""
+and writes it as motion.toml, a rig file that runs, with design.json. The file is run again, and
+the exit status is 1 where it tells something else than the search. DATA are recordings that there
+are already."""
 
 
 def add_commands(commands: Any) -> None:
@@ -53,4 +54,4 @@ def design(options: argparse.Namespace) -> int:
         for notice in (*chosen.found.limits, *chosen.found.notices):
             say(f"note: {notice}")
     say(f"written to {options.out / 'motion.toml'} and {options.out / 'design.json'}")
-    return 0
+    return 0 if chosen.found is None or chosen.found.confirmed else 1

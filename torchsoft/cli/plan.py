@@ -14,8 +14,9 @@ motion whose knots may move (low, high, speed, after) and every number of the fi
 (low, high), [targets.NAME] (channel, value, tolerance, at) and [limits.NAME] (channel, low, high,
 since, until). With [uncertain."NUMBER"] (low, high) the plan is made for draws of them; with
 --answer, the file of an identification with `rig = "RIG.toml"`, for draws of what that leaves
-unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json, run.nc
-and run.png; the exit status is 1 where a target or limit is not kept."""
+unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json, and the
+run of that file as run.nc and run.png; the exit status is 1 where it does not keep a target or
+limit."""
 
 
 def add_commands(commands: Any) -> None:

@@ -65,7 +65,7 @@ def profile(reference: Reference, name: str) -> Profile:
 
 
 def knots(reference: Reference, names: Iterable[str]) -> dict[str, Any]:
-    """Profiles of some signals, as tables of a rig file, without what its own add to values."""
+    """Profiles of some signals, as whole tables of a rig file: nothing of older ones is kept."""
     signals = {name: profile(reference, name) for name in names}
     return {
         name: {

@@ -15,8 +15,9 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
-from torchsoft.plan.planning import RTOL, SLACK, Method, Robust
-from torchsoft.plan.problem import Free, evaluated
+from torchsoft.plan.planning import RTOL, Method, Robust
+from torchsoft.plan.problem import Free, Terms
+from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
@@ -130,28 +131,40 @@ def plan_file(
     moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
     numbers = {name: value.tolist() for name, value in found.parameters.items()}
     written = file.override(motion=knots(found.reference, moved), **nested(numbers))
-    return Planned(repeated(found, written, goal), written)
+    return Planned(run_again(found, written, goal), written)
 
 
-def repeated(found: Plan, written: RigFile, goal: Goal) -> Plan:
-    """The plan with what a run of the written file says of it: not reached where that misses a
-    target or a limit."""
-    if not found.reached:
-        return found
-    missed = []
+SAME = 0.01
+"""Largest difference between the plan's run and that of its file, in tolerances of targets and
+scales of limits, that needs no word."""
+
+
+def run_again(found: Plan, written: RigFile, goal: Goal) -> Plan:
+    """The plan, its first draw judged by a run of the file that carries it out.
+
+    That run differs where the file makes something anew with the planned values: "rest", "held" and
+    "auto".
+    """
     try:
         built = written.build()
         run = simulate(built.rig, built.t, y0=built.y0, rtol=found.made_by["checked_rtol"])
-        off = evaluated(goal.targets, run, "targets")
-        missed += [f"targets.{name}" for name, e in off.items() if float(e.abs().max()) > 1]
-        over = evaluated(goal.limits, run, "limits")
-        missed += [f"limits.{name}" for name, e in over.items() if float(e.max()) > SLACK]
-    except (ValueError, SimulationFailed) as error:
-        missed.append(str(error))
-    if not missed:
-        return found
-    reason = (
-        f"the written file, run from its own start, does not keep {', '.join(missed)}: its free "
-        "parameters change where it rests, or the limits are kept by less than the tolerance"
-    )
-    return replace(found, reached=False, reasons=(*found.reasons, reason))
+        terms = Terms(None, goal.targets, goal.limits)
+        _, errors, excess = (part.detach() for part in terms.of(run))
+    except (ValueError, SimulationFailed) as failure:
+        reason = f"the written file cannot be run: {failure}"
+        return replace(found, reached=False, reasons=(*found.reasons, reason))
+    said = list[str]()
+    for numbers, values, off in (
+        (found.errors, errors, "tolerances off"), (found.excess, excess, "of its scale beyond"),
+    ):  # fmt: skip
+        for (name, one), now in zip(numbers.items(), values):
+            if not abs(float(now - one[0])) <= SAME:
+                said.append(
+                    f"{name} is {float(now):+.3g} {off} in the run of the written file, and "
+                    f'{float(one[0]):+.3g} in the plan\'s: the file makes "rest", "held" or '
+                    '"auto" anew with what was planned; give numbers in their place'
+                )
+            one[0] = now
+    kept = bool((errors.abs() <= 1).all() and (excess <= SLACK).all())
+    parts = {"notices": (*found.notices, *said)} if kept else {"reasons": (*found.reasons, *said)}
+    return replace(found, trajectory=run, reached=found.reached and kept, **parts)

@@ -4,7 +4,7 @@ rehearsal of an experiment."""
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -123,7 +123,8 @@ class Design:
     `recording` follows it, with noiseless samples at the nominal parameters; so does `given`, with
     the motion at the start of the search. `before` and `after` are the relative standard deviations
     with either, including the other recordings and priors. `history` has the criterion over the
-    search, `limits` the active constraints, `notices` other facts about the search.
+    search, `limits` the active constraints, `notices` other facts about the search, and
+    `confirmed` whether the rig file written of it, run again, tells the same.
     """
 
     given: Recording
@@ -134,6 +135,7 @@ class Design:
     limits: tuple[str, ...]
     notices: tuple[str, ...]
     made_by: dict[str, Any]
+    confirmed: bool = True
 
     def table(self) -> str:
         """A line for each parameter."""
@@ -369,7 +371,7 @@ class Chosen(NamedTuple):
             out |= {
                 "before": one.before, "after": one.after, "limits": one.limits,
                 "history": [asdict(visit) for visit in one.history], "notices": one.notices,
-                "made_by": one.made_by,
+                "confirmed": one.confirmed, "made_by": one.made_by,
             }  # fmt: skip
         return out
 
@@ -401,6 +403,26 @@ def rank(
         else:
             rated.append(Rated(one.name, seen.value, planner.deviations(x, seen), seen.peaks))
     return sorted(rated, key=lambda one: (one.score, one.value))
+
+
+SAME = 1e-6
+"""Largest difference between a motion of the search and of the written file, over its largest
+value."""
+
+
+def unlike(found: Recording, again: Recording) -> list[str]:
+    """Sentences on motions of a written file that are not those that the search found."""
+    t, said = torch.from_numpy(found.times), list[str]()
+    motions = [one.rig.follow(t).detach()[..., 0].mT for one in (found, again)]
+    for name, was, now in zip(found.rig.signals, *motions):
+        off, most = float((now - was).abs().max()), float(was.abs().max())
+        if not off <= SAME * most:
+            said.append(
+                f"motion.{name} of the written file is up to {off:.3g} off what the search found, "
+                f'of {most:.3g}: the file makes "start" or "held" anew with the new motion; give '
+                "numbers in their place"
+            )
+    return said
 
 
 def choose(
@@ -441,4 +463,10 @@ def choose(
             progress=progress, **common,
         )  # fmt: skip
         chosen = chosen.override(motion=knots(found.recording.rig.reference, plan.bounds))
+        try:
+            again = planned(stated, chosen, chosen.build(), best, plan.rtol, noise=0.0)
+            said = unlike(found.recording, again)
+        except (ValueError, SimulationFailed) as failure:
+            said = [f"the written file cannot be run: {failure}"]
+        found = replace(found, notices=(*found.notices, *said), confirmed=not said)
     return Chosen(rated, chosen, found)
