@@ -24,6 +24,7 @@ from torchsoft.sysid import (
     record,
 )
 from torchsoft.sysid.assumptions import assumptions
+from torchsoft.sysid.columns import wraps
 from torchsoft.sysid.measured import load, vocabulary
 from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.refits import since
@@ -192,6 +193,41 @@ def test_what_a_rig_cannot_be_identified_from_is_refused(folder, case):
     (folder / name).write_text(change(text), encoding="utf-8")
     with pytest.raises(ValueError, match=words):
         load([folder / "run.csv"], folder / "fit.toml")
+
+
+@pytest.mark.parametrize(("heading", "name"), [("theta_disc", "theta_disc"), ("eye", "theta_disc")])
+@pytest.mark.parametrize("low", [-180.0, 0.0])
+def test_an_angle_that_wraps_is_named_and_unwrapped(folder, heading, name, low):
+    """Jumps by a turn, across a missing sample too; angles of the recording are those turned."""
+    rows = (folder / "run.csv").read_text(encoding="utf-8").splitlines()
+    turned = 500 * np.linspace(0, 1.2, 241) ** 2  # [deg], 1.2 turns and more
+    column = [f",{(x - low) % 360 + low:.9g}" for x in turned]
+    first = int(np.argmax(turned >= 360 + low)) + 1  # index of the row of the jump, from 1
+    column[first - 2] = ","
+    lines = [f"{rows[0]},{heading} [deg]", *(a + b for a, b in zip(rows[1:], column))]
+    (folder / "run.csv").write_text("\n".join(lines), encoding="utf-8")
+    fit, of = (folder / "fit.toml").read_text(encoding="utf-8"), f'of = "{name}", '
+    named = f'columns.eye = "{name}"\ncolumns.camera' if heading != name else "columns.camera"
+    (folder / "fit.toml").write_text(fit.replace("columns.camera", named), encoding="utf-8")
+    words = rf"row {first + 1}, column `{heading}` jumps by a turn, .* columns.{heading}.unwrap = "
+    with pytest.raises(ValueError, match=words):
+        load([folder / "run.csv"], folder / "fit.toml")
+    said = f"columns.{heading} = {{{of}unwrap = true}}\ncolumns.camera"
+    (folder / "fit.toml").write_text(fit.replace("columns.camera", said), encoding="utf-8")
+    (made,) = load([folder / "run.csv"], folder / "fit.toml").problem.recordings
+    kept = np.delete(turned, first - 2)
+    assert made.samples[name][1] == pytest.approx(np.radians(kept), abs=1e-9)
+
+
+def test_what_is_no_angle_is_not_unwrapped(folder):
+    fit = (folder / "fit.toml").read_text(encoding="utf-8")
+    fit = fit.replace("columns.camera", "columns.y_disc.unwrap = true\ncolumns.camera")
+    (folder / "fit.toml").write_text(fit, encoding="utf-8")
+    with pytest.raises(ValueError, match=r"columns\.y_disc\.unwrap: `y_disc` is in m, and only"):
+        load([folder / "run.csv"], folder / "fit.toml")
+    assert not len(wraps(np.array([3.0])))
+    assert wraps(np.array([3.0, 3.1, -3.1, -3.0])).tolist() == [1]
+    assert not len(wraps(10.0 * np.arange(9)))  # degrees taken for radians are another mistake
 
 
 def test_columns_are_channels_and_signals_with_a_unit():

@@ -4,6 +4,7 @@ in SI units.
 Every error is a `ValueError` in a sentence that names the file, the row and the column.
 """
 
+import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,22 +24,30 @@ from torchsoft.tables import shown
 
 
 class Vocabulary(NamedTuple):
-    """Columns of the recordings of a rig: `units` by column, the names of signals, and what
-    `headings` of other names stand for."""
+    """Columns of the recordings of a rig: `units` by column, the names of signals, what `headings`
+    of other names stand for, and the angles that are `unwrapped`."""
 
     units: Mapping[str, str]
     signals: tuple[str, ...]
     headings: Mapping[str, str] = {}
+    unwrapped: tuple[str, ...] = ()
 
-    def renamed(self, headings: Mapping[str, str]) -> "Vocabulary":
-        """With headings of other names. Raises `ValueError` for one that stands for no column."""
-        for heading, name in headings.items():
-            if name not in self.units:
+    def renamed(self, headings: Mapping[str, str], unwrapped: Collection[str]) -> "Vocabulary":
+        """With headings of other names, and with angles that are unwrapped, by their headings.
+        Raises `ValueError` for one that stands for no column, or for no angle."""
+        for heading in (*headings, *unwrapped):
+            if (name := headings.get(heading, heading)) not in self.units:
                 raise ValueError(
                     f"columns.{heading} = {shown(name)} is no channel of the rig; "
                     f"{suggestion(name, self.units, 'there are')}"
                 )
-        return self._replace(headings=headings)
+            if heading in unwrapped and self.units[name] != "rad":
+                raise ValueError(
+                    f"columns.{heading}.unwrap: `{name}` is in {self.units[name]}, and only angles "
+                    "wrap: leave it out"
+                )
+        turned = tuple(headings.get(heading, heading) for heading in unwrapped)
+        return self._replace(headings=headings, unwrapped=turned)
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -167,10 +176,34 @@ def check_times(tables: Tables) -> None:
 
 
 def read_table(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
-    """A CSV, NetCDF or MCAP file, by its suffix, without the columns `ignore`."""
-    if path.suffix in (".nc", ".h5", ".mcap"):
-        return read_trajectory(path, ignore, known)
-    return read_csv(path, ignore, known)
+    """A CSV, NetCDF or MCAP file, by its suffix, without the columns `ignore`, and with angles
+    unwrapped. Raises `ValueError` for others that wrap."""
+    binary = path.suffix in (".nc", ".h5", ".mcap")
+    table = (read_trajectory if binary else read_csv)(path, ignore, known)
+    for name, y in table.values.items():
+        if known.units[name] != "rad":
+            continue
+        rows = np.flatnonzero(np.isfinite(y))
+        if name in known.unwrapped:
+            y[rows] = np.unwrap(y[rows])
+        elif len(turns := wraps(y[rows])):
+            i = int(turns[0])
+            heading = next((one for one, of in known.headings.items() if of == name), name)
+            raise ValueError(
+                f"{table.at(int(rows[i + 1]))}, column `{heading}` jumps by a turn, from "
+                f"{y[rows[i]]:.4g} to {y[rows[i + 1]]:.4g} rad, as an angle does that wraps: say "
+                f"columns.{heading}.unwrap = true"
+            )
+    return table
+
+
+def wraps(angle: Array) -> Array:
+    """Samples of an angle [rad] after which it jumps by a turn, while it mostly moves by far
+    less."""
+    apart = np.abs(np.diff(angle))
+    if not len(apart) or np.median(apart) > math.pi / 2:
+        return np.zeros(0)
+    return np.flatnonzero(np.abs(apart - 2 * math.pi) <= math.pi / 2)
 
 
 def hint(name: str, columns: int, names: Collection[str]) -> str:

@@ -65,6 +65,19 @@ class Moving(Table):
 Beginning = Annotated[Rest | Moving, Field(discriminator="kind")]
 
 
+class Column(Table):
+    """A column of the data by its heading: the channel or motion that it is `of`, where it has
+    another name, and whether its jumps by a turn are taken out (`unwrap`)."""
+
+    of: Name | None = None
+    unwrap: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_name_alone(cls, data: Any) -> Any:
+        return {"of": data} if isinstance(data, str) else data
+
+
 class Entry(Table):
     """One more recording, called `name` or like its file: its columns stand in `file`, or in
     several `files` next to the configuration, each with times of its own. Without a file it has
@@ -138,16 +151,16 @@ class Config(Table):
 
     `rig` is the rig file, whose fields have the names of its tables: `settings` replaces known
     ones, `unknowns` are tables by the dotted names of parameters, `sensors` by channels. `columns`
-    has channels and signals by headings of another name, `heldout` names recordings that are
-    predicted and not fitted, `ignore` columns that are left out, and `acknowledged` findings that
-    are no mistakes. `start` holds for all recordings that say nothing else. `compare` has competing
-    laws by name.
+    has channels and signals by headings of another name, and angles to `unwrap`; `heldout` names
+    recordings that are predicted and not fitted, `ignore` columns that are left out, and
+    `acknowledged` findings that are no mistakes. `start` holds for all recordings that say nothing
+    else. `compare` has competing laws by name.
     """
 
     rig: File
     unknowns: dict[str, Unknown]
     sensors: dict[str, Sensor]
-    columns: dict[Name, Name] = Field(default_factory=dict)
+    columns: dict[Name, Column] = Field(default_factory=dict)
     settings: dict[str, Any] = Field(default_factory=dict)
     start: Beginning = Rest()
     fit: Settings = Field(default_factory=lambda: Settings.model_validate({}))

@@ -24,7 +24,7 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.trajectory import Touch, channels, measurable, units
 from torchsoft.sysid.columns import Tables, Vocabulary, read_tables
-from torchsoft.sysid.configuration import Beginning, Config, Entry, Law, Moving, read_config
+from torchsoft.sysid.configuration import Beginning, Column, Config, Entry, Law, Moving, read_config
 from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing, Start
@@ -66,14 +66,16 @@ SLACK = 0.05
 """Time [s] by which a recording may begin after the file's own motions, or end after them."""
 
 
-def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
-    """Columns that recordings of a rig may have. Raises `ValueError` for a heading that stands for
-    something else."""
+def vocabulary(rig: Rig, stated: Mapping[str, Column]) -> Vocabulary:
+    """Columns that recordings of a rig may have, with what is `stated` of headings. Raises
+    `ValueError` for a heading that stands for something else."""
     known, signals, touch = units(rig), rig.signals, Touch(rig)
     known |= {name: touch.unit(name) for name in touch}
     names = (*signals, *(f"{name}_dot" for name in signals), *measurable(rig), *touch)
     columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
-    return Vocabulary(columns, signals).renamed(headings)
+    headings = {heading: one.of for heading, one in stated.items() if one.of is not None}
+    unwrapped = [heading for heading, one in stated.items() if one.unwrap]
+    return Vocabulary(columns, signals).renamed(headings, unwrapped)
 
 
 def followed(tables: Tables, rig: Rig) -> Reference:
