@@ -37,7 +37,9 @@ FLOWS = {
         planner columns configuration measured design figures report .
     """,
     "plan": "knots problem search planning .",
-    "rigs": "fields parts control motion geometry build written course recorded check goal run .",
+    "rigs": """
+        fields parts control motion geometry build written course recorded gripped check goal run .
+    """,
     "cli": "results rigs plan identify design material dataset reduce plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build

@@ -638,3 +638,32 @@ def test_a_part_that_is_called_alike_is_asked_about():
         template("t").override(materials={"rubbr": {"E": 1e6}})
     with pytest.raises(ValueError, match=r"bodies\.disk: .*; did you mean bodies\.disc\?"):
         template("t").override(bodies={"disk": {"mass": 1.0}})
+
+
+BOX = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 20e-3, "radius": 3e-3}
+
+
+@pytest.mark.parametrize(
+    ("disc", "far", "press", "mu", "where"),
+    [
+        ({"shape": BOX}, 20e-3, -30.0, 0.7, {"bodies.disc"}),  # the run: 95 % of a pad's height
+        ({"shape": BOX}, 10e-3, -30.0, 0.7, {"bodies.disc"}),  # 56 %
+        ({"shape": BOX}, 2e-3, -30.0, 0.7, set()),  # 13 %
+        ({"shape": BOX}, 20e-3, -30.0, 0.2, set()),  # it slides: 11 %
+        ({"theta": 0.0}, 20e-3, -200.0, 0.7, {"pads.lower", "pads.upper"}),  # 53 %
+        ({"theta": 0.0}, 20e-3, -30.0, 0.7, set()),  # 20 %
+        ({}, 20e-3, -300.0, 0.7, set()),  # it rolls: 22 %
+    ],
+)  # fmt: skip
+def test_pads_that_are_moved_along_a_body_that_cannot_roll_are_warned_about(
+    disc, far, press, mu, where
+):
+    few = {"elements_x": 40, "elements_y": 2}
+    file = template("t").override(
+        pads={"lower": few, "upper": few}, bodies={"disc": disc},
+        laws={"dry": {"friction": {"mu_s": mu, "mu_k": mu}}},
+        motion={"x_d": {"values": ("start", far)}, "press": {"values": (0.0, press)}},
+    )  # fmt: skip
+    found = [one for one in check(file) if one.severity == "warning"]
+    assert {one.where for one in found} == where
+    assert all("cannot roll" in one.message for one in found)

@@ -7,24 +7,22 @@ of the bodies.
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchsoft.diagnostic import SEVERITIES, Diagnostic
 from torchsoft.parallel import single_threaded
-from torchsoft.physics.motion import Reference, hold
+from torchsoft.physics.motion import hold
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.setup import Setup
-from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, massless, standing
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, signals
 from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.geometry import Scene, at, collision, nodes, tied
+from torchsoft.rigs.gripped import LINEAR, Moment, drags, room
 from torchsoft.rigs.motion import ProfileTable
 from torchsoft.rigs.recorded import recordings
 from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, modes, strained
@@ -33,11 +31,6 @@ from torchsoft.solve.kernel.arrays import PASSED
 # Checks of a rig in static equilibrium at some moments of its motions: room, strains, modes and
 # steps, friction.
 
-
-LINEAR = 0.25
-"""Largest indentation over a pad's height without a warning (assumed): strains under a contact are
-of that order, and there the stress of rubber deviates from linear elasticity by some ten per
-cent."""
 
 MOMENTS = 5
 """Most times at which the rig is brought into equilibrium."""
@@ -54,17 +47,6 @@ STEPS_PER_PERIOD = 5
 
 STEPS_PER_PROFILE = 20
 """Fewest steps between two values of a profile."""
-
-
-class Moment(NamedTuple):
-    """The rig with massless pads in equilibrium at a time [s]: the scene, the state (size,) with
-    settled pads and its parts, and the signals as constants."""
-
-    time: float
-    scene: Scene
-    y: Tensor
-    state: State
-    reference: Reference
 
 
 @torch.no_grad()
@@ -101,8 +83,8 @@ def at_moments(e: Estimate) -> list[Diagnostic]:
             )
         )  # fmt: skip
     return [
-        *found, *presses(there), *strains(there), *softens(there), *swings(e, there),
-        *slips(e, there),
+        *found, *presses(there), *strains(there), *drags(e, there), *softens(there),
+        *swings(e, there), *slips(e, there),
     ]  # fmt: skip
 
 
@@ -125,15 +107,6 @@ def fits(time: float, scene: Scene) -> Iterator[Diagnostic]:
 def named(scene: Scene, group: Sequence[str]) -> str:
     """Names of the pads of some contacts."""
     return " and ".join(f"`{scene.rig.contacts[key].pad}`" for key in group)
-
-
-def room(scene: Scene, group: Sequence[str]) -> float:
-    """Total indentation [m] of the pads of some contacts of one body; negative where they are
-    apart, or the body is beyond the end of one."""
-    beside = max(
-        scene.surface(key).off(scene.pose[scene.rig.contacts[key].body][:2]) for key in group
-    )
-    return -beside if beside > 0 else sum(scene.pressed(key) for key in group)
 
 
 def presses(there: list[Moment]) -> Iterator[Diagnostic]:
