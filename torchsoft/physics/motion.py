@@ -422,12 +422,12 @@ class Reference(nn.Module):
         """These signals, if all of them are polynomials of this package's and nothing else decides
         their values; else None. Raises `ValueError` for knots that are none."""
         chosen = [self._now(name) for name in names]
-        if self._own_way or not all(map(polynomial, chosen)):
+        if self.own_way or not all(map(polynomial, chosen)):
             return None
         return chosen  # pyright: ignore[reportReturnType]
 
     @property
-    def _own_way(self) -> bool:
+    def own_way(self) -> bool:
         """Whether anything but its signals decides the values."""
         changed = type(self).forward is not Reference.forward
         return bool(changed or self._forward_hooks or self._forward_pre_hooks)
@@ -438,7 +438,7 @@ class Reference(nn.Module):
         it."""
         if origin == 0:
             return self
-        if self._own_way:
+        if self.own_way:
             return _Since(self, origin)
         out = Reference()
         out.origin = self.origin + origin

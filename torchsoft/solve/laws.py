@@ -18,7 +18,9 @@ from torchsoft.codegen.emit import check_pointwise
 from torchsoft.codegen.graph import Graph
 from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.physics.motion import Reference, polynomial
 from torchsoft.physics.parts import Actuator
+from torchsoft.physics.rig import Rig
 from torchsoft.solve.kernel.arrays import FELT, INPUTS
 
 
@@ -47,6 +49,22 @@ def copied(
             k: m if m is None else copied(m, known, values) for k, m in module._modules.items()
         }
     return known[id(module)]
+
+
+def snapshot(rig: Rig, reference: Reference | None) -> tuple[Rig, Reference | None]:
+    """The rig, and the reference of a run, with copies of their parameters as they are now, through
+    which gradients pass: another thread may change them during the run. Signals that are not this
+    package's are kept as they are."""
+    known: dict[int, nn.Module] = {}
+    given = [one for one in (rig, reference) if one is not None]
+    for one in (rig.reference, reference):
+        for part in (*one.signals.values(), *([one] if one.own_way else [])) if one else ():
+            if part is one or not polynomial(part):
+                known[id(part)] = part
+    with torch.inference_mode(False), torch.enable_grad():
+        values = {id(p): p.clone() for one in given for p in one.parameters()}
+    copies: list[Any] = [copied(one, known, values) for one in given]
+    return copies[0], copies[1] if copies[1:] else None
 
 
 class _Called(nn.Module):

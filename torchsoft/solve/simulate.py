@@ -30,6 +30,7 @@ from torchsoft.solve.gradients import (
     march,
     without_gradient,
 )
+from torchsoft.solve.laws import snapshot
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.steps import check_times
@@ -92,13 +93,14 @@ def simulate(
         tolerance=tolerance, gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid, touch=touch,
     )  # fmt: skip
     trajectory = run(task, TAPE_BYTES, progress).trajectory()
-    for doubt in doubts(trajectory, rig).values():
+    for doubt in doubts(trajectory, task.stepper.rig).values():
         warnings.warn(doubt, stacklevel=2)
     return trajectory
 
 
 class Task(NamedTuple):
-    """A run that may begin: the arguments of `simulate`, checked."""
+    """A run that may begin: the arguments of `simulate`, checked. The stepper has a snapshot of the
+    `rig`."""
 
     stepper: ImplicitStepper
     t: Tensor
@@ -108,6 +110,7 @@ class Task(NamedTuple):
     dy0: Tensor | None
     rigid: bool
     touch: tuple[str, ...]
+    rig: Rig | None = None
 
 
 def prepare(
@@ -132,9 +135,12 @@ def prepare(
         raise ValueError(f"{' and '.join(given)} each say which steps to take; give one of them")
     if rtol is None:
         rtol = RTOL if atol is None else 10 * positive("atol", atol)
+    now, followed = rig, reference
+    if isinstance(rig, Rig) and isinstance(reference, Reference | None):
+        now, followed = snapshot(rig, reference)
     stepper = ImplicitStepper(
-        rig,
-        reference,
+        now,
+        followed,
         step=step,
         rtol=rtol,
         atol=0.1 * positive("rtol", rtol) if atol is None else atol,
@@ -143,12 +149,12 @@ def prepare(
     )
     check_times(t, step)
     if y0 is None:
-        if not isinstance(rig, SoftGrasp):
+        if not isinstance(now, SoftGrasp):
             raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
-        y0 = rest(rig)
+        y0 = rest(now)
     stepper.check_start(y0)
     felt = _channels_of_touch(rig, touch)
-    return Task(stepper, t, shared(y0), gradient, tuple(wrt), dy0, rigid, felt)
+    return Task(stepper, t, shared(y0), gradient, tuple(wrt), dy0, rigid, felt, rig)
 
 
 class RunOutcome(NamedTuple):
@@ -340,7 +346,7 @@ def gather(
         else dict(
             zip(task.touch, touch.slopes(task.touch, slopes[1][:count], felt).unbind(1))
         ),
-        units=units(rig), setup=Setup.of(rig), rig=rig,
+        units=units(rig), setup=Setup.of(rig), rig=task.rig or rig,
     )  # fmt: skip
 
 
