@@ -17,7 +17,7 @@ FLOWS = {
         solve scenario excitation plan
         plot materials rigs sysid reduced datasets envs experiment cli __main__
     """,
-    "codegen": "graph operations trace emit .",
+    "codegen": "graph operations trace emit . stops",
     "physics": """
         arguments mesh shapes contact material pads multibond state parts names motion
         validity rig summary extensions energy statics setup .

@@ -6,14 +6,21 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from conftest import coarse, grasped, times, towards
+from conftest import coarse, f64, grasped, times, towards
 from torch import Tensor, nn
 
 from torchsoft import (
+    Actuator,
     Body,
     Circle,
+    Contact,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
     Profile,
     Rig,
+    SmoothSlip,
+    SoftContact,
     SoftGrasp,
     hold,
     simulate,
@@ -57,6 +64,87 @@ def test_a_slip_law_that_supplies_power_is_seen_in_the_ledger():
     said = told(model, t=times(0.01, 6), y0=grasped(model, (0.05, 0.0)))
     assert any("`slip` is to dissipate energy, but gave" in text for text in said), said
     assert any("the slip law of `L` gives" in text for text in said), said
+
+
+class Held(nn.Module):
+    """A slip law that records no derivative of its coefficient, or of something that it does not
+    depend on."""
+
+    def __init__(self, mu: float, what: str) -> None:
+        super().__init__()
+        self.mu, self.what = nn.Parameter(f64(mu)[0]), what
+
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        slips = E.detach() > self.mu.detach() * F_N.detach()
+        with torch.set_grad_enabled(self.what != "mu"):
+            cap = self.mu * F_N
+        cap = cap.detach() if self.what == "F_N" else cap
+        return torch.where(slips, (E - cap) / R, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("what", "line"), [("mu", "cap = self.mu"), ("F_N", r"cap = cap.detach\(\)"), ("", "")]
+)
+def test_a_law_that_detaches_what_it_depends_on_is_told_of(what, line):
+    """With its line; not one that detaches the condition of a choice only, nor one whose parameter
+    is held on purpose."""
+    slip = Held(0.3 + 0.001 * len(what), what)
+    model = SoftGrasp(coarse().settings, friction=slip)
+    run = {"t": times(0.01, 3), "y0": grasped(model, (0.05, 0.0)), "gradient": "discrete"}
+    said = told(model, **run)
+    sentence = (
+        r"the gradient of the slip law of `L` is not that of its value: torch is told to record "
+        rf"none at .*test_ledger.py:\d+, `{line}.*so that derivatives by the normal force, `mu` are"
+    )
+    assert [bool(re.match(sentence, text)) for text in said] == [True] * bool(what), said
+
+
+def test_a_parameter_that_is_held_may_be_detached():
+    class Fixed(Held):
+        def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+            return (E - self.mu.detach() * F_N).clamp(min=0.0) / R
+
+    model = SoftGrasp(coarse().settings, friction=Fixed(0.3, ""))
+    run = {"t": times(0.002, 2), "y0": grasped(model)}
+    (text,) = told(model, **run)
+    assert "derivatives by `mu` are wrong" in text
+    model.contact.friction.requires_grad_(False)
+    assert told(model, **run) == []
+
+
+def test_controllers_and_shapes_and_materials_that_detach_are_told_of():
+    class Loop(nn.Module):
+        def forward(self, w: Tensor, w_dot: Tensor, F: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+            return 1e3 * (w - q) - 10 * q_dot.detach()
+
+    class Disc(Circle):
+        def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+            phi, n = super().forward(x)
+            return phi, n.detach()
+
+    class Rubber(KelvinVoigt):
+        def chain(self) -> tuple[Tensor, Tensor]:
+            J, tau = super().chain()
+            return J, tau.detach()
+
+    contact = SoftContact(1e5, 400.0, 1e5, 400.0, friction=SmoothSlip(0.8, 0.7, 0.05))
+    mesh, rubber = PadMesh(0.04, 4e-3, 8, 2), Rubber(7.5e5, 0.45, 1100.0, 0.01, 0.044)
+    rig = Rig(
+        bodies={"disc": Body(0.4, Disc(0.02))}, pads={"P": Pad(mesh, rubber)},
+        contacts={"c": Contact("P", "disc", contact)}, reference=hold(x_d=0.0),
+        actuators={"a": Actuator("disc.x", "disc.x", Loop(), setpoint="x_d")},
+    )  # fmt: skip
+    y0 = rig.state(disc={"x": 0.02, "y": "rest"})
+    for text, what in zip(
+        told(rig, t=times(1e-3, 2), y0=y0),
+        (
+            "the material of `P`.*by `tau` are",
+            "the law of `actuators.a`.*by disc.x's rate are",
+            "the shape of `disc`.*by x, y are",
+        ),
+        strict=True,
+    ):
+        assert re.match(rf"the gradient of {what} wrong", text), text
 
 
 def test_a_pad_pressed_flat_is_told_of():

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsoft.codegen import emit
 from torchsoft.codegen.graph import Graph, adjoints, dependent, jacobian
-from torchsoft.codegen.trace import UnknownOperation, check_backward, traced
+from torchsoft.codegen.trace import Trace, UnknownOperation, check_backward, traced
 
 __all__ = ["Law", "UnknownOperation", "compile_law"]
 
@@ -45,6 +45,7 @@ def compile_law(
     *,
     linear: int | None = None,
     differentiated: int | None = None,
+    kind: type[Trace] = Trace,
 ) -> Law:
     """Compile function(x, parameters), which gives an (outputs,) float64 tensor for x (inputs,) and
     float64 parameters.
@@ -61,9 +62,9 @@ def compile_law(
     _check(x, parameters)
     check_backward(function, x, parameters)
     graph = Graph()
-    outputs = traced(graph, function, x, parameters)
+    outputs = traced(graph, function, x, parameters, kind=kind)
     elsewhere = {name: 0.9 * tensor.detach() + 0.01 for name, tensor in parameters.items()}
-    if traced(graph, function, 0.9 * x.detach() + 0.01, elsewhere) != outputs:
+    if traced(graph, function, 0.9 * x.detach() + 0.01, elsewhere, kind=kind) != outputs:
         raise UnknownOperation(
             "The law gives other expressions at other values, so it reads a tensor outside torch "
             "or keeps a state."

@@ -46,7 +46,7 @@ class UnknownOperation(TypeError):
     the operation and its place."""
 
 
-def _place() -> str:
+def source_line() -> str:
     """The innermost line outside torch and this package, and its source."""
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_SKIPPED):
@@ -86,7 +86,7 @@ class Trace(TorchDispatchMode):
         """Error for an operation. It is kept, since torch's operators swallow a TypeError and
         report another."""
         self.refusal = UnknownOperation(
-            f"The law cannot be compiled because of {cause} at {_place()}; {remedy}."
+            f"The law cannot be compiled because of {cause} at {source_line()}; {remedy}."
         )
         return self.refusal
 
@@ -178,11 +178,13 @@ class Trace(TorchDispatchMode):
                 f"the rule of {func} gives shape {nodes.shape}, torch {tuple(tensor.shape)}"
             )
         if tensor.dtype == torch.float64 and not torch.is_grad_enabled():
-            nodes = mapped(
-                lambda node: node if self.graph.ops[node] == "stop" else self.graph("stop", node),
-                nodes,
-            )
+            nodes = self.stopped(nodes)
         self.register(tensor, nodes)
+
+    def stopped(self, nodes: Nodes) -> Nodes:
+        """The same values without derivatives."""
+        g = self.graph
+        return mapped(lambda node: node if g.ops[node] == "stop" else g("stop", node), nodes)
 
     def _recorded(self, name: str, func: Any, args: tuple, kwargs: Mapping[str, Any]) -> Any:
         if name in MOVES:

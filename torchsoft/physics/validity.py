@@ -245,6 +245,13 @@ def check_points(rig: Any) -> None:
         slip_rates(name, contact.law.friction, several, several, 1.0)
 
 
+def tried() -> tuple[Tensor, Tensor]:
+    """Efforts and normal forces [N] at which a slip law is tried."""
+    every = (torch.tensor(x).double() for x in (EFFORTS, NORMALS))
+    E, F_N = torch.meshgrid(*every, indexing="ij")
+    return E.flatten(), F_N.flatten()
+
+
 def check_slip(where: str, law: Any, R: float) -> str:
     """Fault of a slip law at some efforts and normal forces, with the dashpot R [N.s/m]; empty
     where there is none.
@@ -254,12 +261,7 @@ def check_slip(where: str, law: Any, R: float) -> str:
     function that is no law of three tensors, gives no number, or gives several points at once other
     rates than each alone.
     """
-    E, F_N = (
-        x.flatten()
-        for x in torch.meshgrid(
-            *(torch.tensor(x).double() for x in (EFFORTS, NORMALS)), indexing="ij"
-        )
-    )
+    E, F_N = tried()
     together, alone = (
         slip_rates(where, law, E, F_N, R),
         torch.stack([slip_rates(where, law, e, f, R) for e, f in zip(E, F_N)]),

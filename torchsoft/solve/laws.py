@@ -6,7 +6,8 @@ since nothing else shows whether a number that it reads has changed.
 """
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -16,11 +17,15 @@ from torch import Tensor, nn
 from torchsoft.codegen import Law, UnknownOperation, compile_law
 from torchsoft.codegen.emit import check_pointwise
 from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.stops import left_out
 from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.physics.material import Material
 from torchsoft.physics.motion import Reference, polynomial
 from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import Shape
+from torchsoft.physics.validity import tried
 from torchsoft.solve.kernel.arrays import FELT, INPUTS
 
 
@@ -79,6 +84,19 @@ class _Called(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.function(*(getattr(self, name) for name in self.names), x)
+
+
+def _law(
+    function: Callable[..., Tensor], modules: Mapping[str, Any]
+) -> Callable[[Tensor, Mapping[str, Tensor]], Tensor]:
+    """A function of x and of the parameters of modules, of those only."""
+    called = _Called(function, **modules)
+
+    def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        own = {name: value for name, value in values.items() if name.split(".")[0] in modules}
+        return torch.func.functional_call(called, own, (x,))
+
+    return law
 
 
 def structure(module: object) -> Any:
@@ -144,12 +162,7 @@ def compiled_law(
         key = (function, decided, shapes, linear, differentiated)
         if known and key in _laws:
             return _laws[key]
-        called = _Called(function, **modules)
-
-        def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-            own = {name: value for name, value in values.items() if name.split(".")[0] in modules}
-            return torch.func.functional_call(called, own, (x,))
-
+        law = _law(function, modules)
         example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
 
         def expressions() -> tuple[Any, ...]:
@@ -180,6 +193,68 @@ def compiled_law(
                 law, example, names, linear=linear, differentiated=differentiated
             )
         return _laws[key]
+
+
+# Laws of users whose derivative is not that of their value, since they detach what it is made of.
+
+
+def gradient_fault(what: str, law: Any, x: Tensor, inputs: Sequence[str]) -> str:
+    """Sentence on the derivatives that a law of `inputs` leaves out at samples x (samples, inputs),
+    by them and by its parameters that require a gradient; empty where there are none."""
+    parameters = dict(_Called(_outputs, law=law).named_parameters())
+    with _compiling:
+        found = left_out(_law(_outputs, {"law": law}), x, parameters)
+    if found is None:
+        return ""
+    names = [inputs[i] for i in found.inputs]
+    names += [f"`{name.removeprefix('law.')}`" for name in found.parameters]
+    return (
+        f"the gradient of {what} is not that of its value: torch is told to record none at "
+        f"{found.lines[0]}, so that derivatives by {', '.join(names)} are wrong; take detach() or "
+        "torch.no_grad() out there, or call requires_grad_(False) on a parameter that is to be held"
+    )
+
+
+def _outputs(law: Callable[..., Any], x: Tensor) -> Tensor:
+    """Outputs of a law of tensors, of an actuator or a shape; the chain of a material."""
+    if isinstance(law, Material):
+        out = law.chain()
+    else:
+        out = law(x) if isinstance(law, Actuator | Shape) else law(*x.unbind(-1))
+    parts = out if isinstance(out, tuple) else (out,)
+    return torch.cat([part.reshape(-1) for part in parts])
+
+
+def friction_fault(where: str, slip: Any, R: float) -> str:
+    """`gradient_fault` of a slip law with the dashpot R [N.s/m]."""
+    x = torch.stack((*tried(), torch.full((len(tried()[0]),), R).double()), -1)
+    inputs = ("the effort", "the normal force", "the dashpot")
+    return gradient_fault(f"the slip law of `{where}`", slip, x, inputs)
+
+
+def actuator_fault(name: str, actuator: Actuator) -> str:
+    """`gradient_fault` of an actuator's law."""
+    inputs = [x for setpoint in actuator.setpoints for x in (setpoint, f"{setpoint}'s rate")]
+    inputs.append(actuator.feed_forward or "the feed-forward")
+    inputs += [x for measured in actuator.measures for x in (measured, f"{measured}'s rate")]
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(8, len(inputs), generator=generator, dtype=torch.float64)
+    x *= torch.logspace(-4, 0, 8, dtype=torch.float64)[:, None]
+    return gradient_fault(f"the law of `actuators.{name}`", actuator, x, inputs)
+
+
+def shape_fault(body: str, shape: Shape) -> str:
+    """`gradient_fault` of a shape: of its distance and its normal."""
+    angle = torch.linspace(0.1, 6.2, 12, dtype=torch.float64)
+    x = shape.size() * torch.stack((angle.cos(), angle.sin()), -1)
+    return gradient_fault(f"the shape of `{body}`", shape, x, ("x", "y"))
+
+
+def material_fault(pad: str, material: Material) -> str:
+    """`gradient_fault` of a material's chain."""
+    with suppress(UnknownOperation):  # it is not compiled, so that it may do what it likes
+        return gradient_fault(f"the material of `{pad}`", material, torch.zeros(1, 0).double(), ())
+    return ""
 
 
 def _effort(actuator: nn.Module, x: Tensor) -> Tensor:

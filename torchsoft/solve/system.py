@@ -47,7 +47,16 @@ from torchsoft.solve.kernel.arrays import (
 )
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array, Index, layout
-from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
+from torchsoft.solve.laws import (
+    LawSet,
+    actuator_fault,
+    actuator_law,
+    contact_laws,
+    friction_fault,
+    material_fault,
+    shape_fault,
+    structure,
+)
 from torchsoft.solve.progress import Integrals, SimulationFailed
 from torchsoft.solve.steps import Followed
 
@@ -165,6 +174,9 @@ class Compiled:
         rig, slices, bodies = self.rig, self.layout.slices, list(self.rig.bodies)
         pads, sizes = rig.pads.values(), [len(pad.mesh.surface) for pad in rig.pads.values()]
         base = [3 * (len(bodies) if pad.base is None else bodies.index(pad.base)) for pad in pads]
+        for name, pad in rig.pads.items():
+            if structure(pad.material) is None and (wrong := material_fault(name, pad.material)):
+                warnings.warn(wrong, stacklevel=2)
         chains = [pad.chain() for pad in pads]
         branches = np.array([len(fractions) for fractions, _ in chains], np.int64)
         chain_at = [self._add(torch.cat((*chain, moduli(pad)))) for chain, pad in zip(chains, pads)]
@@ -238,6 +250,8 @@ class Compiled:
         for name, actuator in rig.actuators.items():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
             laws.append(actuator_law(name, actuator, parameters))
+            if structure(actuator) is None and (wrong := actuator_fault(name, actuator)):
+                warnings.warn(wrong, stacklevel=2)
             starts.append(self._add_all(parameters))
         every = rig.actuators.values()
         setpoint_start, setpoint = _ragged([numbers(one.setpoints) for one in every])
@@ -268,7 +282,12 @@ class Compiled:
                 one = torch.ones(()).double()
                 slip_rates(name, slip, one, one, stiffness)
             self._known[key] = contact_laws(law, shape.prepared())
-            if own and (wrong := check_slip(name, slip, stiffness)):
+            faults = list[str]()
+            if own:
+                faults += check_slip(name, slip, stiffness), friction_fault(name, slip, stiffness)
+            if structure(shape) is None:
+                faults.append(shape_fault(self.rig.contacts[name].body, shape))
+            for wrong in filter(None, faults):
                 warnings.warn(wrong, stacklevel=2)
         return self._known[key]
 
