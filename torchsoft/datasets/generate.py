@@ -258,12 +258,13 @@ def generate(
     finished = total - sum(len(config.rows(shard)) for shard in left)
     options: Any = {
         "unit": " simulated s",
-        "unit_scale": config.duration,
+        "unit_scale": True,
         "disable": not progress,
         "smoothing": 0.05,
         "mininterval": 0.1 if sys.stderr.isatty() else 30.0,  # [s], a line each in a log
     }
-    with tqdm(total=total, initial=finished, **options) as bar:
+    seconds = config.duration
+    with tqdm(total=total * seconds, initial=finished * seconds, **options) as bar:
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):
@@ -276,7 +277,8 @@ def generate(
                     finished, failed = finished + count, failed + bad
                     del running[future]
                 bar.set_postfix_str(f"{failed} failed", refresh=False)
-                bar.update(max(finished + sum(map(store.simulated, running.values())) - bar.n, 0))
+                made = finished + sum(map(store.simulated, running.values()))
+                bar.update(max(made * seconds - bar.n, 0))
         finally:
             for future in running:
                 future.cancel()
