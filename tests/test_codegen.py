@@ -432,6 +432,12 @@ REFUSED = {
 }
 
 
+def test_a_law_that_torch_compiled_says_so():
+    law = torch.compile(lambda x, p: x * p["a"], backend="aot_eager")
+    with pytest.raises(UnknownOperation, match=r"torch\.compile is around it, .* leave that out"):
+        compile_law(law, torch.ones(2).double(), _numbers(a=1.0))
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_compiled_is_refused_with_its_line(name):
     law, reason = REFUSED[name]

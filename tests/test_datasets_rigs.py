@@ -217,6 +217,15 @@ def test_it_is_sound_and_resumes_to_the_same_bytes_without_the_rig_file(made, tm
     assert any("x_disc/c/1/0 is damaged" in one for one in check(str(tmp_path / "set")))
 
 
+def test_the_bar_of_a_finished_set_shows_no_rate(made, capsys):
+    """Not the simulated seconds of the shards that were there already."""
+    folder, config = made
+    generate(config, str(folder), Serial(), progress=True)
+    last = capsys.readouterr().err.replace("\r", "\n").strip().splitlines()[-1]
+    total = re.escape(f"{config.duration * config.trajectories:.3g}")
+    assert re.search(rf"100%.* {total}0?/{total}0? .*(\?|0\.00) ?simulated s/s", last), last
+
+
 def test_another_file_is_another_dataset(tmp_path):
     path = written(tmp_path)
     before = Config.from_toml(path).hash

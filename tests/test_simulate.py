@@ -52,6 +52,20 @@ def test_values_set_on_the_module_run_and_are_saved():
     assert run.made_by["parameters"]["contact.K_n"] == 2e5
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # torch's, of what it does not compile
+def test_torch_compile_leaves_a_run_alone():
+    """A run in a compiled function is the run, gradient and all."""
+    model = coarse()
+
+    def end(scale: float) -> Tensor:
+        return rolled(model, gradient="discrete")["theta"][-1] * scale
+
+    made = [one(2.0) for one in (end, torch.compile(end, backend="aot_eager"))]
+    slopes = [torch.autograd.grad(one, model.parameter("pad.E"))[0] for one in made]
+    assert torch.equal(*made)
+    assert torch.equal(*slopes)
+
+
 class Polygonal(Shape):
     """A shape of somebody's own in plain torch: a circle by its support, radius and all."""
 

@@ -33,6 +33,7 @@ from torchsoft.sysid.assumptions import (
     delayed,
     remeshed,
 )
+from torchsoft.sysid.estimate import Quantity
 from torchsoft.sysid.identification import held_by, notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
@@ -498,6 +499,34 @@ def test_no_bound_is_to_be_widened_for_what_is_not_identifiable():
                                    name="a", last=1.0, step_bias_sd=0.0)  # fmt: skip
         said = notices_on([one], {}, True, 1e-5, False)
         assert any("widen" in text for text in said) == seen
+
+
+def test_a_shift_is_said_of_what_moves_in_numbers_that_mean_something():
+    """No estimate at a bound, and no part of a sensor's fault that is next to nothing."""
+
+    def one(label: str, **others: Any) -> Any:
+        usual = {"identifiable": True, "at_bound": False, "relative_sd": 0.01, "last": 2.0,
+                 "step_bias_sd": 2.0, "unit": "m", "name": label}  # fmt: skip
+        return SimpleNamespace(label=label, **usual | others)
+
+    bound = one("at its bound", at_bound=True, step_bias_sd=-1e7, relative_sd=2.0)
+    unseen = one("unseen", identifiable=False, step_bias_sd=90.0, relative_sd=2.0)
+    *_, said = notices_on([bound, unseen, one("E")], {}, True, 1e-5, False)
+    assert "it shifts E by 2 standard deviations (+2.00%); take rtol = 1e-06" in said
+    nearly = one("bias of x", last=1e-9, relative_sd=1e4)
+    (said,) = notices_on([nearly], {}, True, 1e-5, False)
+    assert "it shifts bias of x by 2 standard deviations (+2e-05 m)" in said
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "seen"),
+    [(0.2, 250.5, False), (300.0, 160.0, False), (300.0, 100.0, True), (0.2, 1.0, True)],
+)
+def test_an_interval_wider_than_its_value_determines_nothing(value, sd, seen):
+    """On a linear scale from 0 to 600, but for a value that is next to zero for certain."""
+    one = Quantity("R_t", "parameter", None, "", value, 1.0, 600.0, np.ones(1), [0], None)
+    assert one.identifiable(sd / 600.0) is seen
+    assert one._replace(kind="bias").identifiable(sd / 600.0)
 
 
 def test_a_known_number_that_holds_an_unknown_one_is_named():

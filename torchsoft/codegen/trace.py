@@ -297,6 +297,11 @@ def check_backward(
         seen.add(node)
         if isinstance(node, torch.autograd.function.FunctionCtx):
             name = node.name().removesuffix("Backward")
+            if name == "CompiledFunction":
+                raise UnknownOperation(
+                    "The law cannot be compiled because torch.compile is around it, or around what "
+                    "runs it; leave that out: laws are compiled here, with their derivatives."
+                )
             raise UnknownOperation(
                 f"The law cannot be compiled because of the torch.autograd.Function {name} at "
                 f"{_defined(name)}; its own backward cannot be compiled, so write it with torch's "

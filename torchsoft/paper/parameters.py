@@ -135,7 +135,7 @@ class ContactParameters(Table):
             self.R_n,
             self.K_t,
             self.R_t,
-            friction=friction or slip,
+            friction=slip if friction is None else friction,
             node_spacing=self.node_spacing,
         )
 

@@ -22,7 +22,7 @@ from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.laws import copied
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import RunOutcome, prepare, run
+from torchsoft.solve.simulate import RunOutcome, prepare, run, ungraphed
 from torchsoft.solve.trajectory import Trajectory
 
 
@@ -133,6 +133,7 @@ class Batch(Shown):
         return torch.stack(rows)
 
 
+@ungraphed
 def simulate_batch(
     rig: Rig | Sequence[Rig], t: Numbers, *,
     parameters: Mapping[str, Numbers] | None = None, y0: Numbers | None = None,

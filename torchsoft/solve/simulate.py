@@ -1,11 +1,13 @@
 """`simulate`: run a rig over given times, by the route to a derivative that is wanted, into one
 `Trajectory`."""
 
+import sys
 import time as clock
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import wraps
 from importlib.metadata import version
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -42,8 +44,23 @@ Route = Literal["none", "discrete", "forward"]
 
 VERSION = version("torchsoft")
 
+P, R = ParamSpec("P"), TypeVar("R")
+
 RTOL = 1e-5
 """Relative tolerance where nothing else is asked for."""
+
+
+def ungraphed(run: Callable[P, R]) -> Callable[P, R]:
+    """A function that `torch.compile` leaves to Python, with what it calls."""
+
+    @wraps(run)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        if "torch._dynamo" not in sys.modules:  # whose import takes a second
+            return run(*args, **kwargs)
+        reason = "a run of a rig is no graph for torch.compile, and is compiled already"
+        return torch.compiler.disable(run, reason=reason)(*args, **kwargs)
+
+    return called
 
 
 class Interrupted(KeyboardInterrupt):
@@ -54,6 +71,7 @@ class Interrupted(KeyboardInterrupt):
         self.trajectory = trajectory
 
 
+@ungraphed
 @one_torch_thread()
 def simulate(
     rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,

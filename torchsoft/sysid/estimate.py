@@ -24,6 +24,10 @@ IDENTIFIABLE = 0.5
 """Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval
 spans a factor of seven."""
 
+NOTHING = 0.1
+"""Part of the width of its bounds below which a parameter on a linear scale is next to zero, where
+its interval may be wider than itself."""
+
 Seen = Annotated[bool, Field(alias="seen")]
 """Whether the data determine it; called `seen` in files since their first version."""
 
@@ -102,6 +106,14 @@ class Quantity(NamedTuple):
     def label(self) -> str:
         return self.name + (f" in {self.recording}" if self.recording else "")
 
+    def identifiable(self, sd: float) -> bool:
+        """Whether the data determine it to a standard deviation of the logarithm, or of the value
+        over `size`."""
+        known = sd < IDENTIFIABLE
+        if self.size is None or self.kind != "parameter":
+            return known
+        return known and sd * self.size < IDENTIFIABLE * max(abs(self.value), NOTHING * self.size)
+
     def interval(self, sd: float) -> tuple[float, float]:
         """95 % interval for a standard deviation of the logarithm, or of the value over `size`."""
         reach = float(stats.norm.ppf(0.5 + CONFIDENCE / 2)) * sd
@@ -154,9 +166,8 @@ def estimates(
     edge, out = free & problem.coordinates.at_bound(x), []
     for one in quantities(problem, x, free):
         sd = float(np.sqrt(max(one.slope @ C @ one.slope, 0.0)))
-        known = (
-            (one.value, one.interval(sd)) if (identifiable := sd < IDENTIFIABLE) else (None, None)
-        )
+        identifiable = one.identifiable(sd)
+        known = (one.value, one.interval(sd)) if identifiable else (None, None)
         relative = sd if one.size is None else sd * one.size / max(abs(one.value), 1e-300)
         bias = float(one.slope @ shift) / sd if sd > 0 else 0.0
         found = Estimate(

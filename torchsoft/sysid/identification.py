@@ -360,17 +360,22 @@ def notices_on(
             if np.isclose(e.last, value, rtol=NEXT_TO):
                 remedy = f"{other} = {value:.4g}, which is known, holds it there; is that right?"
             out.append(f"{e.label} ended at a bound ({e.last:.4g}): {remedy}")
-    worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
+    movable = [e for e in found if e.identifiable and not e.at_bound]
+    worst = max(movable, key=lambda e: abs(e.step_bias_sd), default=None)
     if unchecked:
         out.append(
             f"the tolerance rtol = {rtol:g} could not be checked: a run failed that was made to "
             "check it"
         )
     elif worst is not None and abs(worst.step_bias_sd) > STEP_BIAS:
+        part = worst.step_bias_sd * worst.relative_sd
+        size = f"{part:+.2%}"
+        if abs(part) > 1:  # of a fault of a sensor that is next to nothing
+            size = f"{part * abs(worst.last):+.2g} {worst.unit}"
         out.append(
             f"the tolerance rtol = {rtol:g} is too coarse for these data: it shifts {worst.label} "
-            f"by {abs(worst.step_bias_sd):.2g} standard deviations "
-            f"({worst.step_bias_sd * worst.relative_sd:+.2%}); take rtol = {FINER * rtol:g}"
+            f"by {abs(worst.step_bias_sd):.2g} standard deviations ({size}); take rtol = "
+            f"{FINER * rtol:g}"
         )
     if not converged:
         out.append("the last stage stopped before it converged: give it more evaluations")
