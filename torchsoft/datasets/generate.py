@@ -263,21 +263,12 @@ def generate(
     options: Any = {
         "bar_format": BAR,
         "unit": " simulated s",
-<<<<<<< HEAD
-=======
-        "unit_scale": True,
->>>>>>> help-d
         "disable": not progress,
         "smoothing": 0.05,
         "mininterval": 0.1 if sys.stderr.isatty() else 30.0,  # [s], a line each in a log
     }
-<<<<<<< HEAD
     each = config.duration
     with tqdm(total=total * each, initial=finished * each, **options) as bar:
-=======
-    seconds = config.duration
-    with tqdm(total=total * seconds, initial=finished * seconds, **options) as bar:
->>>>>>> help-d
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):
@@ -290,13 +281,8 @@ def generate(
                     finished, failed = finished + count, failed + bad
                     del running[future]
                 bar.set_postfix_str(f"{failed} failed", refresh=False)
-<<<<<<< HEAD
                 simulated = finished + sum(map(store.simulated, running.values()))
                 bar.update(max(simulated * each - bar.n, 0.0))
-=======
-                made = finished + sum(map(store.simulated, running.values()))
-                bar.update(max(made * seconds - bar.n, 0))
->>>>>>> help-d
         finally:
             for future in running:
                 future.cancel()
