@@ -27,6 +27,7 @@ from torchsoft.experiment import COARSE, numbers, options, write
 CASES: tuple[tuple[str, str, float, float], ...] = (  # verb, method, rtol, longest window [s]
     ("odeint", "sdirk2", 1e-4, 0.4), ("odeint_adjoint", "sdirk2", 1e-4, 0.4),
     ("odeint", "sdirk2", 1e-6, 0.4), ("odeint_adjoint", "sdirk2", 1e-6, 0.4),
+    ("odeint", "sdirk2", 1e-8, 0.4),
     ("odeint", "dopri5", 1e-5, 0.002), ("odeint", "dopri5", 1e-7, 0.002),
     ("odeint_adjoint", "dopri5", 1e-5, 0.002), ("odeint_adjoint", "dopri5", 1e-7, 0.002),
 )  # fmt: skip
