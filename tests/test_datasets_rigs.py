@@ -308,7 +308,8 @@ def tree(folder: Path) -> Any:
         (("parameters",), {}, "parameters is missing: nothing would differ"),
         (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
         (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),
-        (("rig", "bodies", "disc", "symbol"), "disc/1", "cannot be the name of an array"),
+        (("rig", "bodies", "disc", "symbol"), "disc/1",
+         r"rig: bodies\.disc\.symbol\.disc/1: the name should be letters, digits and"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_by_its_name(tmp_path, place, value, message):

@@ -160,6 +160,9 @@ def test_strokes_go_there_and_back_until_there_is_no_time_for_more():
 def test_channels_have_the_names_that_a_file_gives_them():
     with pytest.raises(ValueError, match=r"channels.theta_X: the rig has no such channel"):
         changed(coarse(ready_rig("paper")), channels__theta_X="angle").assemble()
+    file = changed(coarse(shorter(ready_rig("paper"), 0.02)), channels__F_x="push")
+    numbers = running.summary(file, running.carry_out(file), [])
+    assert set(numbers["actuators"]) == {"x", "y"}
     with pytest.raises(ValueError, match=r"the channel `x_C`: disc\.x and disc\.theta"):
         changed(coarse(ready_rig("paper")), channels__theta_C="x_C").assemble()
 

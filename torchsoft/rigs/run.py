@@ -110,7 +110,8 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             for name, u in run.displacement.items()
         },
         "actuators": {
-            name: {"largest_effort": float(run[f"F_{name}"].abs().max())} for name in rig.actuators
+            name: {"largest_effort": float(run[one.channel].abs().max())}
+            for name, one in run.setup.actuators.items()
         },
         "energy": {
             "injected_J": float(run.injected[-1]),
