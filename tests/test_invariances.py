@@ -1,6 +1,8 @@
 """The same motion wherever the rig stands, whichever way it looks, in any order and at any size."""
 
 import math
+import warnings
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +56,7 @@ def motion(
     reordered: bool = False,
     weighted: bool = True,
     units: Units = SI,
+    atol: float | None = None,
 ) -> np.ndarray:
     """Two ellipses thrown onto two pads, taken back into the first frame and units: (times, 6)."""
     L, M, T = units
@@ -80,8 +83,8 @@ def motion(
         }  # fmt: skip
     if reordered:
         pads, bodies, contacts = (dict(reversed(one.items())) for one in (pads, bodies, contacts))
-    rig = Rig(bodies=bodies, pads=pads, contacts=contacts, gravity=9.81 * L / T**2)
-    run = simulate(rig, T * times(0.12, 25), y0=rig.state(start), rtol=RTOL)
+    rig = Rig(bodies=bodies, pads=pads, contacts=contacts, gravity=weighted * 9.81 * L / T**2)
+    run = simulate(rig, T * times(0.12, 25), y0=rig.state(start), rtol=RTOL, atol=atol)
     out = []
     c, s = math.cos(turn), math.sin(turn)
     for name in ("one", "two"):
@@ -123,3 +126,25 @@ def test_the_order_of_parts_does_not_matter(first):
 def test_motions_of_all_sizes_are_similar(L):
     """Lengths times L, masses times L^3, times by sqrt(L): under gravity nothing else is left."""
     check(motion(units=Units(L, L**3, math.sqrt(L))), motion())
+
+
+@pytest.mark.parametrize(
+    "units", [Units(T=0.1), Units(M=1e-4), Units(0.1, 1e-6), Units(0.01, 1e-9, 0.1)]
+)
+def test_motions_in_all_units_are_similar(units, first):
+    """Forces down to 1e-8 N and steps of a tenth: tolerances count by the rig's own weight and
+    size (1.6e-4 of the range where they count N and mm)."""
+    assert np.abs(motion(units=units) - first).max() < RTOL
+
+
+def test_a_run_says_that_atol_is_above_its_forces():
+    """Without gravity nothing says beforehand how large forces are."""
+    thrown = partial(motion, weighted=False)
+    with pytest.warns(UserWarning, match=r"contact forces reach .*: take atol = ") as said:
+        thrown(units=(small := Units(0.1, 1e-5)))
+    atol = float(str(said[0].message).rpartition("= ")[2])
+    with warnings.catch_warnings(action="error"):
+        better = thrown(units=small, atol=atol)
+    assert np.abs(better - thrown()).max() < SAME
+    with pytest.warns(UserWarning, match=r"reach .*e-\d+ N, .*: take units that make them larger"):
+        thrown(units=Units(0.01, 1e-9, 0.1))

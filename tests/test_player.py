@@ -2,18 +2,26 @@
 
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from browser import MISSING, browser
 from conftest import coarse, times
+from matplotlib.figure import Figure
 from PIL import Image
 
 from torchsoft import simulate
 from torchsoft.plot.animation import charts, frame_rows, packed, player
+from torchsoft.plot.scene import Scene, instants
+from torchsoft.rigs import RigFile
 from torchsoft.scenario import grasp_and_roll
+
+ROOT = Path(__file__).parents[1]
 
 SEEN = "return [...document.querySelectorAll('.chart span')].map(x => x.textContent)"
 SLIDE = """const s = document.getElementById('slider'); s.value = arguments[0];
@@ -65,6 +73,55 @@ def test_the_file_holds_everything(run, tmp_path):
     assert {"disc", "bracket"} == set(data["bodies"])
     with pytest.raises(ValueError, match="`frames` must be 2 or more"):
         player(run, tmp_path / "run.html", frames=1)
+
+
+NODE = shutil.which("node")
+LOADED = re.compile(r"<script>\n(.*?)const whole = extent\(\);", re.S)
+CURVES = """const curves = Object.fromEntries(Object.entries(data.contacts).map(
+  ([name, c]) => [name, data.times.map((_, f) => [0, 1].map(j => curve(c, f, j)))]));
+console.log(JSON.stringify({ scale: data.scale, curves }));"""
+
+
+def fingers():
+    """Pads that stand upright, on bases with angles."""
+    tips = {name: {"elements_x": 18} for name in ("left_tip", "right_tip")}
+    file = RigFile.from_toml(ROOT / "rigs" / "two_fingers.toml").override(
+        pads={"table": {"elements_x": 25}, **tips}
+    )
+    rig, y0, _ = file.build()
+    return simulate(rig, times(0.9, 10), y0=y0, rtol=1e-3)
+
+
+@pytest.mark.skipif(NODE is None, reason="node is not installed")
+@pytest.mark.parametrize("rig", ["grasp", "fingers"])
+def test_force_curves_are_those_of_the_snapshots(rig, run, tmp_path):
+    """They stand on a straight line behind the pad, wherever the surface has given way."""
+    shown = run if rig == "grasp" else fingers()
+    player(shown, tmp_path / "run.html", frames=10)
+    script = LOADED.search((tmp_path / "run.html").read_text(encoding="utf-8"))
+    assert NODE
+    assert script
+    stub = "const document = { getElementById: () => ({ getContext: () => null }) };\n"
+    done = subprocess.run(
+        [NODE, "-"], input=stub + script[1] + CURVES, capture_output=True, text=True, check=True
+    )
+    drawn, rows = json.loads(done.stdout), frame_rows(shown, 10)
+    compared, reversed_ = 0, 0
+    for f, instant in enumerate(instants(shown, shown.t[rows].tolist())):
+        scene = Scene(Figure().subplots(), shown.setup, curves=(drawn["scale"], 1.0))
+        scene.show(instant)
+        for name in shown.setup.contacts:
+            for j, areas in enumerate((scene.normal, scene.friction)):
+                lines = np.array(drawn["curves"][name][f][j])
+                if not len(lines):
+                    continue
+                around = np.concatenate((lines[:1, 0], lines[:, 1], lines[-1:, 0]))
+                expected = areas[name].get_xy()[:-1]
+                assert around == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+                compared += 1
+                reversed_ += float(instant.force[name][:, j].min()) < -1e-3
+    assert compared > 20
+    assert reversed_ > 0
 
 
 def test_frames_are_denser_where_steps_are_short(run):

@@ -34,11 +34,13 @@ from torchsoft.plot.scene import (
     STEEL,
     Scene,
     along_surface,
+    foot,
     force_scale,
     instants,
     keys,
     largest_stress,
     own_axes,
+    own_places,
     plates,
     straight_up,
 )
@@ -261,18 +263,22 @@ def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
 
 def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
     """Positions of the points in the frame of the base [mm], forces [N] and states, by contact;
-    `along` is the direction along the surface, `up` its outward normal."""
-    out = {}
+    `along` is the direction along the surface, `up` its outward normal, `foot` a point [mm] of the
+    line on which force curves stand."""
+    out, thickness = {}, plates(run.setup)
     for name, contact in run.setup.contacts.items():
         pad = run.setup.pads[contact.pad]
         u = run.displacement[contact.pad][rows].detach().numpy()
         still = np.zeros(3)
-        direction, (_, up) = along_surface(pad, still), own_axes(pad, still)
-        turn = float(np.sign(direction @ np.array([up[1], -up[0]])))
+        first = still if pad.base is None else run.state.pose[pad.base][rows[0]].detach().numpy()
+        _, (x, y) = own_axes(pad, first)  # as snapshots have it: friction is positive to the right
+        turn = float(np.sign(along_surface(pad, first) @ np.array([y, -x])))
+        direction, up = own_axes(pad, still)
         force = run.force[name][rows].detach().numpy() * [1.0, turn]
         out[name] = {
             "pad": contact.pad, "body": contact.body, "mu": contact.friction.get("mu_s"),
             "along": direction.tolist(), "up": up.tolist(),
+            "foot": own_places(pad, still, foot(run.setup, thickness[contact.pad])).tolist(),
             "points": packed(MM * pad.surface_points(u)), "force": packed(force),
             "state": encoded(run.contact_state[name][rows].numpy().astype(np.int8)),
         }  # fmt: skip
@@ -335,8 +341,8 @@ def player(
             for name, body in run.setup.bodies.items()
         },
         "pads": pads(run, rows), "contacts": contacts(run, rows),
-        "scale": force_scale(run.setup, shown)[0], "thickness": plates(run.setup),
-        "t": first["t"], "charts": curves_, "note": RIPPLE if ripples(run) else "",
+        "scale": force_scale(run.setup, shown)[0], "t": first["t"], "charts": curves_,
+        "note": RIPPLE if ripples(run) else "",
         "made": {k: str(v) for k, v in run.made_by.items() if isinstance(v, str)},
     }  # fmt: skip
     data = json.dumps(about, allow_nan=False).replace("<", "\\u003c")  # or it may end the script

@@ -40,6 +40,9 @@ STATES = {
 
 MM = 1e3
 
+STEEP = 0.7
+"""Cosine of the slope of a surface along which up is more telling than right."""
+
 
 def in_world(places: Array, pose: Array) -> Array:
     """Points (..., 2) in the world from the frame of a body; pose (3,) is the body's x, y and angle
@@ -125,15 +128,16 @@ def own_axes(pad: PadSetup, base: Array) -> Array:
 
 
 def along_surface(pad: PadSetup, base: Array) -> Array:
-    """Unit vector (2,) along a pad's surface that points to the right, or straight up."""
+    """Unit vector (2,) along a pad's surface that points to the right, or up where it is steep: the
+    same way while a finger leans."""
     x = own_axes(pad, base)[0]
-    return x if x[0] + 1e-6 * x[1] > 0 else -x
+    return x if x[int(abs(x[0]) < STEEP)] > 0 else -x
 
 
 def outwards(setup: Setup, instant: Instant) -> str:
     """Direction of positive friction in the picture, in words."""
     steep = any(
-        abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in setup.pads.items()
+        abs(along_surface(pad, instant.base[name])[0]) < STEEP for name, pad in setup.pads.items()
     )
     return "outwards: to the right or up" if steep else "outwards: to the right"
 
@@ -158,6 +162,12 @@ def unit(setup: Setup) -> float:
 def curve_height(setup: Setup) -> float:
     """Height [mm] of the curve of the largest force."""
     return 16.0 * unit(setup)
+
+
+def foot(setup: Setup, thickness: float) -> Array:
+    """A point (2,) [mm] of the line on which force curves stand, behind the plate of that
+    thickness, in the pad's own frame."""
+    return np.array([0.0, -thickness - 5.0 * unit(setup)])
 
 
 def force_scale(setup: Setup, shown: Sequence[Instant]) -> tuple[float, float]:
@@ -291,11 +301,11 @@ class Scene:
             x = (instant.points[k][rows] - own_places(pad, base, np.zeros(2))) @ own_axes(
                 pad, base
             )[0]
-            foot = -self.thickness[name] - 5.0 * unit(self.setup)
+            _, low = foot(self.setup, self.thickness[name])
             for area, values in ((self.normal[k], force[:, 0]), (self.friction[k], force[:, 1])):
                 assert self.curves
-                row = np.stack((x, foot - self.curves[0] * values), -1)
-                ends = np.stack((x, np.full_like(x, foot)), -1)[[0, -1]] if len(x) else row
+                row = np.stack((x, low - self.curves[0] * values), -1)
+                ends = np.stack((x, np.full_like(x, low)), -1)[[0, -1]] if len(x) else row
                 around = np.concatenate((ends[:1], row, ends[1:]))
                 area.set_xy(own_places(pad, base, around) if len(x) else np.zeros((1, 2)))
 

@@ -13,6 +13,7 @@ from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
+from torchsoft.solve.steps import own_units
 from torchsoft.solve.trajectory import Trajectory
 
 # Checks of a finished run: whether its energies balance, and whether its pads are pressed beyond
@@ -28,6 +29,12 @@ NEGLIGIBLE = 1e-9
 
 SUPPLIED = 1e-9
 """Part of that energy by which the dissipated energy may fall: rounding."""
+
+RESOLVED = 0.01
+"""Error of one step over the largest force of the run, up to which forces count as resolved."""
+
+NEWTON = 1e-9
+"""Error of forces [N] that Newton's tolerance leaves."""
 
 COMPRESSED = 0.5
 """Part of its height by which a pad may be pressed in: linear elasticity ends well below."""
@@ -80,6 +87,17 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     for name in rig.contacts:
         if bounded := softened(run, rig, name):
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"
+    steps, unit = run.made_by["steps"], own_units(rig)["force"]
+    most = max((float(f.detach().norm(dim=-1).max()) for f in run.force.values()), default=0.0)
+    if 0 < RESOLVED * most < (off := steps.get("atol", 0.0) * unit):
+        better = 0.1 * RESOLVED * most
+        remedy = (
+            f"atol = {better / unit:.1g}" if better >= NEWTON else "units that make them larger"
+        )
+        found["atol"] = (
+            f"contact forces reach {most:.2g} N, and `atol` lets a step be off by {off:.2g} N: "
+            f"take {remedy}"
+        )
     for name, u in run.displacement.items():
         deepest, height = float(u.detach().norm(dim=-1).max()), rig.pads[name].mesh.height
         if not deepest <= COMPRESSED * height:

@@ -86,12 +86,13 @@ def simulate(
     y0 defaults to the paper's rig at rest. `reference` is followed by the rig, its own by default.
 
     Steps are chosen so that the error of each stays below rtol times the largest value so far plus
-    atol, which counts nodal forces in N, lengths in mm, angles in rad; either alone brings the
-    other, a tenth of rtol being atol. A motion is right long before its derivative is: rtol = 1e-3
-    holds positions to 1e-4 of their range and forces to 1 %; the default, `RTOL`, ten times that
-    and most derivatives to 1 %. With `step` [s] they are equal ones between the times t instead, no
-    longer than it. `knots` are the steps of another run (its `knots`), frozen, for a fit whose
-    residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
+    atol, which counts nodal forces in N, lengths in mm, angles in rad, and in a light or small rig
+    forces by its weight, lengths by a tenth of its smallest body (`steps.own_units`); either alone
+    brings the other, a tenth of rtol being atol. A motion is right long before its derivative is:
+    rtol = 1e-3 holds positions to 1e-4 of their range and forces to 1 %; the default, `RTOL`, ten
+    times that and most derivatives to 1 %. With `step` [s] they are equal ones between the times t
+    instead, no longer than it. `knots` are the steps of another run (its `knots`), frozen, for a
+    fit whose residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
 
     gradient: with "discrete" the states, channels, forces, loads and stored energies of the result
     carry the exact gradient of the discrete run (of the steps that were taken, which are not

@@ -47,6 +47,7 @@ from torchsoft.solve.steps import (
     equal_steps,
     error_parts,
     given_steps,
+    own_units,
     part_name,
 )
 from torchsoft.solve.system import Compiled
@@ -57,12 +58,13 @@ HALVINGS = 6
 START_ITERATIONS = 400
 """Most Newton iterations of a start, which no step before it has brought near its rates."""
 
-FIRST, SHORTEST = 1e-3, CLOSEST
-"""Length [s] of the first step that tolerances try, and the shortest that they may choose."""
+FIRST, SHORTEST, PART = 1e-3, CLOSEST, 1e-7
+"""Length [s] of the first step that tolerances try, the shortest that they may choose, and the part
+of a run that is the shortest where that is less."""
 
 SMALLEST_TOLERANCE = 1e-10
-"""Newton tolerance [N] that the ready excitations can meet: at a tenth of it one step in ten is
-halved because of rounding."""
+"""Newton tolerance [N] that the ready excitations can meet, in units of the rig's forces: at a
+tenth of it one step in ten is halved because of rounding."""
 
 NONE, START = np.zeros(0), np.zeros(3)
 """Placeholders for given steps: an array, and a clock."""
@@ -77,8 +79,8 @@ class ImplicitStepper:
     Steps are chosen by `rtol` and `atol`, or given: `step` [s] cuts every output interval into
     equal steps no longer than it, `knots` (n + 1,) [s] are the steps of another run. Tolerances
     hold the error that one step makes, in every part of the state (a pad's nodal forces, a
-    contact's stretches, a body's position, its angle), below atol units (`UNITS`) plus rtol times
-    the largest value so far; no step is longer than `longest` [s] or passes a knot of the
+    contact's stretches, a body's position, its angle), below atol units (`own_units`) plus rtol
+    times the largest value so far; no step is longer than `longest` [s] or passes a knot of the
     reference, and with `landing` a step ends at every output.
 
     Inside, time counts from the `origin` of the last run [s], its first time: steps are as fine
@@ -116,19 +118,19 @@ class ImplicitStepper:
         self.longest = positive("longest", longest)
         self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
-        if self.tolerance < SMALLEST_TOLERANCE:
-            raise ValueError(
-                f"`tolerance` must be at least {SMALLEST_TOLERANCE:g} N, but is {tolerance:g} N, "
-                "which rounding hides"
-            )
         self.knots = None if knots is None else check_knots(knots)
         self.rig, self.reference = rig, followed
         self.compiled = Compiled(rig)
+        if self.tolerance < (least := SMALLEST_TOLERANCE * own_units(rig)["force"]):
+            raise ValueError(
+                f"`tolerance` must be at least {least:.3g} N, but is {tolerance:g} N, "
+                "which rounding hides"
+            )
         if landing and step is None and self.compiled.inertial:
             raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
         self.layout, self.integrals = self.compiled.layout, Integrals(rig)
         self._since(0.0)
-        self._cap = 64
+        self._cap, self._shortest = 64, SHORTEST
         self.still: Any = None
 
     def along(self, knots: Array) -> "ImplicitStepper":
@@ -179,9 +181,9 @@ class ImplicitStepper:
         limits = Limits(self.tolerance, most, self.window)
         run = Run(
             s, self.still, now.work, now.step, follow, errors, limits, outputs, tape, given,
-            now.y, k, clock, stops, times, row, rung, self.rtol, self.longest, SHORTEST,
-            now.integrals, plan.starts, plan.h, signals.reshape(steps, 2, *signals.shape[1:]),
-            counts,
+            now.y, k, clock, stops, times, row, rung, self.rtol, self.longest,
+            self._shortest, now.integrals, plan.starts, plan.h,
+            signals.reshape(steps, 2, *signals.shape[1:]), counts,
         )  # fmt: skip
         with others_turn():
             call("run", run)
@@ -223,6 +225,7 @@ class ImplicitStepper:
         self.check_start(y0)
         check_times(t, self.step)
         self._since(float(t[0]))
+        self._shortest = min(SHORTEST, PART * float(t[-1] - t[0]))
         self.still = self.compiled.system(INSTANT / GAMMA)
         s, names = self.still, self.integrals.names
         out = self._room(len(t))
@@ -416,7 +419,7 @@ class ImplicitStepper:
         if h == INSTANT:
             most, tried, instead = START_ITERATIONS, "at the start", "another start"
         elif worst:
-            most, tried = self.max_iterations, f"in steps down to {SHORTEST:g} s"
+            most, tried = self.max_iterations, f"in steps down to {self._shortest:.3g} s"
             instead = "other tolerances"
         else:
             most, tried = self.max_iterations, f"in the step of {h:.3g} s, halved {HALVINGS} times"
@@ -427,8 +430,8 @@ class ImplicitStepper:
             "faster than the pads damp, massless pads have no unique velocity",
             OFF_THE_PAD: "the body was lost: its contact reached the end of a pad",
             LOST: "the body was lost: it left the space over a pad",
-            REFUSED: f"the tolerances would need steps below {SHORTEST:g} s for {worst}; loosen "
-            "rtol or atol, or look for a jump in the reference or in a law there",
+            REFUSED: f"the tolerances would need steps below {self._shortest:.3g} s for {worst}; "
+            "loosen rtol or atol, or look for a jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
         }
         return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)

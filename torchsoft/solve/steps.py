@@ -1,6 +1,7 @@
 """Steps of a run: equal ones between output times, or those that tolerances choose."""
 
 import ctypes
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -183,7 +184,22 @@ def given_steps(t: Tensor, knots: NDArray[np.float64]) -> Iterator[Plan]:
 
 
 UNITS = {"force": 1.0, "length": 1e-3, "angle": 1.0}
-"""Units of `atol`: nodal forces [N], displacements, stretches and positions [m], angles [rad]."""
+"""Largest units of `atol`: nodal forces [N], displacements, stretches and positions [m], angles
+[rad]."""
+
+THIN = 0.1
+"""Unit of lengths over the size of the smallest body, at the most."""
+
+
+def own_units(rig: Rig) -> dict[str, float]:
+    """Units of `atol` for a rig: `UNITS`, or what its bodies weigh or would weigh, and a part of
+    the smallest one, where they are less."""
+    free = [one for one in rig.bodies.values() if "free" in one.freedom.values()]
+    weight = sum(float(one.mass.detach() * rig.gravity.detach()) for one in free)
+    shapes = [one.shape for one in rig.bodies.values() if one.shape is not None]
+    size = min((one.size() for one in shapes), default=math.inf)
+    most = {"force": weight or math.inf, "length": THIN * size, "angle": math.inf}
+    return {name: min(unit, most[name]) for name, unit in UNITS.items()}
 
 
 def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
@@ -191,7 +207,7 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
     stretches, a body's position, its angle. A rate's error counts by the displacement within a
     step. A position's size is how far it has come from y0."""
     first, last, rate, unit, size, origin = [], [], [], [], [], np.zeros(len(y0))
-    layout = rig.layout
+    layout, units = rig.layout, own_units(rig)
     for (kind, name), here in layout.slices.items():
         if kind in ("pads", "stretch", "rates"):
             parts = [
@@ -213,7 +229,7 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
                 first.append(begin)
                 last.append(end)
                 rate.append(kind in ("rates", "velocity"))
-                unit.append(UNITS[dimension])
+                unit.append(units[dimension])
                 size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
     whole = [np.array(numbers, np.int64) for numbers in (first, last, rate)]
     return Errors(whole[0], whole[1], whole[2], atol * np.array(unit), np.array(size), origin)
