@@ -156,8 +156,8 @@ def hand() -> Rig:
             "tip": Pad(mesh, rubber, base="finger", angle=np.pi / 2, origin=(0.008, -0.03)),
         },
         contacts={
-            "egg on floor": Contact("floor", "egg", law),
-            "ball on floor": Contact("floor", "ball", law),
+            "egg_on_floor": Contact("floor", "egg", law),
+            "ball_on_floor": Contact("floor", "ball", law),
             "egg at wall": Contact("wall", "egg", law), "egg at tip": Contact("tip", "egg", law),
         },
         reference=Reference(
