@@ -158,7 +158,7 @@ def hand() -> Rig:
         contacts={
             "egg_on_floor": Contact("floor", "egg", law),
             "ball_on_floor": Contact("floor", "ball", law),
-            "egg at wall": Contact("wall", "egg", law), "egg at tip": Contact("tip", "egg", law),
+            "egg_at_wall": Contact("wall", "egg", law), "egg_at_tip": Contact("tip", "egg", law),
         },
         reference=Reference(
             **{"finger.x": Profile([0.0, 0.1], [-2e-3, -0.009]),
@@ -190,8 +190,8 @@ def test_any_rig_is_drawn_where_its_bodies_are(held):
     face = rig.pads["tip"].mesh.nodes[bonded] @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + [0.008, -0.03]
     expected = 1e3 * (face @ np.array([[c, s], [-s, c]]) + [x, y])
     np.testing.assert_allclose(instant.mesh["tip"][bonded], expected, atol=1e-9)
-    surface = instant.points["egg at tip"]
-    touching = instant.force["egg at tip"][:, 0] > 0
+    surface = instant.points["egg_at_tip"]
+    touching = instant.force["egg_at_tip"][:, 0] > 0
     centre, turn = instant.pose["egg"][:2], instant.pose["egg"][2]
     d = (surface[touching] - centre) @ np.array(
         [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
@@ -314,7 +314,7 @@ def test_save_writes_the_whole_file_or_none(done, tmp_path):
 def test_diagram_places_every_node_of_the_graph_by_itself(build):
     rig = build()
     graph = graph_of(rig)
-    assert {"egg_spin", "contact_egg at tip", "pad_tip: field"} <= set(graph) or isinstance(
+    assert {"egg_spin", "contact_egg_at_tip", "pad_tip: field"} <= set(graph) or isinstance(
         rig, SoftGrasp
     )
     at = positions(graph)

@@ -3,11 +3,11 @@ the fit takes for granted?
 
 A second simulator (`tests/foreign`: own finite elements, one dense Newton system, backward Euler at
 20 us, no function shared with torchsoft) makes recordings of rigs that differ in what a laboratory
-would not know: the mesh, the friction law, the place of the disc, its radius. Others differ in the sensors (zero, sign, delay, colour) or in what is noted down
-(set-points at the samples only, F_ff left out, whose x the loop measures). `torchsoft.sysid`
-identifies eight parameters from each, with noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz; every case
-has the same noise, so that cases differ by what is wrong and not by luck. An interval holds the
-truth or not; a warning names the cause or not.
+would not know: the mesh, the friction law, the place of the disc, its radius. Others differ in the
+sensors (zero, sign, delay, colour) or in what is noted down (set-points at the samples only, F_ff
+left out, whose x the loop measures). `torchsoft.sysid` identifies eight parameters from each, with
+noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz; every case has the same noise, so that cases differ by
+what is wrong and not by luck. An interval holds the truth or not; a warning names the cause or not.
 
 Command: .venv/bin/python experiments/validation/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"]
 [--workers 2] Expected: every interval holds, or a warning names the cause; no case is silent. About

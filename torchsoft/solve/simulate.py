@@ -44,7 +44,8 @@ Route = Literal["none", "discrete", "forward"]
 
 VERSION = version("torchsoft")
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 RTOL = 1e-5
 """Relative tolerance where nothing else is asked for."""
