@@ -16,7 +16,7 @@ from torchdiffeq import odeint
 from torchsoft import Profile, Reference, press, simulate
 from torchsoft.cli import main
 from torchsoft.physics.statics import BuiltRig
-from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, score
+from torchsoft.reduced.fit import Recipe, assemble, choose, contradictions, fit, loop, score
 from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics, variable
@@ -418,6 +418,33 @@ def test_a_fit_that_misses_its_record_says_why(motions):
         fit(problem, RECIPE, away)
     with pytest.warns(UserWarning, match="give `feedback`, the law that makes F_x"):
         fit(problem, replace(RECIPE, threshold=0.3))
+
+
+def test_coefficients_that_no_rig_has_are_named(motions):
+    """Against the mass that a run says; a spring and a dashpot that drive; opposite signs."""
+    known = [replace(one, mass=1 / TRUTH["v_Br"]["F_x"]) for one in motions]
+    assert contradictions(truth(), known) == []
+    with pytest.warns(UserWarning, match=r"mechanics: 2\.46 F_x in v_Br', where 1 / m is 1\.67\. "):
+        fit(
+            assemble([replace(one, mass=0.6) for one in motions], mechanics(R), RECIPE), RECIPE, LAW
+        )
+    library = mechanics(R)
+    wrong = {"v_C": list(zip(library["v_C"][:2], (1e5, -9e2))),
+             "omega": list(zip(library["omega"][2:4], (2e6, -5e3)))}  # fmt: skip
+    model = ReducedModel(STATES, ("F_x",), KINEMATICS, wrong | {"v_Br": []}, feedback=LAW)
+    drives, opposite, others = contradictions(model, motions)
+    assert drives == "-900 (v_Br - 2 v_C) in v_C' drives the motion"
+    assert opposite == "(x_Br - 2 x_C) and (v_Br - 2 v_C) in v_C' have opposite signs"
+    assert others == "(x_Br - 2 x_C) and (v_Br - 2 v_C) in omega' have opposite signs"
+
+
+def test_a_run_says_what_its_bracket_weighs(beside, tmp_path):
+    assert record(beside).mass == 0.4
+    beside.save(tmp_path / "run.nc")
+    assert record(Trajectory.load(tmp_path / "run.nc")).mass == 0.4
+    model = coarse()
+    run = simulate(model, times(0.01, 5), y0=press(model, 49.6e-3))
+    assert record(run).mass == model.settings.bracket.mass
 
 
 def test_objects_show_themselves_in_a_few_lines(motions):

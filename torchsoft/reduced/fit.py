@@ -30,6 +30,9 @@ LAW_OFF = 0.3
 """Root mean square error of a control law's effort, in standard deviations of the record's, above
 which the record has another law."""
 
+MASS_OFF = 0.1
+"""Relative error of the coefficient of F_x above which it is not 1 / m."""
+
 ROWS_PER_TERM = 10
 """Fewest rows of a regression per candidate term."""
 
@@ -202,14 +205,17 @@ def fit(
     """The sparse model of a problem at the recipe's threshold.
 
     Warns where a rollout of the model diverges or misses a record of the problem by more than
-    `GROSS` standard deviations, and where `feedback` is not the law of the record's effort.
+    `GROSS` standard deviations, where `feedback` is not the law of the record's effort, and where
+    coefficients contradict mechanics.
     """
     model = build(
         problem,
         {target: solve(problem, target, recipe) for target in problem.regressions},
         feedback,
     )
-    _warn_of_misses(model, problem.records, [score(model, one) for one in problem.records])
+    scores = [score(model, one) for one in problem.records]
+    if not _warn_of_misses(model, problem.records, scores):
+        _warn_of_mechanics(model, problem.records)
     return model
 
 
@@ -280,9 +286,9 @@ def score(model: ReducedModel, on: Record) -> Score:
 
 def _warn_of_misses(
     model: ReducedModel, records: Sequence[Record], scores: Sequence[Score]
-) -> None:
+) -> bool:
     """Warn of the record with the worst rollout, with the remedy, if it is a gross miss or has
-    another control law."""
+    another control law. Returns whether it does."""
     misses = [max(one.over_deviation.values()) for one in scores]
     i = int(np.argmax(misses))
     on, out = records[i], scores[i]
@@ -299,7 +305,7 @@ def _warn_of_misses(
             if np.sqrt((error**2).mean()) > LAW_OFF * on.series[name].std():
                 wrong.append(f"{name} off by {amount(float(np.abs(error).max()), symbol(name)[1])}")
     if misses[i] <= GROSS and not wrong:
-        return
+        return False
     if "F_x" in model.outer:
         remedy = (
             "give `feedback`, the law that makes F_x: under a recorded F_x nothing holds the "
@@ -319,6 +325,41 @@ def _warn_of_misses(
         f"the reduced model is not to be trusted: rolled out on record {i}, it {miss}; {remedy}",
         stacklevel=3,
     )
+    return True
+
+
+def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
+    """Coefficients that no rig of springs and dashpots has: that of F_x is 1 / m of the bracket, a
+    slip of a body's own acts against it, a dashpot has the sign of its spring."""
+    out, found = list[str](), dict[tuple[str, tuple[tuple[str, float], ...]], tuple[str, float]]()
+    masses = [one.mass for one in records if one.mass is not None]
+    rates = {rate: name for name, rate in KINEMATICS.items()}
+    for target, term, value in zip(model.targets, model.terms, model.coefficients.tolist()):
+        form = dict(term.factors[0].form) if term.linear else {}
+        if form.keys() == {"F_x"} and target == "v_Br" and masses:
+            right = 1 / float(np.mean(masses))
+            if abs(value / right - 1) > MASS_OFF:
+                out.append(f"{value:.3g} F_x in v_Br', where 1 / m is {right:.3g}")
+        if len(form) < 2:
+            continue
+        spring = form.keys() <= rates.keys() and {rates[name]: x for name, x in form.items()}
+        place = spring or form
+        if value * place.get(rates[target], 0.0) > 0:
+            out.append(f"{value:.3g} ({term.text}) in {target}' drives the motion")
+        other, its = found.setdefault((target, tuple(place.items())), (term.text, value))
+        if its * value < 0:
+            out.append(f"({other}) and ({term.text}) in {target}' have opposite signs")
+    return out
+
+
+def _warn_of_mechanics(model: ReducedModel, records: Sequence[Record]) -> None:
+    if wrong := contradictions(model, records):
+        warnings.warn(
+            f"the reduced model contradicts mechanics: {'; '.join(wrong)}. Its coefficients are "
+            "not those of the rig, although it may predict well: kick disc and bracket at the start of "
+            "the taps, sample them every 0.25 ms, and keep them to some micrometres",
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True)
@@ -392,7 +433,8 @@ def choose(
         )
     good = [i for i, row in enumerate(tried) if row["nrmse"] <= slack * best]
     chosen = min(good, key=lambda i: (tried[i]["terms"], tried[i]["nrmse"]))
-    _warn_of_misses(models[chosen], validation, every[chosen])
+    if not _warn_of_misses(models[chosen], validation, every[chosen]):
+        _warn_of_mechanics(models[chosen], problem.records)
     return Choice(models[chosen], chosen, tried)
 
 

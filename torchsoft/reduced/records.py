@@ -26,10 +26,12 @@ ALIKE = 1e-9
 @dataclass(frozen=True, repr=False)
 class Record(Shown):
     """One motion: equally spaced times t (T,) [s] and series (T,) by variable in SI units,
-    positions relative to their start."""
+    positions relative to their start; `mass` [kg] of the bracket, on which F_x acts, where it is
+    known."""
 
     t: np.ndarray
     series: dict[str, np.ndarray]
+    mass: float | None = None
 
     def __post_init__(self) -> None:
         """Raises `ValueError` for times that are not equally spaced, and for series of another
@@ -91,7 +93,10 @@ def record(
     spaced, for a value that is not finite, naming the series, for a body that is not in the run,
     for a set-point of an unknown coordinate, and for a source without any of the series.
     """
+    mass = None
     if isinstance(source, Trajectory):
+        given = source.made_by.get("parameters", {})
+        mass = given.get(f"bodies.{bracket}.mass", given.get(f"{bracket}.mass"))
         t = source.t.detach() if t is None else t
         source, own = _of_run(source, disc, bracket)
         measured = measured or own
@@ -121,7 +126,8 @@ def record(
     origin = {name: float(series[name][0]) for name in ("x_C", "theta", "x_Br") if name in series}
     if "x_d" in series:
         origin["x_d"] = _start(source, keep, origin, measured)
-    return Record(times[keep], {name: x - origin.get(name, 0.0) for name, x in series.items()})
+    counted = {name: x - origin.get(name, 0.0) for name, x in series.items()}
+    return Record(times[keep], counted, mass)
 
 
 def _start(
