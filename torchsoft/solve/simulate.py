@@ -59,7 +59,8 @@ def ungraphed(run: Callable[P, R]) -> Callable[P, R]:
         if "torch._dynamo" not in sys.modules:  # whose import takes a second
             return run(*args, **kwargs)
         reason = "a run of a rig is no graph for torch.compile, and is compiled already"
-        return torch.compiler.disable(run, reason=reason)(*args, **kwargs)
+        disabled: Any = torch.compiler.disable(run, reason=reason)
+        return disabled(*args, **kwargs)
 
     return called
 
