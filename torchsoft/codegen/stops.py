@@ -114,7 +114,7 @@ def left_out(function: Function, x: Tensor, parameters: Mapping[str, Tensor]) ->
 
 def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
     """Which derivatives (samples, ...) are not the same."""
-    largest = np.maximum(np.abs(one), np.abs(other)).max(0, initial=0.0)
+    largest = np.maximum(np.abs(one), np.abs(other)).max(axis=0, initial=0.0)
     with np.errstate(invalid="ignore"):
         same = np.abs(one - other) <= SAME * largest
-    return ~(same | (np.isnan(one) & np.isnan(other)))
+    return np.asarray(~(same | (np.isnan(one) & np.isnan(other))))
