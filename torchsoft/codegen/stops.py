@@ -95,10 +95,11 @@ def left_out(function: Function, x: Tensor, parameters: Mapping[str, Tensor]) ->
 
     whole, own = made(opened()), made(Trace)
     inputs = tuple(np.flatnonzero(_differ(own.by_input, whole.by_input).any((0, 1))).tolist())
-    entries, names, start = _differ(own.by_parameter, whole.by_parameter).any(0), [], 0
+    entries = np.any(_differ(own.by_parameter, whole.by_parameter), axis=0).tolist()
+    names, start = list[str](), 0
     for name, p in parameters.items():
         end = start + p.numel()
-        if p.requires_grad and entries[start:end].any():
+        if p.requires_grad and any(entries[start:end]):
             names.append(name)
         start = end
     if not inputs and not names:

@@ -22,7 +22,7 @@ RESIDUAL = 0.01
 """Part of the energy stored at the start and injected that a run may miss."""
 
 STATES = 5
-"""States of a run at which powers are balanced, at the most: they are slow without compiled code."""
+"""States of a run at which powers are balanced, at the most: that is slow."""
 
 
 class CheckFailed(AssertionError):
