@@ -14,7 +14,7 @@ FLOWS = {
     "": """
         channels display extras diagnostic files parallel tables csvfile quantity codegen
         physics paper cost
-        solve scenario excitation plan
+        solve testing scenario excitation plan
         plot materials rigs sysid reduced datasets envs experiment cli __main__
     """,
     "codegen": "graph operations trace emit . stops",
@@ -36,6 +36,7 @@ FLOWS = {
         result identification compare
         planner columns configuration measured design figures report .
     """,
+    "testing": "energy laws gradients .",
     "plan": "knots problem search planning .",
     "rigs": """
         fields parts control motion geometry build written course recorded gripped check goal run .

@@ -12,9 +12,8 @@ from rig_tester import (
     assert_compiled_is_the_module,
     assert_gradients_exact,
     assert_parts_are_kept,
-    assert_power_balanced,
     assert_rates_differentiable,
-    assert_rigid_motion_is_free,
+    at_random,
     telling,
 )
 from test_meshes import trapezium
@@ -53,6 +52,7 @@ from torchsoft import (
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.statics import standing
+from torchsoft.testing import check_power
 
 MESH = PadMesh(60e-3, 4.59e-3, 30, 2)
 R = 19.37e-3
@@ -293,8 +293,7 @@ def seed(start):
 
 
 def test_power_and_momentum_are_balanced(start, seed):
-    assert_power_balanced(start, seed)
-    assert_rigid_motion_is_free(start, seed)
+    check_power(start[0], at_random(start, seed), 0.01)
     assert_rates_differentiable(start, seed)
 
 

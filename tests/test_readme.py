@@ -168,7 +168,7 @@ def test_messages_are_said():
 def test_the_api_is_documented():
     """Public names of the package, and of its namespaces for users, stand on a page of the API."""
     import torchsoft
-    from torchsoft import datasets, envs, plan, reduced, rigs, sysid
+    from torchsoft import datasets, envs, plan, reduced, rigs, sysid, testing
 
     text = "".join(
         page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md")
@@ -184,6 +184,7 @@ def test_the_api_is_documented():
         *rigs.__all__,
         *sysid.__all__,
         *reduced.__all__,
+        *testing.__all__,
     }
     for module in re.findall(r"automodule:: (torchsoft\S+)", text):
         documented |= set(vars(__import__(module, fromlist=["_"])))

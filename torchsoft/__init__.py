@@ -21,7 +21,7 @@ friction    SmoothSlip, Coulomb, or any torch function
 motions     Reference, Profile, Sampled, hold
 runs        simulate, simulate_batch, Trajectory, Batch; rest, press; register_method (torchdiffeq)
 beyond      torchsoft.sysid (identification), torchsoft.reduced, torchsoft.datasets, torchsoft.envs
-            (gymnasium), torchsoft.plot
+            (gymnasium), torchsoft.plot, torchsoft.testing (checks for pytest)
 
 The command `torchsoft --help` runs rig files. Names are imported when they are first used.
 """

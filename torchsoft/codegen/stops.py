@@ -95,11 +95,11 @@ def left_out(function: Function, x: Tensor, parameters: Mapping[str, Tensor]) ->
 
     whole, own = made(opened()), made(Trace)
     inputs = tuple(np.flatnonzero(_differ(own.by_input, whole.by_input).any((0, 1))).tolist())
-    entries = np.asarray(_differ(own.by_parameter, whole.by_parameter).any(0))
+    entries = np.any(_differ(own.by_parameter, whole.by_parameter), axis=0).tolist()
     names, start = list[str](), 0
     for name, p in parameters.items():
         end = start + p.numel()
-        if p.requires_grad and entries[start:end].any():
+        if p.requires_grad and any(entries[start:end]):
             names.append(name)
         start = end
     if not inputs and not names:
@@ -115,7 +115,7 @@ def left_out(function: Function, x: Tensor, parameters: Mapping[str, Tensor]) ->
 
 def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
     """Which derivatives (samples, ...) are not the same."""
-    largest = np.maximum(np.abs(one), np.abs(other)).max(0, initial=0.0)
+    largest = np.maximum(np.abs(one), np.abs(other)).max(axis=0, initial=0.0)
     with np.errstate(invalid="ignore"):
         same = np.abs(one - other) <= SAME * largest
-    return ~(same | (np.isnan(one) & np.isnan(other)))
+    return np.asarray(~(same | (np.isnan(one) & np.isnan(other))))

@@ -56,13 +56,22 @@ def strained(strain: float, time: float) -> str:
     )
 
 
+def energy_scale(run: Trajectory) -> float:
+    """Energy [J] by which a run's ledger is judged: stored at the start, and injected since."""
+    stored = sum(float(part[0].detach()) for part in run.energy.values())
+    return max(stored + float(run.injected[-1].detach()), NEGLIGIBLE)
+
+
+def missing_energy(run: Trajectory) -> float:
+    """Part of `energy_scale` that a run's ledger lacks, or has too much, at the most."""
+    return float(run.energy_residual.detach().abs().max()) / energy_scale(run)
+
+
 def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     """Sentences on the faults of a finished run that has a ledger, by their subject; none if there
     are none."""
     run, found = trajectory, {}
-    stored = sum(float(part[0].detach()) for part in run.energy.values())
-    scale = max(stored + float(run.injected[-1].detach()), NEGLIGIBLE)
-    part = float(run.energy_residual.detach().abs().max()) / scale
+    scale, part = energy_scale(run), missing_energy(run)
     if not part <= RESIDUAL:
         longest = float(run.knots.diff().max())
         better = 0.4 * longest * min(1.0, RESIDUAL / part)

@@ -86,17 +86,17 @@ class _Called(nn.Module):
         return self.function(*(getattr(self, name) for name in self.names), x)
 
 
-def _law(
+def as_law(
     function: Callable[..., Tensor], modules: Mapping[str, Any]
-) -> Callable[[Tensor, Mapping[str, Tensor]], Tensor]:
-    """A function of x and of the parameters of modules, of those only."""
+) -> tuple[Callable[[Tensor, Mapping[str, Tensor]], Tensor], dict[str, Tensor]]:
+    """A function of x and of the parameters of modules, of those only; and these parameters."""
     called = _Called(function, **modules)
 
     def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         own = {name: value for name, value in values.items() if name.split(".")[0] in modules}
         return torch.func.functional_call(called, own, (x,))
 
-    return law
+    return law, dict(called.named_parameters())
 
 
 def structure(module: object) -> Any:
@@ -162,7 +162,7 @@ def compiled_law(
         key = (function, decided, shapes, linear, differentiated)
         if known and key in _laws:
             return _laws[key]
-        law = _law(function, modules)
+        law, _ = as_law(function, modules)
         example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
 
         def expressions() -> tuple[Any, ...]:
@@ -201,9 +201,9 @@ def compiled_law(
 def gradient_fault(what: str, law: Any, x: Tensor, inputs: Sequence[str]) -> str:
     """Sentence on the derivatives that a law of `inputs` leaves out at samples x (samples, inputs),
     by them and by its parameters that require a gradient; empty where there are none."""
-    parameters = dict(_Called(_outputs, law=law).named_parameters())
     with _compiling:
-        found = left_out(_law(_outputs, {"law": law}), x, parameters)
+        function, parameters = as_law(outputs_of, {"law": law})
+        found = left_out(function, x, parameters)
     if found is None:
         return ""
     names = [inputs[i] for i in found.inputs]
@@ -215,7 +215,7 @@ def gradient_fault(what: str, law: Any, x: Tensor, inputs: Sequence[str]) -> str
     )
 
 
-def _outputs(law: Callable[..., Any], x: Tensor) -> Tensor:
+def outputs_of(law: Callable[..., Any], x: Tensor) -> Tensor:
     """Outputs of a law of tensors, of an actuator or a shape; the chain of a material."""
     if isinstance(law, Material):
         out = law.chain()
@@ -225,11 +225,23 @@ def _outputs(law: Callable[..., Any], x: Tensor) -> Tensor:
     return torch.cat([part.reshape(-1) for part in parts])
 
 
+def tried_efforts(R: float) -> Tensor:
+    """Efforts, normal forces and the dashpot R (samples, 3) at which slip laws are tried."""
+    E, F_N = tried()
+    return torch.stack((E, F_N, torch.full_like(E, R)), -1)
+
+
 def friction_fault(where: str, slip: Any, R: float) -> str:
     """`gradient_fault` of a slip law with the dashpot R [N.s/m]."""
-    x = torch.stack((*tried(), torch.full((len(tried()[0]),), R).double()), -1)
     inputs = ("the effort", "the normal force", "the dashpot")
-    return gradient_fault(f"the slip law of `{where}`", slip, x, inputs)
+    return gradient_fault(f"the slip law of `{where}`", slip, tried_efforts(R), inputs)
+
+
+def tried_states(actuator: Actuator) -> Tensor:
+    """Inputs (samples, inputs) of an actuator's law at which it is tried."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(8, actuator.inputs, generator=generator, dtype=torch.float64)
+    return x * torch.logspace(-4, 0, 8, dtype=torch.float64)[:, None]
 
 
 def actuator_fault(name: str, actuator: Actuator) -> str:
@@ -237,10 +249,9 @@ def actuator_fault(name: str, actuator: Actuator) -> str:
     inputs = [x for setpoint in actuator.setpoints for x in (setpoint, f"{setpoint}'s rate")]
     inputs.append(actuator.feed_forward or "the feed-forward")
     inputs += [x for measured in actuator.measures for x in (measured, f"{measured}'s rate")]
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(8, len(inputs), generator=generator, dtype=torch.float64)
-    x *= torch.logspace(-4, 0, 8, dtype=torch.float64)[:, None]
-    return gradient_fault(f"the law of `actuators.{name}`", actuator, x, inputs)
+    return gradient_fault(
+        f"the law of `actuators.{name}`", actuator, tried_states(actuator), inputs
+    )
 
 
 def shape_fault(body: str, shape: Shape) -> str:
@@ -290,9 +301,7 @@ def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]
 
 def contact_laws(law: Any, shape: Any) -> LawSet:
     """The laws of a contact of `law` on a body of `shape`."""
-    parameters: dict[str, Tensor] = dict(
-        _Called(interface_law, law=law, shape=shape).named_parameters()
-    )
+    _, parameters = as_law(interface_law, {"law": law, "shape": shape})
     return LawSet(
         compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
         compiled_law(parameters, interface_law, INPUTS, FELT, 7, points=True, law=law, shape=shape),
