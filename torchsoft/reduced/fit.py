@@ -356,8 +356,8 @@ def _warn_of_mechanics(model: ReducedModel, records: Sequence[Record]) -> None:
     if wrong := contradictions(model, records):
         warnings.warn(
             f"the reduced model contradicts mechanics: {'; '.join(wrong)}. Its coefficients are "
-            "not those of the rig, although it may predict well: kick disc and bracket at the start of "
-            "the taps, sample them every 0.25 ms, and keep them to some micrometres",
+            "not those of the rig, although it may predict well: kick disc and bracket at the "
+            "start of the taps, sample them every 0.25 ms, and keep them to some micrometres",
             stacklevel=3,
         )
 

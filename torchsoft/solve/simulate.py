@@ -198,6 +198,7 @@ def run(
         bar = tqdm(
             total=float(t[-1] - t[0]),
             unit="s",
+            disable=None,
             bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]",
         )
     done, began = None, clock.perf_counter()
@@ -207,7 +208,7 @@ def run(
         ):
             for solved, slopes in _rows(task, tape_bytes):
                 done = RunOutcome(task, solved, slopes, clock.perf_counter() - began)
-                if bar is not None:
+                if bar is not None and not bar.disable:
                     bar.n = float(t[solved.out.rows - 1] - t[0])
                     bar.refresh()
     except SimulationFailed as failure:
