@@ -43,7 +43,8 @@ Route = Literal["none", "discrete", "forward"]
 
 VERSION = version("torchsoft")
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 RTOL = 1e-5
 """Relative tolerance where nothing else is asked for."""
@@ -57,7 +58,8 @@ def ungraphed(run: Callable[P, R]) -> Callable[P, R]:
         if "torch._dynamo" not in sys.modules:  # whose import takes a second
             return run(*args, **kwargs)
         reason = "a run of a rig is no graph for torch.compile, and is compiled already"
-        return torch.compiler.disable(run, reason=reason)(*args, **kwargs)
+        plain: Any = torch.compiler.disable(run, reason=reason)
+        return plain(*args, **kwargs)
 
     return called
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from torchsoft import csvfile
 from torchsoft.channels import UNITS
@@ -197,12 +198,12 @@ def read_table(path: Path, ignore: Collection[str], known: Vocabulary) -> Column
     return table
 
 
-def wraps(angle: Array) -> Array:
+def wraps(angle: Array) -> NDArray[np.intp]:
     """Samples of an angle [rad] after which it jumps by a turn, while it mostly moves by far
     less."""
     apart = np.abs(np.diff(angle))
     if not len(apart) or np.median(apart) > math.pi / 2:
-        return np.zeros(0)
+        return np.zeros(0, np.intp)
     return np.flatnonzero(np.abs(apart - 2 * math.pi) <= math.pi / 2)
 
 
