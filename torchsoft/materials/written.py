@@ -71,23 +71,32 @@ def summary(
     """Coefficients, their origin and the method, in SI units."""
     m = fit.measured
     return {
-        "made_by": {"torchsoft": version("torchsoft"), "command": "torchsoft material fit",
-        "options": dict(options)}, "data": {
-            "file": m.path.name, "sha256": sha256(m.path.read_bytes()).hexdigest(),
-            "rows": len(m.t), "test": m.test, "resolved_s": list(m.window),
+        "made_by": {
+            "torchsoft": version("torchsoft"),
+            "command": "torchsoft material fit",
+            "options": dict(options),
+        },
+        "data": {
+            "file": m.path.name,
+            "sha256": sha256(m.path.read_bytes()).hexdigest(),
+            "rows": len(m.t),
+            "test": m.test,
+            "resolved_s": list(m.window),
             "largest_strain": None if m.per_load else float(abs(m.strain).max()),
         },
         "method": "nonnegative least squares on a logarithmic grid of times, then least squares in "
-                  "strengths and times together; the number of terms by Schwarz's criterion (BIC)",
+        "strengths and times together; the number of terms by Schwarz's criterion (BIC)",
         "kind": fit.kind,
-        "coefficients": {name: finite({"value": x, "sd": fit.sd[name]}) for name,
-        x in fit.values.items()}, "assumed": dict(assumed),
+        "coefficients": {
+            name: finite({"value": x, "sd": fit.sd[name]}) for name, x in fit.values.items()
+        },
+        "assumed": dict(assumed),
         "criterion": {str(count): score for count, score in fit.scores.items()},
         "residual_rms": fit.rms,
         "residual_of": fit.residual_of,
         "residual_correlation": fit.correlation,
         "notices": list(fit.notices),
-    }  # fmt: skip
+    }
 
 
 def printed(fit: Fit) -> str:

@@ -147,9 +147,12 @@ class Trajectory(Shown):
         rows.append(("contacts at the end", forces or "none"))
         rows.append(("energy", f"{self.energy_residual_rel:.1e} of what was injected is missing"))
         rows.append(
-            ("steps", f"{stats.steps}, {stats.newton_per_step:.2g} Newton iterations each, "
-                      f"{stats.wall_s:.2g} s")
-        )  # fmt: skip
+            (
+                "steps",
+                f"{stats.steps}, {stats.newton_per_step:.2g} Newton iterations each, "
+                f"{stats.wall_s:.2g} s",
+            )
+        )
         if self.y.requires_grad:
             rows.append(("gradient", "of every channel, by the discrete adjoint"))
         if self.wrt:
