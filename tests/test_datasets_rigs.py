@@ -217,6 +217,12 @@ def test_it_is_sound_and_resumes_to_the_same_bytes_without_the_rig_file(made, tm
     assert any("x_disc/c/1/0 is damaged" in one for one in check(str(tmp_path / "set")))
 
 
+def test_trajectories_show_themselves(made):
+    title, force, mass = str(Trajectories(str(made[0]), ["F_x", "bodies.disc.mass"])).splitlines()
+    assert title == f"Trajectories: 3 windows of 21 samples, of 3 trajectories in {made[0]}"
+    assert (force.split()[1:], mass.split()[1:]) == (["N,", "over", "time"], ["kg,", "a", "number"])
+
+
 def test_the_bar_of_a_finished_set_shows_no_rate(made, capsys):
     """Not the simulated seconds of the shards that were there already."""
     folder, config = made

@@ -83,6 +83,10 @@ def folder(tmp_path, run):
 
 def test_numbers_of_a_rig_file_are_found_by_their_names(folder):
     case = load([folder / "run.csv"], folder / "fit.toml")
+    shown = str(case.problem).splitlines()
+    assert shown[0] == "Problem: 2 unknowns, recordings run"
+    assert shown[1].split() == ["materials.silicone.E", "5e+04", "to", "5e+06,", "from", "5e+05"]
+    assert shown[-1].split() == ["F_left_x", "measured", "to", "0.05", "N"]
     result = identify(case.problem, **case.config.fit.model_dump() | {"assumptions": "trusted"})
     for one in result.estimates:
         assert one.value == pytest.approx(TRUTH[one.name], rel=4 * one.relative_sd)

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
+from torchsoft.display import hidden
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.setup import von_mises
 from torchsoft.physics.statics import NoEquilibrium
@@ -29,6 +31,8 @@ from torchsoft.rigs.written import template
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.simulate import SharedStart
 from torchsoft.solve.trajectory import Stats, load, save
+from torchsoft.sysid.columns import read_csv
+from torchsoft.sysid.measured import vocabulary
 
 T = times(0.1, 11)
 
@@ -248,6 +252,51 @@ def test_objects_show_themselves(done):
 
 # starts and inputs
 # ----------------------------------------------------------------------
+
+
+def test_a_notebook_shows_figures_and_films(done, tmp_path):
+    """A picture, not an address; a video or the player."""
+    figure = done[1].plot()
+    assert "_EmbeddedFonts" not in repr(figure)
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    gif = done[1].animate(tmp_path / "run.gif", frames=2, dpi=30)
+    assert gif._repr_html_().startswith('<img src="data:image/gif;base64,R0lG')
+    player = done[1].animate(str(tmp_path / "run.html"), frames=2)
+    page = re.fullmatch(r'<iframe srcdoc="([^"]*)" .*></iframe>', player._repr_html_())
+    assert page
+    assert unescape(page[1]) == (tmp_path / "run.html").read_text(encoding="utf-8")
+    assert (
+        str(player) == f"Film: {tmp_path / 'run.html'}, {player.path.stat().st_size / 1e6:.2g} MB"
+    )
+
+
+def test_channels_have_units_in_tables_and_meanings_in_files(tmp_path):
+    """As `identify` reads them; what each one is, whatever the rig calls it."""
+    ready = template("t").build()
+    run = simulate(ready.rig, ready.t[:12], y0=ready.y0)
+    assert list(run.to_pandas()) == list(run.channels)
+    table = run.to_pandas(units=True)
+    assert table.index.name == "t [s]"
+    wanted = ["x_disc [m]", "theta_disc [rad]", "F_x [N]", "y_d_dot [m/s]", "y_d [m]"]
+    table[wanted].to_csv(tmp_path / "run.csv")
+    columns = read_csv(tmp_path / "run.csv", (), vocabulary(ready.rig, {})).values
+    assert np.array_equal(columns["theta_disc"], run["theta_disc"].numpy())
+    assert np.array_equal(columns["t"], run.t.numpy())
+    data = run.to_xarray()
+    said = {name: data[name].attrs["long_name"] for name in run.channels}
+    assert said["x_disc"] == "x of the body disc"
+    assert said["omega_disc"] == "rate of angle (anticlockwise) of the body disc"
+    assert said["x_d"] == "set-point of bracket.x"
+    assert said["F_y"] == "effort of the actuator y on bracket.y"
+    assert said["M_upper"] == "moment of the pad upper on its base"
+    assert not [name for name, meaning in said.items() if "channel" in meaning]
+
+
+def test_a_bar_is_shown_to_people_only(capfd):
+    """And not to a file, to which it would write a line for every step of it."""
+    simulate(coarse(), T[:3], y0=rest(coarse()).detach(), progress=True)
+    assert capfd.readouterr().err == ""
+    assert (hidden(True), hidden(False)) == (None, True)
 
 
 def test_a_start_is_stated_by_coordinates():

@@ -53,6 +53,12 @@ def suggestion(name: object, known: Iterable[str], listed: str = "known are") ->
     return f"did you mean `{near}`? ({listed} {', '.join(some)})"
 
 
+def hidden(progress: bool) -> bool | None:
+    """What `disable` of tqdm is to be: a bar is shown where it is asked for, and on terminals and
+    in notebooks only, since a file would hold a line for every step of it."""
+    return None if progress else True
+
+
 def amount(x: float, unit: str) -> str:
     """A number with its unit, in four digits."""
     return f"{x:.4g} {unit}" if unit and unit != "1" else f"{x:.4g}"

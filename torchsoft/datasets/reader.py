@@ -26,7 +26,7 @@ from torchsoft.datasets.files import (
     record_key,
 )
 from torchsoft.datasets.subject import SPLITS
-from torchsoft.display import suggestion
+from torchsoft.display import Shown, suggestion
 from torchsoft.physics.arguments import whole
 
 DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
@@ -112,7 +112,7 @@ def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
     return data
 
 
-class Trajectories(Dataset[dict[str, Tensor]]):
+class Trajectories(Shown, Dataset[dict[str, Tensor]]):
     """Windows of the trajectories of one split, from memory where they fit.
 
     Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number
@@ -179,6 +179,17 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         most = HELD * machine_memory() if memory is None else memory
         self.fits = self.size <= most * 2**30
         self._held = self._read(self.trajectories) if self.fits else None
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        units = {name: self.data.variables[name].attrs.get("units", "") for name in self.variables}
+        title = (
+            f"Trajectories: {len(self)} windows of {self.window} samples, of "
+            f"{len(self.trajectories)} trajectories in {self.url}"
+        )
+        return title, [
+            (name, f"{units[name] or '1'}, {'over time' if self._timed[name] else 'a number'}")
+            for name in self.variables
+        ]
 
     @property
     def size(self) -> int:

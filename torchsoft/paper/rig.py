@@ -72,8 +72,14 @@ class SoftGrasp(Rig):
         }
         at_bracket = (-p.pad.length / 2, -p.bracket.cm_height)
         super().__init__(
-            groups={"pad": rubber, "contact": law, "disc": disc, "bracket": bracket,
-            "control": control}, bodies={"disc": disc, "bracket": bracket},
+            groups={
+                "pad": rubber,
+                "contact": law,
+                "disc": disc,
+                "bracket": bracket,
+                "control": control,
+            },
+            bodies={"disc": disc, "bracket": bracket},
             pads={
                 "L": Pad(p.pad.mesh, rubber, **common),
                 "U": Pad(upper, rubber, base="bracket", origin=at_bracket, mirrored=True, **common),
@@ -81,11 +87,18 @@ class SoftGrasp(Rig):
             contacts={name: Contact(name, "disc", law) for name in ("L", "U")},
             actuators={
                 "x": Actuator(
-                    f"{k.senses}.x", "bracket.x", control["x"], setpoint="x_d",
-                    elements=("C: K_81^-1", "R: R_80")
+                    f"{k.senses}.x",
+                    "bracket.x",
+                    control["x"],
+                    setpoint="x_d",
+                    elements=("C: K_81^-1", "R: R_80"),
                 ),
                 "y": Actuator(
-                    "bracket.y", "bracket.y", control["y"], setpoint="y_d", feed_forward="F_ff",
+                    "bracket.y",
+                    "bracket.y",
+                    control["y"],
+                    setpoint="y_d",
+                    feed_forward="F_ff",
                     elements=("C: K_98^-1", "R: R_99", "Se: F_y"),
                 ),
             },
@@ -93,7 +106,7 @@ class SoftGrasp(Rig):
             gravity=p.scenario.gravity,
             symbols={"disc": "C", "bracket": "Br"},
             taxels=taxels,
-        )  # fmt: skip
+        )
         self._settings = p
 
     @property

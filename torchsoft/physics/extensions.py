@@ -71,8 +71,9 @@ def extensions(rig: Rig) -> dict[str, Extension]:
     for coordinate in _guided(rig):
         turns = coordinate.endswith(".theta")
         for kind, size, most in (("friction", 0.1, 50.0), ("damping", 1.0, 500.0)):
-            unit = ("N.m" if turns else "N") + ("" if kind == "friction" else ".s/rad" if turns
-                    else ".s/m")  # fmt: skip
+            unit = ("N.m" if turns else "N") + (
+                "" if kind == "friction" else ".s/rad" if turns else ".s/m"
+            )
             part = 0.02 if turns else 1.0  # m: of the arm at which a guide acts
             out[f"guides.{coordinate}.{kind}"] = Extension(
                 0.0, part * size, 0.0, part * most, unit, f"{coordinate} has no {kind}",
@@ -165,6 +166,9 @@ def _tilt(rig: Rig, bodies: Collection[str]) -> nn.Parameter:
             if _free(rig, name, axis):
                 law = Tilt(axis, tilt, body.mass, rig.gravity)
                 coordinate = f"{name}.{axis}"
-                _added(rig, f"tilt_{name}_{axis}", Actuator(coordinate, coordinate, law,
-                       setpoint=(), elements=("Se: m g",)))  # fmt: skip
+                _added(
+                    rig,
+                    f"tilt_{name}_{axis}",
+                    Actuator(coordinate, coordinate, law, setpoint=(), elements=("Se: m g",)),
+                )
     return tilt

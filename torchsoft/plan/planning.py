@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft.display import Shown
+from torchsoft.display import Shown, hidden
 from torchsoft.physics.arguments import Numbers, tensor, whole
 from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Reference
@@ -135,7 +135,7 @@ def plan(
     evaluator = Evaluator(rig, t, variables, terms, y0, drawn, rtol, threads)
     weight = (1.0 if objective is None else 0.0) if change is None else change
     notices, checked = list[str](), None
-    with tqdm(desc="plan", unit=" evaluations", disable=not progress) as bar:
+    with tqdm(desc="plan", unit=" evaluations", disable=hidden(progress)) as bar:
         search = Search(evaluator, robust, weight, seconds, bar)
         try:
             search.begin(starts, seed)

@@ -4,6 +4,8 @@ import base64
 import importlib.util
 import json
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from torchsoft.channels import CHANNELS
-from torchsoft.display import suggestion
+from torchsoft.display import hidden, suggestion
 from torchsoft.files import replacing, save_text
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.setup import von_mises
@@ -118,6 +120,24 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> 
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+@dataclass(frozen=True)
+class Film:
+    """A video, or a player, in a file; a notebook shows it."""
+
+    path: Path
+
+    def __repr__(self) -> str:
+        return f"Film: {self.path}, {1e-6 * self.path.stat().st_size:.2g} MB"
+
+    def _repr_html_(self) -> str:
+        if self.path.suffix == ".html":
+            page = escape(self.path.read_text(encoding="utf-8"))
+            return f'<iframe srcdoc="{page}" style="width:100%;height:640px;border:0"></iframe>'
+        kind = "video/mp4" if self.path.suffix == ".mp4" else "image/gif"
+        data = f"data:{kind};base64,{base64.b64encode(self.path.read_bytes()).decode()}"
+        return f'<video controls src="{data}"></video>' if kind[0] == "v" else f'<img src="{data}">'
+
+
 def animate(
     run: Trajectory, path: Path, *, frames: int = 150, dpi: int = 110, progress: bool = False,
     title: str = "", follow: str = "", slow: float = 0.0,
@@ -148,7 +168,7 @@ def animate(
         "animation",
         len(times),
         unit="frame",
-        disable=not progress,
+        disable=hidden(progress),
     )
     with replacing(path) as partial:
         (write_gif if path.suffix == ".gif" else write_mp4)(bar, partial)

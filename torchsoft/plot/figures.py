@@ -5,6 +5,7 @@ Times in s, lengths in mm, forces in N, stresses in kPa.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -116,6 +117,16 @@ class _EmbeddedFonts(Figure):
         """`savefig` of matplotlib."""
         with rc_context({name: STYLE[name] for name in ("pdf.fonttype", "svg.fonttype")}):
             super().savefig(*args, **kwargs)
+
+    def __repr__(self) -> str:
+        width, height = self.get_size_inches()
+        return f"Figure of {width:g} x {height:g} in: show it in a notebook, or .savefig(FILE)"
+
+    def _repr_png_(self) -> bytes:
+        """The picture that a notebook shows."""
+        with BytesIO() as file:
+            self.savefig(file, format="png", dpi=100)
+            return file.getvalue()
 
 
 def new_figure(title: str, width: float, height: float) -> Figure:

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from torchsoft.cost import Cost, row_bytes, step_time, steps_per_second
 from torchsoft.diagnostic import Diagnostic
+from torchsoft.display import hidden
 from torchsoft.files import make_folder, write_json
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.mesh.mesh import SMALLEST_BLOCK
@@ -207,7 +208,7 @@ def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]
         "snapshots": lambda: figures.snapshots(run, times, title=title),
     }
     if file.outputs.figures:
-        for name, figure in tqdm(made.items(), "figures", unit="figure", disable=not progress):
+        for name, figure in tqdm(made.items(), "figures", unit="figure", disable=hidden(progress)):
             figures.save(figure(), out / f"{name}.png")
             written.append(f"{name}.png")
     if file.outputs.figures if file.outputs.player is None else file.outputs.player:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from torchsoft.display import Shown
+from torchsoft.display import Shown, hidden
 from torchsoft.parallel import cores, parallel_map, single_threaded
 from torchsoft.physics.arguments import Numbers, tensor, whole
 from torchsoft.physics.motion import Reference
@@ -190,7 +190,7 @@ def simulate_batch(
             return failure
 
     results: list[RunOutcome | Trajectory | Exception] = [ValueError("not run")] * count
-    with single_threaded(), tqdm(total=count, unit="run", disable=not progress) as bar:
+    with single_threaded(), tqdm(total=count, unit="run", disable=hidden(progress)) as bar:
         for i, result in parallel_map(work, count, threads, turns=True):
             results[i] = result
             bar.update()

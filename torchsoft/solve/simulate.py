@@ -59,8 +59,8 @@ def ungraphed(run: Callable[P, R]) -> Callable[P, R]:
         if "torch._dynamo" not in sys.modules:  # whose import takes a second
             return run(*args, **kwargs)
         reason = "a run of a rig is no graph for torch.compile, and is compiled already"
-        disabled: Any = torch.compiler.disable(run, reason=reason)
-        return disabled(*args, **kwargs)
+        plain: Any = torch.compiler.disable(run, reason=reason)
+        return plain(*args, **kwargs)
 
     return called
 
@@ -206,6 +206,7 @@ def run(
         bar = tqdm(
             total=float(t[-1] - t[0]),
             unit="s",
+            disable=None,
             bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]",
         )
     done, began = None, clock.perf_counter()
@@ -215,7 +216,7 @@ def run(
         ):
             for solved, slopes in _rows(task, tape_bytes):
                 done = RunOutcome(task, solved, slopes, clock.perf_counter() - began)
-                if bar is not None:
+                if bar is not None and not bar.disable:
                     bar.n = float(t[solved.out.rows - 1] - t[0])
                     bar.refresh()
     except SimulationFailed as failure:

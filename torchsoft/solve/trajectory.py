@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # these take as long to import as all of this package
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
+
+    from torchsoft.plot.animation import Film
 from typing import NamedTuple
 
 import numpy as np
@@ -146,9 +148,12 @@ class Trajectory(Shown):
         rows.append(("contacts at the end", forces or "none"))
         rows.append(("energy", f"{self.energy_residual_rel:.1e} of what was injected is missing"))
         rows.append(
-            ("steps", f"{stats.steps}, {stats.newton_per_step:.2g} Newton iterations each, "
-                      f"{stats.wall_s:.2g} s")
-        )  # fmt: skip
+            (
+                "steps",
+                f"{stats.steps}, {stats.newton_per_step:.2g} Newton iterations each, "
+                f"{stats.wall_s:.2g} s",
+            )
+        )
         if self.y.requires_grad:
             rows.append(("gradient", "of every channel, by the discrete adjoint"))
         if self.wrt:
@@ -210,17 +215,13 @@ class Trajectory(Shown):
 
         return dashboard(self, **options)
 
-    def animate(self, path: str | Path, **options: Any) -> None:
-        """Write a video, .mp4 or .gif, or the interactive player, .html; options of
-        `torchsoft.plot.animation.animate` or `torchsoft.plot.animation.player`."""
-        if Path(path).suffix == ".html":
-            from torchsoft.plot.animation import player
+    def animate(self, path: str | Path, **options: Any) -> Film:
+        """Write a video, .mp4 or .gif, or the interactive player, .html, which a notebook shows;
+        options of `torchsoft.plot.animation.animate` or `torchsoft.plot.animation.player`."""
+        from torchsoft.plot.animation import Film, animate, player
 
-            player(self, Path(path), **options)
-            return
-        from torchsoft.plot.animation import animate
-
-        animate(self, Path(path), **options)
+        (player if Path(path).suffix == ".html" else animate)(self, Path(path), **options)
+        return Film(Path(path))
 
     def to_xarray(self) -> xr.Dataset:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""
@@ -228,12 +229,17 @@ class Trajectory(Shown):
 
         return to_xarray(self)
 
-    def to_pandas(self) -> pd.DataFrame:
-        """The channels as columns over time [s]; their units are in `attrs`."""
+    def to_pandas(self, *, units: bool = False) -> pd.DataFrame:
+        """The channels as columns over time [s]; their units are in `attrs`, and with `units` in
+        the headings too, as `torchsoft identify` reads them: `x_disc [m]`."""
         import pandas as pd
 
-        columns = {name: x.detach().numpy() for name, x in self.channels.items()}
-        table = pd.DataFrame(columns, index=pd.Index(self.t.numpy(), name="t"))
+        def heading(name: str) -> str:
+            unit = "s" if name == "t" else self.units.get(name) or "1"
+            return f"{name} [{unit}]" if units else name
+
+        columns = {heading(name): x.detach().numpy() for name, x in self.channels.items()}
+        table = pd.DataFrame(columns, index=pd.Index(self.t.numpy(), name=heading("t")))
         table.attrs["units"] = dict(self.units)
         return table
 

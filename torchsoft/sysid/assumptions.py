@@ -64,10 +64,17 @@ class Fault(NamedTuple):
     ) -> "Variation":
         scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit)}
         factor, shown = scale.get(self.per, (sensor.noise, f"{unit} over a recording"))
-        return Variation(f"{kind} {channel}", "sensor", f"{channel} has no unknown {kind}",
-                          f"{channel} {self.verb}", factor * self.amount, shown,
-                          nominal=float(kind == "gain"), step=self.size(sensor, recording),
-                          fault=(channel, kind))  # fmt: skip
+        return Variation(
+            f"{kind} {channel}",
+            "sensor",
+            f"{channel} has no unknown {kind}",
+            f"{channel} {self.verb}",
+            factor * self.amount,
+            shown,
+            nominal=float(kind == "gain"),
+            step=self.size(sensor, recording),
+            fault=(channel, kind),
+        )
 
 
 FAULTS: dict[Nuisance, Fault] = {
@@ -140,20 +147,38 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
     nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
     at = f"{points} points an element" if points else "on the nodes"
     out = [
-        Variation("mesh", "numerical", f"the pads have {nx} x {ny} elements",
-        f"they had {2 * nx} x {2 * ny}",
-                   vary=lambda r: remeshed(r, 2, points)),
-        Variation("contact points", "numerical", f"contact is computed {at}",
-        f"it were at {points + 2} points an element",
-                   vary=lambda r: remeshed(r, 1, points + 2)),
-        Variation("mesh phase", "numerical", "a node lies where the mesh puts it",
-        "nodes lay a quarter of an element on",
-                   vary=lambda r: shifted(r, 0.25)),
-    ]  # fmt: skip
+        Variation(
+            "mesh",
+            "numerical",
+            f"the pads have {nx} x {ny} elements",
+            f"they had {2 * nx} x {2 * ny}",
+            vary=lambda r: remeshed(r, 2, points),
+        ),
+        Variation(
+            "contact points",
+            "numerical",
+            f"contact is computed {at}",
+            f"it were at {points + 2} points an element",
+            vary=lambda r: remeshed(r, 1, points + 2),
+        ),
+        Variation(
+            "mesh phase",
+            "numerical",
+            "a node lies where the mesh puts it",
+            "nodes lay a quarter of an element on",
+            vary=lambda r: shifted(r, 0.25),
+        ),
+    ]
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
-        out.append(Variation("set-points", "numerical",
-        "set-points are what a smooth curve through the recorded ones says",
-                              "only every second one were known", vary=sparser))  # fmt: skip
+        out.append(
+            Variation(
+                "set-points",
+                "numerical",
+                "set-points are what a smooth curve through the recorded ones says",
+                "only every second one were known",
+                vary=sparser,
+            )
+        )
     out += [
         Variation("clock of the set-points", "known", "set-points and sensors have one clock",
                   "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r: delayed(r, CLOCK),
@@ -164,17 +189,33 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
                   by=lambda r, amount: stretched(r, 1e-2 * amount)),
     ]  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
-        out.append(Variation("feed-forward", "known", "what was fed forward is known",
-            f"it were {FORCE} N more", FORCE, "N",
-                              vary=lambda r: raised(r, FORCE), by=raised))  # fmt: skip
+        out.append(
+            Variation(
+                "feed-forward",
+                "known",
+                "what was fed forward is known",
+                f"it were {FORCE} N more",
+                FORCE,
+                "N",
+                vary=lambda r: raised(r, FORCE),
+                by=raised,
+            )
+        )
     if isinstance(first.start, Standing):
         lead, other = first.start.lead, 0.0 if first.start.lead else SETTLE
         stated = f"bodies were put where they stand {lead:g} s before the first sample (lead)"
         out.append(Variation("lead", "law", stated, f"it were {other:g} s",
                              vary=partial(led, lead=other)))  # fmt: skip
     if any(isinstance(law.friction, SmoothSlip) for law in laws(rig)):
-        out.append(Variation("Coulomb friction", "law", "slip is smooth (friction \"smooth\")",
-                              "it were Coulomb's", vary=coulomb))  # fmt: skip
+        out.append(
+            Variation(
+                "Coulomb friction",
+                "law",
+                'slip is smooth (friction "smooth")',
+                "it were Coulomb's",
+                vary=coulomb,
+            )
+        )
     pushed = {one.pushes for one in rig.actuators.values()}
     for name, axes in rig.layout.free.items() if isinstance(first.start, Standing) else ():
         if 0 in axes and f"{name}.x" not in pushed and f"start.{name}.x" not in unknown:
@@ -188,14 +229,36 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         if name in unknown or value == 0.0 or name.startswith("start.") or "fixed" in name:
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
-        out.append(Variation(name, "known", f"{name} is {value:.6g}",
-        f"{name} were {(1 + part) * value:.6g}", 100 * part, "%", parameter=name, nominal=value,
-                              step=part * value))  # fmt: skip
+        out.append(
+            Variation(
+                name,
+                "known",
+                f"{name} is {value:.6g}",
+                f"{name} were {(1 + part) * value:.6g}",
+                100 * part,
+                "%",
+                parameter=name,
+                nominal=value,
+                step=part * value,
+            )
+        )
     for name, one in extensions(rig).items():
         if ".slow(" not in name or all(isinstance(r.start, Standing) for r in (first, *others)):
-            out.append(Variation(name, "known", one.stated, one.otherwise, one.amount, one.unit,
-            parameter=name, nominal=one.neutral, step=one.amount,
-                                  one_sided=one.low == one.neutral, extension=True))  # fmt: skip
+            out.append(
+                Variation(
+                    name,
+                    "known",
+                    one.stated,
+                    one.otherwise,
+                    one.amount,
+                    one.unit,
+                    parameter=name,
+                    nominal=one.neutral,
+                    step=one.amount,
+                    one_sided=one.low == one.neutral,
+                    extension=True,
+                )
+            )
     return out
 
 

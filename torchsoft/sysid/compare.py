@@ -583,11 +583,11 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
             one.heldout,
             one.law.problem.coordinates,
         )
+        found = zip(c.all, one.law.x, one.law.free)
         out.append(
             LawFit(
-                name, int(k[i]),
-                {a.label: a.to_value(x) for a, x,
-                free in zip(c.all, one.law.x, one.law.free) if free}, one.fitted.log,
+                name, int(k[i]), {a.label: a.to_value(x) for a, x, free in found if free},
+                one.fitted.log,
                 square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]),
                 float(aicc[i]), float(bic[i]), float(weight[i] / weight.sum()),
                 None if held is None else held.log / len(held.r), None if held is None else held.p,

@@ -14,6 +14,7 @@ import torch
 from tqdm import tqdm
 
 from torchsoft import csvfile
+from torchsoft.display import hidden
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan.knots import Bounds, Moves, knots
 from torchsoft.plan.search import ProjectedAdam
@@ -192,7 +193,7 @@ def design(
             f"the motion given cannot be run, so that nothing can begin with it: {failure}"
         ) from None
     before, given = planner.deviations(x, search.seen), planner.made(search.z, x, search.seen)
-    with tqdm(total=iterations, desc="design", disable=not progress) as bar:
+    with tqdm(total=iterations, desc="design", disable=hidden(progress)) as bar:
         try:
             while search.iteration < iterations:
                 search.move(iterations)

@@ -90,9 +90,16 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
     for row, (e, s) in enumerate(rows):
         if e.value is None or e.ci95 is None:
             axes.axhspan(row - 0.32, row + 0.32, color="#f6e3d6", lw=0)
-            axes.text(0.5, row, "not identifiable", transform=axes.get_yaxis_transform(),
-                ha="center", va="center",
-                      fontsize=9, color="#a34400")  # fmt: skip
+            axes.text(
+                0.5,
+                row,
+                "not identifiable",
+                transform=axes.get_yaxis_transform(),
+                ha="center",
+                va="center",
+                fontsize=9,
+                color="#a34400",
+            )
             continue
         low, value, high = (max(v / s, 1e-6) for v in (e.ci95[0], e.value, e.ci95[1]))
         axes.errorbar(
@@ -135,9 +142,15 @@ def correlation_figure(result: IdentificationResult) -> Figure:
     for i in range(n if n <= 8 else 0):
         for j in range(n):
             dark = abs(C[i, j]) > 0.6
-            axes.text(j, i, f"{C[i, j]:.2f}".replace("-", "−"), ha="center", va="center",
+            axes.text(
+                j,
+                i,
+                f"{C[i, j]:.2f}".replace("-", "−"),
+                ha="center",
+                va="center",
                 fontsize=8 if n <= 6 else 6.5,
-                      color="white" if dark else "#1d2329")  # fmt: skip
+                color="white" if dark else "#1d2329",
+            )
     figure.colorbar(image, ax=axes, shrink=0.75, ticks=[-1, 0, 1])
     return figure
 
@@ -159,10 +172,16 @@ def spectrum_figure(result: IdentificationResult) -> Figure:
         text = literal(shorten(direction_name(d), 60, placeholder=" …")) + (
             "" if d.identifiable else ": not identifiable"
         )
-        axes.text(0.01, row - 0.17, text, transform=axes.get_yaxis_transform(), va="center",
+        axes.text(
+            0.01,
+            row - 0.17,
+            text,
+            transform=axes.get_yaxis_transform(),
+            va="center",
             fontsize=9,
-                  color="#1d2329" if d.identifiable else "#a34400",
-                  bbox={"fc": "white", "ec": "none", "pad": 0.8})  # fmt: skip
+            color="#1d2329" if d.identifiable else "#a34400",
+            bbox={"fc": "white", "ec": "none", "pad": 0.8},
+        )
     axes.axvline(IDENTIFIABLE, color="#1d2329", lw=1, ls=(0, (4, 2)))
     axes.set_xscale("log")
     axes.set(

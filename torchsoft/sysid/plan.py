@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 from tqdm import tqdm
 
+from torchsoft.display import hidden
 from torchsoft.sysid.fit import (
     SETTLED,
     Fit,
@@ -185,7 +186,7 @@ def stage_entry(
 @contextmanager
 def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
     """A progress bar of one stage. Yields a function to call with chi2 after every evaluation."""
-    with tqdm(desc=plain(label), unit=" evaluations", disable=not shown) as bar:
+    with tqdm(desc=plain(label), unit=" evaluations", disable=hidden(shown)) as bar:
 
         def notify(chi2: float) -> None:
             bar.set_postfix_str(f"chi2 = {chi2:.4g}", refresh=False)

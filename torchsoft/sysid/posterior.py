@@ -19,6 +19,7 @@ import numpy as np
 from scipy.special import expit, log_expit, logit
 from tqdm import tqdm
 
+from torchsoft.display import hidden
 from torchsoft.extras import needed
 from torchsoft.files import write_json
 from torchsoft.parallel import parallel_map, single_threaded
@@ -167,7 +168,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
             return -np.inf, at.reason
         return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
 
-    with single_threaded(), tqdm(desc="Laplace", total=draws, disable=not progress) as bar:
+    with single_threaded(), tqdm(desc="Laplace", total=draws, disable=hidden(progress)) as bar:
         for k, (value, reason) in parallel_map(density, draws, o.workers):
             log_p[k], failures = value, [*failures, reason] if reason else failures
             bar.update()

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.display import suggestion
+from torchsoft.display import Shown, amount, suggestion
 from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
@@ -118,7 +118,7 @@ class Reading(NamedTuple):
     weight: Array
 
 
-class Problem:
+class Problem(Shown):
     """The problem of finding the parameters that explain some recordings.
 
     `recordings` have distinct names; `sensors` are the channels that count, with their noise;
@@ -200,6 +200,14 @@ class Problem:
         if key not in self._whiteners:
             self._whiteners[key] = self.noise[channel].whitener(recording.samples[channel][0])
         return self._whiteners[key] @ rows
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        free = [one for one in self.coordinates.all if one.kind == "parameter" and not one.fixed]
+        rows = [(one.label, f"{one.low:.4g} to {one.high:.4g}, from {one.nominal:.4g}")
+                for one in free]  # fmt: skip
+        rows += [(name, f"measured to {amount(one.noise, self.unit(name))}")
+                 for name, one in self.sensors.items()]  # fmt: skip
+        return f"Problem: {len(free)} unknowns, recordings {', '.join(self.names)}", rows
 
     @property
     def names(self) -> tuple[str, ...]:

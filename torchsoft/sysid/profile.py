@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
-from torchsoft.display import suggestion
+from torchsoft.display import hidden, suggestion
 from torchsoft.parallel import parallel_map, single_threaded
 from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton
 from torchsoft.sysid.problem import Problem, Residuals
@@ -232,7 +232,7 @@ def profiles(
         work = parallel_map(
             lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers
         )
-        done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=not progress))
+        done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=hidden(progress)))
     return [
         assemble(optimum, where[label], done[2 * k], done[2 * k + 1])
         for k, label in enumerate(chosen)

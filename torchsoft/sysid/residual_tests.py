@@ -380,18 +380,18 @@ def contradicted(name: str, r: float, q: Array) -> Verdict:
 
 SENTENCES: dict[str, str] = {
     "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or "
-              "the noise larger",
+    "the noise larger",
     "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or "
     "intervals are too wide, and faults of the model stay hidden",
     "white": "residuals are not white in {}: something systematic is left, and intervals may be "
-             "too narrow",
+    "too narrow",
     "motion": "residuals follow the motion in {}: a sensor is not as it was stated, or the model "
-              "is wrong",
+    "is wrong",
     "channels": "residuals of different channels belong together, {}: the model leaves out "
-                "something that moves both",
+    "something that moves both",
     "outliers": "there are outliers in {}: look at these samples, or take a robust loss",
     "priors": "the data contradict what was known before, {}: the prior is wrong, or the model",
-}  # fmt: skip
+}
 
 
 def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from tqdm import tqdm
 
+from torchsoft.display import hidden
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
 from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
@@ -234,7 +235,7 @@ def new_fits(
     a law leaves less than `RIVAL` of the misfit that all numbers together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
-    bar = tqdm(total=len(candidates) + 1, unit="fit", disable=not progress)
+    bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(progress))
     with warnings.catch_warnings(action="ignore"), bar:
 
         def notify(chi2: float) -> None:
