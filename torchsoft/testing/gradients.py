@@ -30,6 +30,9 @@ LENGTHS = 1e-8, 3e-9, 3e-8, 1e-9, 1e-7, 1e-10, 1e-6
 """Of differences, relative to the parameter, in the order in which they are tried until two
 neighbours agree."""
 
+REPEATS = 4
+"""Most runs along the steps of the one before, until all of them are solved as they are given."""
+
 WEAK = 100.0
 """Most by which a parameter that matters less than others is moved further."""
 
@@ -149,17 +152,30 @@ def check_gradients(
 
 
 class Start(NamedTuple):
-    """Times (T,), the initial state and the states of a run from it (T, size)."""
+    """Times (T,), the initial state, and a run from it: its states (T, size) and its steps."""
 
     t: Tensor
     y0: Tensor
     y: Tensor
+    knots: Tensor
 
 
 def _start(rig: Rig, t: Numbers, y0: Numbers | None, rtol: float) -> Start:
     run = simulate(rig, t, y0=y0, rtol=rtol, tolerance=NEWTON)
     first = run.y[0] if y0 is None else tensor("y0", y0).detach()
-    return Start(run.t, first, run.y)
+    # rounding may keep Newton from solving a step where a law bends, which is then halved
+    for _ in range(REPEATS):
+        run = _along(rig, run.t, run.knots, y0=first)
+        if run.stats.failed_steps == 0:
+            break
+    return Start(run.t, first, run.y, run.knots)
+
+
+def _along(rig: Rig, t: Tensor, knots: Tensor, **how: Any) -> Trajectory:
+    """A run along given steps; those that were halved show in its `stats`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return simulate(rig, t, knots=knots, tolerance=NEWTON, **how)
 
 
 @contextmanager
@@ -239,9 +255,8 @@ def _checked(
     kick, generator = leaves.get("start"), torch.Generator().manual_seed(1)
     shake = _direction(rig, start) if dy0 is None else tensor("dy0", dy0).detach()
 
-    def run(**how: Any) -> Trajectory:
-        y0 = start.y0 if kick is None else start.y0 + kick * shake
-        return simulate(rig, start.t, y0=y0, tolerance=NEWTON, **how)
+    def begin() -> Tensor:
+        return start.y0 if kick is None else start.y0 + kick * shake
 
     ways: Leaves = {}
     for name, p in leaves.items():
@@ -263,19 +278,23 @@ def _checked(
             found[kind] = {name: float((slope * ways[name]).sum()) for name, slope in pairs}
         return found
 
-    made = run(rtol=rtol, gradient="discrete")
+    made = _along(rig, start.t, start.knots, y0=begin(), gradient="discrete")
     own = shares(made)
     finer = {}
     if step_error:
         try:
-            finer = shares(run(rtol=0.1 * rtol, gradient="discrete"))
+            finer = shares(
+                simulate(
+                    rig, start.t, y0=begin(), rtol=0.1 * rtol, tolerance=NEWTON, gradient="discrete"
+                )
+            )
         except SimulationFailed as failed:
             warnings.warn(
                 f"the error of the steps is not known, since a run at a tenth of rtol = {rtol:g} "
                 f"failed: {failed}",
                 stacklevel=3,
             )
-    ahead = _forward(rig, start, made, leaves, shake, ways, by_forward, centres)
+    ahead = _forward(rig, start, leaves, shake, ways, by_forward, centres)
 
     largest = {kind: max(map(abs, found.values()), default=0.0) for kind, found in own.items()}
 
@@ -284,10 +303,9 @@ def _checked(
         ends = []
         for h in (by, -by):
             moved = {name: h * way for name, way in along.items()}
-            with _moved(leaves, moved), warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                ended = run(knots=made.knots)
-            failed = ended.stats.failed_steps != made.stats.failed_steps
+            with _moved(leaves, moved):
+                ended = _along(rig, start.t, start.knots, y0=begin())
+            failed = ended.stats.failed_steps > 0
             ends.append({k: np.nan if failed else float(v) for k, v in values(ended).items()})
         return {kind: (ends[0][kind] - ends[1][kind]) / (2 * by) for kind in ends[0]}
 
@@ -400,7 +418,7 @@ def _moved(leaves: Leaves, by: Leaves) -> Iterator[None]:
 
 
 def _forward(
-    rig: Rig, start: Start, made: Trajectory, leaves: Leaves, shake: Tensor, ways: Leaves,
+    rig: Rig, start: Start, leaves: Leaves, shake: Tensor, ways: Leaves,
     by_forward: Callable[..., dict[str, Tensor]] | None, centres: bool,
 ) -> dict[str, dict[str, float]]:  # fmt: skip
     """Forward sensitivities of every value along the ways of the start and of the scalars."""
@@ -414,11 +432,12 @@ def _forward(
         return {}
     dy0 = torch.zeros(len(start.y0), len(wanted), dtype=torch.float64)
     felt = felt_channels(rig, centres)
-    run = simulate(
-        rig, start.t, y0=start.y0, knots=made.knots, tolerance=NEWTON, gradient="forward",
-        wrt=wanted, touch=felt, dy0=torch.cat((dy0, shake[:, None]), -1),
+    run = _along(
+        rig, start.t, start.knots, y0=start.y0, gradient="forward", wrt=wanted, touch=felt,
+        dy0=torch.cat((dy0, shake[:, None]), -1),
     )  # fmt: skip
-    assert run.sensitivities is not None
+    if run.stats.failed_steps or run.sensitivities is None:
+        return {}
     of_forces = torch.stack([run.touch_sensitivities[name] for name in felt], 1) if felt else None
     names = [*wanted, "start"] if kicked else wanted
     return {
