@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from torchsoft.files import check_file
-from torchsoft.materials.measured import Array
-from torchsoft.physics.material import INSTANT, Prony
+from torchsoft.materials.measured import Array, instant_time
+from torchsoft.physics.material import Prony
 from torchsoft.tables import line
 
 LARGEST = 2e9
@@ -23,9 +23,6 @@ LARGEST = 2e9
 
 INCOMPRESSIBLE = 0.4995
 """Poisson's ratio that stands for a material that a deck calls incompressible."""
-
-INSTANT_PART = 0.1
-"""Retardation time of the instantaneous spring over the shortest relaxation time, at the most."""
 
 OF_MATERIALS = {
     "DAMPING", "DENSITY", "DEPVAR", "ELASTIC", "EXPANSION", "HYPERELASTIC", "TRS",
@@ -60,7 +57,7 @@ class Deck:
         tau = self.listed("tau")
         return {
             "E": self.values["E"], "moduli": self.listed("E"), "tau": tau,
-            "tau_instant": min(INSTANT, INSTANT_PART * min(tau)), "nu": self.values["nu"],
+            "tau_instant": instant_time(tau), "nu": self.values["nu"],
         }  # fmt: skip
 
     def material(self, *, rho: float, depth: float) -> Prony:

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from torchsoft.materials.measured import SMALL_STRAIN, Array, Measured, Spectrum
-from torchsoft.physics.material import INSTANT, KINDS, Material
+from torchsoft.materials.measured import SMALL_STRAIN, Array, Measured, Spectrum, instant_time
+from torchsoft.physics.material import KINDS, Material
 
 GRID = 10
 """Times a decade of the grid that fits begin on."""
@@ -52,9 +52,6 @@ FLOW = 100.0
 
 ROUNDING = 1e-12
 """Residual over the largest answer below which a fit is exact."""
-
-INSTANT_PART = 0.1
-"""Largest retardation time of the instantaneous spring, over the shortest time of the series."""
 
 SWEPT_PART = 0.01
 """That time over the shortest one of a sweep."""
@@ -108,7 +105,7 @@ class Fit:
         numbers = range(1, self.terms + 1)
         tau = [self.values[f"tau_{k}"] for k in numbers]
         strengths = [self.values[f"{symbol}_{k}"] for k in numbers]
-        instant = min(INSTANT, INSTANT_PART * min(tau))
+        instant = instant_time(tau)
         if isinstance(self.measured, Spectrum):  # its dashpot adds omega tau_instant to the loss
             instant = min(instant, SWEPT_PART * self.measured.window[0])
         return {"E": self.values["E"], argument: strengths, "tau": tau, "tau_instant": instant}

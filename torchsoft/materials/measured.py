@@ -7,7 +7,7 @@ strain over a stress held so. A frequency sweep has `frequency` with storage and
 tension or of shear; a pull needs no `t`.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torchsoft import csvfile
 from torchsoft.channels import UNITS
 from torchsoft.physics.arguments import positive
+from torchsoft.physics.material import INSTANT
 
 Array = NDArray[np.float64]
 
@@ -56,6 +57,9 @@ DECADE = 10.0
 
 FLOWING = 0.8
 """Power of time above which creep at the end of a test is a flow: 1 is a dashpot's."""
+
+INSTANT_PART = 0.1
+"""Largest retardation time of the instantaneous spring, over the shortest time of the series."""
 
 SMALL_STRAIN = 0.1
 """Strain up to which a linear material is taken at its word."""
@@ -386,6 +390,11 @@ def hint(name: str, columns: int) -> str:
         f"and their units are {known}; one of another name is told by --column NAME={name or 'ITS'}"
         f", others are left out by --ignore"
     )
+
+
+def instant_time(tau: Sequence[float]) -> float:
+    """Retardation time [s] of the instantaneous spring of a series of times tau [s]."""
+    return min(INSTANT, INSTANT_PART * min(tau))
 
 
 def faded(t: Array, x: Array, tau: Array) -> Array:

@@ -31,7 +31,7 @@ from torchsoft.physics.statics import (
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import Gravity, Quantity, Time
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
-from torchsoft.rigs.fields import Group, at_field, misnamed, with_entry
+from torchsoft.rigs.fields import Group, at_field, called_alike, with_entry
 from torchsoft.rigs.geometry import AWAY, Scene, above, at, upon
 from torchsoft.rigs.motion import HELD, MotionContext, MotionTable, flattened
 from torchsoft.rigs.parts import (
@@ -216,7 +216,7 @@ class RigFile(Group):
         try:
             file = type(self).model_validate(merged(own, groups))
         except InvalidTable as error:
-            raise InvalidTable(f"{error}{misnamed(str(error), own, groups)}") from None
+            raise InvalidTable(f"{error}{called_alike(str(error), own, groups)}") from None
         file._folder = self._folder
         return file
 

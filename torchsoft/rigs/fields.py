@@ -200,7 +200,7 @@ def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any
     return out
 
 
-def misnamed(error: str, own: Mapping[str, Any], given: Mapping[str, Any]) -> str:
+def called_alike(error: str, own: Mapping[str, Any], given: Mapping[str, Any]) -> str:
     """Question after the parts of a file that an error names and that were given but are not its
     `own`, where one of these is called alike."""
     return "".join(
