@@ -25,7 +25,14 @@ from torchsoft import (
     hold,
 )
 from torchsoft.physics.multibond import Junction, Transformer
-from torchsoft.testing import CheckFailed, check_energy, check_gradients, check_law, check_power
+from torchsoft.testing import (
+    CheckFailed,
+    check_energy,
+    check_gradients,
+    check_law,
+    check_power,
+    gradients,
+)
 
 LAW = Actuator("disc.x", "disc.x", lambda w, w_dot, F, q, q_dot: F, setpoint="x", feed_forward="F")
 
@@ -234,3 +241,24 @@ def test_laws_that_are_wrong_are_named(k):
     law, sentence = WRONG[k]
     with pytest.raises(CheckFailed, match=sentence):
         check_law(law)
+
+
+def test_all_routes_take_steps_that_are_solved_as_they_are_given(monkeypatch):
+    """Where rounding halves a step of the first run along the knots, every other route takes the
+    halves too: else adjoint and forward are of different steps."""
+    along, taken = gradients._along, list[Tensor]()
+
+    def halved(rig: Rig, t: Tensor, knots: Tensor, **how: Any) -> Any:
+        taken.append(knots)
+        if len(taken) > 1:
+            return along(rig, t, knots, **how)
+        middle = 0.5 * (knots[-2:-1] + knots[-1:])
+        run = along(rig, t, torch.cat((knots[:-1], middle, knots[-1:])), **how)
+        return dataclasses.replace(run, stats=dataclasses.replace(run.stats, failed_steps=1))
+
+    monkeypatch.setattr(gradients, "_along", halved)
+    y0 = torch.zeros(6, dtype=torch.float64)
+    check_gradients(thrown(), times(0.3, 4), y0, wrt=["bodies.disc.mass"], of=["x_disc"])
+    first, *others = taken
+    assert len(others) > 2
+    assert all(len(knots) == len(first) + 1 for knots in others[:3])
