@@ -1,6 +1,7 @@
 """Shared rigs and states: at rest, in the grasp, rolling, and at random."""
 
 import gc
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -9,17 +10,16 @@ from torch import Tensor, nn
 
 from torchsoft import (
     Body,
-    Parameters,
+    BuiltRig,
     Reference,
     Rig,
+    RigFile,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
+    excite,
     hold,
-    press,
     register_method,
 )
-from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.state import State
 
 register_method()
@@ -31,11 +31,55 @@ RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
 
-def coarse(**changes: object) -> SoftGrasp:
-    """A model on a coarse mesh (2 mm nodes), quick enough for hundreds of evaluations."""
-    return SoftGrasp(
-        Parameters().override(COARSE | {k.replace("__", "."): v for k, v in changes.items()})
-    )
+PAPER = RigFile.ready("paper")
+APART, GRASPED = 50.1e-3, 48.6e-3
+"""Height of the paper's bracket [m] where undeformed pads just touch the disc, and in the grasp."""
+
+
+def paper(changes: Mapping[str, Any] | None = None, **groups: Any) -> BuiltRig:
+    """The paper's rig with its motion, with changes by name, full or short, and by tables."""
+    return PAPER.override(changes, **groups).build()
+
+
+def still(changes: Mapping[str, Any] | None = None, **parts: Any) -> Rig:
+    """The paper's rig that is held where it starts, with `parts` of its own: friction, shape,
+    material."""
+    names = {
+        "friction": "laws.steel_on_rubber.friction", "shape": "bodies.disc.shape",
+        "material": "materials.rubber",
+    }  # fmt: skip
+    file = PAPER.override(changes)
+    rig = file.assemble({names[name]: part for name, part in parts.items()})
+    rig.reference = hold(x_d=file.bodies["disc"].start.x, y_d=APART, F_ff=0.0)
+    return rig
+
+
+def excited(name: str, changes: Mapping[str, Any] | None = None, **how: Any) -> BuiltRig:
+    """The paper's rig under an excitation of the catalogue."""
+    return excite(PAPER.override(changes), name, **how).build()
+
+
+def rest(rig: Rig, x: float = 60e-3) -> Tensor:
+    """The paper's disc at rest on the lower pad, the upper one just touching it."""
+    return rig.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": "touch"})
+
+
+def press(rig: Rig, height: float = GRASPED) -> Tensor:
+    """The paper's disc between its pads, with the bracket at a height [m], without friction."""
+    return rig.state(disc={"x": 60e-3, "y": "rest"}, bracket={"x": 60e-3, "y": height})
+
+
+@torch.no_grad()
+def holding_force(rig: Rig, y: Tensor) -> float:
+    """Downward force [N] on the paper's bracket that balances the upper pad's normal forces."""
+    pad, part = rig.pads["U"], rig.unpack(y).pads["U"]
+    return float((pad.elastic_force(part) if pad.inertial else part[0])[:, 1].sum())
+
+
+def coarse(**changes: object) -> Rig:
+    """The paper's rig, still, on a coarse mesh (2 mm nodes), quick enough for hundreds of
+    evaluations."""
+    return still(COARSE | {k.replace("__", "."): v for k, v in changes.items()})
 
 
 def turning(**changes: object) -> Rig:
@@ -44,17 +88,11 @@ def turning(**changes: object) -> Rig:
     model = coarse(**changes)
     bracket = Body(0.4, inertia=3e-4)
     rig = Rig(
-        bodies={"disc": model.disc, "bracket": bracket}, pads=dict(model.pads),
+        bodies={"disc": model.bodies["disc"], "bracket": bracket}, pads=dict(model.pads),
         contacts=dict(model.contacts), actuators=dict(model.actuators), reference=model.reference,
     )  # fmt: skip
     rig.fixed = lambda: model  # the same rig with a bracket that does not turn
     return rig
-
-
-def paper_settings(recording: Any) -> Parameters:
-    """Of a recording of the paper's rig."""
-    assert isinstance(recording.rig, SoftGrasp)
-    return recording.rig.settings
 
 
 def nested(name: str, value: Any) -> dict[str, Any]:
@@ -77,10 +115,10 @@ def f64(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def grasp(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tensor, Reference]:
+def grasp(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tensor, Reference]:
     """The frictionless grasp (size,) with the disc moving at `velocity` [m/s], and the reference
     that holds it there."""
-    y = press(model, model.settings.scenario.y_Br_grasp).detach()
+    y = press(model).detach()
     pose = model.unpack(y).pose
     y[model.layout.slices["velocity", "disc"]] = f64(*velocity, 0.0)
     return y, hold(
@@ -88,7 +126,7 @@ def grasp(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple
     )
 
 
-def grasped(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Tensor:
+def grasped(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> Tensor:
     """The grasp, after the model was given the reference that holds it."""
     y, model.reference = grasp(model, velocity)
     return y
@@ -101,10 +139,8 @@ def towards(model: Rig, x_d: nn.Module) -> Reference:
 
 def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
     """A grasped state (size,) of the paper's rigs shaken about."""
-    model = rig if isinstance(rig, SoftGrasp) else rig.fixed()
-    return shaken(
-        rig, model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach()), seed, slip
-    )
+    model = rig.fixed() if hasattr(rig, "fixed") else rig
+    return shaken(rig, model.unpack(press(model).detach()), seed, slip)
 
 
 def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchsoft import csvfile
-from torchsoft.channels import UNITS
+from torchsoft.csvfile import UNITS
 
 KNOWN = {"t": UNITS["s"], "force": UNITS["N"], "x": UNITS["m"]}
 T, FORCE, X = [0.0, 0.5, 1.25], [1.5, -2.0, 3e3], [1e-3, 2e-3, 4e-3]

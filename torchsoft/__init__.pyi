@@ -1,8 +1,5 @@
 """torchsoft: a differentiable simulator of soft contact manipulation."""
 
-from .paper.equilibrium import press, rest
-from .paper.parameters import Parameters
-from .paper.rig import SoftGrasp
 from .physics.contact import Coulomb, SmoothSlip, SoftContact
 from .physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
 from .physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
@@ -20,6 +17,9 @@ from .physics.shapes import (
     Superellipse,
 )
 from .physics.statics import NoEquilibrium
+from .rigs.build import RigFile
+from .rigs.built import BuiltRig
+from .rigs.excite import excite
 from .solve.batch import Batch, SamplesFailed, simulate_batch
 from .solve.progress import SimulationFailed
 from .solve.simulate import Interrupted, simulate
@@ -35,6 +35,7 @@ __all__ = [
     "Actuator",
     "Batch",
     "Body",
+    "BuiltRig",
     "Circle",
     "Contact",
     "Contour",
@@ -48,12 +49,12 @@ __all__ = [
     "NoEquilibrium",
     "Pad",
     "PadMesh",
-    "Parameters",
     "Profile",
     "Prony",
     "QuadMesh",
     "Reference",
     "Rig",
+    "RigFile",
     "RoundedBox",
     "RoundedPolygon",
     "Sampled",
@@ -62,17 +63,15 @@ __all__ = [
     "SimulationFailed",
     "SmoothSlip",
     "SoftContact",
-    "SoftGrasp",
     "StandardLinearSolid",
     "StateFeedback",
     "Superellipse",
     "Taxels",
     "Trajectory",
     "controller",
+    "excite",
     "hold",
-    "press",
     "register_method",
-    "rest",
     "simulate",
     "simulate_batch",
 ]

@@ -21,6 +21,25 @@ from torchsoft.extras import needed
 from torchsoft.files import check_file, replacing
 from torchsoft.tables import line, shown
 
+UNITS = {
+    "s": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "°": math.pi / 180},
+    "m/s": {"m/s": 1.0, "mm/s": 1e-3, "um/s": 1e-6},
+    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": math.pi / 180},
+    "N": {
+        "N": 1.0,
+        "mN": 1e-3,
+        "uN": 1e-6,
+        "kN": 1e3,
+        "gf": 9.80665e-3,
+        "kgf": 9.80665,
+        "lbf": 4.4482216152605,
+    },
+    "N.m": {"N.m": 1.0, "mN.m": 1e-3, "N.mm": 1e-3},
+}
+"""Units by dimension, and what they are in SI."""
+
 LARGEST = 2e9
 """Size [B] of a file at the most."""
 

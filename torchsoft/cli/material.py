@@ -65,8 +65,8 @@ def add_commands(commands: Any) -> None:
         "--unit", choices=("Pa", "kPa", "MPa", "GPa", "psi"), help="unit of a deck's stresses"
     )
     one.add_argument("--name", help="which material of a deck")
-    for name, meaning in ASSUMED.items():
-        one.add_argument(f"--{name}", type=float, help=f"{meaning} (as the paper's pads)")
+    for name, (value, meaning) in ASSUMED.items():
+        one.add_argument(f"--{name}", type=float, help=f"{meaning} (assumed: {value:g})")
     add_command(commands, "presets", list_presets, "list rubbers from the literature", PRESETS)
 
 
@@ -75,25 +75,33 @@ SIZES = {
     "area": "cross-section before the test [m2], which `force` is divided by",
 }
 ASSUMED = {
-    "nu": "Poisson's ratio [1], which no test in one dimension tells",
-    "rho": "density [kg/m3], which no test tells",
-    "depth": "depth of the pads [m]",
-    "tau": "retardation time [s], which a pull does not tell",
+    "nu": (0.45, "Poisson's ratio [1], which no test in one dimension tells"),
+    "rho": (1100.0, "density [kg/m3], which no test tells"),
+    "depth": (44e-3, "depth of the pads [m]"),
+    "tau": (10e-3, "retardation time [s], which a pull does not tell"),
 }
+"""Numbers that a test may not tell: assumed values and meanings."""
 
 
 def fit_material(options: argparse.Namespace) -> int:
     """Read a material from a test or a deck, and write it."""
     from torchsoft.materials.written import FILES, printed, write
-    from torchsoft.paper.parameters import Parameters
+    from torchsoft.physics.material import KelvinVoigt
+    from torchsoft.quantity import quantities
 
     given = {name: getattr(options, name) for name in ASSUMED}
-    changes = {f"pad.{name}": x for name, x in given.items() if x is not None}
-    pad = Parameters().override(changes).pad
-    found = deck(options) if options.file.suffix.lower() == ".inp" else tested(options, pad.nu)
+    values = {name: value for name, (value, _) in ASSUMED.items()}
+    for name, value in given.items():
+        if value is not None:
+            try:
+                values[name] = quantities(KelvinVoigt)[name].check(value)
+            except ValueError as error:
+                raise ValueError(f"--{name} {error}") from None
+    nu = values["nu"]
+    found = deck(options) if options.file.suffix.lower() == ".inp" else tested(options, nu)
     assumed = {
-        name: getattr(pad, name)
-        for name in ASSUMED
+        name: value
+        for name, value in values.items()
         if name not in found.table() and (name != "tau" or found.kind == "kelvin_voigt")
     }
     for name, value in given.items():

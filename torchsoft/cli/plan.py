@@ -39,7 +39,7 @@ def plan(options: argparse.Namespace) -> int:
     from torchsoft.rigs.goal import Goal, plan_file
     from torchsoft.rigs.written import save
 
-    file, goal = RigFile.from_toml(options.rig), Goal.from_toml(options.goal)
+    file, goal = RigFile.from_toml(RigFile.path(options.rig)), Goal.from_toml(options.goal)
     known = None
     if options.answer is not None:
         from torchsoft.sysid.result import load_answer

@@ -59,7 +59,7 @@ def run_rig(options: argparse.Namespace) -> int:
     from torchsoft.solve.progress import SimulationFailed
 
     out: Path = options.out or Path("out") / options.file.stem
-    file = RigFile.from_toml(options.file)
+    file = RigFile.from_toml(RigFile.path(options.file))
     agree(
         cost(file, runs=True),
         options.yes,
@@ -97,7 +97,7 @@ def check_rig(options: argparse.Namespace) -> int:
     from torchsoft.rigs.check import check
     from torchsoft.rigs.run import cost
 
-    file = RigFile.from_toml(options.file)
+    file = RigFile.from_toml(RigFile.path(options.file))
     agree(cost(file, runs=False), options.yes, "take fewer elements")
     found = check(file)
     for one in found:

@@ -96,8 +96,8 @@ class Config(Table):
         if "rig" not in data and (old := [name for name in OUTDATED if name in data]):
             raise ValueError(
                 f"{old[0]} is of torchsoft 0.2.0 and before, which makes, checks and exports such "
-                "datasets; now every configuration names a rig file, for the paper's rig "
-                'rig = "rigs/paper.toml", and `fixed`, `parameters` and `kinds` speak of its tables'
+                'datasets; now every configuration names a rig, such as rig = "paper", and '
+                "`fixed`, `parameters` and `kinds` speak of its tables"
             )
         if not isinstance(data.get("rig"), Mapping):
             return data

@@ -1,7 +1,7 @@
 """The rig file of a dataset, embedded in its configuration, and places in it by name."""
 
 import base64
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,13 +12,13 @@ from pydantic.fields import FieldInfo
 
 from torchsoft.files import check_file
 from torchsoft.physics.energy import stores
-from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.quantity import metadata
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import NumberOr
-from torchsoft.rigs.written import Place, files_renamed
-from torchsoft.rigs.written import place as place_in
+from torchsoft.rigs.places import Place
+from torchsoft.rigs.places import place as place_in
+from torchsoft.rigs.written import files_renamed
 from torchsoft.solve.progress import Integrals
 from torchsoft.solve.trajectory import units
 from torchsoft.tables import line, read_toml, shown
@@ -40,7 +40,7 @@ def embedded(tree: Any, folder: Path) -> Any:
         return tree
     if not isinstance(name, str):
         raise ValueError(f"rig should be the name of a rig file, not {shown(name)}")
-    path, contents = folder / name, dict[str, str]()
+    path, contents = RigFile.path(name, folder), dict[str, str]()
     RigFile.from_toml(path)
 
     def stored(file: str) -> str:
@@ -106,22 +106,3 @@ def differs(one: Rig, other: Rig) -> str | None:
         if kind(one) != kind(other):
             return "the coordinates and energies of the rig"
     return None
-
-
-def channel_meanings(rig: Rig) -> Iterator[tuple[str, str]]:
-    """Every channel that a rig may have, and its meaning."""
-    rates = ("v_x", "v_y", "omega")
-    for name, symbol in rig.symbols.items():
-        for axis, rate in zip(COORDINATES, rates):
-            quantity = f"{axis} of the centre of mass of {name}"
-            quantity = f"rotation of {name}, anticlockwise" if axis == "theta" else quantity
-            yield f"{axis}_{symbol}", quantity
-            yield f"{rate}_{symbol}", f"rate of {axis} of {name}"
-        yield f"L_{symbol}", f"angular momentum of {name}"
-    for name in rig.signals:
-        yield name, f"motion {name}"
-        yield f"{name}_dot", f"rate of the motion {name}"
-    for name, actuator in rig.actuators.items():
-        yield f"F_{name}", f"effort of the actuator {name} on {actuator.pushes}"
-    for name in rig.pads:
-        yield f"M_{name}", f"moment of the pad {name} about the centre of its base"

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from torchsoft.datasets.distributions import Distribution, Kind
 from torchsoft.datasets.rig_files import (
-    channel_meanings,
     differs,
     hint,
     number_or_word,
@@ -29,9 +28,10 @@ from torchsoft.datasets.rig_files import (
 from torchsoft.datasets.schema import Label, Variable, arrays
 from torchsoft.physics.parts import PD, Actuator
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.setup import Setup
 from torchsoft.quantity import quantity
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.written import replaced
+from torchsoft.solve.formats import meanings
 from torchsoft.solve.trajectory import channels, units
 from torchsoft.tables import line, shown
 
@@ -132,9 +132,8 @@ class Subject:
         moments = {name: torch.zeros((), dtype=torch.float64) for name in rig.pads}
         with torch.no_grad():
             known = channels(rig, state, signals, moments)
-        of = units(rig)
-        meanings = {rig.renamed.get(key, key): meaning for key, meaning in channel_meanings(rig)}
-        return {key: Label(of[key], meanings[key]) for key in known}
+        of, named = units(rig), meanings(Setup.of(rig))
+        return {key: Label(of[key], named.get(key, f"motion {key}")) for key in known}
 
     @property
     def signals(self) -> dict[str, Label]:
@@ -204,10 +203,7 @@ class Subject:
     @property
     def constants(self) -> dict[str, Any]:
         """Parameters that all trajectories share, by name."""
-        rig = self.template
-        names = {own: name for name, own in rig.aliases.items()}
-        parameters: dict[str, Any] = rig.description()["parameters"]
-        values = {names.get(own, own): x for own, x in parameters.items()}
+        values: dict[str, Any] = self.template.description()["parameters"]
         return {name: x for name, x in values.items() if name not in self.config.parameters}
 
     @property
@@ -243,7 +239,7 @@ class Subject:
     def begin(self, task: Task) -> tuple[Rig, Tensor]:
         """The rig of a trajectory, ready to run, and its initial state (size,). Raises the errors
         of its static equilibrium."""
-        rig, y0, _ = replaced(self.kinds[task.kind][0], task.values).build()
+        rig, y0, _ = self.kinds[task.kind][0].override(task.values).build()
         return rig, rounded(rig, y0)
 
     def check(self) -> None:
@@ -355,7 +351,7 @@ class Drawn(NamedTuple):
         something that all trajectories share. `moves` says that they belong to motions only."""
         template = self.subject.template
         try:
-            file = replaced(self.file, values)
+            file = self.file.override(values)
             rig = template if moves else file.assemble()
             file.reference({name: np.zeros(3) for name in rig.bodies}, lambda *_: 0.0)
         except ValueError as error:
@@ -369,7 +365,7 @@ def with_fixed(file: RigFile, fixed: Mapping[str, Any], where: str) -> RigFile:
     for name, value in fixed.items():
         try:
             place(file, name)
-            file = replaced(file, {name: value})
+            file = file.override({name: value})
         except ValueError as error:
             raise ValueError(f"{where}.{line(name, 80)}: {error}") from None
     return file

@@ -13,8 +13,7 @@ from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, positive, whole
 from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import BuiltRig
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
 from torchsoft.solve.stepper import ImplicitStepper
@@ -95,7 +94,7 @@ class Dynamics:
     """
 
     def __init__(
-        self, built: BuiltRig[Rig], *, actions: Ranges, observations: Ranges, interval: float,
+        self, built: BuiltRig, *, actions: Ranges, observations: Ranges, interval: float,
         goal: Goal | None, reward: Reward | None, begin: float, samples: int,
         solver: Mapping[str, Any], disturbances: Ranges,
     ) -> None:  # fmt: skip

@@ -23,11 +23,9 @@ from torchsoft.display import suggestion
 from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, check_names, checked
 from torchsoft.parallel import cores, executor, parallel_map
 from torchsoft.physics.arguments import number, whole
-from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.plot.scene import Scene, force_scale, instants
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.written import replaced
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.trajectory import Trajectory
@@ -72,14 +70,14 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata = {"render_modes": list(get_args(Mode)), "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
 
     def __init__(
-        self, rig: RigFile | BuiltRig[Rig] | str | Path, *, actions: Ranges,
+        self, rig: RigFile | BuiltRig | str | Path, *, actions: Ranges,
         observations: Ranges, interval: float = 0.1, goal: Goal | None = None,
         reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
         bounds: Ranges | None = None, held: Sequence[str] = (), failure_reward: float = -1.0,
         parameters: Ranges | None = None, disturbances: Ranges | None = None, samples: int = 1,
         judged: bool = False, render_mode: Mode | None = None,
     ) -> None:  # fmt: skip
-        self._file = RigFile.from_toml(rig) if isinstance(rig, str | Path) else rig
+        self._file = RigFile.from_toml(RigFile.path(rig)) if isinstance(rig, str | Path) else rig
         if not isinstance(self._file, RigFile | BuiltRig):
             raise ValueError(
                 "`rig` must be a rig file, its path, or a rig with its start (`BuiltRig`), but is "
@@ -134,7 +132,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         for name, ends in checked("parameters", ranges, ranges, "").items():
             for end in ends:
                 try:
-                    replaced(file, {name: float(end)})  # pyright: ignore[reportArgumentType]
+                    file.override({name: float(end)})  # pyright: ignore[reportArgumentType]
                 except ValueError as error:
                     raise ValueError(f"`parameters[{name!r}]` = {end:g}: {error}") from None
         return dict(ranges)
@@ -150,9 +148,9 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         check_names("held", names, slices, "there are")
         return {body: slices[body] for body in names}
 
-    def _built(self, values: Mapping[str, float]) -> BuiltRig[Rig]:
+    def _built(self, values: Mapping[str, float]) -> BuiltRig:
         if isinstance(self._file, RigFile):
-            return (replaced(self._file, values) if values else self._file).build()
+            return self._file.override(values).build()
         return self._file
 
     @torch.no_grad()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft import csvfile
-from torchsoft.channels import UNITS
+from torchsoft.csvfile import UNITS
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.material import INSTANT
 

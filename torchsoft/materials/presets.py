@@ -6,9 +6,8 @@ fitted to a relaxation or creep test, or identified.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-from torchsoft.paper.parameters import Parameters, Source
 from torchsoft.physics.material import KelvinVoigt
 
 GENT = (
@@ -25,6 +24,9 @@ JOHNSTON = (
 )
 SMOOTH_ON = "Smooth-On Inc., Dragon Skin series, technical bulletin"
 
+RHO, TAU = 1100.0, 10e-3
+"""Assumed density [kg/m3] and retardation time [s]."""
+
 SHORE_A = (20.0, 80.0)
 """Hardnesses for which the relation between Shore A and Young's modulus is taken: at the ends of
 the scale it is not one."""
@@ -34,7 +36,7 @@ class Coefficient(NamedTuple):
     """A number of a preset [SI], whether it is published, and where, or why it was assumed."""
 
     value: float
-    source: Source
+    source: Literal["published", "assumed"]
     origin: str
 
 
@@ -76,18 +78,13 @@ class Preset:
 
 def preset(name: str, E: float, origin: str) -> Preset:
     """A rubber of a published modulus [Pa]; the rest is assumed."""
-    pad = Parameters().pad
     return Preset(
         name,
         {
             "E": Coefficient(E, "published", origin),
             "nu": Coefficient(0.49, "assumed", "nearly incompressible, as rubber is"),
-            "rho": Coefficient(
-                pad.rho, "assumed", "as the paper's pads; counts for inertial ones only"
-            ),
-            "tau": Coefficient(
-                pad.tau, "assumed", "as the paper's pads; fit it to a test, or identify it"
-            ),
+            "rho": Coefficient(RHO, "assumed", "of silicone; counts for inertial pads only"),
+            "tau": Coefficient(TAU, "assumed", "fit it to a test, or identify it"),
         },
     )
 

@@ -66,7 +66,7 @@ def stored(
             energies[f"kinetic_{name}"] = 0.5 * (
                 pad.masses()[:, None] * state.rates[name] ** 2
             ).sum((-2, -1))
-    return {rig.renamed.get(name, name): value for name, value in energies.items()}
+    return energies
 
 
 def stores(rig: Rig) -> tuple[str, ...]:
@@ -75,7 +75,7 @@ def stores(rig: Rig) -> tuple[str, ...]:
     for name, axes in rig.layout.free.items():
         names += [name] * any(axis < 2 for axis in axes) + [f"{name}_spin"] * (2 in axes)
     names += [f"kinetic_{name}" for name, pad in rig.pads.items() if pad.inertial]
-    return tuple(rig.renamed.get(name, name) for name in names)
+    return tuple(names)
 
 
 def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:

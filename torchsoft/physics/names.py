@@ -64,13 +64,18 @@ def check_names(kind: str, names: Iterable[object], dotted: bool = False) -> Non
 
 
 def rate_channel(key: str) -> str:
-    """The key of a coordinate's rate by the coordinate's own, before a rig renames either."""
+    """Channel of a coordinate's rate, from the coordinate's own."""
     return f"omega{key.removeprefix('theta')}" if key.startswith("theta") else f"v_{key}"
 
 
+def effort_channel(actuator: str) -> str:
+    """Channel of an actuator's effort."""
+    return f"effort_{actuator}"
+
+
 def declared(rig: "Rig") -> Iterator[tuple[str, str, str]]:
-    """Key, SI unit and owner of every channel, before a rig renames it; a signal's unit follows
-    from its use, and one with several uses comes several times."""
+    """Name, SI unit and owner of every channel; a signal's unit follows from its use, and one with
+    several uses comes several times."""
 
     def signal(name: str, unit: str) -> Iterator[tuple[str, str, str]]:
         yield name, unit, f"the motion `{name}`"
@@ -83,13 +88,13 @@ def declared(rig: "Rig") -> Iterator[tuple[str, str, str]]:
             yield rate_channel(key), f"{unit}/s", f"the rate of {name}.{axis}"
             if rig.bodies[name].freedom[axis] == "driven":
                 yield from signal(f"{name}.{axis}", unit)
-        yield f"L_{symbol}", "kg.m2/s", f"the angular momentum of the body `{name}`"
+        yield f"angular_momentum_{symbol}", "kg.m2/s", f"the angular momentum of the body `{name}`"
     for name, actuator in rig.actuators.items():
         for coordinate, setpoint in actuator.follows:
             yield from signal(setpoint, coordinate_unit(coordinate))
         if actuator.feed_forward is not None:
             yield from signal(actuator.feed_forward, actuator.effort_unit)
-        yield f"F_{name}", actuator.effort_unit, f"the effort of the actuator `{name}`"
+        yield effort_channel(name), actuator.effort_unit, f"the effort of the actuator `{name}`"
     for name in rig.pads:
         yield f"M_{name}", "N.m", f"the moment on the pad `{name}`"
 
@@ -124,7 +129,7 @@ def junctions(rig: "Rig") -> Iterator[tuple[str, str]]:
 
 def check_unique(rig: "Rig") -> None:
     """Raises `ValueError` where two of a rig's channels, arrays or junctions have one name."""
-    channels = ((rig.renamed.get(key, key), owner) for key, _, owner in declared(rig))
+    channels = ((key, owner) for key, _, owner in declared(rig))
     for what, entries in (
         ("junction", junctions(rig)),
         ("channel", (*channels, *arrays(rig))),

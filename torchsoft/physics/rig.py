@@ -153,10 +153,13 @@ class Rig(Shown, nn.Module):
         return {name: one for name, one in self.actuators.items() if one.is_loop}
 
     aliases: Mapping[str, str] = {}
-    """Other names of parameters."""
+    """Parameters by their names in the rig file."""
 
-    renamed: Mapping[str, str] = {}
-    """Other names of channels and energies."""
+    short: Mapping[str, str] = {}
+    """Parameters and channels by their short names; a convenience of typing, in no result."""
+
+    tables: Mapping[str, Any] | None = None
+    """Tables of the rig file that it was built from, None for a rig with other parts."""
 
     extended: Mapping[str, str] = {}
     """Parameters that were added to the rig, by name."""
@@ -179,13 +182,20 @@ class Rig(Shown, nn.Module):
         the bodies, with massless pads settled around them:
         `rig.state(disc={"x": 0.06, "y": "rest"}, bracket={"x": 0.06, "y": 0.05})`.
 
-        y and theta may be "rest": where the body lies under its weight, the loops open. theta and
-        the rates are zero where they are not given. Differentiable. Raises `ValueError` for names
-        and coordinates that do not fit, `NoEquilibrium` where there is no rest.
+        y and theta may be "rest": where the body lies under its weight, the loops open. y may be
+        "touch": where the pads bonded to the body, undeformed, come down upon what they touch;
+        {"depth": d}: lower than that by d [m]; {"force": F}: where the body is in balance when it
+        is pushed down by F [N]. theta and the rates are zero where they are not given.
+        Differentiable. Raises `ValueError` for names and coordinates that do not fit,
+        `NoEquilibrium` where there is no rest.
         """
-        from torchsoft.physics.statics import start
+        from torchsoft.physics.start import start
 
         return start(self, {**(bodies or {}), **more})
+
+    def full(self, name: str) -> str:
+        """The full name of a parameter or channel."""
+        return self.short.get(name, name)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         from torchsoft.physics.summary import summary
@@ -193,9 +203,9 @@ class Rig(Shown, nn.Module):
         return summary(self)
 
     def parameter(self, name: str) -> Tensor:
-        """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that
-        is not there."""
-        known = dict(self.named_parameters(remove_duplicate=False))
+        """A parameter by its name, in the module, the rig file or `short`. Raises `ValueError` for
+        one that is not there."""
+        known, name = dict(self.named_parameters(remove_duplicate=False)), self.full(name)
         found = known.get(self.names.get(name, name), known.get(name))
         if found is None:
             mine = {own: other for other, own in self.names.items()}
@@ -207,6 +217,7 @@ class Rig(Shown, nn.Module):
 
     def quantity(self, name: str) -> Quantity | None:
         """Unit, bounds and meaning of a parameter by its name, where its part declares them."""
+        name = self.full(name)
         owner, _, last = self.names.get(name, name).rpartition(".")
         part = self.get_submodule(owner)
         found = quantity_of(part, last)

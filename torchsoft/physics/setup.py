@@ -14,6 +14,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from torchsoft.physics.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
 from torchsoft.physics.mesh.mesh import gradients, strains
+from torchsoft.physics.names import effort_channel
 from torchsoft.physics.pads import contact_points, shape_functions
 from torchsoft.physics.rig import Rig
 
@@ -161,12 +162,13 @@ class ActuatorSetup:
 
 @dataclass(frozen=True)
 class Setup:
-    """Bodies, pads, contacts and actuators as a run had them."""
+    """Bodies, pads, contacts and actuators as a run had them, and short names of channels."""
 
     bodies: dict[str, BodySetup] = field(default_factory=dict)
     pads: dict[str, PadSetup] = field(default_factory=dict)
     contacts: dict[str, ContactSetup] = field(default_factory=dict)
     actuators: dict[str, ActuatorSetup] = field(default_factory=dict)
+    short: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     @torch.inference_mode(False)  # outlines need torch's graphs
@@ -178,11 +180,7 @@ class Setup:
                 name: BodySetup(
                     None if body.shape is None else body.shape.outline().detach().numpy().copy(),
                     dict(body.freedom),
-                    {
-                        axis: rig.renamed.get(key, key)
-                        for axis in body.freedom
-                        for key in [f"{axis}_{rig.symbols[name]}"]
-                    },
+                    {axis: f"{axis}_{rig.symbols[name]}" for axis in body.freedom},
                 )
                 for name, body in rig.bodies.items()
             },
@@ -207,11 +205,12 @@ class Setup:
             },
             actuators={
                 name: ActuatorSetup(
-                    one.pushes, rig.renamed.get(f"F_{name}", f"F_{name}"), one.effort_unit,
+                    one.pushes, effort_channel(name), one.effort_unit,
                     {at: signal for at, signal in one.follows if signal != one.feed_forward},
                 )
                 for name, one in rig.actuators.items()
             },
+            short=dict(rig.short),
         )  # fmt: skip
 
     def plain(self) -> dict[str, Any]:
@@ -229,6 +228,7 @@ class Setup:
             "pads": {name: rest(one, ("mesh",)) for name, one in self.pads.items()},
             "contacts": {name: rest(one) for name, one in self.contacts.items()},
             "actuators": {name: rest(one) for name, one in self.actuators.items()},
+            "short": self.short,
         }
 
     @classmethod
@@ -248,4 +248,5 @@ class Setup:
             pads,
             {name: ContactSetup(**one) for name, one in plain["contacts"].items()},
             {name: ActuatorSetup(**one) for name, one in plain["actuators"].items()},
+            plain.get("short", {}),
         )

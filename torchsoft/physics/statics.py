@@ -8,23 +8,17 @@ points' given stretches.
 """
 
 from collections.abc import Container, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from torchsoft.display import suggestion
 from torchsoft.parallel import one_torch_thread
-from torchsoft.physics.arguments import number, tensor
-from torchsoft.physics.contact import turned
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.pads import nodal_forces
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.validity import check_array, check_points, check_values
-
-R = TypeVar("R", bound=Rig)
 
 RESIDUAL = 1e-13
 """Residual of an equilibrium [m]: the way that the loads left over would push."""
@@ -45,15 +39,6 @@ the edge of a contact."""
 
 ITERATIONS = 200
 """Steps of the search at the most: a body may start that many strides above its pad."""
-
-
-class BuiltRig(NamedTuple, Generic[R]):
-    """A rig with the reference that it follows, its state y0 (size,) at the start, and the times t
-    (T,) [s] of the outputs, the last of which is the end of the motion."""
-
-    rig: R
-    y0: Tensor
-    t: Tensor
 
 
 class NoEquilibrium(RuntimeError):
@@ -187,7 +172,7 @@ def unstretched(rig: Rig, batch: Sequence[int]) -> dict[str, Tensor]:
 def resting(
     rig: Rig, pose: Mapping[str, Tensor], free: Mapping[str, Sequence[int]] | None = None, *,
     signals: Tensor | None = None, actuators: Container[str] | None = None,
-    residual: float = RESIDUAL,
+    pushed: Mapping[str, Tensor] | None = None, residual: float = RESIDUAL,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Poses (3,) [m, m, rad] by body of a rig at rest, searched for from `pose`: the coordinates
     `free`, numbers by body (by default all that can move), are brought into balance, and all others
@@ -196,8 +181,9 @@ def resting(
     Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a
     body above its pad comes down to it. Done when a step is below `residual` [m], and at once where
     nothing is free. `actuators` names those that push, by default all, by `signals` (signals, 2),
-    by default the reference's at t = 0. Differentiable once in the given pose and in the rig's
-    parameters, by the implicit function theorem. Raises `NoEquilibrium` where there is no balance,
+    by default the reference's at t = 0; `pushed` are further loads (3,) [N, N, N.m] by body.
+    Differentiable once in the given pose, in these loads and in the rig's parameters, by the
+    implicit function theorem. Raises `NoEquilibrium` where there is no balance,
     and as `settled`.
     """
     check_points(rig)
@@ -238,6 +224,7 @@ def resting(
         state = State({}, unstretched(soft, batch), poses(q), {}, still)
         state = state._replace(pads={name: carried(soft, name, state) for name in soft.pads})
         net = net_loads(soft, state, followed.expand(*batch, -1, -1), actuators)
+        net |= {name: net[name] + load for name, load in (pushed or {}).items()}
         return torch.cat([net[name][..., axes] for name, axes in sought.items()], -1) / scale
 
     path: list[tuple[float, Tensor]] = []
@@ -286,115 +273,3 @@ def stalled(path: Sequence[tuple[float, Tensor]], stride: float) -> bool:
     before, last = path[:-STALLED], path[-STALLED:]
     near = float((last[-1][1] - last[0][1]).norm()) <= stride
     return near and min(size for size, _ in last) >= min(size for size, _ in before)
-
-
-# A rig's state from coordinates of its bodies: placed, moving, or at rest on pads.
-
-
-REST = "rest"
-"""The word for a coordinate that is solved for."""
-
-RATES = {"v_x": "x", "v_y": "y", "omega": "theta"}
-"""Rates by name, and the coordinates that they are of."""
-
-UPWARDS = 0.5
-"""Least upward part of the normal of a pad that something may rest on."""
-
-
-def start(rig: Rig, bodies: Mapping[str, Mapping[str, Any]]) -> Tensor:
-    """Implementation of `Rig.state`."""
-    for name in bodies:
-        if name not in rig.bodies:
-            raise ValueError(
-                f"there is no body `{name}`; {suggestion(name, rig.bodies, 'the bodies are')}"
-            )
-    held, _ = rig.held(rig.follow(0.0))
-    pose = {name: list(at.unbind()) for name, at in held.items()}
-    at_rest: dict[str, list[int]] = {}
-    rates: dict[str, list[Tensor]] = {}
-    for name, body in rig.bodies.items():
-        given = checked(name, bodies.get(name, {}))
-        for i, axis in enumerate(COORDINATES):
-            rate = next(key for key, of in RATES.items() if of == axis)
-            if body.freedom[axis] != "free":
-                for key in {axis, rate} & given.keys():
-                    raise ValueError(
-                        f"`{key}` of `{name}` has no meaning: {axis} is {body.freedom[axis]}"
-                    )
-                continue
-            if axis not in given and axis != "theta":
-                raise ValueError(
-                    f"`{axis}` of `{name}` is missing: it is free, so say where it starts [m]"
-                    + (f', or "{REST}"' if axis == "y" else "")
-                )
-            if isinstance(place := given.get(axis, 0.0), str):
-                at_rest.setdefault(name, []).append(i)
-            else:
-                pose[name][i] = scalar(f"{name}.{axis}", place)
-            rates.setdefault(name, []).append(scalar(f"{name}.{rate}", given.get(rate, 0.0)))
-    places = {name: torch.stack(at) for name, at in pose.items()}
-    for name, axes in at_rest.items():
-        if 1 in axes:
-            places[name] = places[name] + torch.tensor([0.0, above(rig, places, name), 0.0])
-    if at_rest:
-        places = resting(
-            rig, places, at_rest, signals=torch.zeros(len(rig.signals), 2).double(), actuators=()
-        )
-    y = standing(rig, places)
-    if any(bool(v.any()) for at in rates.values() for v in at):
-        own = {("velocity", name): torch.stack(at) for name, at in rates.items()}
-        parts = {part: y[where] for part, where in rig.layout.slices.items()} | own
-        y = torch.cat([parts[part] for part in rig.layout.slices])
-    return y
-
-
-def checked(body: str, given: Any) -> Mapping[str, Any]:
-    """Coordinates and rates of a body by name. Raises `ValueError` for other names and values."""
-    if not isinstance(given, Mapping):
-        raise ValueError(
-            f"`{body}` must be given coordinates by name, such as {{'x': 0.06, 'y': '{REST}'}}, "
-            f"but is {given!r}"
-        )
-    for key, value in given.items():
-        if key not in (*COORDINATES, *RATES):
-            raise ValueError(
-                f"`{key}` is no coordinate of `{body}`; {suggestion(key, (*COORDINATES, *RATES))}"
-            )
-        if isinstance(value, str) and (value != REST or key not in ("y", "theta")):
-            allowed = f"a number or {REST!r}" if key in ("y", "theta") else "a number"
-            raise ValueError(f"`{key}` of `{body}` must be {allowed}, but is {value!r}")
-    return given
-
-
-def scalar(name: str, value: Any) -> Tensor:
-    """A finite number as a tensor, with its graph. Raises `ValueError`."""
-    out = tensor(name, value if isinstance(value, Tensor) else [number(name, value)]).squeeze()
-    if out.ndim or not bool(out.isfinite()):
-        raise ValueError(f"`{name}` must be one finite number, but is {value!r}")
-    return out
-
-
-@torch.no_grad()
-def above(rig: Rig, pose: Mapping[str, Tensor], body: str) -> float:
-    """A height [m] at which a body is clear of the pads under it. Raises `NoEquilibrium` where
-    there is none."""
-    shape, (x, _, theta) = rig.bodies[body].shape, pose[body]
-    heights = []
-    for contact in rig.contacts.values():
-        if contact.body != body or shape is None:
-            continue
-        pad = rig.pads[contact.pad]
-        base = torch.zeros(3, dtype=torch.float64) if pad.base is None else pose[pad.base]
-        points = turned(pad.point_positions, base[2]) + base[:2]
-        ways = torch.tensor([[0.0, -1.0], [-1.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-        below, left, right = shape.support(turned(ways, -theta)).tolist()
-        normal = turned(pad.axes[:, 1], base[2])
-        under = points[(points[:, 0] > x - left) & (points[:, 0] < x + right)]
-        if normal[1] > UPWARDS and len(under):
-            heights.append(float(under[:, 1].max()) + below)
-    if not heights:
-        raise NoEquilibrium(
-            f'`y` of `{body}` is "{REST}", but no pad that it has a contact with lies under x = '
-            f"{float(x):g} m; place it over one, or say at which height it starts"
-        )
-    return max(heights)

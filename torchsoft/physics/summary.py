@@ -85,11 +85,13 @@ def summary(rig: Rig) -> tuple[str, list[tuple[str, str]]]:
 
 def description(rig: Rig) -> dict[str, Any]:
     """Implementation of `Rig.description`."""
-    mine = {
-        name: value for name, value in rig.named_parameters() if not name.startswith("reference.")
-    }
+    names = {own: name for name, own in rig.names.items()}
     return {
-        "parameters": {name: value.detach().tolist() for name, value in mine.items()},
+        "parameters": {
+            names.get(own, own): value.detach().tolist()
+            for own, value in rig.named_parameters()
+            if not own.startswith("reference.")
+        },
         "friction": {
             name: law_name(contact.law.friction) for name, contact in rig.contacts.items()
         },

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from torchsoft.channels import CHANNELS
 from torchsoft.display import hidden, suggestion
 from torchsoft.files import replacing, save_text
 from torchsoft.physics.mesh import Array
@@ -334,8 +333,7 @@ def charts(run: Trajectory) -> list[dict[str, Any]]:
     shown = {one for body in run.setup.bodies.values() for one in body.channels.values()}
     for name, values in run.channels.items():
         if name not in shown and float(values.detach().abs().max()) > 0:
-            unit = run.units.get(name) or (CHANNELS[name].unit if name in CHANNELS else "")
-            group(name, unit, [(name, values.detach().numpy(), COLOURS[0])])
+            group(name, run.units.get(name, ""), [(name, values.detach().numpy(), COLOURS[0])])
     return [{"t": t}, *out]
 
 

@@ -19,13 +19,17 @@ from numba import njit
 from scipy.signal import cont2discrete
 from torch import Tensor, nn
 
-from torchsoft.channels import CHANNELS
 from torchsoft.codegen import compile_law
 from torchsoft.display import Shown
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 
-ALIASES = {"v_C": "v_x", "v_Br": "v_x_Br"}
-"""Channels by their names in a reduced model, which omit the only direction."""
+SYMBOLS = {
+    "x_C": ("x_C", "m"), "theta": (r"\theta", "rad"), "x_Br": ("x_{Br}", "m"),
+    "v_C": (r"\dot x_C", "m/s"), "omega": (r"\dot\theta", "rad/s"),
+    "v_Br": (r"\dot x_{Br}", "m/s"), "F_x": ("F_x", "N"), "x_d": ("x_d", "m"),
+    "x_d_dot": (r"\dot x_d", "m/s"),
+}  # fmt: skip
+"""LaTeX and unit of the variables of a reduced model."""
 
 BEYOND = 100.0
 """Largest state of a rollout, over the states' scale; beyond, it has diverged."""
@@ -42,8 +46,7 @@ HALVINGS = 8
 
 def symbol(name: str) -> tuple[str, str]:
     """LaTeX and unit of a variable; the name itself where there is no such channel."""
-    channel = CHANNELS.get(ALIASES.get(name, name))
-    return (channel.symbol, channel.unit) if channel else (name, name)
+    return SYMBOLS.get(name, (name, name))
 
 
 class Factor(NamedTuple):

@@ -8,13 +8,19 @@ import numpy as np
 import torch
 
 from torchsoft.display import Shown, amount, suggestion
-from torchsoft.reduced.ode import ALIASES, symbol
+from torchsoft.reduced.ode import symbol
 from torchsoft.solve.trajectory import Trajectory
 
 STATES = ("x_C", "theta", "x_Br", "v_C", "omega", "v_Br")
 KINEMATICS = {"x_C": "v_C", "theta": "omega", "x_Br": "v_Br"}
 VARIABLES = (*STATES, "F_x", "x_d", "x_d_dot")
 """Series of a record."""
+
+CHANNELS = {
+    "theta": ("theta_C",), "v_C": ("v_x_C", "v_x"), "omega": ("omega_C",), "v_Br": ("v_x_Br",),
+    "F_x": ("effort_x",),
+}  # fmt: skip
+"""Other names of series in a dataset of rigs/paper.toml, of this version or an older one."""
 
 EVEN = 1e-6
 """Largest difference between equal steps, over their size."""
@@ -79,7 +85,7 @@ def record(
     source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: float | None = None,
     disc: str = "disc", bracket: str = "bracket", measured: str | None = None,
 ) -> Record:  # fmt: skip
-    """A record of a run of any rig, or of series by their names in a dataset of the paper's rig (an
+    """A record of a run of any rig, or of series by name, or by the channels of `CHANNELS` (an
     `xarray.Dataset` of one trajectory or an item of `torchsoft.datasets.Trajectories`) at times t
     [s].
 
@@ -105,9 +111,9 @@ def record(
     if not keep.any():
         raise ValueError(f"`begin` = {begin:g} s is after the last sample, at {times[-1]:g} s")
     series = {}
-    channels = {name: ALIASES.get(name, name) for name in VARIABLES}
-    for name, channel in channels.items():
-        if channel not in source:
+    for name in VARIABLES:
+        channel = next((c for c in (name, *CHANNELS.get(name, ())) if c in source), None)
+        if channel is None:
             continue
         x = np.asarray(source[channel], dtype=float)[keep]
         if not np.isfinite(x).all():
@@ -118,7 +124,7 @@ def record(
             )
         series[name] = x
     if not series:
-        known = ", ".join(dict.fromkeys(channels.values()))
+        known = ", ".join(VARIABLES)
         raise ValueError(
             f"`source` has none of {known}; take a run, or give series by these names, as in "
             '{"x_C": data["x_disc"], ...}'
@@ -150,7 +156,7 @@ def _start(
 
 
 def _of_run(run: Trajectory, disc: str, bracket: str) -> tuple[dict[str, np.ndarray], str | None]:
-    """Series of a run by their names in a dataset, and the name of the coordinate that the loop of
+    """Series of a run, and the name of the coordinate that the loop of
     x_d measures."""
     setup, state = run.setup, run.state
     for field, name in (("disc", disc), ("bracket", bracket)):
@@ -165,9 +171,9 @@ def _of_run(run: Trajectory, disc: str, bracket: str) -> tuple[dict[str, np.ndar
         "x_C": state.pose[disc][:, 0],
         "theta": state.pose[disc][:, 2],
         "x_Br": state.pose[bracket][:, 0],
-        "v_x": state.velocity[disc][:, 0],
+        "v_C": state.velocity[disc][:, 0],
         "omega": state.velocity[disc][:, 2],
-        "v_x_Br": state.velocity[bracket][:, 0],
+        "v_Br": state.velocity[bracket][:, 0],
     }
     pushing = [one for one in setup.actuators.values() if one.pushes == f"{bracket}.x"]
     if pushing:

@@ -5,38 +5,31 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import torch
 from pydantic import Field, PrivateAttr, model_validator
-from torch import Tensor
+from pydantic.fields import FieldInfo
 
-from torchsoft.display import suggestion
+from torchsoft.display import Shown, suggestion
 from torchsoft.parallel import single_threaded
-from torchsoft.physics.material import Series
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
-from torchsoft.physics.names import check_names, check_unique
+from torchsoft.physics.names import check_names
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import (
-    BuiltRig,
-    NoEquilibrium,
-    massless,
-    net_loads,
-    resting,
-    standing,
-)
-from torchsoft.physics.validity import sound
-from torchsoft.quantity import Gravity, Quantity, Time
+from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed
+from torchsoft.physics.statics import NoEquilibrium, massless, net_loads, resting, standing
+from torchsoft.quantity import Gravity
+from torchsoft.rigs.assembly import assemble, too_stiff
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
-from torchsoft.rigs.fields import Group, at_field, called_alike, with_entry
-from torchsoft.rigs.geometry import AWAY, Scene, above, at, upon
+from torchsoft.rigs.fields import Group, called_alike, with_entry
+from torchsoft.rigs.geometry import at
 from torchsoft.rigs.motion import HELD, MotionContext, MotionTable, flattened
+from torchsoft.rigs.outputs import OutputsTable, SolverTable
 from torchsoft.rigs.parts import (
-    REST,
-    TOUCH,
     AnyPad,
     BodyTable,
     ContactTable,
@@ -44,20 +37,13 @@ from torchsoft.rigs.parts import (
     MaterialTable,
     TaxelsTable,
 )
-from torchsoft.solve.trajectory import units
+from torchsoft.rigs.places import entries, listed, place, replaced, unit
 from torchsoft.tables import LISTED, InvalidTable, from_toml, line
 
 M = TypeVar("M")
 
 ENTRY = re.compile(r"(.+?)((?:_\d+)+)")
 """Name of an entry of a list, such as tau_2."""
-
-ROWS = 1_000_000
-"""Most outputs of one run."""
-
-STIFF = 100.0
-"""Largest stiffness of a contact, over that of a point of its pad, at which a failed equilibrium is
-not blamed on the contact."""
 
 PARTS = (
     "bodies", "materials", "pads", "laws", "contacts", "taxels", "actuators", "controllers",
@@ -77,87 +63,21 @@ USED = {
 """Tables whose every entry must be named by others, with the naming table and field."""
 
 
-class OutputsTable(Group):
-    """Duration of the run, and files to be written."""
+READY = Path(__file__).with_name("ready")
+"""Folder of the ready rigs."""
 
-    duration: Annotated[float, Quantity("s", 1e-3, 1e5)] = Field(description="of the run")
-    interval: Annotated[float, Quantity("s", 1e-6, 1e3)] = Field(
-        default=0.01, description="between outputs"
-    )
-    figures: bool = Field(default=True, description="write the figures")
-    player: bool | None = Field(
-        default=None, description="write player.html; as figures says if not given"
-    )
-    snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
-        default=(),
-        description="times of the pictures in snapshots.png; six over the whole run if none is "
-        "given [s]",
-    )
-    video: Literal["gif", "mp4", "none"] = Field(
-        default="gif", description="kind of the video, or none; mp4 needs imageio-ffmpeg"
-    )
-    frames: Annotated[int, Field(ge=2, le=10_000)] = Field(
-        default=150, description="pictures of the video, 12 a second"
-    )
-    follow: str = Field(
-        default="",
-        description='coordinate under the video, such as "disc.x"; the one that moves most if not '
-        "given",
-    )
+SOURCES = "published", "assumed"
+"""First words of a number's source."""
 
-    @model_validator(mode="after")
-    def _are_possible(self) -> Self:
-        if self.interval > self.duration:
-            raise ValueError(
-                f"interval = {self.interval:g} s is longer than duration = {self.duration:g} s"
-            )
-        if self.duration / self.interval > ROWS:
-            raise ValueError(
-                f"interval = {self.interval:g} s makes more than {ROWS} outputs in "
-                f"{self.duration:g} s"
-            )
-        if late := [time for time in self.snapshots if time > self.duration]:
-            raise ValueError(
-                f"snapshots: {late[0]:g} s is after the end of the run, duration = "
-                f"{self.duration:g} s"
-            )
-        return self
-
-    def times(self) -> Tensor:
-        """Output times [s]: equal intervals, and the times of snapshots."""
-        count = max(1, round(self.duration / self.interval)) + 1
-        grid = torch.linspace(0, self.duration, count, dtype=torch.float64)
-        more = [t for t in self.snapshots if float((grid - t).abs().min()) > 1e-6]
-        return torch.cat((grid, torch.tensor(more, dtype=torch.float64))).sort().values
+Names = Annotated[tuple[str, ...], LISTED, Field(min_length=1)]
 
 
-class SolverTable(Group):
-    """Choice of steps: by tolerance, or equal ones."""
-
-    rtol: Annotated[float, Quantity("1", 1e-9, 1e-1)] | None = Field(
-        default=None, description="relative tolerance; 1e-5 if not given"
-    )
-    atol: Annotated[float, Quantity("1", 1e-12, 1.0)] | None = Field(
-        default=None,
-        description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given",
-    )
-    step: Annotated[float, Quantity("s", 1e-7, 1.0)] | None = Field(
-        default=None, description="equal steps no longer than this instead"
-    )
-    tolerance: Annotated[float, Quantity("N", 1e-10, 1e-3)] = Field(
-        default=1e-9, description="Newton's, on every nodal force"
-    )
-
-    @model_validator(mode="after")
-    def _choose_once(self) -> Self:
-        if self.step is not None and (self.rtol or self.atol) is not None:
-            raise ValueError(
-                "step and rtol (or atol) each say which steps to take; give one of them"
-            )
-        return self
+def ready() -> list[str]:
+    """Names of the ready rigs."""
+    return sorted(path.stem for path in READY.glob("*.toml"))
 
 
-class RigFile(Group):
+class RigFile(Shown, Group):
     """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa; 4.59e-3 is 4.59 mm. The model
     is planar: x to the right, y upwards, theta anticlockwise."""
 
@@ -172,7 +92,13 @@ class RigFile(Group):
     actuators: dict[str, ActuatorTable] = Field(default_factory=dict)
     controllers: dict[str, ControllerTable] = Field(default_factory=dict)
     motion: dict[str, MotionTable] = Field(default_factory=dict)
-    channels: dict[str, str] = Field(default_factory=dict)
+    names: dict[str, str | Names] = Field(
+        default_factory=dict,
+        description="short names of entries of the file and of channels, for typing",
+    )
+    sources: dict[str, str] = Field(
+        default_factory=dict, description="where numbers come from, published or assumed"
+    )
     outputs: OutputsTable
     solver: SolverTable = SolverTable()
     _folder: Path = PrivateAttr(default_factory=Path)
@@ -184,6 +110,27 @@ class RigFile(Group):
         return from_toml(path, lambda tree: cls.from_tree(tree, Path(path).parent))
 
     @classmethod
+    def ready(cls, name: str) -> Self:
+        """A ready rig, such as "paper". Raises `ValueError` naming those that there are."""
+        if name not in ready():
+            known = suggestion(name, ready(), "there are")
+            raise ValueError(f"there is no ready rig `{line(name, 80)}`; {known}")
+        return cls.from_toml(cls.path(name))
+
+    @staticmethod
+    def path(name: str | Path, folder: Path = Path()) -> Path:
+        """Path of a rig file that is named from a folder, or of a ready rig of that name. Raises
+        `ValueError` for a file that is not there."""
+        path = folder / name
+        if not path.exists() and str(name) in ready():
+            return READY / f"{name}.toml"
+        if not path.exists():
+            raise ValueError(
+                f"{path}: No such file or directory; the ready rigs are {', '.join(ready())}"
+            )
+        return path
+
+    @classmethod
     def from_tree(cls, tree: Any, folder: Path = Path()) -> Self:
         """Read from the parsed TOML of a file in `folder`. Raises `ValueError`."""
         if isinstance(tree, dict) and "motion" in tree:
@@ -192,11 +139,17 @@ class RigFile(Group):
         file._folder = folder
         return file
 
-    def override(self, **groups: dict[str, Any]) -> Self:
-        """A copy with some fields replaced: `override(outputs={"duration": 0.1}, pads={"lower":
-        {"elements_x": 30}})`. Entries of lists are counted from one: tau_2, or gain_1_3, the third
-        of the first row. A table of another kind replaces the old one as a whole. Raises
-        `ValueError`."""
+    def override(
+        self, values: Mapping[str, Any] | None = None, /, **groups: dict[str, Any]
+    ) -> Self:
+        """A copy with some entries replaced, by their names, full or short, or by tables:
+        `override({"materials.rubber.E": 1e6}, outputs={"duration": 0.1})`.
+
+        A name stands for what is there, of which nothing is left. Tables are merged with those that
+        are there; entries of lists in them are counted from one: tau_2, or gain_1_3, the third of
+        the first row; a table of another kind replaces the old one as a whole. What was replaced
+        loses its source. Raises `ValueError`.
+        """
 
         def merged(old: Any, new: Any) -> Any:
             both = isinstance(old, dict) and isinstance(new, dict)
@@ -212,16 +165,74 @@ class RigFile(Group):
                     out[key] = merged(old.get(key), value)
             return out
 
-        own = self.model_dump(exclude_unset=True)
+        file, own = self, self.model_dump(exclude_unset=True) if groups else {}
         try:
-            file = type(self).model_validate(merged(own, groups))
+            if groups:
+                file = type(self).from_tree(self._still_true(merged(own, groups)), self._folder)
         except InvalidTable as error:
             raise InvalidTable(f"{error}{called_alike(str(error), own, groups)}") from None
-        file._folder = self._folder
-        return file
+        if not values:
+            return file
+        full = {name: value for key, value in values.items() for name in file.full(key)}
+        return type(self).from_tree(file._still_true(replaced(file, full)), self._folder)
+
+    def _still_true(self, tree: dict[str, Any]) -> dict[str, Any]:
+        """Changed tables of this file, without sources of numbers that are others now and names of
+        entries that are gone."""
+
+        def value(name: str) -> Any:
+            node: Any = tree
+            for key in place(self, name).keys:
+                if key not in (node if isinstance(node, Mapping) else range(len(node or ()))):
+                    return None
+                node = node[key]
+            return listed(node)
+
+        old = {name: value for name, value, _ in entries(self)}
+        for name in tree.get("sources", {}).keys() & self.sources.keys():
+            if value(name) != listed(old[name]):
+                tree = tree | {"sources": {k: x for k, x in tree["sources"].items() if k != name}}
+        kept = {
+            short: full for short, full in tree.get("names", {}).items()
+            if short not in self.names
+            or all("." not in one or value(one) is not None for one in self.full(short))
+        }  # fmt: skip
+        return tree | ({"names": kept} if "names" in tree else {})
+
+    def full(self, name: str) -> tuple[str, ...]:
+        """What a name stands for: entries or a channel, itself if it is not a short one."""
+        found = self.names.get(name, name)
+        return (found,) if isinstance(found, str) else found
+
+    def table(self) -> dict[str, dict[str, Any]]:
+        """Every number that the file states, by its name: value, unit, source ("published" or
+        "assumed", and where) and meaning."""
+        hidden = "names.", "sources.", "outputs.", "title"
+        return {
+            name: {
+                "value": value, "unit": self._unit(name, field) or "1",
+                "source": self.sources.get(name, "assumed"), "meaning": field.description or "",
+            }
+            for name, value, field in entries(self)
+            if not name.startswith(hidden) and type(value) in (float, int, tuple)
+        }  # fmt: skip
+
+    def _unit(self, name: str, field: FieldInfo) -> str:
+        group, _, motion = name.partition(".")
+        if group == "motion" and name.endswith((".value", ".values", ".offset")):
+            return self.unit(motion.rpartition(".")[0])
+        return unit(field)
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        return f"RigFile: {self.title or 'a rig'}", [
+            (name, f"{line(row['value'], 40)} {row['unit']}; {row['source']}")
+            for name, row in self.table().items()
+        ]
 
     def __reduce__(self) -> Any:  # since tables of parts are no attributes of a module
         return _again, (type(self), self.model_dump(exclude_unset=True), self._folder)
+
+    __str__ = Shown.__repr__  # pyright: ignore[reportAssignmentType]
 
     @property
     def folder(self) -> Path:
@@ -273,9 +284,33 @@ class RigFile(Group):
             check_names(group, getattr(self, group), dotted=group == "motion")
         for name, body in self.bodies.items():
             check_names(f"bodies.{name}.symbol", [body.symbol] if body.symbol else [])
-        for name, new in self.channels.items():
-            check_names(f"channels.{name}", [new], dotted=True)
+        for short in self.names:
+            for name in self.full(short):
+                try:
+                    _ = "." not in name or place(self, name)
+                except ValueError as error:
+                    raise ValueError(f"names.{short}: {error}") from None
+        for name, text in self.sources.items():
+            if not text.startswith(SOURCES):
+                raise ValueError(
+                    f'sources.{name}: it should begin with "published" or "assumed", not '
+                    f"{line(text, 40)}"
+                )
+            try:
+                place(self, name)
+            except ValueError as error:
+                raise ValueError(f"sources.{error}") from None
         return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_names(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and "channels" in data:
+            raise ValueError(
+                "channels is not known: channels have one name each; say [names], the short name "
+                'first: theta = "theta_C"'
+            )
+        return data
 
     @model_validator(mode="after")
     def _names_are_there(self) -> Self:
@@ -380,80 +415,25 @@ class RigFile(Group):
                 )
         return self
 
-    def assemble(self) -> Rig:
-        """The rig without a reference. Raises `ValueError` with the field's name for parts that are
-        not physical."""
-        folder = self.folder
-
-        def made(group: str, build: Callable[[Any], M]) -> dict[str, M]:
-            found = {}
-            for name, table in getattr(self, group).items():
-                with at_field(f"{group}.{name}"):
-                    found[name] = sound(build(table))
-            return found
-
-        actuators = made("actuators", lambda one: one.build(folder))
-        for name, one in self.controllers.items():
-            with at_field(f"controllers.{name}"):
-                actuators |= one.build(name, folder)
-        materials = made("materials", lambda one: one.build(folder))
-        pads = made("pads", lambda one: one.build(materials[one.material], folder))
-        pressed = lambda law: [
-            pads[c.pad] for c in self.contacts.values() if self.laws[c.law] is law
-        ]
-        laws = made("laws", lambda one: one.numbers(pressed(one)).build(folder))
-        rig = Rig(
-            bodies=made("bodies", lambda one: one.build(folder)),
-            pads=pads,
-            contacts=made("contacts", lambda one: one.build(laws)),
-            actuators=actuators,
-            gravity=self.gravity,
-            symbols={name: one.symbol or name for name, one in self.bodies.items()},
-            taxels=made("taxels", lambda one: one.build(folder)),
-        )
-        known = units(rig)
-        for name in self.channels:
-            if name not in known:
-                raise ValueError(
-                    f"channels.{line(name, 80)}: the rig has no such channel; "
-                    f"{suggestion(name, known)}"
-                )
-        rig.renamed = dict(self.channels)
-        check_unique(rig)
-        named = {self._own_name(rig, *name.split(".")): name for name, _ in rig.named_parameters()}
-        rig.aliases = {alias: name for alias, name in named.items() if alias != name}
-        return rig
-
-    def _own_name(self, rig: Rig, group: str, part: str = "", *rest: str) -> str:
-        """Name in this file of a parameter of its rig, such as "materials.silicone.E"."""
-        made = {a: name for name, one in self.controllers.items() for a in one.actuators(name)}
-        if group == "pads" and rest[:1] == ("material",):
-            material = rig.pads[part].material
-            group, part, rest = "materials", self.pads[part].material, rest[1:]
-            if isinstance(material, Series):
-                last = re.sub(rf"^{material.symbol}(?=_\d)", material.strength, rest[-1])
-                rest = (*rest[:-1], last)
-        elif group == "contacts" and rest[:1] == ("law",):
-            group, part, rest = "laws", self.contacts[part].law, rest[1:]
-        elif part in made:
-            group, part = "controllers", made[part]
-            rest = tuple(one for one in rest if one not in ("law", "module", "feedback"))
-        elif group in ("actuators", "bodies"):
-            rest = tuple(one for one in rest if one not in ("law", "fixed"))
-        last = ["inertia" if name == "own_inertia" else name for name in rest]
-        return ".".join([group, part, *last] if part else [group])
+    def assemble(self, parts: Mapping[str, Any] | None = None) -> Rig:
+        """The rig without a reference; `parts` are as of `build`. Raises `ValueError` with the
+        field's name for parts that are not physical."""
+        return assemble(self, parts or {})
 
     @single_threaded()
     @torch.no_grad()
-    def build(self) -> BuiltRig[Rig]:
-        """The rig, its initial state and its output times, ready for `simulate(rig, t, y0=y0)`.
+    def build(self, parts: Mapping[str, Any] | None = None) -> BuiltRig:
+        """The rig, its initial state and its output times, ready to `run`.
 
-        Pads are settled around the bodies where these start. Raises `ValueError` with the field's
-        name: for motions that cannot be, recorded ones that cannot be read, bodies that find no
-        rest, and bodies too deep in a pad for it to settle.
+        `parts` are parts of your own, by the names of those that they replace: a friction law by
+        "laws.steel.friction", a shape by "bodies.disc.shape", any other by its table, such as
+        "materials.rubber". Pads are settled around the bodies where these start. Raises
+        `ValueError` with the field's name: for motions that cannot be, recorded ones that cannot be
+        read, bodies that find no rest, and bodies too deep in a pad for it to settle.
         """
-        rig = self.assemble()
-        pose = self._starts(rig)
+        rig = self.assemble(parts)
+        starts = {name: body.given for name, body in self.bodies.items()}
+        pose = self._starts(rig, starts)
         rig.reference = self.reference(pose, lambda *arguments: self._held(rig, pose, *arguments))
         try:
             y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
@@ -462,10 +442,8 @@ class RigFile(Group):
                 too_stiff(self, rig)
                 or f"bodies: the pads cannot settle where bodies start: {error}"
             ) from None
-        for name, body in self.bodies.items():
-            rates = [v for v, axis in zip(body.start.velocity, COORDINATES) if axis in body.free]
-            y0[rig.layout.slices["velocity", name]] = torch.tensor(rates, dtype=torch.float64)
-        return BuiltRig(rig, y0, self.outputs.times())
+        solver = self.solver.model_dump(exclude_none=True)
+        return BuiltRig(rig, moving(rig, y0, starts), self.outputs.times(), starts, solver)
 
     def reference(
         self, pose: Mapping[str, Array], held: Callable[[str, float], float]
@@ -510,30 +488,25 @@ class RigFile(Group):
                 moved.add((body, axis))
         return moved
 
-    def _starts(self, rig: Rig) -> dict[str, Array]:
-        """Initial poses (3,) [m, m, rad] by body, solved for where bodies rest or touch."""
-        pose = {name: np.zeros(3) for name in self.bodies}
+    def _starts(self, rig: Rig, starts: Starts) -> dict[str, Array]:
+        """Initial poses (3,) [m, m, rad] by body. Raises `ValueError` naming the field."""
+        held = {name: np.zeros(3) for name in self.bodies}
         for name, axis, kind in self.coordinates():
-            given = getattr(self.bodies[name].start, axis) if kind == "free" else kind
-            if given == TOUCH or not isinstance(given, str):
-                pose[name][COORDINATES.index(axis)] = AWAY if given == TOUCH else given or 0.0
-        self._follow(pose, 0.0, ("driven",))
-        for name, axes in (resting_axes := self.rests()).items():
-            if 1 in axes:
-                pose[name][1] = above(Scene(rig, pose), name)
+            if not isinstance(kind, str):
+                held[name][COORDINATES.index(axis)] = kind
+        self._follow(held, 0.0, ("driven",))
         try:
-            pose = self._rested(rig, pose, resting_axes)
+            pose = placed(rig, starts, {name: torch.from_numpy(x) for name, x in held.items()})
+        except NoPlace as error:
+            raise ValueError(f"bodies.{error.body}.start.{error.axis}: {error.reason}") from None
         except NoEquilibrium as error:
-            name, (axis, *_) = next(iter(resting_axes.items()))
+            name, (axis, *_) = next(iter(self.rests().items()))
             weight = self.bodies[name].weighted * rig.bodies[name].mass.item() * rig.gravity.item()
             reason = f"no rest under its weight of {weight:.3g} N is found; {error}"
             raise ValueError(
                 too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {reason}"
             ) from None
-        for name, body in self.bodies.items():
-            if body.y == "free" and body.start.y == TOUCH:
-                pose[name][1] = upon(Scene(rig, pose), name)
-        return pose
+        return {name: x.numpy() for name, x in pose.items()}
 
     def rests(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
         """Coordinates with the start "rest", by body, without those in `but`."""
@@ -578,18 +551,3 @@ class RigFile(Group):
 def _again(kind: type[RigFile], tree: Any, folder: Path) -> RigFile:
     """The rig file that was pickled."""
     return kind.from_tree(tree, folder)
-
-
-def too_stiff(file: RigFile, rig: Rig) -> str:
-    """Error message on a contact too stiff for its pad to be solved; empty if there is none."""
-    for name, contact in rig.contacts.items():
-        give = float(rig.pads[contact.pad].compliance().diagonal().max())
-        ratio = float((rig.weight(name) * contact.law.K_n).max()) * give
-        if ratio > STIFF:
-            law, K_n = file.contacts[name].law, contact.law.K_n.item()
-            return (
-                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as "
-                f"the pad `{contact.pad}` that it presses; take {K_n * STIFF / ratio:.1g} N/m or "
-                "less, the pad gives way long before the contact does"
-            )
-    return ""

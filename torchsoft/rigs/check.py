@@ -25,7 +25,7 @@ from torchsoft.rigs.geometry import Scene, at, collision, nodes, tied
 from torchsoft.rigs.gripped import LINEAR, Moment, drags, room
 from torchsoft.rigs.motion import ProfileTable
 from torchsoft.rigs.recorded import recordings
-from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, modes, strained
+from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, UNSTABLE, modes, strained
 from torchsoft.solve.kernel.arrays import PASSED
 
 # Checks of a rig in static equilibrium at some moments of its motions: room, strains, modes and
@@ -214,8 +214,7 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
                 "error", (*across, "actuators")[0],
                 f"the rig is unstable at t = {moment.time:.3g} s: its leading mode is "
                 f"{shown(growing)}, mostly of {moves}, and grows by a factor of e in "
-                f"{1 / growing.real:.2g} s; lower the gains, raise the pads' tau or E, or measure "
-                "what is pushed",
+                f"{1 / growing.real:.2g} s; {UNSTABLE}",
             )  # fmt: skip
             return
         decaying = values[values.real < -NEUTRAL]

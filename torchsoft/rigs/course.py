@@ -16,8 +16,9 @@ from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import BuiltRig, NoEquilibrium, resting
+from torchsoft.physics.statics import NoEquilibrium, resting
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.geometry import Scene, at, turned
 
 ALONG = 0.7
@@ -37,7 +38,7 @@ SAMPLES = 61
 class Estimate:
     """Estimated poses of a rig's bodies at any time of its run."""
 
-    def __init__(self, file: RigFile, ready: BuiltRig[Rig]) -> None:
+    def __init__(self, file: RigFile, ready: BuiltRig) -> None:
         self.file, self.rig, self.end = file, ready.rig, float(ready.t[-1])
         self.start = {
             name: x.detach().numpy().copy() for name, x in self.rig.unpack(ready.y0).pose.items()

@@ -13,23 +13,12 @@ from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
-from torchsoft.rigs.parts import REST, TOUCH
 
 FACING = -0.9
 """Scalar product of two surfaces' normals below which they face each other."""
 
 CORNERS = 1440
 """Number of points of an outline at which its curvature is computed."""
-
-UPWARDS = 0.1
-"""Least upward component of the normal of a pad that can carry a body."""
-
-AWAY = 100.0
-"""Height [m] of a body before its pads are lowered until they touch."""
-
-CLEAR, DESCENTS = 1e-16, 50
-"""Gap [m] between surfaces that just touch, above rounding errors, and the number of steps down to
-it."""
 
 Poses = Mapping[str, Array]
 """Poses (3,) [m, m, rad] by body."""
@@ -202,49 +191,3 @@ def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:
     pairs = ((rig.pads[rig.contacts[key].pad].base, rig.contacts[key].body) for key in contacts)
     graph.add_edges_from((base, body) for base, body in pairs if base is not None)
     return graph
-
-
-def above(scene: Scene, body: str) -> float:
-    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there
-    is no pad under it."""
-    below, *beside = (
-        scene.reach(body, np.array(way)) for way in ([0.0, -1.0], [-1.0, 0.0], [1.0, 0.0])
-    )
-    x, heights = float(scene.pose[body][0]), []
-    for key, contact in scene.rig.contacts.items():
-        at, pad = scene.points(key), scene.pad(key)
-        on = contact.body == body and scene.surface(key).normal[1] > UPWARDS
-        if not on or not at[:, 0].min() < x < at[:, 0].max():
-            continue
-        under = at[(at[:, 0] > x - beside[0]) & (at[:, 0] < x + beside[1])]
-        if not len(under):
-            raise ValueError(
-                f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of "
-                f"`{contact.pad}`, which are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; "
-                f"make it larger, or give pads.{contact.pad} more elements or points"
-            )
-        heights.append(float(under[:, 1].max()) + below)
-    if not heights:
-        raise ValueError(
-            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x '
-            f"= {x:g} m; "
-            "place it over one, or say at which height it starts"
-        )
-    return max(heights)
-
-
-def upon(scene: Scene, body: str) -> float:
-    """Height [m] at which the pads of a body, lowered from above, just touch. Raises `ValueError`
-    where they touch nothing."""
-    rig, pose = scene.rig, {name: x.copy() for name, x in scene.pose.items()}
-    own = [key for key, one in rig.contacts.items() if rig.pads[one.pad].base == body]
-    gap = np.inf
-    for _ in range(DESCENTS if own else 0):
-        gap = -max(Scene(rig, pose).pressed(key) for key in own)
-        pose[body][1] -= gap
-    if not abs(gap) < 1e-9:
-        raise ValueError(
-            f'bodies.{body}.start.y: "{TOUCH}", but no pad bonded to it comes down upon a body '
-            "that it has a contact with; place it over one, or say at which height it starts"
-        )
-    return float(pose[body][1]) + CLEAR

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
 from torchsoft.plan.planning import RTOL, Method, Robust
 from torchsoft.plan.problem import Free, Terms
 from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
@@ -84,11 +83,11 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def drawn(
     file: RigFile, goal: Goal, count: int, seed: int, known: Draws | None = None
-) -> tuple[BuiltRig[Rig], dict[str, Tensor], Tensor]:
+) -> tuple[BuiltRig, dict[str, Tensor], Tensor]:
     """The rig with the stated parameters; draws (1 + count, ...) of the uncertain ones by name, the
     stated values first, with the draws of `known` as given; and the initial states (1 + count,
     size). Raises `ValueError`."""
-    rng, every, known = np.random.default_rng(seed), list[BuiltRig[Rig]](), known or {}
+    rng, every, known = np.random.default_rng(seed), list[BuiltRig](), known or {}
     if twice := known.keys() & goal.uncertain.keys():
         raise ValueError(f"uncertain.{min(twice)} is drawn by the identification; leave it out")
     for i in range(1 + count):

@@ -11,11 +11,11 @@ from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 
 from torchsoft import csvfile
-from torchsoft.channels import UNITS
+from torchsoft.csvfile import UNITS
 from torchsoft.physics.motion import FADE, PERIODS, Piecewise, Profile, Sampled, Waves, wave
 from torchsoft.quantity import Quantity, Time
 from torchsoft.rigs.fields import Group, NumberOr
-from torchsoft.tables import LISTED, line, shown
+from torchsoft.tables import LISTED, SEED, line, shown
 
 START = "start"
 """The word for the initial value of the coordinate that follows a motion."""
@@ -245,6 +245,32 @@ class SinesTable(ModulatedMotion):
         return Waves(self.knots(context), *self.window(context), wave(*columns))
 
 
+class MultiSineTable(ModulatedMotion):
+    """Sines on top of a profile, one in each part of a band of frequencies; their phases, and their
+    places in the parts, are random."""
+
+    kind: Literal["multi_sine"] = "multi_sine"
+    amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(
+        description="of the sum, at most"
+    )
+    band: Annotated[tuple[Frequency, Frequency], LISTED] = Field(
+        description="lowest and highest frequency [Hz]"
+    )
+    components: Annotated[int, Field(ge=1, le=100)] = Field(default=5, description="how many sines")
+    seed: Annotated[int, Field(ge=0, le=SEED)] = Field(default=0, description="of what is random")
+
+    def fastest(self) -> float:
+        return max(self.band)
+
+    def build(self, context: MotionContext) -> Piecewise:
+        rng, n = np.random.default_rng(self.seed), self.components
+        low, high = np.log(self.band)
+        frequency = np.exp(low + (np.arange(n) + rng.random(n)) / n * (high - low))
+        phase = rng.uniform(0, 2 * np.pi, n)
+        waves = wave(np.full(n, self.amplitude / n), frequency, np.zeros(n), phase)
+        return Waves(self.knots(context), *self.window(context), waves)
+
+
 class ChirpTable(ModulatedMotion):
     """A sine on top of a profile, its frequency going from `first` to `last`."""
 
@@ -350,7 +376,14 @@ def read_column(
 
 
 MotionTable = Annotated[
-    HoldTable | ProfileTable | StrokesTable | SplineTable | SinesTable | ChirpTable | CsvTable,
+    HoldTable
+    | ProfileTable
+    | StrokesTable
+    | SplineTable
+    | SinesTable
+    | MultiSineTable
+    | ChirpTable
+    | CsvTable,
     Field(discriminator="kind"),
 ]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import torch
-from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
 from torchsoft.display import suggestion
 from torchsoft.materials.presets import PRESETS, from_shore_a
@@ -23,9 +23,11 @@ from torchsoft.physics.shapes import (
     Ellipse,
     RoundedBox,
     RoundedPolygon,
+    Shape,
     Superellipse,
 )
 from torchsoft.physics.shapes.contour import read_points
+from torchsoft.physics.start import RATES, REST, TOUCH
 from torchsoft.quantity import Angle, Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
 from torchsoft.rigs.fields import (
     AUTO,
@@ -73,21 +75,44 @@ else:
         ContourTable,
     )
 
-REST = "rest"
-"""The word for a coordinate that starts in equilibrium."""
 
-TOUCH = "touch"
-"""The word for the height at which a body's pads just touch the bodies under them."""
+class DepthTable(Group):
+    """A start below "touch"."""
+
+    depth: Annotated[float, Quantity("m", 0.0, 10.0)] = Field(
+        description="by which the pads of the body and those under it give way together"
+    )
+
+
+class ForceTable(Group):
+    """A start under a load."""
+
+    force: Annotated[float, Quantity("N", 0.0, 1e6)] = Field(
+        description="that presses the body down, besides its weight"
+    )
+
+
+def height(given: Any) -> str:
+    """Kind of a height that is given."""
+    table = given if isinstance(given, Mapping) else getattr(type(given), "model_fields", {})
+    return "force" if "force" in table else "depth" if table else "number"
 
 
 class StartTable(Group):
     """Free coordinates and rates of a body when the run begins."""
 
     x: Place | None = Field(default=None, description="centre of mass, to the right")
-    y: Annotated[float | str | None, NumberOr("m", REST, TOUCH, optional=True)] = Field(
+    y: Annotated[
+        Annotated[float | str | None, NumberOr("m", REST, TOUCH, optional=True), Tag("number")]
+        | Annotated[DepthTable, Tag("depth")]
+        | Annotated[ForceTable, Tag("force")],
+        Discriminator(height),
+    ] = Field(
         default=None,
         description='centre of mass, upwards; "rest": where it lies under its weight, the loops '
-        'off; "touch": where the pads bonded to it, undeformed, come down upon what they touch',
+        'off; "touch": where the pads bonded to it, undeformed, come down upon what they touch; '
+        "{depth = 1e-3}: lower than that [m]; {force = 20.0}: where it is in balance when it is "
+        "pressed down [N]",
     )
     theta: Annotated[float | str | None, NumberOr("rad", REST, optional=True)] = Field(
         default=None, description='anticlockwise, 0 if not given; "rest" as for y'
@@ -97,10 +122,6 @@ class StartTable(Group):
     omega: Annotated[float, Quantity("rad/s", -1e5, 1e5)] = Field(
         default=0.0, description="angular velocity"
     )
-
-    @property
-    def velocity(self) -> tuple[float, float, float]:
-        return self.v_x, self.v_y, self.omega
 
 
 class BodyTable(Group):
@@ -197,16 +218,25 @@ class BodyTable(Group):
                 )
         return self
 
-    def build(self, folder: Path) -> Body:
-        """The body. Raises `ValueError`."""
+    @property
+    def given(self) -> dict[str, Any]:
+        """Free coordinates and rates at the start, as `Rig.state` takes them."""
+        start = self.start.model_dump(exclude_unset=True, exclude_none=True)
+        known = zip(COORDINATES, RATES)
+        free = [name for pair in known if pair[0] in self.free for name in pair]
+        return {name: value for name, value in start.items() if name in free}
+
+    def build(self, folder: Path, own: Shape | None = None) -> Body:
+        """The body, with a shape of the user's `own`. Raises `ValueError`."""
         given: dict[str, Any] = {
             "inertia": self.inertia, "inertia_ratio": self.inertia_ratio, "weighted": self.weighted,
             **self.freedom,
         }  # fmt: skip
-        if self.shape is None:
+        if self.shape is None and own is None:
             return Body(self.mass or 1.0, **given)
         with at_field("shape"):
-            shape = self.shape.build(folder)
+            shape = own if self.shape is None or own is not None else self.shape.build(folder)
+        assert shape is not None
         if self.density is not None and self.depth is not None:
             return Body.uniform(shape, self.density, self.depth, **given)
         return Body(self.mass or 1.0, shape, **given)

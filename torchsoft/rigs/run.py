@@ -16,8 +16,8 @@ from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.mesh.mesh import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.diagnostics import SMALL_STRAIN, doubts, strained
 from torchsoft.solve.progress import SimulationFailed
@@ -35,7 +35,7 @@ FLOPS = 1e10
 class RunOutcome(NamedTuple):
     """A run, complete or up to its early end, and the cause of that end."""
 
-    ready: BuiltRig[Rig]
+    ready: BuiltRig
     trajectory: Trajectory
     stopped: SimulationFailed | Interrupted | None
 

@@ -1,17 +1,17 @@
 """A rig file as TOML text: every field with its unit and meaning from the schema as a comment;
-fields at their default are commented out. Fields by dotted names."""
+fields at their default are commented out."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
 
 from torchsoft.files import save_text
-from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.fields import Group, NumberOr
-from torchsoft.tables import Table, line, read_toml, toml_row
+from torchsoft.rigs.fields import Group
+from torchsoft.rigs.places import unit
+from torchsoft.tables import read_toml, toml_row
 
 
 def to_toml(file: RigFile) -> str:
@@ -20,8 +20,9 @@ def to_toml(file: RigFile) -> str:
     lines = [*heading(type(file)), "", *scalars(file, [], seen)]
     for name, field in type(file).model_fields.items():
         value = getattr(file, name)
-        if name == "channels" and value:
-            lines += ["", "[channels]", *(toml_row(f'"{key}"', own) for key, own in value.items())]
+        if name in ("names", "sources"):
+            rows = [toml_row(f'"{key}"', own) for key, own in value.items()]
+            lines += ["", f"[{name}]", *rows] if rows else []
         elif isinstance(value, Mapping):
             for key, table in value.items():
                 lines += ["", *(heading(type(table)) if type(table) not in seen else ())]
@@ -77,17 +78,8 @@ def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[
 
 def remark(field: FieldInfo) -> str:
     """Meaning and unit of a field."""
-    annotations = (*field.metadata, *metadata(field.annotation))
-    unit = next(
-        (
-            one.unit
-            for one in annotations
-            if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")
-        ),
-        "",
-    )
-    meaning = field.description or ""
-    return meaning if not unit or f"[{unit}]" in meaning else f"{meaning} [{unit}]"
+    own, meaning = unit(field), field.description or ""
+    return meaning if not own or f"[{own}]" in meaning else f"{meaning} [{own}]"
 
 
 def tables(annotation: Any) -> Iterator[type[Group]]:
@@ -123,63 +115,6 @@ def located(file: RigFile) -> RigFile:
     )
 
 
-# Access to fields of a rig file by dotted names.
-
-
-class Place(NamedTuple):
-    """A place in a rig file: keys of its tables, the value, and its field."""
-
-    keys: tuple[str | int, ...]
-    value: Any
-    field: FieldInfo
-
-
-def place(file: RigFile, name: str) -> Place:
-    """The place of a name such as "materials.silicone.E" or "motion.lift.values.2". Raises
-    `ValueError` for an unknown name."""
-    at: Any = file
-    keys, left, field = list[str | int](), name.split("."), FieldInfo()
-    while left:
-        here = ".".join(map(str, keys)) or "the rig file"
-        if isinstance(at, Table):
-            known, n = list(type(at).model_fields), 1
-            key: str | int = left[0]
-            if key in known:
-                field, at = type(at).model_fields[key], getattr(at, key)
-        elif isinstance(at, Mapping):  # names of motions may have dots in them
-            known = list(at)
-            n = next((n for n in range(len(left), 0, -1) if ".".join(left[:n]) in at), 1)
-            key = ".".join(left[:n])
-            at = at.get(key)
-        elif isinstance(at, tuple):
-            known, n = [str(i) for i in range(len(at))], 1
-            key = int(left[0]) if left[0] in known else left[0]
-            at = at[key] if isinstance(key, int) else at
-        else:
-            known, n, key = [], 1, left[0]
-        if str(key) not in known:
-            there = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
-            raise ValueError(
-                f"`{line(name, 80)}` is not in the rig file: {here} has {there or 'no parts'}"
-            )
-        keys, left = [*keys, key], left[n:]
-    return Place(tuple(keys), at, field)
-
-
-def replaced(file: RigFile, values: Mapping[str, Any]) -> RigFile:
-    """A copy of the rig file with other values at these names. Raises `ValueError`."""
-    tree, whole = (listed(file.model_dump(exclude_unset=some)) for some in (True, False))
-    for name, value in values.items():
-        *way, last = place(file, name).keys
-        node, full = tree, whole
-        for key in way:
-            if isinstance(node, dict) and key not in node:
-                node[key] = full[key]
-            node, full = node[key], full[key]
-        node[last] = value
-    return RigFile.from_tree(tree, file.folder)
-
-
 FILES = ("file", "network")
 """Fields of a rig file that name another file."""
 
@@ -195,10 +130,3 @@ def files_renamed(tree: Any, name: Callable[[str], str]) -> Any:
             for key, x in tree.items()
         }
     return [files_renamed(x, name) for x in tree] if isinstance(tree, list) else tree
-
-
-def listed(value: Any) -> Any:
-    """A copy with dictionaries and lists, which can be changed."""
-    if isinstance(value, dict):
-        return {key: listed(x) for key, x in value.items()}
-    return [listed(x) for x in value] if isinstance(value, list | tuple) else value

@@ -136,7 +136,7 @@ class Batch(Shown):
 @ungraphed
 def simulate_batch(
     rig: Rig | Sequence[Rig], t: Numbers, *,
-    parameters: Mapping[str, Numbers] | None = None, y0: Numbers | None = None,
+    parameters: Mapping[str, Numbers] | None = None, y0: Numbers,
     reference: Reference | Sequence[Reference] | None = None, knots: Sequence[Tensor] | None = None,
     dy0: Numbers | None = None, threads: int | None = None,
     progress: bool = False, **options: Any,
@@ -168,7 +168,7 @@ def simulate_batch(
         parameters,
         rig=(rig, isinstance(rig, nn.Module)),
         t=(t, isinstance(t, Tensor) and t.ndim == 1),
-        y0=(y0, y0 is None or (isinstance(y0, Tensor) and y0.ndim == 1)),
+        y0=(y0, isinstance(y0, Tensor) and y0.ndim == 1),
         reference=(reference, reference is None or isinstance(reference, nn.Module)),
         knots=(knots, knots is None),
         dy0=(dy0, dy0 is None or (isinstance(dy0, Tensor) and dy0.ndim == 2)),

@@ -6,13 +6,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsoft.paper.equilibrium import holding_force, press
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.energy import SLIPPING
-from torchsoft.physics.motion import Reference, hold
+from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import NoEquilibrium, standing
 from torchsoft.solve.steps import own_units
 from torchsoft.solve.trajectory import Trajectory
 
@@ -143,11 +142,9 @@ def softened(run: Trajectory, rig: Rig, name: str) -> str:
     )
 
 
-# Stability of the closed loop: the linearised modes of any rig about a state of rest, of the
-# grasped system about its own.
-#
-# The horizontal loop senses the disc and pushes the bracket, through two soft pads:
-# non-collocated, and unstable for many combinations of gains, pad stiffness and pad damping.
+# Stability of the closed loop: the linearised modes of a rig about a state of rest. A loop that
+# measures one body and pushes another through soft pads, non-collocated, is unstable for many
+# combinations of gains, stiffness and damping.
 
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
@@ -228,32 +225,29 @@ def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
     return Modes(values[order], moves)
 
 
+UNSTABLE = "lower the gains, raise the pads' tau or E, or measure what is pushed"
+"""Remedies for an unstable loop."""
+
+
 @torch.no_grad()
-def loop_modes(model: SoftGrasp) -> Tensor:
-    """Eigenvalues [1/s] of the linearised closed loop in the grasp, complex, the least stable
-    first.
-
-    The grasp is the frictionless equilibrium at the scenario's y_Br(t_g), with every touching node
-    sticking. Raises `NoEquilibrium` when that grasp does not exist.
-    """
-    y = press(model, model.settings.scenario.y_Br_grasp)
-    pose = model.unpack(y).pose
-    reference = hold(
-        x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y)
-    )
-    return modes(model, y, reference).values
-
-
-def describe_instability(model: SoftGrasp) -> str:
-    """A sentence on an unstable loop with its remedy; empty when the loop is stable."""
-    leading = complex(loop_modes(model)[0])
-    if leading.real <= NEUTRAL:
+def instability(rig: Rig, run: Trajectory) -> str:
+    """A sentence on an unstable loop with its remedy, from the modes about the poses in which the
+    contacts of a run carried most, each of them; empty where no mode grows there or none is
+    found."""
+    if not run.force or not rig.actuators or any(pad.inertial for pad in rig.pads.values()):
         return ""
-    names = [
-        name for name, _ in model.pads["L"].material.named_parameters() if name.startswith("tau")
-    ]
-    slower = ", ".join(f"pad.{name}" for name in names if name != "tau_instant")
+    least = torch.stack([force.detach()[..., 0].sum(-1) for force in run.force.values()]).amin(0)
+    k = int(least.argmax())
+    still = Reference(**{name: Profile([0.0], [float(run[name][k])]) for name in rig.signals})
+    try:
+        y = standing(rig, {name: pose[k].detach() for name, pose in run.state.pose.items()})
+    except NoEquilibrium:
+        return ""
+    values, moves = modes(rig, y, still)
+    if not len(values) or float(values[0].real) <= NEUTRAL:
+        return ""
+    leading = complex(values[0])
     return (
         f"the closed loop is unstable: its leading mode is {leading.real:+.3g} "
-        f"{leading.imag:+.3g}j 1/s; raise {slower} or pad.E, or lower control.K_81"
+        f"{leading.imag:+.3g}j 1/s, mostly of {moves}; {UNSTABLE}"
     )

@@ -12,7 +12,6 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchsoft.channels import CHANNELS
 from torchsoft.extras import needed
 from torchsoft.files import check_file, replacing
 from torchsoft.physics.mesh import Array, StoredMesh
@@ -86,7 +85,7 @@ def meanings(setup: Setup) -> dict[str, str]:
                 }
         if turns := body.channels.get("theta"):
             own = turns.removeprefix("theta_")
-            out[f"L_{own}"] = f"angular momentum of the body {name}"
+            out[f"angular_momentum_{own}"] = f"angular momentum of the body {name}"
     for name, one in setup.actuators.items():
         out[one.channel] = f"effort of the actuator {name} on {one.pushes}"
         for at, signal in one.follows.items():
@@ -98,11 +97,8 @@ def add_results(run: Trajectory, add: Add) -> None:
     """Results of the run."""
     time, named = ("time",), meanings(run.setup)
     for name, value in run.channels.items():
-        known = CHANNELS.get(name)
-        unit = run.units.get(name, known.unit if known else "")
         meaning = f"rate of {name[:-4]}" if name.endswith("_dot") else f"signal {name}"
-        meaning = named.get(name, known.meaning if known and known.unit == unit else meaning)
-        add(name, time, value, unit, meaning)
+        add(name, time, value, run.units.get(name, ""), named.get(name, meaning))
     for key, force in run.force.items():
         points = ("time", f"{key}_point")
         for i, kind in enumerate(("normal", "friction")):

@@ -13,8 +13,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft.paper.equilibrium import rest
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.parallel import one_torch_thread
 from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.energy import stored
@@ -22,7 +20,7 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.validity import check_array
-from torchsoft.solve.diagnostics import describe_instability, doubts
+from torchsoft.solve.diagnostics import doubts, instability
 from torchsoft.solve.gradients import (
     TAPE_BYTES,
     Rows,
@@ -76,7 +74,7 @@ class Interrupted(KeyboardInterrupt):
 @ungraphed
 @one_torch_thread()
 def simulate(
-    rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
@@ -85,7 +83,7 @@ def simulate(
     """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s]: tensors, numpy's arrays
     or lists, which are computed with in float64.
 
-    y0 defaults to the paper's rig at rest. `reference` is followed by the rig, its own by default.
+    `reference` is followed by the rig, its own by default.
 
     Steps are chosen so that the error of each stays below rtol times the largest value so far plus
     atol, which counts nodal forces in N, lengths in mm, angles in rad, and in a light or small rig
@@ -135,7 +133,7 @@ class Task(NamedTuple):
 
 
 def prepare(
-    rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
@@ -143,12 +141,11 @@ def prepare(
 ) -> Task:  # fmt: skip
     """Checks the arguments of `simulate`; raises its `ValueError`s."""
     t = tensor("t", t)
-    y0, knots, dy0 = (
-        None if x is None else tensor(name, x)
-        for name, x in (("y0", y0), ("knots", knots), ("dy0", dy0))
+    start = tensor("y0", y0)
+    knots, dy0 = (
+        x if x is None else tensor(name, x) for name, x in (("knots", knots), ("dy0", dy0))
     )
-    if y0 is not None:
-        check_array("y0", y0)
+    check_array("y0", start)
     _check_wanted(gradient, wrt, dy0, rigid, touch)
     ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
@@ -169,13 +166,9 @@ def prepare(
         tolerance=tolerance,
     )
     check_times(t, step)
-    if y0 is None:
-        if not isinstance(now, SoftGrasp):
-            raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
-        y0 = rest(now)
-    stepper.check_start(y0)
+    stepper.check_start(start)
     felt = _channels_of_touch(rig, touch)
-    return Task(stepper, t, shared(y0), gradient, tuple(wrt), dy0, rigid, felt, rig)
+    return Task(stepper, t, shared(start), gradient, tuple(wrt), dy0, rigid, felt, rig)
 
 
 class RunOutcome(NamedTuple):
@@ -312,12 +305,9 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor,
 def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
     """The failure with the run so far, and with the closed loop's instability as its cause if the
     loop is unstable."""
-    try:
-        cause = describe_instability(rig) if isinstance(rig, SoftGrasp) else ""
-    except RuntimeError:  # a rig that cannot grasp has no grasp to linearise
-        cause = ""
+    cause = instability(rig, trajectory)
     reason = (
-        f"the disc was lost at t = {failure.time:.4f} s: {cause} (the run ended with: {failure})"
+        f"the run was lost at t = {failure.time:.4f} s: {cause} (it ended with: {failure})"
         if cause
         else str(failure)
     )

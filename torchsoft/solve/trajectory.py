@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsoft.display import Shown, amount, suggestion
 from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.energy import contact_states
-from torchsoft.physics.names import FORCES, ON_BODY, declared, rate_channel
+from torchsoft.physics.names import FORCES, ON_BODY, declared, effort_channel, rate_channel
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
@@ -104,7 +104,9 @@ class Trajectory(Shown):
     known_contact_state: dict[str, Tensor] | None = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, channel: str) -> Tensor:
-        """A channel (T,). Raises `KeyError` naming those that are there."""
+        """A channel (T,), by its name or a short one. Raises `KeyError` naming those that are
+        there."""
+        channel = self.setup.short.get(channel, channel)
         if channel in self.channels:
             return self.channels[channel]
         touch = self.touch
@@ -115,6 +117,7 @@ class Trajectory(Shown):
         raise KeyError(f"the run has no channel `{channel}`; {known}, and of touch {more}")
 
     def __contains__(self, channel: object) -> bool:
+        channel = self.setup.short.get(str(channel), channel)
         return channel in self.channels or (self.touch is not None and channel in self.touch)
 
     def __iter__(self) -> Iterator[str]:
@@ -305,18 +308,17 @@ def channels(
         out |= zip(keys, pose.unbind(-1))
         out |= zip(map(rate_channel, keys), velocity.unbind(-1))
         if rig.bodies[name].freedom["theta"] == "free":
-            out[f"L_{symbol}"] = rig.bodies[name].inertia * velocity[..., 2]
+            out[f"angular_momentum_{symbol}"] = rig.bodies[name].inertia * velocity[..., 2]
     for i, name in enumerate(rig.signals):
         out[name], out[f"{name}_dot"] = signals[..., i, 0], signals[..., i, 1]
     for name in rig.actuators:
-        out[f"F_{name}"] = rig.actuator_effort(name, state, signals)
-    out |= {f"M_{name}": moment for name, moment in (moments or {}).items()}
-    return {rig.renamed.get(key, key): value for key, value in out.items()}
+        out[effort_channel(name)] = rig.actuator_effort(name, state, signals)
+    return out | {f"M_{name}": moment for name, moment in (moments or {}).items()}
 
 
 def units(rig: Rig) -> dict[str, str]:
     """SI unit of every channel, by its key."""
-    return {rig.renamed.get(key, key): unit for key, unit, _ in declared(rig)}
+    return {name: unit for name, unit, _ in declared(rig)}
 
 
 def measurable(rig: Rig) -> tuple[str, ...]:
@@ -327,8 +329,7 @@ def measurable(rig: Rig) -> tuple[str, ...]:
         for axis in axes:
             poses.append(f"{COORDINATES[axis]}_{rig.symbols[name]}")
             rates.append(rate_channel(poses[-1]))
-    keys = (*poses, *rates, *(f"F_{name}" for name in rig.actuators))
-    return tuple(rig.renamed.get(key, key) for key in keys)
+    return *poses, *rates, *map(effort_channel, rig.actuators)
 
 
 # Channels of touch: recorded forces of a run as read by sensors on pads, under them and at
@@ -411,7 +412,7 @@ class Touch:
             for key, unit in (
                 (f"{name}.force_x", "N"),
                 (f"{name}.force_y", "N"),
-                (rig.renamed.get(f"M_{name}", f"M_{name}"), "N.m"),
+                (f"M_{name}", "N.m"),
             )
         ] + [
             (f"{name}.{key}", unit)

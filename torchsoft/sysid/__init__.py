@@ -1,6 +1,5 @@
 """System identification: parameters of a rig from recordings, with their uncertainty."""
 
-from torchsoft.channels import MEASURED
 from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.fit import Unreachable
@@ -14,7 +13,6 @@ from torchsoft.sysid.synthetic import RIG, record
 from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
 
 __all__ = [
-    "MEASURED",
     "RIG",
     "Estimate",
     "IdentificationResult",

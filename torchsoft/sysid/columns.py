@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from torchsoft import csvfile
-from torchsoft.channels import UNITS
+from torchsoft.csvfile import UNITS
 from torchsoft.display import enumerated, nearest, suggestion
 from torchsoft.solve.formats import read_log
 from torchsoft.solve.trajectory import load

@@ -180,7 +180,7 @@ class Config(Table):
         if "rig" not in tree:
             raise ValueError(
                 'rig is missing: say rig = "FILE.toml", the rig file whose names [settings] and '
-                "[unknowns] have; rigs/paper.toml is the rig of the paper"
+                '[unknowns] have, or the name of a ready rig, such as "paper"'
             )
         compared = tree.get("compare")
         laws = compared.values() if isinstance(compared, dict) else ()

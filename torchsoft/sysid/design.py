@@ -15,10 +15,10 @@ from tqdm import tqdm
 
 from torchsoft import csvfile
 from torchsoft.display import hidden
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.plan.knots import Bounds, Moves, knots
 from torchsoft.plan.search import ProjectedAdam
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
@@ -247,7 +247,7 @@ FINER = 0.1
 
 
 def planned(
-    stated: Config, file: RigFile, built: BuiltRig[Any], name: str, rtol: float,
+    stated: Config, file: RigFile, built: BuiltRig, name: str, rtol: float,
     start: Beginning | None = None, **options: Any,
 ) -> Recording:  # fmt: skip
     """A planned recording of a file's rig, `built`, by a configuration, from a run with the
@@ -255,7 +255,7 @@ def planned(
     `SimulationFailed`."""
     plan, start = stated.rehearsal, start or stated.start
     if plan.duration is not None:
-        built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
+        built = replace(built, t=torch.tensor([0.0, plan.duration]).double())
     lead = start.lead if isinstance(start, Rest) else 0.0
     at_rest = Standing.of(built.rig, built.y0, lead, file.rests())
     return record(
@@ -270,7 +270,7 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
     Returns the configuration of their identification, whose search begins away from the truth, and
     the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot follow.
     """
-    file, plan = RigFile.from_toml(config.parent / stated.rig), stated.rehearsal
+    file, plan = RigFile.from_toml(RigFile.path(stated.rig, config.parent)), stated.rehearsal
     entries = stated.recordings or (Entry(name="rehearsal"),)
     paths, random = [], np.random.default_rng(plan.seed)
     for entry in entries:
@@ -438,7 +438,9 @@ def choose(
     """
     plan = stated.design
     with at_field("settings"):
-        file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)
+        file = RigFile.from_toml(RigFile.path(stated.rig, config.parent)).override(
+            **stated.settings
+        )
     files, made, failures = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
         with at_field(f"design.candidates.{name}"):

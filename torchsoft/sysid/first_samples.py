@@ -15,12 +15,12 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import cross
-from torchsoft.physics.parts import PD, Contact
+from torchsoft.physics.parts import COORDINATES, PD, Contact
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.start import above
 from torchsoft.physics.state import State
-from torchsoft.physics.statics import NoEquilibrium, settled
+from torchsoft.physics.statics import NoEquilibrium, resting, settled
 from torchsoft.solve.trajectory import measurable
 from torchsoft.sysid.initial_state import (
     LEAD,
@@ -43,8 +43,8 @@ WIDER = 4.0
 """Standard deviation of a prior over the error of that polynomial, whose noise is estimated from a
 few samples."""
 
-MIDWAY, FOLLOWED, SPEED = 2e-4, 1e-3, 0.05
-"""Standard deviations without a sensor: of a disc midway between two pads [m], of a coordinate that
+BALANCED, FOLLOWED, SPEED = 2e-4, 1e-3, 0.05
+"""Standard deviations without a sensor: of a body in balance on its pads [m], of a coordinate that
 follows a set-point [m], of a rate by which the contacts roll [m/s]. Those of angles are over the
 size of the body."""
 
@@ -62,7 +62,7 @@ def estimate_initial_state(
 
     Coordinates that `sensors` do not measure are `given`, by mean and standard deviation under the
     names of `MovingStart.bodies`, or assumed: a coordinate measured by an actuator follows its
-    set-point, the disc of the paper's rig lies midway between the pads or on the lower one, the
+    set-point, a height is that at which the body is in balance on its pads or between them, the
     angle of a round body is zero, and other rates are those by which the contacts roll.
 
     Raises `ValueError` for fewer than four early samples of a channel or two later ones, a
@@ -170,10 +170,8 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float, load: float) -> 
             out = {f"{body}.v_{axis}": (rate, SPEED / size)} | out | {name: (value, sd)}
         elif axis == "theta" and shape is not None and shape.round:
             out[name] = 0.0, 0.0
-        elif isinstance(rig, SoftGrasp) and name == "disc.y" and "bracket.y" in out:
-            p = rig.settings
-            highest = p.pad.height + p.disc.radius
-            out[name] = min(0.5 * (out["bracket.y"][0] - p.bracket.cm_height), highest), MIDWAY
+        elif axis == "y" and (height := balanced(rig, body, out, signals)) is not None:
+            out[name] = height, BALANCED
         else:
             raise ValueError(
                 f"no sensor tells where `{name}` is when the run begins: give its mean and "
@@ -182,6 +180,26 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float, load: float) -> 
     missing = [name for name in names if name not in out]
     out |= rolling(rig, out, missing, signals)
     return {name: out[name] for name in names}
+
+
+def balanced(rig: Rig, body: str, known: Mapping[str, Normal], signals: Tensor) -> float | None:
+    """Height [m] of a body in balance on its pads, with others at their known places; None where
+    these are not known, or there is no balance."""
+    pose = {name: x.clone() for name, x in rig.held(signals)[0].items()}
+    for name, axes in rig.layout.free.items():
+        for i in axes:
+            mean, _ = known.get(f"{name}.{COORDINATES[i]}", (0.0 if i == 2 else np.nan, 0.0))
+            pose[name][i] = mean
+    pose[body][1] = 0.0
+    if any(bool(x.isnan().any()) for x in pose.values()):
+        return None
+    try:
+        pose[body][1] = above(rig, pose, body)
+        still = torch.zeros_like(signals)
+        with torch.no_grad():
+            return float(resting(rig, pose, {body: [1]}, signals=still, actuators=())[body][1])
+    except NoEquilibrium:
+        return None
 
 
 def yielding(rig: Rig, coordinate: str) -> float:

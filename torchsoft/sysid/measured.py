@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.channels import UNITS
 from torchsoft.cost import RUN, Cost, rig_row, rig_step, steps_per_second
+from torchsoft.csvfile import UNITS
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
@@ -385,7 +385,7 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     stated = read_config(config) if stated is None else stated
     entries, tables = sources(data, config, stated), dict[str, Tables]()
     try:
-        file = RigFile.from_toml(config.parent / stated.rig)
+        file = RigFile.from_toml(RigFile.path(stated.rig, config.parent))
         columns = vocabulary(file.assemble(), stated.columns)
     except ValueError as error:
         raise ValueError(f"{config}, rig: {error}") from None

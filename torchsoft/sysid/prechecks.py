@@ -17,8 +17,8 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 from torchsoft.diagnostic import Diagnostic
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.motion import Sampled, spline_rates
+from torchsoft.physics.names import effort_channel
 from torchsoft.physics.parts import COORDINATES, Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import PREFIX
@@ -51,8 +51,7 @@ def found(code: str, recording: Recording, message: str, grave: bool = False) ->
 def channel(rig: Rig, name: str) -> str:
     """Channel of a coordinate such as "disc.x", or of the effort of an actuator such as "x"."""
     body, _, axis = name.partition(".")
-    own = f"{axis}_{rig.symbols[body]}" if axis else f"F_{body}"
-    return rig.renamed.get(own, own)
+    return f"{axis}_{rig.symbols[body]}" if axis else effort_channel(body)
 
 
 NOTICED = 0.2
@@ -537,10 +536,8 @@ def another_body(
                 evidence = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
             else:
                 continue
-            paper = isinstance(rig, SoftGrasp) and axis == "x"
-            senses = f'control.senses = "{other}"' if paper else f'measures = "{other}.{axis}"'
-            remedy = f" (say {senses})" if paper else f" (say {senses} of the actuator {loop})"
-            code = "control.senses" if paper else f"what {setpoint} is of"
+            remedy = f' (say measures = "{other}.{axis}" of the actuator {loop})'
+            code = f"what {setpoint} is of"
             text = (
                 f"{setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
                 f"or are {own} and {alternative} exchanged? ({evidence})"

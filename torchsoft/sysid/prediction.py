@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr
 from torch import Tensor
 
-from torchsoft.physics.names import rate_channel
+from torchsoft.physics.names import effort_channel, rate_channel
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout
 from torchsoft.solve.gradients import directions
@@ -133,48 +133,34 @@ def censored(z: Array) -> tuple[Array, Array]:
 def partner(rig: Rig, channel: str) -> tuple[str, float]:
     """The perpendicular channel, and the sign with which a rotated sensor sees it. Raises
     `ValueError`."""
-    names = {rig.renamed.get(key, key): key for key in every_key(rig)}
-    key = names.get(channel, channel)
+    known = measurable(rig)
     for a, b, sign in (
         ("x_", "y_", 1.0),
         ("y_", "x_", -1.0),
         ("v_x_", "v_y_", 1.0),
         ("v_y_", "v_x_", -1.0),
     ):
-        if key.startswith(a):
-            other = b + key.removeprefix(a)
-            if other in names.values():
-                return rig.renamed.get(other, other), sign
+        if channel.startswith(a) and (other := b + channel.removeprefix(a)) in known:
+            return other, sign
     for name, actuator in rig.actuators.items():
         body, axis = actuator.pushes.split(".")
         other = {"x": "y", "y": "x"}.get(axis)
         twin = next((k for k, a in rig.actuators.items() if a.pushes == f"{body}.{other}"), None)
-        if key == f"F_{name}" and twin is not None:
-            return rig.renamed.get(f"F_{twin}", f"F_{twin}"), 1.0 if axis == "x" else -1.0
+        if channel == effort_channel(name) and twin is not None:
+            return effort_channel(twin), 1.0 if axis == "x" else -1.0
     raise ValueError(
         f"sensors.{channel}.misalignment: `{channel}` has no channel at right angles that it could "
         "see"
     )
 
 
-def every_key(rig: Rig) -> list[str]:
-    """Keys of the free coordinates and their rates, before renaming."""
-    poses = [
-        f"{['x', 'y', 'theta'][i]}_{rig.symbols[b]}"
-        for b, axes in rig.layout.free.items()
-        for i in axes
-    ]
-    return [*poses, *map(rate_channel, poses)]
-
-
 def pushed(rig: Rig, channel: str) -> str:
     """Channel of the rate of the coordinate that an actuator pushes, by the channel of its effort.
     Raises `ValueError` for other channels."""
     for name, actuator in rig.actuators.items():
-        if channel == rig.renamed.get(f"F_{name}", f"F_{name}"):
+        if channel == effort_channel(name):
             body, axis = actuator.pushes.split(".")
-            key = rate_channel(f"{axis}_{rig.symbols[body]}")
-            return rig.renamed.get(key, key)
+            return rate_channel(f"{axis}_{rig.symbols[body]}")
     raise ValueError(f"sensors.{channel}.inertia: `{channel}` is not the force of an actuator")
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.display import Shown, amount, suggestion
-from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
 from torchsoft.solve.trajectory import Touch
@@ -95,12 +94,9 @@ def check_possible(recording: Recording, values: Mapping[str, float]) -> None:
     """Raises `ValueError` for parameter values that make the rig impossible."""
     # of a steep friction law, through which a search may pass
     with warnings.catch_warnings(action="ignore"):
-        if isinstance(recording.rig, SoftGrasp) and values.keys() <= NAMES.keys():
-            recording.rig.settings.override(dict(values))
-        else:
-            rig = deepcopy(recording.rig)
-            set_parameters(rig, values)
-            check_values(rig)
+        rig = deepcopy(recording.rig)
+        set_parameters(rig, values)
+        check_values(rig)
 
 
 class Reading(NamedTuple):

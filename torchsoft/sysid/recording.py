@@ -71,6 +71,8 @@ class Recording:
     def __post_init__(self) -> None:
         if not self.samples:
             raise ValueError(f"recording `{self.name}` has no samples")
+        full = {self.rig.full(channel): given for channel, given in self.samples.items()}
+        object.__setattr__(self, "samples", full)
         known, touch = measurable(self.rig), Touch(self.rig)
         for channel, (t, y) in self.samples.items():
             if channel not in known and channel not in touch:
@@ -227,6 +229,8 @@ def plain(part: nn.Module) -> str:
     }
     known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
     for name, value in vars(part).items():
+        if name in ("tables", "short"):  # which no run depends on
+            continue
         if isinstance(value, ARRAYS) or (not name.startswith("_") and isinstance(value, VALUES)):
             known[name] = stated(value)
     if isinstance(part, Pad):

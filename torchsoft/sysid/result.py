@@ -16,15 +16,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from torchsoft.display import Shown, suggestion
 from torchsoft.files import check_file, finite, save_text
-from torchsoft.paper.parameters import Parameters
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.rig import Rig
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.written import files_renamed
 from torchsoft.sysid.estimate import (
     ChannelResiduals,
     Contribution,
@@ -36,7 +37,7 @@ from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import Array, identity
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.sensitivity import AssumptionTest
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
@@ -48,8 +49,8 @@ class RecordedRig:
     laws before the fit (`description`), the `identified` parameters, and the values `began` of the
     start's coordinates.
 
-    `settings` are those from which `SoftGrasp` makes the same rig; None for another rig, or for
-    user-defined laws.
+    `tables` are those of the rig file that it was built from; None for a rig with parts of its own,
+    or with files beside its own.
     """
 
     name: str
@@ -60,38 +61,43 @@ class RecordedRig:
     start: str
     rig: str
     description: dict[str, Any]
-    settings: Parameters | None
+    tables: dict[str, Any] | None
     identified: dict[str, float]
     began: dict[str, float]
 
     @property
     def known(self) -> dict[str, Any]:
-        """Parameters and laws that were not identified, without those of a scenario."""
+        """Parameters and laws that were not identified."""
         return known(self.description, self.identified)
 
     def rebuilt(self) -> Rig:
-        """The rig before the fit, with a constant reference. Raises `ValueError` for user-defined
-        laws, which a file cannot hold."""
-        if self.settings is None:
+        """The rig before the fit, with the motions of its file. Raises `ValueError` for one with
+        parts of its own, which a file cannot hold."""
+        rig = None if self.tables is None else RigFile.from_tree(self.tables).build().rig
+        if rig is None or laws(rig.description()) != laws(self.description):
             raise ValueError(
                 f"the rig of recording `{self.name}` is a {self.rig} with parts of its own, which "
                 "the answer does not hold: build it as it was built for the fit, as in "
                 "RigFile.from_toml(FILE).build().rig, and call `applied_to(rig)`"
             )
-        return SoftGrasp(self.settings)
+        for name, value in self.description["parameters"].items():
+            with torch.no_grad():
+                rig.parameter(name).copy_(torch.tensor(value, dtype=torch.float64))
+        return rig
 
 
 def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str, Any]:
-    """A rig's description as one table, without the identified parameters and the scenario."""
+    """A rig's description as one table, without the identified parameters."""
     parameters = {
         name: value for name, value in description["parameters"].items() if name not in identified
     }
+    return parameters | laws(description)
+
+
+def laws(description: dict[str, Any]) -> dict[str, Any]:
+    """Laws, shapes and meshes of a rig's description as one table."""
     parts = {part: laws for part, laws in description.items() if part != "parameters"}
-    laws = {f"{part} of {name}": law for part, laws in parts.items() for name, law in laws.items()}
-    scenario = {
-        name for name in parameters if name.startswith("scenario.") and name != "scenario.gravity"
-    }
-    return {name: value for name, value in (parameters | laws).items() if name not in scenario}
+    return {f"{part} of {name}": law for part, laws in parts.items() for name, law in laws.items()}
 
 
 def undetermined(values: Mapping[str, float]) -> str:
@@ -100,34 +106,21 @@ def undetermined(values: Mapping[str, float]) -> str:
     return f"not identifiable from the data, and so only where the search ended: {listed}"
 
 
-def rebuildable(rig: Rig) -> bool:
-    """Whether `SoftGrasp` makes the same rig from its settings, and these are valid."""
-    if type(rig) is not SoftGrasp:
-        return False
-    settings = rig.settings
-    try:
-        with warnings.catch_warnings(action="ignore"):  # of a steep friction law
-            Parameters.model_validate(settings.model_dump())
-    except ValueError:
-        return False
-    return identity(SoftGrasp(settings)) == identity(rig)
-
-
 def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[RecordedRig]:
     """Every recording with its rig, at x (n,)."""
-    out, seen = list[RecordedRig](), dict[bytes, bool]()
+    out = list[RecordedRig]()
     for k, recording in enumerate(problem.recordings):
-        values, rig, key = problem.values(x, k), recording.rig, identity(recording.rig)
-        if key not in seen:
-            seen[key] = rebuildable(rig)
-        settings = rig.settings if isinstance(rig, SoftGrasp) and seen[key] else None
+        values, rig = problem.values(x, k), recording.rig
+        files = list[str]()  # beside the rig file, which an answer does not hold
+        files_renamed(dict(rig.tables or {}), lambda name, files=files: files.append(name) or name)
+        tables = None if rig.tables is None or files else dict(rig.tables)
         identified = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
         began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
         start = line(str(recording.start), 300)
         one = RecordedRig(
             recording.name, recording.name in fitted, recording.fingerprint,
             problem.samples([recording.name]), recording.duration, start, type(rig).__qualname__,
-            rig.description(), settings, identified, began,
+            rig.description(), tables, identified, began,
         )  # fmt: skip
         out.append(one)
     return out
@@ -136,7 +129,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
 # The result
 
 
-SCHEMA = "torchsoft-answer-5"
+SCHEMA = "torchsoft-answer-6"
 """Name and version of the file format."""
 
 
@@ -268,9 +261,8 @@ class IdentificationResult(Shown):
     def model(self, recording: str | None = None) -> Rig:
         """The identified rig, ready to run: that of a recording, which is needed where they differ.
 
-        The paper's rig from a file holds still until it is given a reference. Warns of parameters
-        that are not identifiable. Raises `ValueError` for a rig that a file cannot hold:
-        `applied_to` says what to do then.
+        Warns of parameters that are not identifiable. Raises `ValueError` for a rig that a file
+        cannot hold: `applied_to` says what to do then.
         """
         one = self.recorded(recording)
         rig = deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()

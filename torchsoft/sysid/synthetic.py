@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 
-from torchsoft.paper.rig import SoftGrasp
+from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import BuiltRig
+from torchsoft.physics.start import REST
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.sysid.initial_state import Standing, Start
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Grid, Recording
@@ -19,35 +19,37 @@ from torchsoft.sysid.unknowns import Sensor, by_channel
 RIG = {
     channel: Sensor(noise=noise)
     for channel, noise in (
-        ("x_C", 1e-5), ("y_C", 1e-5), ("theta", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5), ("F_x", 0.1),
-        ("F_y", 0.1),
+        ("x_C", 1e-5), ("y_C", 1e-5), ("theta_C", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5),
+        ("effort_x", 0.1), ("effort_y", 0.1),
     )
 }  # fmt: skip
-"""Sensors of a good rig: poses to 10 um and 0.5 mrad, forces to 0.1 N."""
+"""Sensors of rigs/paper.toml where they are good: poses to 10 um and 0.5 mrad, forces to 0.1 N."""
 
 RTOL = 1e-6
 """Relative tolerance of the runs behind synthetic recordings, a tenth of a fit's."""
 
 
 def record(
-    name: str, planned: BuiltRig[Any], truth: Mapping[str, float] | Rig,
+    name: str, planned: BuiltRig, truth: Mapping[str, float] | Rig,
     sensors: Mapping[str, Sensor], *, start: Start | None = None, rate: float = 200.0,
     rtol: float = RTOL, noise: float = 1.0, seed: int | np.random.Generator = 0,
 ) -> Recording:  # fmt: skip
     """A synthetic recording of a rig with the parameters of the `truth`, which follows the motion
     `planned`.
 
-    `planned` is the result of `RigFile.build` or, for the paper's rig, `excitation.begin`; `truth`
-    holds parameters that differ, by the names of `Rig.parameter`, or is a rig with other laws and
-    the same pads. The run begins at `start`, by default with bodies that stand as planned; the disc
-    of the paper's rig rests on the lower pad. Samples are taken at `rate` [Hz] from a run with the
-    tolerance `rtol`, with Gaussian noise of `noise` times each sensor's own. The recording holds
-    nothing of the truth but the samples. Raises `ValueError` for an unknown name or channel, and
-    `SimulationFailed`.
+    `planned` is the result of `RigFile.build`; `truth` holds parameters that differ, by the names
+    of `Rig.parameter`, or is a rig with other laws and the same pads. The run begins at `start`, by
+    default with bodies that stand, or rest, as planned. Samples are taken at `rate` [Hz] from a run
+    with the tolerance `rtol`, with Gaussian noise of `noise` times each sensor's own. The recording
+    holds nothing of the truth but the samples. Raises `ValueError` for an unknown name or channel,
+    and `SimulationFailed`.
     """
     rig, y0, t = planned
     sensors = by_channel([rig], sensors)
-    rests = {"disc": [1]} if isinstance(rig, SoftGrasp) else {}
+    rests = {
+        name: [COORDINATES.index(axis) for axis, value in given.items() if value == REST]
+        for name, given in planned.starts.items()
+    }
     begins = start or Standing.of(rig, y0, rests=rests)
     at = np.arange(float(t[0]), float(t[-1]) + 0.5 / rate, 1.0 / rate)
     made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)

@@ -49,7 +49,7 @@ def check_power(rig: Rig, y: Numbers, t: float = 0.0) -> None:
 
 
 def check_energy(
-    rig: Rig, t: Numbers, y0: Numbers | None = None, *, rtol: float | None = None,
+    rig: Rig, t: Numbers, y0: Numbers, *, rtol: float | None = None,
     residual: float = RESIDUAL,
 ) -> Trajectory:  # fmt: skip
     """A run from y0 through the times t whose energies are to balance within `residual` of what was

@@ -124,7 +124,7 @@ class GradientCheck(Shown):
 
 
 def check_gradients(
-    rig: Rig, t: Numbers, y0: Numbers | None = None, *, wrt: Sequence[str] | None = None,
+    rig: Rig, t: Numbers, y0: Numbers, *, wrt: Sequence[str] | None = None,
     of: Value | Sequence[str] | None = None, rtol: float = RTOL, bound: float = BOUND,
     dy0: Numbers | None = None, each: bool = True, step_error: bool = True, centres: bool = False,
 ) -> GradientCheck:  # fmt: skip
@@ -160,9 +160,9 @@ class Start(NamedTuple):
     knots: Tensor
 
 
-def _start(rig: Rig, t: Numbers, y0: Numbers | None, rtol: float) -> Start:
+def _start(rig: Rig, t: Numbers, y0: Numbers, rtol: float) -> Start:
     run = simulate(rig, t, y0=y0, rtol=rtol, tolerance=NEWTON)
-    first = run.y[0] if y0 is None else tensor("y0", y0).detach()
+    first = tensor("y0", y0).detach()
     # rounding may keep Newton from solving a step where a law bends, which is then halved
     for _ in range(REPEATS):
         run = _along(rig, run.t, run.knots, y0=first)

@@ -1,0 +1,233 @@
+"""States from coordinates of bodies: placed, moving, at rest on pads, touching or pressing."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsoft.display import suggestion
+from torchsoft.physics.arguments import number, tensor
+from torchsoft.physics.contact import turned
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.state import State
+from torchsoft.physics.statics import NoEquilibrium, resting, standing, unstretched
+
+REST = "rest"
+"""The word for a coordinate in equilibrium."""
+
+TOUCH = "touch"
+"""The word for the height at which a body's pads just touch the bodies under them."""
+
+PRESSES = "depth", "force"
+"""Keys of a pressing start: way below "touch" [m], downward force [N]."""
+
+RATES = {"v_x": "x", "v_y": "y", "omega": "theta"}
+"""Rates by name, and the coordinates that they are of."""
+
+UPWARDS = 0.1
+"""Least upward component of the normal of a pad that can carry a body."""
+
+AWAY = 100.0
+"""Height [m] of a body before its pads are lowered until they touch."""
+
+CLEAR, DESCENTS = 1e-16, 50
+"""Gap [m] between surfaces that just touch, above rounding errors, and the number of steps down to
+it."""
+
+Poses = dict[str, Tensor]
+"""Poses (3,) [m, m, rad] by body."""
+
+Starts = Mapping[str, Mapping[str, Any]]
+"""Coordinates and rates of bodies by name."""
+
+
+class NoPlace(NoEquilibrium):
+    """A coordinate of a body that cannot start as asked for."""
+
+    def __init__(self, body: str, axis: str, reason: str) -> None:
+        super().__init__(f"`{axis}` of `{body}`: {reason}")
+        self.body, self.axis, self.reason = body, axis, reason
+
+
+def start(rig: Rig, bodies: Starts) -> Tensor:
+    """Implementation of `Rig.state`."""
+    for name in bodies:
+        if name not in rig.bodies:
+            raise ValueError(
+                f"there is no body `{name}`; {suggestion(name, rig.bodies, 'the bodies are')}"
+            )
+    for name, body in rig.bodies.items():
+        check_start(name, body.freedom, bodies.get(name, {}))
+    held, _ = rig.held(rig.follow(0.0))
+    return moving(rig, standing(rig, placed(rig, bodies, held)), bodies)
+
+
+def moving(rig: Rig, y: Tensor, bodies: Starts) -> Tensor:
+    """The state y (size,) with the bodies' rates as given."""
+    own = {}
+    for name, axes in rig.layout.free.items():
+        given, rates = bodies.get(name, {}), list(RATES)
+        if any(rate in given for rate in rates):
+            values = [scalar(f"{name}.{rates[i]}", given.get(rates[i], 0.0)) for i in axes]
+            own["velocity", name] = torch.stack(values)
+    parts = {part: y[where] for part, where in rig.layout.slices.items()} | own
+    return torch.cat([parts[part] for part in rig.layout.slices]) if own else y
+
+
+def placed(rig: Rig, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
+    """Poses of bodies that start as given, by what `held` has of coordinates that are not free.
+
+    First bodies rest, then others come down until they touch, then these are pressed and the
+    resting ones give way. Differentiable; raises `NoPlace` and `NoEquilibrium`.
+    """
+    pose = {name: list(at.unbind()) for name, at in held.items()}
+    rests: dict[str, list[int]] = {}
+    presses: dict[str, Any] = {}
+    for name, axes in rig.layout.free.items():
+        for i in axes:
+            value = bodies.get(name, {}).get(COORDINATES[i], 0.0)
+            if isinstance(value, str) and value == REST:
+                rests.setdefault(name, []).append(i)
+            elif isinstance(value, str | Mapping):
+                presses[name] = value
+                pose[name][i] = torch.tensor(AWAY, dtype=torch.float64)
+            else:
+                pose[name][i] = scalar(f"{name}.{COORDINATES[i]}", value)
+    places = {name: torch.stack(at) for name, at in pose.items()}
+    for name, axes in rests.items():
+        if 1 in axes:
+            places[name] = at_height(places[name], scalar(name, above(rig, places, name)))
+    still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+    if rests:
+        places = resting(rig, places, rests, signals=still, actuators=())
+    pushed: Poses = {}
+    for name, value in presses.items():
+        height = upon(rig, places, name)
+        if isinstance(value, Mapping) and "force" in value:
+            force = scalar(f"{name}.y.force", value["force"])
+            pushed[name] = at_height(torch.zeros(3, dtype=torch.float64), -force)
+        elif isinstance(value, Mapping):
+            height = height - scalar(f"{name}.y.depth", value["depth"])
+        places[name] = at_height(places[name], height)
+    if any(value != TOUCH for value in presses.values()):
+        free = rests | {name: sorted({*rests.get(name, ()), 1}) for name in pushed}
+        places = resting(rig, places, free, signals=still, actuators=(), pushed=pushed)
+    return places
+
+
+def at_height(pose: Tensor, y: Tensor) -> Tensor:
+    """A pose (3,) at another height [m]."""
+    return torch.stack((pose[0], y, pose[2]))
+
+
+def check_start(body: str, freedom: Mapping[str, str], given: Any) -> None:
+    """Raises `ValueError` for coordinates and rates of a body by other names, with other values,
+    without meaning, or missing."""
+    if not isinstance(given, Mapping):
+        raise ValueError(
+            f"`{body}` must be given coordinates by name, such as {{'x': 0.06, 'y': '{REST}'}}, "
+            f"but is {given!r}"
+        )
+    words = {"y": (REST, TOUCH), "theta": (REST,)}
+    for key, value in given.items():
+        axis = RATES.get(key, key)
+        if axis not in COORDINATES:
+            raise ValueError(
+                f"`{key}` is no coordinate of `{body}`; {suggestion(key, (*COORDINATES, *RATES))}"
+            )
+        if freedom[axis] != "free":
+            raise ValueError(f"`{key}` of `{body}` has no meaning: {axis} is {freedom[axis]}")
+        pressed = isinstance(value, Mapping) and list(value) in [[one] for one in PRESSES]
+        if key == "y" and pressed:
+            number(f"{body}.y.{next(iter(value))}", next(iter(value.values())))
+        elif isinstance(value, str | Mapping) and value not in words.get(key, ()):
+            allowed = " or ".join(["a number", *map(repr, words.get(key, ()))])
+            raise ValueError(f"`{key}` of `{body}` must be {allowed}, but is {value!r}")
+    for axis, kind in freedom.items():
+        if kind == "free" and axis != "theta" and axis not in given:
+            raise ValueError(
+                f"`{axis}` of `{body}` is missing: it is free, so say where it starts [m]"
+                + (f', or "{REST}"' if axis == "y" else "")
+            )
+
+
+def scalar(name: str, value: Any) -> Tensor:
+    """A finite number as a tensor, with its graph. Raises `ValueError`."""
+    out = tensor(name, value if isinstance(value, Tensor) else [number(name, value)]).squeeze()
+    if out.ndim or not bool(out.isfinite()):
+        raise ValueError(f"`{name}` must be one finite number, but is {value!r}")
+    return out
+
+
+@torch.no_grad()
+def above(rig: Rig, pose: Mapping[str, Tensor], body: str) -> float:
+    """A height [m] at which a body is clear of the pads under it. Raises `NoPlace` where there is
+    none."""
+    shape, (x, _, theta) = rig.bodies[body].shape, pose[body]
+    heights = []
+    for contact in rig.contacts.values():
+        if contact.body != body or shape is None:
+            continue
+        pad = rig.pads[contact.pad]
+        base = torch.zeros(3, dtype=torch.float64) if pad.base is None else pose[pad.base]
+        points = turned(pad.point_positions, base[2]) + base[:2]
+        ways = torch.tensor([[0.0, -1.0], [-1.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
+        below, left, right = shape.support(turned(ways, -theta)).tolist()
+        along = points[:, 0]
+        if turned(pad.axes[:, 1], base[2])[1] <= UPWARDS or not along.min() < x < along.max():
+            continue
+        under = points[(along > x - left) & (along < x + right)]
+        if not len(under):
+            raise NoPlace(
+                body, "y",
+                f"{1e3 * (left + right):.3g} mm wide, it falls between points of "
+                f"`{contact.pad}`, which are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; "
+                f"make it larger, or give pads.{contact.pad} more elements or points",
+            )  # fmt: skip
+        heights.append(float(under[:, 1].max()) + below)
+    if not heights:
+        raise NoPlace(
+            body, "y",
+            f'"{REST}", but no pad that it has a contact with lies under x = {float(x):g} m; place '
+            "it over one, or say at which height it starts",
+        )  # fmt: skip
+    return max(heights)
+
+
+def upon(rig: Rig, pose: Mapping[str, Tensor], body: str) -> Tensor:
+    """Height [m] at which the undeformed pads of a body, lowered from above, just touch: one step
+    of Newton's method with a graph after those without. Raises `NoPlace` where they touch
+    nothing."""
+    own = [key for key, one in rig.contacts.items() if rig.pads[one.pad].base == body]
+    still = {name: torch.zeros_like(at) for name, at in pose.items()}
+
+    def gap(y: Tensor) -> Tensor:
+        """Distance [m] to what is touched first."""
+        at = {**pose, body: at_height(pose[body], y)}
+        state = State({}, unstretched(rig, ()), at, {}, still)
+        deepest = []
+        for key in own:
+            pad = rig.pads[rig.contacts[key].pad]
+            undeformed = torch.zeros(pad.nodes, 2, dtype=torch.float64)
+            deepest.append(rig.penetration(key, state, undeformed).max())
+        return -torch.stack(deepest).max()
+
+    y, left = pose[body][1].detach(), torch.tensor(torch.inf)
+    with torch.no_grad():
+        for _ in range(DESCENTS if own else 0):
+            left = gap(y)
+            y = y - left
+    if not abs(float(left)) < 1e-9:
+        raise NoPlace(
+            body, "y",
+            f'"{TOUCH}", but no pad bonded to it comes down upon a body that it has a contact '
+            "with; place it over one, or say at which height it starts",
+        )  # fmt: skip
+    if torch.is_grad_enabled():
+        at = y.clone().requires_grad_()
+        left = gap(at)
+        (slope,) = torch.autograd.grad(left, at, retain_graph=True)
+        y = y - (left - left.detach()) / slope  # by the implicit function theorem
+    return y + CLEAR

@@ -1,0 +1,95 @@
+"""Places in a rig file by dotted names, such as "materials.silicone.E"."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from pydantic.fields import FieldInfo
+
+from torchsoft.quantity import Quantity, metadata
+from torchsoft.rigs.fields import NumberOr
+from torchsoft.tables import Table, line
+
+
+class Place(NamedTuple):
+    """A place in a rig file: keys of its tables, the value, and its field."""
+
+    keys: tuple[str | int, ...]
+    value: Any
+    field: FieldInfo
+
+
+def place(file: Table, name: str) -> Place:
+    """The place of a name such as "materials.silicone.E" or "motion.lift.values.2". Raises
+    `ValueError` for an unknown name."""
+    at: Any = file
+    keys, left, field = list[str | int](), name.split("."), FieldInfo()
+    while left:
+        here = ".".join(map(str, keys)) or "the rig file"
+        if isinstance(at, Table):
+            known, n = list(type(at).model_fields), 1
+            key: str | int = left[0]
+            if key in known:
+                field, at = type(at).model_fields[key], getattr(at, key)
+        elif isinstance(at, Mapping):  # names of motions may have dots in them
+            known = list(at)
+            n = next((n for n in range(len(left), 0, -1) if ".".join(left[:n]) in at), 1)
+            key = ".".join(left[:n])
+            at = at.get(key)
+        elif isinstance(at, tuple):
+            known, n = [str(i) for i in range(len(at))], 1
+            key = int(left[0]) if left[0] in known else left[0]
+            at = at[key] if isinstance(key, int) else at
+        else:
+            known, n, key = [], 1, left[0]
+        if str(key) not in known:
+            there = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
+            raise ValueError(
+                f"`{line(name, 80)}` is not in the rig file: {here} has {there or 'no parts'}"
+            )
+        keys, left = [*keys, key], left[n:]
+    return Place(tuple(keys), at, field)
+
+
+def replaced(file: Table, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of a rig file with other values at these names. Raises `ValueError`."""
+    tree, whole = (listed(file.model_dump(exclude_unset=some)) for some in (True, False))
+    for name, value in values.items():
+        *way, last = place(file, name).keys
+        node, full = tree, whole
+        for key in way:
+            if isinstance(node, dict) and key not in node:
+                node[key] = full[key]
+            node, full = node[key], full[key]
+        node[last] = value
+    return tree
+
+
+def listed(value: Any) -> Any:
+    """A copy with dictionaries and lists, which can be changed."""
+    if isinstance(value, dict):
+        return {key: listed(x) for key, x in value.items()}
+    return [listed(x) for x in value] if isinstance(value, list | tuple) else value
+
+
+def entries(table: Table, within: str = "") -> Iterator[tuple[str, Any, FieldInfo]]:
+    """Dotted name, value and field of everything that a table states, tables in it included."""
+    for name, field in type(table).model_fields.items():
+        if name in table.model_fields_set or field.is_required():
+            yield from _entry(f"{within}{name}", getattr(table, name), field)
+
+
+def _entry(name: str, value: Any, field: FieldInfo) -> Iterator[tuple[str, Any, FieldInfo]]:
+    if isinstance(value, Table):
+        yield from entries(value, f"{name}.")
+    elif isinstance(value, Mapping):
+        for key, one in value.items():
+            yield from _entry(f"{name}.{key}", one, field)
+    else:
+        yield name, value, field
+
+
+def unit(field: FieldInfo) -> str:
+    """Unit of a field, empty for one that is not a number."""
+    found = (*field.metadata, *metadata(field.annotation))
+    units = (one.unit for one in found if isinstance(one, Quantity | NumberOr))
+    return next((one for one in units if one not in ("", "1")), "")
