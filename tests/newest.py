@@ -18,7 +18,7 @@ EXTRAS = "reduced,datasets,posterior,export,learn"
 GRADIENT = """
 import torch
 from torchsoft import Circle, SoftGrasp, rest, simulate
-model = SoftGrasp()
+model = still()
 t = torch.linspace(0, 0.05, 6, dtype=torch.float64)
 run = simulate(model, t, y0=rest(model).detach(), gradient="discrete")
 run["y_C"][-1].backward()
@@ -27,7 +27,7 @@ class Straight(torch.autograd.Function):
     forward = staticmethod(lambda ctx, x: x.clamp(max=0.5))
     backward = staticmethod(lambda ctx, g: g)
 try:
-    hidden = SoftGrasp(friction=lambda E, F_N, R: Straight.apply(E) / R)
+    hidden = still(friction=lambda E, F_N, R: Straight.apply(E) / R)
     simulate(hidden, t, y0=rest(model).detach())
 except TypeError as error:
     assert "the torch.autograd.Function" in str(error), error

@@ -54,11 +54,7 @@ def test_at_rest_the_upper_pad_just_touches_the_disc():
     g = model.penetration("U", state)
     assert float(g.max().abs()) < 1e-15
     assert int((g > -1e-9).sum()) == 1
-    assert (
-        float(state.pose["bracket"][0])
-        == float(state.pose["disc"][0])
-        == Parameters().scenario.x_C0
-    )
+    assert float(state.pose["bracket"][0]) == float(state.pose["disc"][0]) == PAPER.scenario.x_C0
     assert float(state.pose["disc"][2]) == 0.0
 
 
@@ -130,7 +126,7 @@ def test_a_bracket_above_the_sunken_disc_is_refused():
     model = build()
     with torch.no_grad():
         touching = float(model.unpack(rest(model)).pose["bracket"][1])
-    p = Parameters()
+    p = PAPER
     assert (
         touching < 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height - 5e-5
     )  # it sinks by 0.1 mm

@@ -13,7 +13,7 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
-MODEL = SoftGrasp(Parameters().override(COARSE))
+MODEL = still(COARSE)
 NAMES = tuple(extensions(MODEL))
 
 

@@ -38,7 +38,7 @@ CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 @cache
 def begun() -> BuiltRig[SoftGrasp]:
-    return begin(SHAKEN, Parameters().override(RIG))
+    return begin(SHAKEN, PAPER.override(RIG))
 
 
 @cache

@@ -60,7 +60,7 @@ class Springy(nn.Module):
 
 
 def test_a_slip_law_that_supplies_power_is_seen_in_the_ledger():
-    model = SoftGrasp(coarse().settings, friction=Springy())
+    model = still(coarse().settings, friction=Springy())
     said = told(model, t=times(0.01, 6), y0=grasped(model, (0.05, 0.0)))
     assert any("`slip` is to dissipate energy, but gave" in text for text in said), said
     assert any("the slip law of `L` gives" in text for text in said), said
@@ -89,7 +89,7 @@ def test_a_law_that_detaches_what_it_depends_on_is_told_of(what, line):
     """With its line; not one that detaches the condition of a choice only, nor one whose parameter
     is held on purpose."""
     slip = Held(0.3 + 0.001 * len(what), what)
-    model = SoftGrasp(coarse().settings, friction=slip)
+    model = still(coarse().settings, friction=slip)
     run = {"t": times(0.01, 3), "y0": grasped(model, (0.05, 0.0)), "gradient": "discrete"}
     said = told(model, **run)
     sentence = (
@@ -104,7 +104,7 @@ def test_a_parameter_that_is_held_may_be_detached():
         def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
             return (E - self.mu.detach() * F_N).clamp(min=0.0) / R
 
-    model = SoftGrasp(coarse().settings, friction=Fixed(0.3, ""))
+    model = still(coarse().settings, friction=Fixed(0.3, ""))
     run = {"t": times(0.002, 2), "y0": grasped(model)}
     (text,) = told(model, **run)
     assert "derivatives by `mu` are wrong" in text

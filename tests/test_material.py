@@ -237,13 +237,13 @@ def test_every_coefficient_of_a_series_is_identified():
 # --- the grasp
 # ----------------------------------------------------------------------
 
-STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
+STABLE = PAPER.override(COARSE | {"control.senses": "bracket.x"})
 
 
 @torch.no_grad()
 def test_the_graph_has_the_fields_of_the_chain(material):
     labels = {
-        data["label"] for _, data in graph_of(SoftGrasp(STABLE, material=material)).nodes(data=True)
+        data["label"] for _, data in graph_of(still(STABLE, material=material)).nodes(data=True)
     }
     own = "L" if material.branches == 1 else f"L,1..{material.branches}"
     assert {f"C: [K_{own}]^-1", f"R: [R_{own}]"} <= labels
@@ -255,7 +255,7 @@ def test_the_graph_has_the_fields_of_the_chain(material):
 
 
 def test_a_recording_that_begins_before_the_pads_forget_is_named():
-    model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
+    model = still(STABLE, material=MATERIALS["prony"]())
     with pytest.warns(
         UserWarning,
         match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s",

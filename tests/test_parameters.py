@@ -21,14 +21,14 @@ NOT_NEGATIVE = [
     "scenario.rest_time",
 ]  # fmt: skip
 ANY_SIGN = ["pad.nu", "bracket.cm_height", "scenario.x_C0", "scenario.travel"]
-NUMBERS = [name for name, row in Parameters().table().items() if isinstance(row["value"], float)]
+NUMBERS = [name for name, row in PAPER.table().items() if isinstance(row["value"], float)]
 POSITIVE = [name for name in NUMBERS if name not in (*NOT_NEGATIVE, *ANY_SIGN)]
 
 
 def refusal(values: dict[str, Any]) -> str:
     """The message with which these values are refused."""
     with pytest.raises(ValueError, match=r".") as error:
-        Parameters().override(values)
+        PAPER.override(values)
     assert isinstance(error.value, InvalidTable)
     assert "\n" not in str(error.value)
     return str(error.value)
@@ -57,16 +57,16 @@ def test_a_mesh_that_would_not_fit_in_memory_is_refused():
     assert "pad.elements_x = 40000 by elements_y = 4 take about" in refusal(
         {"pad.elements_x": 40_000}
     )
-    assert Parameters().override({"pad.elements_x": 1000}).pad.memory < 1.0
+    assert PAPER.override({"pad.elements_x": 1000}).pad.memory < 1.0
 
 
 def test_the_bounds_of_a_parameter_can_be_asked_for():
-    model = SoftGrasp()
+    model = still()
     for name in NAMES:
         declared = model.quantity(name)
         low, high = declared.low, declared.high
-        assert low < Parameters().table()[name]["value"] < high < INF
-        check(name, Parameters().table()[name]["value"], "here")
+        assert low < PAPER.table()[name]["value"] < high < INF
+        check(name, PAPER.table()[name]["value"], "here")
         for value in (low - 1.0, 1.1 * high):
             with pytest.raises(InvalidTable, match="here should be"):
                 check(name, value, "here")
@@ -76,9 +76,7 @@ def test_kinetic_friction_above_static_is_refused():
     message = refusal({"contact.mu_k": 0.9})
     assert "contact" in message
     assert "mu_k = 0.9 > mu_s = 0.8" in message
-    assert (
-        Parameters().override({"contact.mu_k": 0.8}).contact.mu_k == 0.8
-    )  # equal is Coulomb's law
+    assert PAPER.override({"contact.mu_k": 0.8}).contact.mu_k == 0.8  # equal is Coulomb's law
 
 
 def test_a_tangential_spring_without_a_dashpot_is_refused():
@@ -122,7 +120,7 @@ def test_a_trajectory_that_leaves_the_pad_is_refused(values):
 
 
 def test_a_trajectory_that_just_stays_on_the_pad_is_accepted():
-    assert Parameters().override({"scenario.travel": -54e-3}).scenario.travel == -54e-3
+    assert PAPER.override({"scenario.travel": -54e-3}).scenario.travel == -54e-3
 
 
 # the warning
@@ -132,19 +130,19 @@ def test_a_trajectory_that_just_stays_on_the_pad_is_accepted():
 def test_a_slip_law_that_is_not_single_valued_is_warned_about():
     # (mu_s - mu_k) F_N / v_s = 0.1 * 10 N / 5 mm/s = 200 N.s/m against R_t
     with pytest.warns(UserWarning, match=r"not single-valued.*contact\.v_s"):
-        Parameters().override({"contact.R_t": 199.0})
+        PAPER.override({"contact.R_t": 199.0})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Parameters().override({"contact.R_t": 201.0})
-        Parameters().override({"contact.R_t": 199.0, "contact.v_s": 5.1e-3})
-        Parameters().override({"contact.R_t": 199.0, "contact.mu_k": 0.8})
-        Parameters().override({"contact.friction": "coulomb", "contact.R_t": 10.0})  # not its law
+        PAPER.override({"contact.R_t": 201.0})
+        PAPER.override({"contact.R_t": 199.0, "contact.v_s": 5.1e-3})
+        PAPER.override({"contact.R_t": 199.0, "contact.mu_k": 0.8})
+        PAPER.override({"contact.friction": "coulomb", "contact.R_t": 10.0})  # not its law
 
 
 def test_default_and_paper_like_sets_do_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert Parameters().contact.K_t == 1.2e5
+        assert PAPER.contact.K_t == 1.2e5
         assert Parameters.paper_like().contact.K_t == 100.0
 
 
@@ -155,12 +153,12 @@ def test_default_and_paper_like_sets_do_not_warn():
 @pytest.mark.parametrize("name", ["pad.Young", "pad", "E", "pad.E.x", ""])
 def test_override_refuses_an_unknown_name(name):
     with pytest.raises(ValueError, match=r"is not a parameter; known names: .*pad\.E") as error:
-        Parameters().override({name: 1.0})
+        PAPER.override({name: 1.0})
     assert f"`{name}`" in str(error.value)
 
 
 def test_table_tells_published_from_assumed():
-    table = Parameters().table()
+    table = PAPER.table()
     published = {name for name, row in table.items() if row["source"] == "published"}
     assert published == {
         "pad.length", "pad.height", "disc.radius", "control.K_81", "control.R_80", "control.K_98",
@@ -176,7 +174,7 @@ def test_table_tells_published_from_assumed():
 
 
 def test_published_numbers():
-    p = Parameters()
+    p = PAPER
     assert p.compression == pytest.approx(1.5e-3, abs=1e-15)
     assert p.scenario.duration == 30.0
 
@@ -204,20 +202,20 @@ def toml(value: Any) -> str:
 
 @given(changes=CHANGES)
 def test_overrides_arrive_in_the_table_and_undo(changes):
-    changed = Parameters().override(changes)
-    table, default = changed.table(), Parameters().table()
+    changed = PAPER.override(changes)
+    table, default = changed.table(), PAPER.table()
     for name, row in table.items():
         assert row["value"] == changes.get(name, default[name]["value"])
         assert row["source"] == (
             default[name]["source"] if row["value"] == default[name]["value"] else "assumed"
         )
-    assert changed.override({name: default[name]["value"] for name in changes}) == Parameters()
-    assert Parameters().override({name: row["value"] for name, row in table.items()}) == changed
+    assert changed.override({name: default[name]["value"] for name in changes}) == PAPER
+    assert PAPER.override({name: row["value"] for name, row in table.items()}) == changed
 
 
 @given(changes=CHANGES)
 def test_a_file_holds_the_same_parameters(changes, tmp_path_factory):
-    changed = Parameters().override(changes)
+    changed = PAPER.override(changes)
     lines = [f"{name} = {toml(row['value'])}" for name, row in changed.table().items()]
     path = tmp_path_factory.getbasetemp() / "parameters.toml"
     path.write_text("\n".join(lines))

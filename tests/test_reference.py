@@ -51,7 +51,7 @@ def series(run: Trajectory) -> dict[str, Tensor]:
 @pytest.fixture(scope="module")
 def manipulation():
     """The 30 s with the gradient behind them, pads' initial displacements held."""
-    made = grasp_and_roll(SoftGrasp(), grasp_force=REFERENCE["manipulation"]["grasp_force"])
+    made = grasp_and_roll(still(), grasp_force=REFERENCE["manipulation"]["grasp_force"])
     t = times(30, 3001)
     y0 = held_displacements(made.model, made.y0)
     return made.model, simulate(made.model, t, y0=y0, step=2e-3, gradient="discrete")
@@ -101,7 +101,7 @@ def test_light_shaking_is_the_reference():
     )  # to seven digits `apart`
     model, y0, _ = begin(
         excitation,
-        Parameters().override({"contact.v_s": 0.05}),
+        PAPER.override({"contact.v_s": 0.05}),
         grasp_force=reference["grasp_force"],
     )
     y0[model.layout.slices["pose", "bracket"].start + 1] = y_Br
@@ -145,7 +145,7 @@ CASES = {"default": {}, "E = 60e3": {"pad.E": 60e3}}
 @pytest.fixture(params=CASES)
 def case(request):
     """The model, and what the reference says of it."""
-    model = SoftGrasp(Parameters().override(CASES[request.param]))
+    model = still(CASES[request.param])
     return model, REFERENCE["statics"][request.param]
 
 

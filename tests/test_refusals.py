@@ -64,7 +64,7 @@ Call = Callable[[], object]
 
 def resting(**parts: Any) -> Tensor:
     """The paper's coarse rig with a part replaced, at rest: every part is checked."""
-    return rest(SoftGrasp(Parameters().override(COARSE), **parts))
+    return rest(still(COARSE, **parts))
 
 
 # parts
@@ -171,7 +171,7 @@ class Oval(Ellipse):
 
 def ran(**parts: Any) -> object:
     """A run of the rig with a part replaced, from no state in particular."""
-    model = SoftGrasp(coarse().settings, **parts)
+    model = still(coarse().settings, **parts)
     return simulate(model, T, y0=torch.zeros(model.layout.size, dtype=torch.float64))
 
 
@@ -312,7 +312,7 @@ PARTS: list[tuple[Call, str]] = [
      "`tau of the material of L` must be a float64 tensor, but is float"),
     (lambda: chain([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
     (lambda: chain([1.0, 0.0]), "`chain` of the material of `L` must give two tensors, J and tau"),
-    (lambda: SoftGrasp(Parameters().override({"pad.fidelity": "inertial"}),
+    (lambda: still({"pad.inertial": True},
     material=Prony(**RUBBER, moduli=[1e5], tau=[0.1])),
      r"inertial pad `L` needs a Kelvin-Voigt material \(one retardation time\), but has"),
     # laws of contact
@@ -329,7 +329,7 @@ PARTS: list[tuple[Call, str]] = [
      "several points at once other rates .*numel"),
     (lambda: slipping(rated(lambda N: (-1 - N).sqrt())),
      "the slip law of `L` gives nan at an effort of 0.001 N"),
-    (lambda: rest(SoftGrasp(friction=of_one_point)),
+    (lambda: rest(still(friction=of_one_point)),
      "the slip law of `L` must take three tensors .*RuntimeError"),
     (lambda: slipping(nn.Dropout()), r"the slip law of `L` must take three tensors .*TypeError"),
     (lambda: slipping(lambda E, F_N, R: None),
@@ -467,7 +467,7 @@ def test_a_part_or_call_that_is_none_is_refused(row):
 
 def test_a_coupled_law_is_refused_after_its_pointwise_twin():
     """For one point both have the same expression, which is compiled already."""
-    model = SoftGrasp(coarse().settings, friction=rated(lambda N: N, mu=0.49))
+    model = still(coarse().settings, friction=rated(lambda N: N, mu=0.49))
     simulate(model, T, y0=rest(model).detach())
     with pytest.raises(ValueError, match="several points at once other rates"):
         slipping(rated(lambda N: N.sum().expand_as(N), mu=0.49))
@@ -650,7 +650,7 @@ class Dropping(nn.Module):
 def test_a_law_in_training_is_refused_after_it_ran_in_evaluation(
     start,
 ):
-    model = SoftGrasp(coarse().settings, friction=Dropping(), reference=start[0].reference)
+    model = still(coarse().settings, friction=Dropping(), reference=start[0].reference)
     simulate(model.eval(), T, y0=start[1])
     with pytest.raises(TypeError, match="the random operation"):
         simulate(model.train(), T, y0=start[1])

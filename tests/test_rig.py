@@ -22,8 +22,8 @@ from torchsoft.paper.rig import NAMES
 
 def test_the_radius_of_a_box_is_not_the_discs():
     """A box has a radius, too, that of its corners: it must not be read as the object's."""
-    model = SoftGrasp(shape=RoundedBox(20e-3, 19e-3, radius=5e-3))
-    assert model.settings.compression == Parameters().compression
+    model = still(shape=RoundedBox(20e-3, 19e-3, radius=5e-3))
+    assert model.settings.compression == PAPER.compression
     with pytest.raises(ValueError, match=r"`disc\.radius` is not a parameter"):
         model.parameter("disc.radius")
     said = model.description()["parameters"]
@@ -44,7 +44,7 @@ def test_parameters_have_the_names_of_the_settings():
             is model.parameter(module_name)
             is model.get_parameter(module_name)
         )
-    rolling = SoftGrasp(Parameters().override({"contact.friction": "coulomb"}))
+    rolling = still({"contact.friction": "coulomb"})
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
         rolling.parameter("contact.v_s")
 

@@ -108,7 +108,7 @@ def test_a_loop_that_is_about_to_close_is_not_judged(gap):
 
 def test_the_papers_rig_is_soft_grasp():
     """The same start to rounding, and from the same start the same bits."""
-    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
+    model = still({"pad.elements_x": 60, "pad.elements_y": 2})
     manipulation = grasp_and_roll(model, grasp_force=80.0)
     file = coarse(ready_rig("paper"))
     assert torch.allclose(file.build().y0, manipulation.y0, rtol=0, atol=1e-11)
@@ -127,9 +127,9 @@ def test_the_papers_rig_is_soft_grasp():
 def test_what_is_held_is_the_papers_grasping_force():
     """Fed forward, it is that of the friction-free grasp, and the bracket comes down to touch the
     disc wherever this is; both by statics."""
-    model = SoftGrasp(Parameters().override({
+    model = still({
         "pad.elements_x": 60, "pad.elements_y": 2, "scenario.x_C0": 60.3e-3, "pad.E": 0.6e6,
-    }))  # fmt: skip
+    })  # fmt: skip
     file = changed(
         coarse(ready_rig("paper")), motion__F_ff__values=(0.0, "held"), materials__rubber__E=0.6e6,
         bodies__disc__start__x=60.3e-3, bodies__bracket__start__x=60.3e-3,
@@ -190,7 +190,7 @@ def test_a_drop_is_not_missed():
 def test_a_loop_is_unstable_as_the_papers_modes_say():
     """The leading mode is that of the paper's own equilibrium: the friction-free grasp."""
     changes = {"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3}
-    leading = complex(loop_modes(SoftGrasp(Parameters().override(changes)))[0])
+    leading = complex(loop_modes(still(changes))[0])
     paper = coarse(ready_rig("paper"))
     (found,) = check(changed(paper, materials__rubber__tau=1e-3))
     assert found.severity == "error"
@@ -203,7 +203,7 @@ def test_a_loop_is_unstable_as_the_papers_modes_say():
 
 def test_modes_are_those_of_the_whole_state():
     """What is left out where nothing touches decides nothing."""
-    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
+    model = still({"pad.elements_x": 60, "pad.elements_y": 2})
     y = press(model, model.settings.scenario.y_Br_grasp)
     whole = torch.linalg.eigvals(linearised(model, y, model.reference))
     some = modes(model, y, model.reference).values

@@ -386,7 +386,7 @@ def test_derivatives_are_those_of_differences(case):
         )  # of thirty points, some come from a side onto an arc
 
 
-COARSE = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3})
+COARSE = PAPER.override({"pad.elements_x": 60, "pad.elements_y": 3})
 
 
 # --- what is refused, and what is said
@@ -398,7 +398,7 @@ def test_control_points_that_were_spoilt_are_refused():
     with torch.no_grad():
         shape.control[3] *= 3.0
     with pytest.raises(ValueError, match="so sharp, or so narrow"):
-        rest(SoftGrasp(COARSE, shape=shape))
+        rest(still(COARSE, shape=shape))
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
@@ -449,11 +449,11 @@ def test_an_object_that_its_pads_would_turn_is_told_of():
     with pytest.warns(
         UserWarning, match=r"held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m"
     ):
-        rest(SoftGrasp(COARSE, shape=wedge))
+        rest(still(COARSE, shape=wedge))
 
 
 def test_a_long_box_rests_on_its_whole_side():
-    model = SoftGrasp(COARSE, shape=RoundedBox(30e-3, 5e-3, 1e-3))
+    model = still(COARSE, shape=RoundedBox(30e-3, 5e-3, 1e-3))
     state = model.unpack(rest(model).detach())
     g = model.penetration("L", state)
     x = model.pads["L"].positions[:, 0] - state.pose["disc"][0]

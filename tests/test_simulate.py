@@ -91,7 +91,7 @@ def test_a_shape_and_a_friction_law_of_ones_own_run_with_gradients():
     mine = SmoothSlip(p.mu_s, p.mu_k, p.v_s).requires_grad_(
         False
     )  # captured, so a constant of the law
-    own = SoftGrasp(
+    own = still(
         built_in.settings, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3)
     )
     one, other = rolled(built_in, gradient="discrete"), rolled(own, gradient="discrete")
@@ -223,14 +223,14 @@ class Sharing(nn.Module):
 def test_a_law_is_what_its_code_is_now():
     """A global that it reads, and the number of iterations of a shape of the package, changed
     between two runs."""
-    model = SoftGrasp(coarse().settings, friction=Sharing())
+    model = still(coarse().settings, friction=Sharing())
     y0 = grasped(model, (0.08, 0.0))
     first = simulate(model, T, y0=y0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(globals(), "SHARE", 0.9)
         assert not torch.equal(simulate(model, T, y0=y0).y, first.y)
     assert torch.equal(simulate(model, T, y0=y0).y, first.y)
-    oval = SoftGrasp(coarse().settings, shape=Ellipse(20e-3, 18.8e-3))
+    oval = still(coarse().settings, shape=Ellipse(20e-3, 18.8e-3))
     with pytest.MonkeyPatch.context() as patch:
         exact = simulate(oval, T, y0=y0).y
         patch.setattr(Ellipse, "ITERATIONS", 1)
@@ -260,7 +260,7 @@ def test_what_is_saved_is_what_ran():
     assert "contact.v_s" not in made_by["parameters"]
     assert made_by["control"] == {"x": "PD", "y": "PD"}
     assert made_by["mesh"]["L"] == f"PadMesh, {len(model.pads['L'].mesh.nodes)} nodes"
-    oval = SoftGrasp(coarse().settings, shape=Ellipse(19.8e-3, 19.1e-3))
+    oval = still(coarse().settings, shape=Ellipse(19.8e-3, 19.1e-3))
     described = oval.description()
     assert "disc.radius" not in described["parameters"]
     assert described["shape"] == {"disc": "Ellipse"}
@@ -283,9 +283,7 @@ def made_and_run() -> list[Tensor]:
     run = simulate(begun.rig, times(0.1, 6), y0=begun.y0, gradient="discrete")
     forward = simulate(begun.rig, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
     gradients = torch.autograd.grad(run["y_C"][-1], [begun.rig.pad.E, begun.rig.contact.K_t])
-    oval = SoftGrasp(
-        begun.rig.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4)
-    )
+    oval = still(begun.rig.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4))
     parts = [
         rest(oval),
         oval(0.0, rest(oval)),
@@ -391,7 +389,7 @@ def test_parts_replaced_after_a_run_run():
     for pad in model.pads.values():
         pad.material = model.pad
     assert model.layout.size > size
-    fresh = SoftGrasp(coarse().settings, material=model.pad)
+    fresh = still(coarse().settings, material=model.pad)
     y0 = grasped(fresh)
     model.reference = fresh.reference
     assert torch.equal(simulate(model, T, y0=y0).y, simulate(fresh, T, y0=y0).y)
@@ -406,7 +404,7 @@ def test_a_law_that_turns_nan_never_converges():
             (E > 13.0) & (E < 90.0) & (F_N > 10.0), torch.nan, (E - 0.8 * F_N).clamp(min=0.0) / R
         )
 
-    model = SoftGrasp(coarse().settings, friction=broken)
+    model = still(coarse().settings, friction=broken)
     y0 = grasped(model)
     pushed = towards(model, Profile([0.0, 0.2], [0.06, 0.09]))
     with pytest.raises(

@@ -97,7 +97,7 @@ def punched(K_n: float, elements_x: int) -> tuple[SoftGrasp, State, float]:
     """The box pressed between the pads without weight; the force [N] on the bracket."""
     changes = {"scenario.gravity": 0.0, "contact.K_n": K_n}
     mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
-    model = SoftGrasp(Parameters().override(changes | mesh), shape=PUNCH)
+    model = still(changes | mesh, shape=PUNCH)
     p = model.settings
     y = press(model, 2 * (p.pad.height + 10e-3 - DEPTH) + p.bracket.cm_height).detach()
     return model, model.unpack(y), holding_force(model, y)
@@ -126,7 +126,7 @@ def test_a_long_box_is_a_flat_punch_on_springs():
 def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch():
     """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are
     bilinear of half a millimetre."""
-    pad = Parameters().pad
+    pad = PAPER.pad
     mesh = MeshQuad.init_tensor(np.linspace(0, pad.length, 481), np.linspace(0, pad.height, 17))
     basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=4)
     lame_lambda, lame_mu = lame_moduli(pad.E, pad.nu)

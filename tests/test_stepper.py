@@ -33,7 +33,7 @@ def test_second_order_on_a_smooth_motion(fidelity):
 
 def test_an_unstable_loop_ends_in_an_error_that_says_so():
     """E = 60 kPa, tau = 5 ms with the paper's gains."""
-    model = SoftGrasp(Parameters().override(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3}))
+    model = still(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3})
     with pytest.raises(
         SimulationFailed, match=r"disc was lost at t = .* s: the closed loop is unstable"
     ) as caught:

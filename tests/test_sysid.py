@@ -49,7 +49,7 @@ from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.runs import Runner
 
-BASE = Parameters().override(COARSE)
+BASE = PAPER.override(COARSE)
 RTOL = 1e-4
 TRUSTED: dict[str, Any] = {"assumptions": "trusted"}
 """Nothing but the fit."""

@@ -39,7 +39,7 @@ from torchsoft.sysid.unknowns import Coordinate
 
 ROOT = Path(__file__).parents[1]
 PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
-BASE = Parameters().override(COARSE)
+BASE = PAPER.override(COARSE)
 SENSORS = {
     "theta": Sensor(noise=5e-4, bias=0.02),
     "y_Br": Sensor(noise=1e-5),
@@ -60,7 +60,7 @@ def example(kind: Any) -> Any:
     finite are not."""
     known = {
         str: HOSTILE, float: 0.25, int: 3, bool: True, Any: {"a": [1]}, Number: nan,
-        Parameters: Parameters(), Prior: Prior(median=0.25, sd=0.25),
+        Parameters: PAPER, Prior: Prior(median=0.25, sd=0.25),
         Unknown: Unknown(low=0.1, high=0.3), Sensor: Sensor(noise=0.1),
     }  # fmt: skip
     if kind in known:
@@ -307,7 +307,7 @@ def slippery(problem, result):
 
 
 def slide(settings: Parameters, reference: Reference) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=Viscous(0.6, 30.0))
+    return still(settings, reference, friction=Viscous(0.6, 30.0))
 
 
 def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
@@ -340,7 +340,7 @@ def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
     with pytest.raises(
         ValueError, match=r"`contact\.friction\.alpha` is not a parameter of this rig"
     ):
-        answer.applied_to(SoftGrasp(BASE))
+        answer.applied_to(still(BASE))
 
 
 def test_contributions_are_those_of_the_inverse_matrices(problem, result):

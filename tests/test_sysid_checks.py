@@ -62,7 +62,7 @@ from torchsoft.sysid.sensitivity import (
 )
 from torchsoft.sysid.suspects import assumption_notices
 
-BASE = Parameters().override(COARSE)
+BASE = PAPER.override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9)
 BRIEF = Excitation(

@@ -16,7 +16,7 @@ from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import parts
 from torchsoft.sysid.runs import Runner
 
-BASE = Parameters().override(COARSE)
+BASE = PAPER.override(COARSE)
 TRUTH = {"pad.E": 0.8e6, "pad.tau": 0.011}
 NOISE = {"x_C": 1e-5, "theta": 5e-4, "F_x": 0.1}
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.6, senses="bracket")

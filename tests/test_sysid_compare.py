@@ -134,7 +134,7 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
     assert "take a tighter tolerance" in judged([fitted("a"), fitted("b")], [rough])[2]
 
 
-BASE = Parameters().override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
+BASE = PAPER.override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
 SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
 BRIEF: dict[str, Any] = {"duration": 0.4, "grasp_time": 0.15, "settle": 0.05}
 STROKE = Excitation(motion=Strokes(travel=25e-3, stroke_time=0.15), depth=2e-4, **BRIEF)
@@ -147,7 +147,7 @@ UNKNOWNS = {
 
 
 def viscous(settings: Parameters, reference: Reference) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=Viscous(0.6, 5.0))
+    return still(settings, reference, friction=Viscous(0.6, 5.0))
 
 
 BUILDS = {"smooth": SoftGrasp, "viscous": viscous}
@@ -217,7 +217,7 @@ def test_laws_that_were_not_given_the_same_data_are_refused(stroke):
         ({"b": other(name="two")}, {}, "`a` and `b` have other recordings: one and two"),
         ({"b": other(samples=noisier)}, {}, "`one` of the laws `a` and `b` has other samples"),
         ({"b": other({"x_C": SENSORS["x_C"]})}, {}, "have other sensors"),
-        ({"b": other(rig=SoftGrasp(STROKE.settings(BASE), moved))}, {},
+        ({"b": other(rig=still(STROKE.settings(BASE), moved))}, {},
          "follow another reference in recording `one`"),
         ({"b": p}, {"heldout": ["one"]}, r"`heldout` must name some of \['one'\], but not all"),
         ({"b": p}, {"plans": elsewhere}, "the last stage of the plan of `a` must fit one"),

@@ -22,7 +22,7 @@ from torchsoft.sysid.planner import LEFT, Optimality, Planner, chosen, deviation
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 
-P = Parameters().override(COARSE)
+P = PAPER.override(COARSE)
 PLAN = Excitation(
     motion=Knots(x=((0.05, 1e-3), (0.1, -0.5e-3)), y=((0.06, -2e-4), (0.1, 1e-4))),
     duration=0.25, grasp_time=0.1, settle=0.02, depth=1e-3,

@@ -18,7 +18,7 @@ from torchsoft.physics.contact import SlipLaw
 from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import RIG, Problem, Recording, Stage, Unknown, identify, record
 
-BASE = Parameters().override(COARSE)
+BASE = PAPER.override(COARSE)
 SENSORS = {
     name: RIG[name].model_copy(update={"noise": 0.7 * RIG[name].noise})
     for name in ("x_C", "theta", "F_x")
@@ -45,7 +45,7 @@ class Viscous(nn.Module):
 
 
 def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=Viscous(alpha, 100.0))
+    return still(settings, reference, friction=Viscous(alpha, 100.0))
 
 
 def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGrasp]) -> Recording:
@@ -108,7 +108,7 @@ def frictionless(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
 
 
 def plain(settings: Parameters, reference: Reference, law: SlipLaw = frictionless) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=law)
+    return still(settings, reference, friction=law)
 
 
 def scaled(factor: float) -> SlipLaw:

@@ -393,7 +393,7 @@ def test_the_examples_files_are_what_its_script_makes(made):
     assert case.problem.names == ("rolling", "checking")
     assert {k: s.noise for k, s in case.problem.sensors.items()} == script.SENSORS
     rig, truth = case.problem.recordings[0].rig, script.NOMINAL.override(script.TRUTH)
-    own = SoftGrasp(truth)
+    own = still(truth)
     text, found = (EXAMPLE / "README.md").read_text(), set()
     for name, of in NAMES.items():  # the file tells the truth, but for what is unknown
         filed = reduce(lambda x, pair: re.sub(*pair, x), FILED, of)
@@ -416,7 +416,7 @@ def run():
     excitation = Excitation(
         motion=Strokes(), senses="bracket", grasp_time=0.05, settle=0.0, depth=1e-3
     )
-    model, y0, _ = begin(excitation, Parameters().override({"contact.v_s": 0.05}))
+    model, y0, _ = begin(excitation, PAPER.override({"contact.v_s": 0.05}))
     return simulate(model, torch.linspace(0, 0.06, 31, dtype=torch.float64), y0=y0, step=2e-3)
 
 
@@ -510,7 +510,7 @@ def test_recordings_have_settings_of_their_own(case, tmp_path):
     first, second = load([data], config).problem.recordings
     mass, v_s = "bodies.disc.mass", f"{LAW}.friction.v_s"
     assert (first.name, first.parameters[mass]) == ("data", 0.5)
-    assert (second.name, second.parameters[mass]) == ("b", Parameters().disc.mass)
+    assert (second.name, second.parameters[mass]) == ("b", PAPER.disc.mass)
     assert first.parameters[v_s] == second.parameters[v_s] == 0.05
 
 

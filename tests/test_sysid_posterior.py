@@ -203,7 +203,7 @@ def test_nuts_says_what_it_needs(monkeypatch):
 def rolling():
     """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a
     saturated sensor."""
-    base = Parameters().override(COARSE)
+    base = PAPER.override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
     sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
     data = record("roll", begin(roll, base), {}, sensors, noise=0.0)

@@ -32,7 +32,7 @@ from torchsoft.sysid.prechecks import (
 from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner
 
-NOMINAL = Parameters().override(COARSE)
+NOMINAL = PAPER.override(COARSE)
 SENSORS = RIG | {"omega": Sensor(noise=0.02)}
 FAR = {
     "contact.K_n": 3.0, "contact.R_n": 0.4, "contact.K_t": 0.4, "contact.R_t": 2.5,
@@ -107,7 +107,7 @@ def noted(
     """With other settings, and other signals of the reference."""
     p, old = paper_settings(recording), recording.rig.reference
     reference = Reference(**{name: signals.get(name, old[name]) for name in ("x_d", "y_d", "F_ff")})
-    return replace(recording, rig=SoftGrasp(p.override(dict(settings or {})), reference))
+    return replace(recording, rig=still(p.override(dict(settings or {})), reference))
 
 
 def scaled(factor: float) -> Callable[[Any, Any], Any]:
@@ -142,20 +142,20 @@ MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]
         "degrees taken for radians", True
     ),
     "the disc's set-point taken for the bracket's": (
-        "about the disc", lambda r: noted(r, {"control.senses": "bracket"}), "control.senses",
+        "about the disc", lambda r: noted(r, {"control.senses": "bracket.x"}), "control.senses",
         'set-point of the disc, not of the bracket (say control.senses = "disc")',
         True,
     ),
     "the bracket's taken for the disc's": (
-        "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses",
+        "rolling", lambda r: noted(r, {"control.senses": "disc.x"}), "control.senses",
         "of the bracket, not of the disc", True
     ),
     "the bracket's taken for the disc's, no forces": (
-        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F),
+        "rolling", lambda r: changed(noted(r, {"control.senses": "disc.x"}), **NO_F),
         "control.senses", "x_Br follows it to", True
     ),
     "the bracket's taken for the disc's, the disc alone": (
-        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F, x_Br=None),
+        "rolling", lambda r: changed(noted(r, {"control.senses": "disc.x"}), **NO_F, x_Br=None),
         "control.senses", "x_C does not follow it", True,
     ),
     "exchanged columns": (
@@ -236,7 +236,7 @@ def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
     assert not list(controller_findings(flipped, SENSORS, gains))
     for one, code in (
         (flipped, "sign of F_y"),
-        (noted(recordings["rolling"], {"control.senses": "disc"}), "control.senses"),
+        (noted(recordings["rolling"], {"control.senses": "disc.x"}), "control.senses"),
     ):
         problem = Problem([one], SENSORS, {name: Unknown() for name in gains})
         assert [f.code for f in precheck(problem, Runner(problem.recordings))] == [code]

@@ -99,7 +99,7 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters():
 def test_profile_and_combination_of_stiffnesses_in_series():
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in
     series."""
-    base = Parameters().override(COARSE)
+    base = PAPER.override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
     sensors = {
         name: sensor.model_copy(update={"noise": 4 * sensor.noise}) for name, sensor in RIG.items()

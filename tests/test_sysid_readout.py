@@ -41,7 +41,7 @@ from torchsoft.sysid.prediction import Readout
 from torchsoft.sysid.residual_tests import CLEAR, parts, predicted
 from torchsoft.sysid.runs import Runner
 
-BASE = Parameters().override(COARSE)
+BASE = PAPER.override(COARSE)
 STROKES = Excitation(
     motion=Strokes(travel=8e-3, stroke_time=0.15), duration=0.45, grasp_time=0.15, settle=0.05
 )

@@ -57,7 +57,7 @@ NOISE = Autoregression((0.8,), 0.7, 5e-3)
 def found():
     """Two grasps, from which the viscosity of slip is not identifiable, and another one held
     out."""
-    p = Parameters().override(COARSE)
+    p = PAPER.override(COARSE)
     truth = {"contact.K_n": 1.6e5, "pad.E": 0.9e6}
     sensors = {
         "theta": Sensor(noise=5e-4),

@@ -49,7 +49,7 @@ Cut = tuple[Recording, Tensor]
 @pytest.fixture(scope="module")
 def cut():
     """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
-    model, y0, _ = begin(MOTION, Parameters().override(COARSE))
+    model, y0, _ = begin(MOTION, PAPER.override(COARSE))
     at = np.arange(SINCE, MOTION.duration, 5e-3)
     run = simulate(model, torch.from_numpy(np.append(-SETTLE, at)), y0=y0, rtol=1e-6)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
@@ -200,7 +200,7 @@ def test_the_start_does_not_depend_on_the_mesh(cut):
     recording, _ = cut
     out = estimate_initial_state(recording, RIG)
     rig = recording.rig
-    finer = SoftGrasp(
+    finer = still(
         rig.settings.override({"pad.elements_x": 120, "contact.points": 2}), rig.reference
     )
     other = replace(out, rig=finer)

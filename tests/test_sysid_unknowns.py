@@ -9,7 +9,7 @@ from torchsoft.paper.rig import SoftGrasp
 from torchsoft.sysid.estimate import nuisance_unit
 from torchsoft.sysid.unknowns import NUISANCES, Coordinate, Coordinates, Prior, Unknown
 
-RIG = SoftGrasp()
+RIG = still()
 GIVEN = {
     "pad.E": 0.75e6,
     "pad.nu": 0.45,

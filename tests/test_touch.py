@@ -106,8 +106,8 @@ def test_a_taxel_takes_what_a_gaussian_has_inside_it():
 REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "both": (lambda: Taxels("L", 1e-3, count=3, centres=[0.0]), "a `count` or their `centres`"),
     "width": (lambda: Taxels("L", 0.0, count=3), "`width` should be from 1e-06 to 10 m, not 0"),
-    "pad": (lambda: SoftGrasp(taxels={"skin": Taxels("K", 1e-3, count=3)}), "they lie on `K`"),
-    "name": (lambda: SoftGrasp(taxels={"L": Taxels("L", 1e-3, count=3)}), "is called `L` too"),
+    "pad": (lambda: still(taxels={"skin": Taxels("K", 1e-3, count=3)}), "they lie on `K`"),
+    "name": (lambda: still(taxels={"L": Taxels("L", 1e-3, count=3)}), "is called `L` too"),
     "channel": (
         lambda: simulate(
             coarse(), times(0.1, 3), gradient="forward", wrt=["pad.E"], touch=["L.norm"]
@@ -179,7 +179,7 @@ def test_taxels_are_sensors_of_a_fit():
     felt = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
     centre = {"L.centre": Sensor(noise=1e-4), "bracket_moment": Sensor(noise=1e-3)}
     planned = begin(SHAKE, BASE)
-    rig = SoftGrasp(planned.rig.settings, planned.rig.reference, taxels=SKIN)
+    rig = still(planned.rig.settings, planned.rig.reference, taxels=SKIN)
     data = record("shake", planned._replace(rig=rig), TRUTH, SENSORS | felt | centre, noise=0.0)
     assert data.channels[-6:] == (*felt, *centre)
     sensors = (

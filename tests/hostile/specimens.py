@@ -74,7 +74,7 @@ from torchsoft.scenario import grasp_and_roll
 torch.set_num_threads(1)
 def roll(_=0):
     coarse = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
-    model = SoftGrasp(Parameters().override(coarse))
+    model = still(coarse)
     rig = grasp_and_roll(model, grasp_force=75.0)
     run = simulate(model, torch.linspace(0, 0.3, 7, dtype=torch.float64), y0=rig.y0)
     return [float(value).hex() for value in run["y_Br"]]
@@ -114,14 +114,14 @@ def make(description: Path, folder: Path) -> None:
 
 def run() -> Trajectory:
     """The disc at rest, for 50 ms."""
-    model = SoftGrasp(Parameters().override(SMALL))
+    model = still(SMALL)
     t = torch.linspace(0, 0.05, 11, dtype=torch.float64)
     return simulate(model, t, y0=rest(model).detach(), step=5e-3)
 
 
 def problem() -> Problem:
     """Stiffnesses of pads and contacts, from strokes of 0.4 s."""
-    p = Parameters().override(SMALL)
+    p = PAPER.override(SMALL)
     sensors = {"x_C": Sensor(noise=1e-5), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
     strokes = Strokes(travel=5e-3, stroke_time=0.15)
     motion = Excitation(motion=strokes, duration=0.4, senses="bracket")

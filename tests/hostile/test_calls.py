@@ -74,7 +74,7 @@ PUSH = {"measures": "disc.x", "pushes": "bracket.x", "law": PD(1.0, 1.0), "setpo
 
 
 def grasping(**parts: Any) -> Any:
-    return simulate(SoftGrasp(coarse(pad__elements_x=24).settings, **parts), T)
+    return simulate(still(coarse(pad__elements_x=24).settings, **parts), T)
 
 
 def falling(body: Any = None, law: Any = None, mesh: Any = None, points: Any = 0) -> Any:
@@ -163,7 +163,7 @@ def of_runs() -> Iterator[Attack]:
                 None,
                 3,
                 "model",
-                Parameters(),
+                PAPER,
                 nn.Linear(1, 1),
                 model.pads["L"],
                 model.forward,

@@ -94,7 +94,7 @@ GRASP = {"duration": 1.0, "depth": 1.5e-3, "senses": "bracket", "grasp_time": 0.
 
 
 def parameters() -> list[dict[str, Any]]:
-    return [Parameters().override(COARSE).model_dump()]
+    return [PAPER.override(COARSE).model_dump()]
 
 
 def excitations() -> list[dict[str, Any]]:
@@ -116,7 +116,7 @@ def run_briefly(p: Parameters) -> None:
     """The rig at rest and three steps on."""
     if p.pad.memory > SMALL or p.pad.elements_x * p.contact.points > 500:
         return
-    model = SoftGrasp(p)
+    model = still(p)
     y0 = rest(model).detach()
     run = simulate(model, BRIEFLY, y0=y0, step=2e-3)
     finite(y0, run.y, *run.channels.values())
@@ -124,7 +124,7 @@ def run_briefly(p: Parameters) -> None:
 
 def excite_briefly(e: Excitation) -> None:
     """The grasp, and its reference to the end."""
-    begun = begin(e, Parameters().override(COARSE))
+    begun = begin(e, PAPER.override(COARSE))
     follow = begun.rig.follow(torch.linspace(0, e.duration, 101, dtype=torch.float64))
     finite(begun.y0, follow, simulate(begun.rig, BRIEFLY, y0=begun.y0, step=2e-3).y)
 

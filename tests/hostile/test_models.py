@@ -74,7 +74,7 @@ def spread(rng: np.random.Generator, value: float, decades: float) -> float:
 
 def settings(rng: np.random.Generator) -> Parameters:
     """Numbers about the usual ones, near for some models and three decades away for others."""
-    decades, base = float(rng.choice([0.1, 0.5, 1.0, 3.0])), Parameters()
+    decades, base = float(rng.choice([0.1, 0.5, 1.0, 3.0])), PAPER
     values: dict[str, Any] = {
         name: spread(rng, row["value"], min(decades, 0.02) if name in SIZES else decades)
         for name, row in base.table().items()
@@ -120,7 +120,7 @@ def build(rng: np.random.Generator) -> tuple[Excitation, SoftGrasp]:
     solid = StandardLinearSolid(p.pad.E, p.pad.E * float(rng.uniform(0.9, 4.0)), *rubber)
     torch.manual_seed(int(rng.integers(99)))
     law = some(None, None, None, Network(), lambda E, F_N, R: (E - 0.3 * F_N).clamp(min=0.0) / R)
-    model = SoftGrasp(
+    model = still(
         p, friction=law, shape=some(*[Circle(r)] * 4, oval, box), material=some(*[usual] * 5, solid)
     )
     numbers = [x for x in model.parameters() if x.ndim == 0]
@@ -213,7 +213,7 @@ def test_threads_give_the_bits_of_runs_alone(tally):
         coarse(pad__elements_x=24),
         coarse(pad__elements_x=24, pad__fidelity="inertial"),
         coarse(pad__elements_x=24, contact__points=2),
-        SoftGrasp(coarse(pad__elements_x=24).settings, friction=law(20)),
+        still(coarse(pad__elements_x=24).settings, friction=law(20)),
     ]
     starts = [grasp(model, (0.05, 0.0)) for model in models]
 
@@ -239,6 +239,6 @@ def test_laws_first_compiled_in_many_threads_are_right(tally):
     line, base = tally("laws first compiled in threads"), coarse(pad__elements_x=24)
     y0, held = grasp(base, (0.05, 0.0))
     for number in range(count(15)):
-        models = [SoftGrasp(base.settings, friction=law(number)) for _ in range(THREADS)]
+        models = [still(base.settings, friction=law(number)) for _ in range(THREADS)]
         run = lambda k, _, models=models: [simulate(models[k], T, y0=y0, reference=held).y]
         together(line, run, 1)
