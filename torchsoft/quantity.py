@@ -2,7 +2,7 @@
 constructor that takes it.
 
 Everything else that speaks of the number reads it there: the check of a module's parameters, the
-tables of rig files, the settings of the paper's rig, the bounds of an identification.
+tables of rig files, the bounds of an identification.
 """
 
 import inspect

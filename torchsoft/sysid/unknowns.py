@@ -57,8 +57,7 @@ class Prior(Table):
 
 
 class Unknown(Table):
-    """One parameter to identify, by its name in the rig, user-defined laws included, or by its
-    alias in `Parameters`.
+    """One parameter to identify, by its name in the rig or its file, user-defined laws included.
 
     `nominal` is the start of the search, by default the value of the recordings' own rigs; with
     `ratio_to`, value, nominal, bounds and prior are those of the ratio to that other parameter, and
