@@ -4,18 +4,15 @@ import base64
 from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic.fields import FieldInfo
 
 from torchsoft.files import check_file
 from torchsoft.physics.energy import stores
 from torchsoft.physics.rig import Rig
-from torchsoft.quantity import metadata
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.fields import NumberOr
 from torchsoft.rigs.places import Place
 from torchsoft.rigs.places import place as place_in
 from torchsoft.rigs.written import files_renamed
@@ -70,20 +67,13 @@ def outputs_of(rig: Any) -> dict[str, Any]:
 def place(file: RigFile, name: str) -> Place:
     """The place of a name in the rig file of a dataset. Raises `ValueError` for an unknown name,
     and for a table that the dataset replaces."""
+    if name in file.names:
+        full = " and ".join(map(repr, file.full(name)))
+        raise ValueError(f"`{line(name, 80)}` is short; in a file say what it stands for, {full}")
     found = place_in(file, name)
     if (own := OWN.get(str(found.keys[0]))) is not None:
         raise ValueError(f"`{line(name, 80)}` has no part in a dataset, whose own {own} decide it")
     return found
-
-
-def hint(field: FieldInfo) -> Any:
-    """The annotation of a field."""
-    return Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
-
-
-def number_or_word(field: FieldInfo) -> NumberOr | None:
-    """The declaration of a field that takes a number or a word, None for other fields."""
-    return next((one for one in metadata(hint(field)) if isinstance(one, NumberOr)), None)
 
 
 def own_points(rig: Rig, name: str) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@ trajectory."""
 
 import base64
 import itertools
-import re
 import shutil
 import weakref
 from collections.abc import Iterable, Mapping
@@ -20,17 +19,14 @@ from torch import Tensor
 from torchsoft.datasets.distributions import Distribution, Kind
 from torchsoft.datasets.rig_files import (
     differs,
-    hint,
-    number_or_word,
     own_points,
     place,
 )
 from torchsoft.datasets.schema import Label, Variable, arrays
-from torchsoft.physics.parts import PD, Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
-from torchsoft.quantity import quantity
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.places import unit
 from torchsoft.solve.formats import meanings
 from torchsoft.solve.trajectory import channels, units
 from torchsoft.tables import line, shown
@@ -177,28 +173,10 @@ class Subject:
 
     def _label(self, name: str) -> Label:
         keys, _, field = place(self.file, name)
-        declared = quantity(hint(field)) or number_or_word(field)
-        unit = declared.unit if declared else "1"
-        if re.search(r",| or ", unit):  # it depends on what the number is of
-            unit = self._unit_of(name, keys) or unit
         meaning = (
             f": {field.description}" if isinstance(keys[-1], str) and field.description else ""
         )
-        return Label(unit, f"parameter {name} of the rig file{meaning}")
-
-    def _unit_of(self, name: str, keys: tuple[Any, ...]) -> str | None:
-        """Unit of a parameter whose field takes several units, such as a motion or a gain."""
-        group, part, *way = keys
-        if group == "motion":
-            return self.file.unit(part)
-        if group == "controllers" and way[:1] == ["gain"]:
-            one, (row, column) = self.file.controllers[part], way[1:]
-            n = len(one.measures)
-            pushed = one.pushes[row]
-            loop = Actuator(one.measures[column % n], pushed, PD(1.0, 1.0), setpoint=part)
-            return loop.gain_unit(column >= n)
-        known = self.template.quantity(name) if name in self.template.aliases else None
-        return known and known.unit
+        return Label(self.file.unit_of(name), f"parameter {name} of the rig file{meaning}")
 
     @property
     def constants(self) -> dict[str, Any]:
@@ -296,7 +274,7 @@ class Drawn(NamedTuple):
             raise ValueError(f"{where}: {error}") from None
         if isinstance(value, int):
             raise ValueError(f"{where} must be the same in every trajectory; set it in `fixed`")
-        word = isinstance(value, str) and number_or_word(field)
+        word = isinstance(value, str) and unit(field)
         if not (value is None or isinstance(value, float) or word):
             raise ValueError(f"{where} is no number, but {shown(value)}")
         if (base := parameters[name].ratio_to) is None:

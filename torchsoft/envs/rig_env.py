@@ -132,7 +132,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         for name, ends in checked("parameters", ranges, ranges, "").items():
             for end in ends:
                 try:
-                    file.override({name: float(end)})  # pyright: ignore[reportArgumentType]
+                    file.override({name: float(end)})  # pyright: ignore[reportAttributeAccessIssue]
                 except ValueError as error:
                     raise ValueError(f"`parameters[{name!r}]` = {end:g}: {error}") from None
         return dict(ranges)

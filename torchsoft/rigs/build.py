@@ -10,14 +10,13 @@ from typing import Annotated, Any, Self, TypeVar
 import numpy as np
 import torch
 from pydantic import Field, PrivateAttr, model_validator
-from pydantic.fields import FieldInfo
 
 from torchsoft.display import Shown, suggestion
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.names import check_names
-from torchsoft.physics.parts import COORDINATES, coordinate_unit
+from torchsoft.physics.parts import COORDINATES, PD, Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed
 from torchsoft.physics.statics import NoEquilibrium, massless, net_loads, resting, standing
@@ -210,18 +209,30 @@ class RigFile(Shown, Group):
         hidden = "names.", "sources.", "outputs.", "title"
         return {
             name: {
-                "value": value, "unit": self._unit(name, field) or "1",
+                "value": value, "unit": self.unit_of(name),
                 "source": self.sources.get(name, "assumed"), "meaning": field.description or "",
             }
             for name, value, field in entries(self)
             if not name.startswith(hidden) and type(value) in (float, int, tuple)
         }  # fmt: skip
 
-    def _unit(self, name: str, field: FieldInfo) -> str:
-        group, _, motion = name.partition(".")
-        if group == "motion" and name.endswith((".value", ".values", ".offset")):
-            return self.unit(motion.rpartition(".")[0])
-        return unit(field)
+    def unit_of(self, name: str) -> str:
+        """Unit of an entry, "1" for one without. Raises `ValueError` for an unknown name."""
+        keys, _, field = place(self, name)
+        own, (group, *way) = unit(field) or "1", keys
+        if not re.search(r",| or ", own) or len(way) < 2:
+            return own
+        if group == "motion":
+            return self.unit(str(way[0]))
+        if group == "actuators":
+            one = self.actuators[str(way[0])]
+            rate, pushed, measured = way[1] == "Kd", one.pushes, one.measured
+        else:
+            part, _, row, column = way if len(way) == 4 else (*way, 0, 0)
+            one = self.controllers[str(part)]
+            rate, number = divmod(int(column), len(one.measures))
+            pushed, measured = one.pushes[int(row)], one.measures[number]
+        return Actuator(measured, pushed, PD(1.0, 1.0), setpoint="w").gain_unit(bool(rate))
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         return f"RigFile: {self.title or 'a rig'}", [

@@ -229,7 +229,7 @@ def plain(part: nn.Module) -> str:
     }
     known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
     for name, value in vars(part).items():
-        if name in ("tables", "short"):  # which no run depends on
+        if name in ("tables", "short"):  # on which no run depends
             continue
         if isinstance(value, ARRAYS) or (not name.startswith("_") and isinstance(value, VALUES)):
             known[name] = stated(value)
