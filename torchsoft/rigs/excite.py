@@ -86,71 +86,57 @@ def excite(
                 f"{suggestion(excitation, CATALOGUE, 'there are')}"
             )
         excitation = CATALOGUE[excitation]
-    body, across, along = _grasping(file, body)
-    grasp = {"times": (0.0, GRASP), "values": (0.0, across.way * excitation.depth)}
-    grasp = {"kind": "profile", "offset": "start"} | grasp
-    press = grasp | dict(excitation.press or {})
+    body, across, way = _presser(file, body)
+    along = "y" if across == "x" else "x"
+    press_loop, roll_loop = (_loops(file)[f"{body}.{axis}"] for axis in (across, along))
+    grasp = {"times": (0.0, GRASP), "values": (0.0, way * excitation.depth), "offset": "start"}
+    press = {"kind": "profile"} | grasp | dict(excitation.press or {})
     roll = dict(excitation.roll)
     for motion in (press, roll):
-        if motion["kind"] in ("strokes", "chirp", "multi_sine"):
+        if motion["kind"] != "profile":
             motion["since"] = SINCE
-    changes: dict[str, Any] = {
-        f"motion.{across.loop.setpoint}": press,
-        f"motion.{along.loop.setpoint}": roll,
-    }
-    if across.loop.field.startswith("actuators."):
-        fed = file.actuators[across.loop.field.removeprefix("actuators.")].feed_forward
-        if fed is not None:
-            values = {"times": (0.0, GRASP), "values": (0.0, "held")}
-            changes[f"motion.{fed}"] = {"kind": "profile"} | values
-    outputs = {"duration": excitation.duration, "interval": INTERVAL, "snapshots": ()}
-    groups: dict[str, Any] = {"outputs": outputs}
-    if along.loop.field.startswith("actuators."):
-        name = along.loop.field.removeprefix("actuators.")
-        groups["actuators"] = {name: {"measures": f"{senses or body}.{along.axis}"}}
-    touched = {one.body for one in file.contacts.values() if file.pads[one.pad].base == body}
-    starts: dict[str, Any] = {}
-    for name in sorted({body, *touched}):
-        given = getattr(file.bodies[name].start, along.axis)
-        if senses is None and isinstance(given, float) and along.axis in file.bodies[name].free:
-            starts[name] = {"start": {along.axis: given + OFF_NODE}}
-    if across.axis == "y":
-        starts.setdefault(body, {}).setdefault("start", {})["y"] = "touch"
-    return file.override(changes, bodies=starts, **groups)
+    motions = {press_loop.setpoint: press, roll_loop.setpoint: roll}
+    actuators: dict[str, Any] = {}
+    if (one := file.actuators.get(press_loop.actuators[0])) and one.feed_forward is not None:
+        held = {"times": (0.0, GRASP), "values": (0.0, "held")}
+        motions[one.feed_forward] = {"kind": "profile"} | held
+    if roll_loop.actuators[0] in file.actuators:
+        actuators[roll_loop.actuators[0]] = {"measures": f"{senses or body}.{along}"}
+    starts: dict[str, dict[str, Any]] = {body: {"y": "touch"} if across == "y" else {}}
+    touched = (one.body for one in file.contacts.values() if file.pads[one.pad].base == body)
+    for name in {body, *touched} if senses is None else ():
+        given = getattr(file.bodies[name].start, along)
+        if isinstance(given, float):
+            starts.setdefault(name, {})[along] = given + OFF_NODE
+    return file.override(
+        {f"motion.{name}": motion for name, motion in motions.items()},
+        bodies={name: {"start": start} for name, start in starts.items() if start},
+        actuators=actuators,
+        outputs={"duration": excitation.duration, "interval": INTERVAL, "snapshots": ()},
+    )
 
 
-class Follower(NamedTuple):
-    """A loop of a grasp: the axis of the coordinate, its sense [1], and the loop."""
-
-    axis: str
-    way: float
-    loop: Loop
+def _loops(file: RigFile) -> dict[str, Loop]:
+    """Loops by the coordinates that they push."""
+    return {one.pushes: one for one in file.loops()}
 
 
-def _grasping(file: RigFile, body: str | None) -> tuple[str, Follower, Follower]:
-    """The body with a pad that is pressed and moved along, and its loops across and along the pad.
-    Raises `ValueError`."""
-    loops = {one.pushes: one for one in file.loops() if one.pushes.partition(".")[2] != "theta"}
-    found: dict[str, tuple[Follower, Follower]] = {}
-    rig = file.assemble()
+def _presser(file: RigFile, body: str | None) -> tuple[str, str, float]:
+    """The body with a pad that loops move across the pad and along it, the axis across, and the
+    sense of a press along it. Raises `ValueError`."""
+    found, loops, rig = dict[str, tuple[str, float]](), _loops(file), file.assemble()
     for contact in file.contacts.values():
         base = file.pads[contact.pad].base
-        if base is None or (body is not None and base != body):
+        if base is None or body not in (None, base):
             continue
         normal = rig.pads[contact.pad].axes[:, 1]
-        i = int(normal.abs().argmax())
-        across, along = COORDINATES[i], COORDINATES[1 - i]
-        if all(f"{base}.{axis}" in loops for axis in (across, along)):
-            press, roll = (loops[f"{base}.{axis}"] for axis in (across, along))
-            found[base] = (
-                Follower(across, float(normal[i].sign()), press),
-                Follower(along, 1.0, roll),
-            )
+        if all(f"{base}.{axis}" in loops for axis in ("x", "y")):
+            i = int(normal.abs().argmax())
+            found[base] = COORDINATES[i], float(normal[i].sign())
     if len(found) != 1:
         there = f"{' and '.join(found)} do; say which `body`" if found else "none does"
         raise ValueError(
             "an excitation needs a body with a pad that two loops move, across the pad and along "
             f"it: {there}"
         )
-    name, (press, roll) = next(iter(found.items()))
-    return name, press, roll
+    return next((name, *one) for name, one in found.items())

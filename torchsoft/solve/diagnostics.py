@@ -225,6 +225,9 @@ def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
     return Modes(values[order], moves)
 
 
+LOOPS = 2.0
+"""Growth rate of a mode over that without loops, from which on the loops are its cause."""
+
 UNSTABLE = "lower the gains, raise the pads' tau or E, or measure what is pushed"
 """Remedies for an unstable loop."""
 
@@ -232,8 +235,8 @@ UNSTABLE = "lower the gains, raise the pads' tau or E, or measure what is pushed
 @torch.no_grad()
 def instability(rig: Rig, run: Trajectory) -> str:
     """A sentence on an unstable loop with its remedy, from the modes about the poses in which the
-    contacts of a run carried most, each of them; empty where no mode grows there or none is
-    found."""
+    contacts of a run carried most, each of them; empty where no mode grows there, or one does
+    without loops."""
     if not run.force or not rig.actuators or any(pad.inertial for pad in rig.pads.values()):
         return ""
     least = torch.stack([force.detach()[..., 0].sum(-1) for force in run.force.values()]).amin(0)
@@ -244,7 +247,12 @@ def instability(rig: Rig, run: Trajectory) -> str:
     except NoEquilibrium:
         return ""
     values, moves = modes(rig, y, still)
-    if not len(values) or float(values[0].real) <= NEUTRAL:
+    free = Rig(
+        bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, reference=rig.reference,
+        gravity=float(rig.gravity), symbols=rig.symbols,
+    )  # fmt: skip
+    alone = float(modes(free, y, still).values.real.amax()) if len(values) else 0.0
+    if not len(values) or float(values[0].real) <= LOOPS * max(alone, NEUTRAL):
         return ""
     leading = complex(values[0])
     return (
