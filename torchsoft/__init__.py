@@ -4,8 +4,8 @@
 
     built = RigFile.ready("paper").build()  # the paper's rig
     run = built.run(gradient="discrete")    # 30 s; a Trajectory
-    run["theta"], run.force["L"]            # channels, forces of every node, SI units
-    run["theta"][1000].backward()           # built.rig.parameter("pad.E").grad
+    run["theta_C"], run.force["L"]          # channels, forces of every node, SI units
+    run["theta_C"][1000].backward()         # rig.parameter("materials.rubber.E").grad
     run.plot(); run.animate("run.html"); run.save("run.nc")
 
 What there is, each with a page of its own in help():

@@ -8,7 +8,6 @@ from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicSpline
 
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
@@ -178,6 +177,8 @@ class SplineTable(Knots):
     kind: Literal["spline"] = "spline"
 
     def build(self, context: MotionContext) -> Piecewise:
+        from scipy.interpolate import CubicSpline  # which takes a fifth of a second
+
         times, values = self.knots(context)
         if len(times) == 1:
             return Profile(times, values)

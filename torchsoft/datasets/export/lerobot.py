@@ -24,6 +24,8 @@ CHUNK, SIZE = 1000, 100
 
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 SEEN = "observation."
+EFFORTS = "effort_", "F_"
+"""Prefixes of the channels of efforts, of now and of version 0.2."""
 INDICES = ("frame_index", "episode_index", "index", "task_index")
 
 
@@ -97,11 +99,11 @@ def write(source: Source, out: Path) -> str:
 
 def of_frames(source: Source) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every feature by its name. Raises `ValueError` where no channel can be an action."""
-    action = source.motions or [name for name in source.channels if name.startswith("F_")]
+    action = source.motions or [name for name in source.channels if name.startswith(EFFORTS)]
     state = [name for name in source.channels if name not in action]
     if not action or not state:
         raise ValueError(
-            "LeRobot needs actions and a state: keep motions or efforts (F_*), and coordinates, "
+            "LeRobot needs actions and a state: keep motions or efforts (effort_*), and coordinates, "
             "in `channels`"
         )
     for key, names in (("action", action), (f"{SEEN}state", state)):
