@@ -38,9 +38,10 @@ def assemble(file: RigFile, parts: Mapping[str, Any]) -> Rig:
 
     def law(name: str, table: Any) -> Any:
         pressed = [pads[c.pad] for c in file.contacts.values() if c.law == name]
-        built = table.numbers(pressed).build(folder)
-        built.friction = left.pop(f"laws.{name}.friction", built.friction)
-        return built
+        sized, friction = table.numbers(pressed), left.pop(f"laws.{name}.friction", None)
+        if friction is None:
+            return sized.build(folder)
+        return table.part(**dict(sized.arguments(folder)) | {"friction": friction})
 
     actuators = made("actuators", lambda _, one: one.build(folder))
     for name, one in file.controllers.items():
