@@ -51,7 +51,7 @@ FLOWS = {
 own file imports."""
 APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets", "envs")
 """Folders over the engine; of these, only what is `SHARED` may be imported by another."""
-SHARED_RIGS = ("build", "built", "fields", "places", "written")
+SHARED_RIGS = ("build", "built", "excite", "fields", "places", "written")
 SHARED = ("plot", "materials.presets", *(f"rigs.{name}" for name in SHARED_RIGS))
 LONGEST = 600
 """Lines; a file that grows past them holds more than one idea."""

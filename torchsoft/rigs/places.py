@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from pydantic.fields import FieldInfo
 
+from torchsoft.display import suggestion
 from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.fields import NumberOr
 from torchsoft.tables import Table, line
@@ -42,10 +43,9 @@ def place(file: Table, name: str) -> Place:
         else:
             known, n, key = [], 1, left[0]
         if str(key) not in known:
-            there = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
-            raise ValueError(
-                f"`{line(name, 80)}` is not in the rig file: {here} has {there or 'no parts'}"
-            )
+            wrong, short = (left[0], []) if keys else (name, getattr(file, "names", ()))
+            there = suggestion(wrong, [*known, *short], f"{here} has")
+            raise ValueError(f"`{line(name, 80)}` is not in the rig file: {there}")
         keys, left = [*keys, key], left[n:]
     return Place(tuple(keys), at, field)
 

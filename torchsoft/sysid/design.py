@@ -19,6 +19,7 @@ from torchsoft.plan.knots import Bounds, Moves, knots
 from torchsoft.plan.search import ProjectedAdam
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
+from torchsoft.rigs.excite import excite
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
@@ -444,7 +445,8 @@ def choose(
     files, made, failures = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
         with at_field(f"design.candidates.{name}"):
-            files[name] = file.override(**settings)
+            known = isinstance(settings, str)
+            files[name] = excite(file, settings) if known else file.override(**settings)
             built = files[name].build()
         try:
             made[name] = planned(stated, files[name], built, name, plan.rtol, noise=0.0)

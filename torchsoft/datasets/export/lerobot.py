@@ -103,8 +103,8 @@ def of_frames(source: Source) -> Iterator[tuple[str, dict[str, Any]]]:
     state = [name for name in source.channels if name not in action]
     if not action or not state:
         raise ValueError(
-            "LeRobot needs actions and a state: keep motions or efforts (effort_*), and coordinates, "
-            "in `channels`"
+            "LeRobot needs actions and a state: keep motions or efforts (effort_*), and "
+            "coordinates, in `channels`"
         )
     for key, names in (("action", action), (f"{SEEN}state", state)):
         yield key, {"dtype": "float32", "shape": [len(names)], "names": names}
