@@ -26,18 +26,21 @@ from torchsoft.tables import shown
 
 class Vocabulary(NamedTuple):
     """Columns of the recordings of a rig: `units` by column, the names of signals, what `headings`
-    of other names stand for, and the angles that are `unwrapped`."""
+    of other names stand for, the angles that are `unwrapped`, and `short` names of columns."""
 
     units: Mapping[str, str]
     signals: tuple[str, ...]
     headings: Mapping[str, str] = {}
     unwrapped: tuple[str, ...] = ()
+    short: Mapping[str, str] = {}
 
     def renamed(self, headings: Mapping[str, str], unwrapped: Collection[str]) -> "Vocabulary":
         """With headings of other names, and with angles that are unwrapped, by their headings.
         Raises `ValueError` for one that stands for no column, or for no angle."""
+        headings = {heading: self.short.get(name, name) for heading, name in headings.items()}
+        names = self.short | headings
         for heading in (*headings, *unwrapped):
-            if (name := headings.get(heading, heading)) not in self.units:
+            if (name := names.get(heading, heading)) not in self.units:
                 raise ValueError(
                     f"columns.{heading} = {shown(name)} is no channel of the rig; "
                     f"{suggestion(name, self.units, 'there are')}"
@@ -47,7 +50,7 @@ class Vocabulary(NamedTuple):
                     f"columns.{heading}.unwrap: `{name}` is in {self.units[name]}, and only angles "
                     "wrap: leave it out"
                 )
-        turned = tuple(headings.get(heading, heading) for heading in unwrapped)
+        turned = tuple(names.get(heading, heading) for heading in unwrapped)
         return self._replace(headings=headings, unwrapped=turned)
 
     @property
@@ -224,7 +227,9 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
 def read_csv(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
     """A table of numbers under `name [unit]`. Raises `ValueError` naming the row and the column."""
     units = {name: UNITS[unit] for name, unit in known.units.items()}
-    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore, known.headings)
+    table = csvfile.read(
+        path, units, lambda name, n: hint(name, n, units), ignore, known.headings, known.short
+    )
     return check_table(Columns(path, table.values, table.rows, ignored=table.ignored), known)
 
 

@@ -75,7 +75,8 @@ def vocabulary(rig: Rig, stated: Mapping[str, Column]) -> Vocabulary:
     columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
     headings = {heading: one.of for heading, one in stated.items() if one.of is not None}
     unwrapped = [heading for heading, one in stated.items() if one.unwrap]
-    return Vocabulary(columns, signals).renamed(headings, unwrapped)
+    short = {name: full for name, full in rig.short.items() if full in columns}
+    return Vocabulary(columns, signals, short=short).renamed(headings, unwrapped)
 
 
 def followed(tables: Tables, rig: Rig) -> Reference:
