@@ -80,11 +80,10 @@ def read(
     hint: Hint,
     ignore: Collection[str] | None = (),
     headings: Mapping[str, str] | None = None,
-    short: Mapping[str, str] | None = None,
 ) -> Numbers:
     """The columns `known` of a file, without those that are to be ignored; None ignores all others.
-    `headings` are names of columns in the file in place of those that are known, and `short` names
-    beside them. Raises `ValueError`, and `OSError`."""
+    `headings` are names of columns in the file in place of those that are known. Raises
+    `ValueError`, and `OSError`."""
     headings = headings or {}
     for written, name in headings.items():
         if name not in known:
@@ -92,9 +91,7 @@ def read(
                 f"{path}: the column {shown(written)} stands for `{line(name, 80)}`, which is not "
                 f"known{hint(written, 2)}"
             )
-    own = known.keys() - headings.values()
-    beside = {name: full for name, full in (short or {}).items() if full in own}
-    names = {name: name for name in own} | beside | dict(headings)
+    names = {name: name for name in known.keys() - headings.values()} | dict(headings)
     places, comma = table(path, {*names, *(ignore or ())})
     if not places:
         raise ValueError(f"{path} is empty{hint('', 1)}")
