@@ -1,8 +1,8 @@
 """Question: which motions should a rig make, for its data to identify contact and pad parameters?
 
-For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of the sensors'
-predicted samples (J: exact sensitivities over the sensors' noise, coordinates: logarithms of the
-parameters) gives the Cramer-Rao standard deviation sqrt(diag F^-1) of each parameter; F is
+For every excitation of `torchsoft.rigs.excite.CATALOGUE` the Fisher matrix F = J^T J of the
+sensors' predicted samples (J: exact sensitivities over the sensors' noise, coordinates: logarithms
+of the parameters) gives the Cramer-Rao standard deviation sqrt(diag F^-1) of each parameter; F is
 additive, so combinations follow by summing. What a tenth of the tolerance changes, shifts an
 estimate by F^-1 J^T of it: what an excitation is worth is the root of both squared. Steps are
 frozen. Derivatives of hard slipping can be inconsistent: J is checked against a central difference
@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from identify_contact import TRUTH
+from identify_contact import MU_K, MU_S, TRUTH
 from tqdm import tqdm
 
-from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, Strokes, begin
+from torchsoft import RigFile, excite
 from torchsoft.experiment import markdown, options, write
+from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
 from torchsoft.sysid.fit import percent, shift, standard_deviations
@@ -94,11 +94,9 @@ def row(
 
 
 SMOKE = {
-    "strokes": Excitation(
-        motion=Strokes(travel=8e-3, stroke_time=0.3), duration=0.9, senses="bracket"
-    ),
+    "strokes": Excitation({"kind": "strokes", "travel": 8e-3, "stroke_time": 0.3}, duration=0.9),
     "jerks, light": Excitation(
-        motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.9, depth=3e-4, senses="bracket"
+        {"kind": "strokes", "travel": 30e-3, "stroke_time": 0.1}, duration=0.9, depth=3e-4
     ),
 }
 
@@ -112,12 +110,11 @@ def check(part: Residuals) -> Residuals:
 
 def assess(excitation: Excitation, rtol: float) -> Information:
     """Raises `SimulationFailed`."""
-    p = Parameters().override({"contact.v_s": V_S})
-    recording = record("one", begin(excitation, p), {}, RIG, rtol=rtol, noise=0.0)
-    friction = 0.5 * (
-        p.contact.mu_k + p.contact.mu_s
-    )  # bounds that do not cross; nothing is searched here
-    apart = {"contact.mu_k": Unknown(high=friction), "contact.mu_s": Unknown(low=friction)}
+    built = excite(RigFile.ready("paper").override({"contact.v_s": V_S}), excitation).build()
+    recording = record("one", built, {}, RIG, rtol=rtol, noise=0.0)
+    # bounds that do not cross; nothing is searched here
+    friction = 0.5 * sum(built.rig.parameter(name).item() for name in (MU_K, MU_S))
+    apart = {MU_K: Unknown(high=friction), MU_S: Unknown(low=friction)}
     problem = Problem([recording], RIG, {name: Unknown() for name in NAMES} | apart)
     x, v = problem.coordinates.start, np.random.default_rng(0).standard_normal(len(NAMES))
     runner = Runner(problem.recordings)
@@ -145,7 +142,8 @@ def table(rows: list[Row]) -> str:
         off = one.dropped or f"{one.inconsistency:.0e}"
         lines.append((" + ".join(one.names), f"{one.seconds:.1f}", *cells, off))
     return markdown(
-        ("excitation", "s", *(name.split(".")[1] for name in NAMES), "derivative off by"), lines
+        ("excitation", "s", *(name.rpartition(".")[2] for name in NAMES), "derivative off by"),
+        lines,
     )
 
 

@@ -21,12 +21,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
-from torchsoft.experiment import COARSE, grid, markdown, options, write
+from torchsoft import BuiltRig, NoEquilibrium, Rig, RigFile, Trajectory
+from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.plot import diagram
 from torchsoft.plot.animation import animate, player
 from torchsoft.plot.dashboard import dashboard
@@ -39,7 +38,16 @@ from torchsoft.plot.figures import (
     snapshots,
     timeline,
 )
-from torchsoft.scenario import grasp_and_roll
+
+PAPER = RigFile.ready("paper")
+PAPER_LIKE = {"contact.K_t": 100.0}
+"""The paper-like friction set."""
+
+SETTLE = 0.5
+"""Time [s] after the grasp at which the bracket is judged to be at rest."""
+
+HELD = 1e-6
+"""Distance [m] to which the bracket is held at its height."""
 
 
 @dataclass(frozen=True)
@@ -56,31 +64,58 @@ class Run:
     """One manipulation."""
 
     friction: str
-    model: SoftGrasp
+    file: RigFile
+    rig: Rig
     trajectory: Trajectory
     grasp_force: float
 
 
-def output_times(duration: float) -> Tensor:
-    """A 10 ms grid, and the instants 0.125 s and 0.375 s of Figs. 14 and 16 [s]."""
-    return torch.cat((grid(duration), torch.tensor([0.125, 0.375], dtype=torch.float64))).sort()[0]
+def pushed(file: RigFile, force: float) -> BuiltRig:
+    """The rig with a force [N] downwards fed forward to the bracket."""
+    return file.override({"motion.F_ff.values": [0.0, -force]}).build()
 
 
-def manipulate(config: Config, friction: str, changes: dict[str, Any]) -> Run:
+def grasping_force(file: RigFile, rtol: float) -> float:
+    """Force [N] fed forward that leaves the vertical loop nothing to do once the grasp has settled.
+
+    Friction locked in during the grasp stiffens the pads, so that the force of statics, "held" in a
+    rig file, is too low: the grasp itself is simulated, by the secant method.
+    """
+    grasp: Any = file.motion["y_d"]
+    t = [0.0, grasp.times[-1], grasp.times[-1] + SETTLE]
+
+    def error(force: float) -> float:
+        return float(pushed(file, force).run(t, rtol=rtol)["y_Br"][-1]) - grasp.values[-1]
+
+    force, off = 0.0, error(0.0)
+    gain = 2.0 * file.actuators["y"].Kp  # the pads are about as stiff as the loop
+    for _ in range(20):
+        if abs(off) <= HELD:
+            return force
+        new = force + gain * off
+        new_off = error(new)
+        gain = (new - force) / (off - new_off)
+        force, off = new, new_off
+    raise NoEquilibrium(
+        f"no grasping force found: the bracket is still {off:.2g} m off at {force:.4g} N"
+    )
+
+
+def manipulate(config: Config, friction: str, changes: Mapping[str, Any]) -> Run:
     """Find the grasping force and run the manipulation with one friction set."""
-    model = SoftGrasp(Parameters().override(changes | (COARSE if config.smoke else {})))
-    t = output_times(0.6 if config.smoke else model.settings.scenario.duration)
+    file = PAPER.override(changes)
+    if config.smoke:
+        file = file.override(COARSE, outputs={"duration": 0.6, "snapshots": [0.125, 0.375]})
     print(f"{friction} friction: finding the grasping force", flush=True)
-    m = grasp_and_roll(model, rtol=config.rtol)
-    print(f"{friction} friction: {m.grasp_force:.3f} N hold the bracket; rolling", flush=True)
-    run = simulate(model, t, y0=m.y0, rtol=config.rtol, progress=True)
-    return Run(friction, model, run, m.grasp_force)
+    force = grasping_force(file, config.rtol)
+    print(f"{friction} friction: {force:.3f} N hold the bracket; rolling", flush=True)
+    built = pushed(file, force)
+    return Run(friction, file, built.rig, built.run(rtol=config.rtol, progress=True), force)
 
 
 def run(config: Config) -> tuple[Run, Run]:
     """The default and the paper-like friction set."""
-    paper_like = {"contact.K_t": Parameters.paper_like().contact.K_t}
-    return manipulate(config, "default", {}), manipulate(config, "paper-like", paper_like)
+    return manipulate(config, "default", {}), manipulate(config, "paper-like", PAPER_LIKE)
 
 
 def summary(run: Run) -> dict[str, Any]:
@@ -101,14 +136,14 @@ def summary(run: Run) -> dict[str, Any]:
             "min": 1e3 * held.min().item() if len(held) else None,
             "max": 1e3 * held.max().item() if len(held) else None,
         },
-        "theta_10_rad": at(10, r["theta"]),
-        "theta_30_rad": at(30, r["theta"]),
-        "peak_speed_mm_s": 1e3 * r["v_x"].abs().max().item(),
-        "F_y_hold_N": at(5, -r["F_y"]),
-        "F_x_peak_N": r["F_x"].abs().max().item(),
-        "M_Br_peak_Nm": r["bracket_moment"].abs().max().item(),
+        "theta_10_rad": at(10, r["theta_C"]),
+        "theta_30_rad": at(30, r["theta_C"]),
+        "peak_speed_mm_s": 1e3 * r["v_x_C"].abs().max().item(),
+        "F_y_hold_N": at(5, -r["effort_y"]),
+        "F_x_peak_N": r["effort_x"].abs().max().item(),
+        "M_Br_peak_Nm": r["M_U"].abs().max().item(),
         "contact_nodes": {name: at(5, count) for name, count in touching.items()},
-        "angular_momentum_sign_out": int(r["omega"][rolling_out].mean().sign())
+        "angular_momentum_sign_out": int(r["omega_C"][rolling_out].mean().sign())
         if r.t[-1] >= 9
         else None,
         "energy_residual_rel": r.energy_residual_rel,
@@ -116,10 +151,9 @@ def summary(run: Run) -> dict[str, Any]:
         "newton_per_step": r.stats.newton_per_step,
         "failed_steps": r.stats.failed_steps,
         "wall_s": r.stats.wall_s,
-        "pad": run.model.settings.pad.fidelity,
         "friction": run.friction,
         "grasp_force_N": run.grasp_force,
-        "parameters": run.model.settings.table(),
+        "parameters": run.file.table(),
     }
 
 
@@ -173,10 +207,10 @@ def table(numbers: Mapping[str, Any]) -> str:
 
 
 CURVES = (  # title, channel, its set-point, label, scale
-    ("speed (paper: Figs. 10b, 13b)", "v_x", "x_d", "$v_x$ [mm/s]", 1e3),
-    ("force on the bracket (Fig. 11)", "F_x", "", "$F_x$ [N]", 1.0),
-    ("moment on the bracket (Fig. 12)", "bracket_moment", "", "$M_{Br}$ [N m]", 1.0),
-    ("angular momentum (Fig. 17)", "angular_momentum", "", r"$I_C\,\omega$ [kg mm$^2$/s]", 1e6),
+    ("speed (paper: Figs. 10b, 13b)", "v_x_C", "x_d", "$v_x$ [mm/s]", 1e3),
+    ("force on the bracket (Fig. 11)", "effort_x", "", "$F_x$ [N]", 1.0),
+    ("moment on the bracket (Fig. 12)", "M_U", "", "$M_{Br}$ [N m]", 1.0),
+    ("angular momentum (Fig. 17)", "angular_momentum_C", "", r"$I_C\,\omega$ [kg mm$^2$/s]", 1e6),
 )
 
 
@@ -211,7 +245,7 @@ def figures(run: Run) -> dict[str, Figure]:
         "snapshots": snapshots(
             trajectory, title=f"Grasp and roll, {run.friction} friction (paper: Fig. 16)"
         ),
-        "multibond": diagram.multibond_graph(run.model),
+        "multibond": diagram.multibond_graph(run.rig),
     }
     for time, number in ((0.125, 14), (5.0, 15)):
         if time <= trajectory.t[-1]:
@@ -228,7 +262,7 @@ def save(config: Config, runs: tuple[Run, Run]) -> None:
     config.out.mkdir(parents=True, exist_ok=True)
     first.trajectory.save(config.out / "trajectory.nc")
     other.trajectory.save(config.out / "trajectory_paper_like.nc")
-    (config.out / "multibond.dot").write_text(diagram.dot(first.model), encoding="utf-8")
+    (config.out / "multibond.dot").write_text(diagram.dot(first.rig), encoding="utf-8")
     content = summary(first) | {"paper_like": summary(other)}
     pictures = figures(first) | {"over_time": over_time(runs)}
     pictures |= {

@@ -23,12 +23,11 @@ from typing import Any
 
 import identify_contact
 import numpy as np
-from identify_contact import TRUTH
+from identify_contact import LAW, MU_K, MU_S, RUBBER, TRUTH
 
-from torchsoft import Parameters, SoftGrasp, Taxels
-from torchsoft.excitation import CATALOGUE, Excitation, Strokes, begin
+from torchsoft import RigFile, excite
 from torchsoft.experiment import COARSE, markdown, options, timed, write
-from torchsoft.physics.motion import Reference
+from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.sysid import RIG, Problem, Recording, identify, record
 from torchsoft.sysid.fit import percent, standard_deviations
 from torchsoft.sysid.recording import Array
@@ -37,9 +36,13 @@ from torchsoft.sysid.unknowns import Sensor, by_channel
 
 FITTED = "strokes"
 """Recording of the two identifications."""
-SKIN = Taxels("L", 3e-3, count=40, spread=1e-3)
+FELT = RigFile.ready("paper").override(
+    {"contact.v_s": 0.05},
+    taxels={"skin": {"pad": "L", "width": 3e-3, "count": 40, "spread": 1e-3}},
+)
+"""The paper's rig with the row of taxels."""
 SETS = {
-    "poses and F_x": {name: sensor for name, sensor in RIG.items() if name != "F_y"},
+    "poses and F_x": {name: sensor for name, sensor in RIG.items() if name != "effort_y"},
     "load cell": {
         "L.force_x": Sensor(noise=0.1),
         "L.force_y": Sensor(noise=0.1),
@@ -67,22 +70,15 @@ class Config:
     smoke: bool = False  # one short motion on a coarse mesh, four parameters
 
 
-def rig(settings: Parameters, reference: Reference | None = None) -> SoftGrasp:
-    """The paper's rig with the row of taxels."""
-    return SoftGrasp(settings, reference, taxels={"skin": SKIN})
-
-
 def sensors(*sets: str) -> dict[str, Sensor]:
     """Sensors of some sets, by channel."""
-    return by_channel([rig(Parameters())], {k: v for one in sets for k, v in SETS[one].items()})
+    return by_channel([FELT.assemble()], {k: v for one in sets for k, v in SETS[one].items()})
 
 
 def recording(config: Config, truth: dict[str, float], name: str, motion: Excitation) -> Recording:
     """What all sensors give, with noise."""
-    nominal = Parameters().override({"contact.v_s": 0.05} | (COARSE if config.smoke else {}))
-    planned = begin(motion, nominal)
-    felt = rig(planned.rig.settings, planned.rig.reference)
-    return record(name, planned._replace(rig=felt), truth, sensors(*SETS))
+    planned = excite(FELT.override(COARSE if config.smoke else {}), motion)
+    return record(name, planned.build(), truth, sensors(*SETS))
 
 
 def problem(data: Recording, sets: tuple[str, ...], start: dict[str, float]) -> Problem:
@@ -115,12 +111,12 @@ def cost(config: Config, data: Recording, truth: dict[str, float]) -> dict[str, 
 
 
 def main(config: Config) -> None:
-    few = ("pad.E", "contact.K_n", "contact.mu_s", "contact.mu_k")
+    few = f"{RUBBER}.E", f"{LAW}.K_n", MU_S, MU_K
     truth = {name: TRUTH[name] for name in few} if config.smoke else TRUTH
     motions = {name: CATALOGUE[name] for name in config.motions}
     if config.smoke:
-        short = Strokes(travel=8e-3, stroke_time=0.2)
-        motions = {FITTED: Excitation(motion=short, duration=0.9, senses="bracket")}
+        short = {"kind": "strokes", "travel": 8e-3, "stroke_time": 0.2}
+        motions = {FITTED: Excitation(short, duration=0.9)}
         config = replace(config, repeats=1)
     recordings = {name: recording(config, truth, name, motion) for name, motion in motions.items()}
     deviations = {
@@ -134,7 +130,7 @@ def main(config: Config) -> None:
     }
     random, fits, chi2 = np.random.default_rng(0), dict[str, Any](), dict[str, float]()
     start = {k: v * float(random.uniform(1 / 1.5, 1.5)) for k, v in truth.items()}
-    start["contact.mu_k"] = min(start["contact.mu_k"], 0.95 * start["contact.mu_s"])
+    start[MU_K] = min(start[MU_K], 0.95 * start[MU_S])
     for label in ("poses and F_x", "+ taxels"):
         stated = problem(recordings[FITTED], WITH[label], start)
         found = identify(stated, rtol=config.rtol, assumptions="trusted")
@@ -154,10 +150,10 @@ def main(config: Config) -> None:
         for motion, by in deviations.items()
         for label, sds in by.items()
     ]
-    head = ("motion", "sensors", *(name.split(".")[1] for name in truth))
+    head = ("motion", "sensors", *(name.rpartition(".")[2] for name in truth))
     write(config, content, table=markdown(head, rows))
     print(
-        f"a Jacobian with {SKIN.count} taxels takes {seconds['with_taxels_s']:.3g} s, "
+        f"a Jacobian with the row of taxels takes {seconds['with_taxels_s']:.3g} s, "
         f"{seconds['ratio']:.2f} times one without"
     )
 

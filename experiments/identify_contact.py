@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
+from torchsoft import RigFile, excite
 from torchsoft.experiment import COARSE, coloured, numbers, options, write
+from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals, StepsByName
 from torchsoft.sysid.recording import Array
@@ -33,9 +33,11 @@ from torchsoft.sysid.report import report
 from torchsoft.sysid.runs import Runner, forget
 from torchsoft.sysid.unknowns import Sensor
 
+LAW, RUBBER = "laws.steel_on_rubber", "materials.rubber"
+MU_S, MU_K = f"{LAW}.friction.mu_s", f"{LAW}.friction.mu_k"
 TRUTH = {
-    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0,
-    "contact.mu_s": 0.65, "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
+    f"{LAW}.K_n": 1.6e5, f"{LAW}.R_n": 300.0, f"{LAW}.K_t": 0.8e5, f"{LAW}.R_t": 600.0,
+    MU_S: 0.65, MU_K: 0.5, f"{RUBBER}.E": 0.9e6, f"{RUBBER}.tau": 0.012,
 }  # fmt: skip
 FITTED, HELD_OUT = ("deep pressing", "light shaking", "light jerks"), "shaking"
 DIFFERENCE = 1e-4  # Step of the finite differences in the logarithms.
@@ -82,27 +84,27 @@ class FiniteDifferences(Problem):
 def excitations(config: Config) -> dict[str, Excitation]:
     if not config.smoke:
         return {name: CATALOGUE[name] for name in (*FITTED, HELD_OUT)}
-    shake = MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2.0, 12.0))
+    strokes = {"kind": "strokes", "travel": 8e-3, "stroke_time": 0.2}
+    shake = {"kind": "multi_sine", "band": (2.0, 12.0)}
+    roll, press = shake | {"amplitude": 6e-3, "seed": 0}, shake | {"amplitude": 1e-4, "seed": 1}
     return {
-        "strokes": Excitation(
-            motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9, senses="bracket"
-        ),
-        "shaking": Excitation(motion=shake, duration=0.9, depth=8e-4, senses="bracket"),
+        "strokes": Excitation(strokes, duration=0.9),
+        "shaking": Excitation(roll, press, duration=0.9, depth=8e-4),
     }
 
 
 def truths(smoke: bool) -> dict[str, float]:
-    few = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
+    few = f"{RUBBER}.E", f"{RUBBER}.tau", f"{LAW}.K_n", MU_S
     return {name: TRUTH[name] for name in few} if smoke else TRUTH
 
 
 def record_all(config: Config, noise: float) -> list[Recording]:
     """What the rig gives; the last one is to be predicted."""
-    coarse = COARSE | {"contact.mu_k": 0.5} if config.smoke else {}
-    nominal = Parameters().override({"contact.v_s": 0.05} | coarse)
+    coarse = COARSE | {MU_K: 0.5} if config.smoke else {}
+    nominal = RigFile.ready("paper").override({"contact.v_s": 0.05} | coarse)
     options: dict[str, Any] = {"rtol": 0.1 * config.rtol, "noise": noise}
     return [
-        record(name, begin(e, nominal), truths(config.smoke), RIG, seed=k, **options)
+        record(name, excite(nominal, e).build(), truths(config.smoke), RIG, seed=k, **options)
         for k, (name, e) in enumerate(excitations(config).items())
     ]
 
@@ -112,8 +114,8 @@ def start(truth: dict[str, float], seed: int) -> dict[str, float]:
     rng, out = np.random.default_rng(seed), {}
     for name, value in truth.items():
         out[name] = float(value * rng.uniform(2.0, 3.0) ** rng.choice((-1.0, 1.0)))
-    if "contact.mu_k" in out:
-        out["contact.mu_k"] = min(out["contact.mu_k"], 0.95 * out["contact.mu_s"])
+    if MU_K in out:
+        out[MU_K] = min(out[MU_K], 0.95 * out[MU_S])
     return out
 
 
@@ -134,11 +136,9 @@ def problem(
 ) -> Problem:  # fmt: skip
     """Unknowns that begin there, mu_k as a part of mu_s."""
     unknowns = {name: Unknown(nominal=value) for name, value in begin.items()}
-    if "contact.mu_k" in begin:
-        ratio = begin["contact.mu_k"] / begin["contact.mu_s"]
-        unknowns["contact.mu_k"] = Unknown(
-            nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0
-        )
+    if MU_K in begin:
+        ratio = begin[MU_K] / begin[MU_S]
+        unknowns[MU_K] = Unknown(nominal=ratio, ratio_to=MU_S, low=0.1, high=1.0)
     return kind(recordings, sensors, unknowns)
 
 

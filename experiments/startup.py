@@ -43,18 +43,17 @@ def passed():
     now = time.perf_counter()
     out, last = now - last, now
     return out
-from torchsoft import SoftGrasp, simulate
-from torchsoft.scenario import grasp_and_roll
-m = grasp_and_roll(SoftGrasp(), grasp_force=80.66)
+from torchsoft import RigFile
+built = RigFile.ready("paper").build()
 t = torch.linspace(0, 0.3, 31, dtype=torch.float64)
 prepared = passed()
-simulate(m.model, t, y0=m.y0, rtol=1e-3)
+built.run(t, rtol=1e-3)
 times = {"model": prepared, "first run": passed(), "first result": time.perf_counter() - start}
-simulate(m.model, t, y0=m.y0, rtol=1e-3)
+built.run(t, rtol=1e-3)
 times["second run"] = passed()
-simulate(m.model, t, y0=m.y0, rtol=1e-3, gradient="discrete")["theta"].sum().backward()
+built.run(t, rtol=1e-3, gradient="discrete")["theta"].sum().backward()
 times["first gradient"] = passed()
-simulate(m.model, t, y0=m.y0, rtol=1e-3, gradient="forward", wrt=["contact.K_n"])
+built.run(t, rtol=1e-3, gradient="forward", wrt=["contact.K_n"])
 times["first sensitivities"] = passed()
 print(json.dumps(times))
 """

@@ -22,11 +22,10 @@ from pathlib import Path
 import identify_contact
 import numpy as np
 import torch
-from identify_contact import TRUTH, noisy
+from identify_contact import LAW, RUBBER, TRUTH, noisy
 from scipy import stats
 
-from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.excitation import CATALOGUE, begin
+from torchsoft import RigFile, excite
 from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
 from torchsoft.sysid import (
     RIG,
@@ -99,21 +98,21 @@ class Result:
 def cut(case: str, config: Config) -> Cut:
     """What the rig gives after the cut of a case; half of the usual mesh."""
     name, since = CUTS[case]
-    nominal = Parameters().override({"contact.v_s": 0.05} | COARSE)
-    planned = begin(CATALOGUE[name], nominal)
-    real = SoftGrasp(CATALOGUE[name].settings(nominal.override(TRUTH)), planned.rig.reference)
-    until = since + 0.5 if config.smoke else CATALOGUE[name].duration
+    file = excite(RigFile.ready("paper").override({"contact.v_s": 0.05} | COARSE), name)
+    planned = file.build()
+    real, given = (file.override(own).assemble() for own in (TRUTH, known(config)))
+    real.reference = given.reference = planned.rig.reference
+    until = since + 0.5 if config.smoke else file.outputs.duration
     at = since + np.arange(0.0, until - since + 0.5 / RATE, 1.0 / RATE)
     t = torch.from_numpy(np.append(-SETTLE, at))
-    run = simulate(real, t, y0=planned.y0, rtol=1e-2 * config.rtol)
+    run = replace(planned, rig=real).run(t, rtol=1e-2 * config.rtol)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
-    given = SoftGrasp(planned.rig.settings.override(known(config)), planned.rig.reference)
     at_rest = Standing.of(given, planned.y0, rests={"disc": [1]})
     return Cut(Recording(case, given, samples, at_rest), run.y[1].detach())
 
 
 def sought(config: Config) -> dict[str, float]:
-    some = ("contact.K_n", "pad.E", "pad.tau") if config.smoke else TRUTH
+    some = (f"{LAW}.K_n", f"{RUBBER}.E", f"{RUBBER}.tau") if config.smoke else TRUTH
     return {name: TRUTH[name] for name in some}
 
 

@@ -123,7 +123,8 @@ def test_experiment_design_smoke(tmp_path):
     module, summary = smoke("experiment_design", tmp_path)
     single = {row["names"][0]: row["sd"] for row in summary["single"]}
     both = summary["together"][0]["sd"]
-    assert single["jerks, light"]["contact.R_n"] < single["strokes"]["contact.R_n"]
+    R_n = "laws.steel_on_rubber.R_n"
+    assert single["jerks, light"][R_n] < single["strokes"][R_n]
     assert all(both[name] <= min(sd[name] for sd in single.values()) for name in module.NAMES)
     assert all(row["inconsistency"] < module.CONSISTENT for row in summary["single"])
 

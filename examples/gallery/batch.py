@@ -9,17 +9,16 @@ of its own, and one gradient for all of them.
 import matplotlib.pyplot as plt
 import torch
 
-from torchsoft import Parameters, SoftGrasp, simulate_batch
-from torchsoft.excitation import CATALOGUE, begin
+from torchsoft import RigFile, excite, simulate_batch
 
-context = begin(CATALOGUE["light shaking"], Parameters())
+rig, y0, _ = excite(RigFile.ready("paper"), "light shaking").build()
 E = torch.linspace(0.4e6, 1.2e6, 16, dtype=torch.float64, requires_grad=True)
 mu = torch.full((16,), 0.5, dtype=torch.float64, requires_grad=True)
 t = torch.linspace(0, 1.0, 201, dtype=torch.float64)
 
 batch = simulate_batch(
-    SoftGrasp(context.rig.settings), t, y0=context.y0, reference=context.rig.reference,
-    parameters={"pad.E": E, "contact.mu_s": mu, "contact.mu_k": 0.9 * mu}, gradient="discrete",
+    rig, t, y0=y0, gradient="discrete",
+    parameters={"pad.E": E, "contact.mu_s": mu, "contact.mu_k": 0.9 * mu},
 )  # fmt: skip
 print(f"{len(batch)} runs in {batch.wall_s:.1f} s; failed: {batch.failures or 'none'}")
 

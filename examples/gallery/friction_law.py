@@ -10,8 +10,7 @@ import matplotlib.pyplot as plt
 import torch
 from torch import nn
 
-from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.excitation import CATALOGUE, begin
+from torchsoft import RigFile, excite
 
 
 class Pressed(nn.Module):
@@ -31,21 +30,20 @@ class Pressed(nn.Module):
 
 
 # a motion in which the disc slips: a light grasp, jerked
-context = begin(CATALOGUE["light jerks"], Parameters())
-t = torch.linspace(0, 1.4, 401, dtype=torch.float64)
-model = SoftGrasp(context.rig.settings, friction=Pressed(mu=0.7, fall=0.05))
-run = simulate(model, t, y0=context.y0, reference=context.rig.reference, gradient="discrete")
+file = excite(RigFile.ready("paper"), "light jerks")
+law = "laws.steel_on_rubber.friction"  # its place in the rig file
+built = file.build({law: Pressed(mu=0.7, fall=0.05)})
+run = built.run(gradient="discrete")
 
 loss = run["theta"].square().mean()
 loss.backward()
 for name in ("mu", "fall", "v_eta"):
-    value = model.parameter(f"contact.friction.{name}")
+    value = built.rig.parameter(f"{law}.{name}")
     print(f"{name:5s} = {float(value.detach()):6.3f}: d(loss)/d({name}) = {float(value.grad):+.3e}")
 
 _, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 for fall in (0.0, 0.05, 0.2):
-    other = SoftGrasp(context.rig.settings, friction=Pressed(mu=0.7, fall=fall))
-    again = simulate(other, t, y0=context.y0, reference=context.rig.reference)
+    again = file.build({law: Pressed(mu=0.7, fall=fall)}).run()
     change = 1e3 * (again["theta"] - run["theta"].detach())
     axes.plot(again.t, change, label=f"fall = {fall:g} 1/N")
 axes.set(xlabel="time [s]", ylabel="angle beside 0.05 1/N [mrad]")

@@ -10,9 +10,8 @@ import matplotlib.pyplot as plt
 import torch
 from torch import nn
 
-from torchsoft import Parameters, SoftGrasp
-from torchsoft.excitation import CATALOGUE, begin
-from torchsoft.sysid import Problem, Recording, Sensor, Unknown, identify, record
+from torchsoft import RigFile, excite
+from torchsoft.sysid import Problem, Sensor, Unknown, identify, record
 
 
 class Pressed(nn.Module):
@@ -28,20 +27,16 @@ class Pressed(nn.Module):
         return (E - self.mu * torch.exp(-self.fall * F_N) * F_N).clamp(min=0.0) / (R + 10.0)
 
 
-# a bench is stood in for by the simulator: a light grasp, shaken, with noise of the sensors
-p = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2})
-motion = CATALOGUE["light shaking"].model_copy(update={"duration": 1.2})
+# a bench is stood in for by the simulator: a light grasp, jerked, with noise of the sensors
+coarse = {"pad.elements_x": 60, "pad.elements_y": 2}
+file = excite(RigFile.ready("paper").override(coarse), "hard light jerks")
 sensors = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
-truth = {"contact.friction.mu": 0.7, "contact.friction.fall": 0.05}
-plain = begin(motion, p).rig
-laws = Pressed(*truth.values()), Pressed(mu=0.5, fall=0.02)  # of the bench, and where to begin
-bench, rig = (SoftGrasp(plain.settings, plain.reference, friction=law) for law in laws)
-made = record("bench", begin(motion, p), bench, sensors)
-
-# a recording is a rig with the reference that it followed, samples (times, values) by channel,
-# and the start of the run
-recording = Recording("bench", rig, made.samples, made.start)
-problem = Problem([recording], sensors, {name: Unknown() for name in truth})
+law = "laws.steel_on_rubber.friction"
+truth = {f"{law}.mu": 0.7, f"{law}.fall": 0.05}
+bench = file.build({law: Pressed(*truth.values())})
+known = file.build({law: Pressed(mu=0.5, fall=0.02)})  # where to begin
+made = record("bench", known, bench.rig, sensors)
+problem = Problem([made], sensors, {name: Unknown() for name in truth})
 result = identify(problem, rtol=1e-4, assumptions="trusted")
 print(result.table())
 print("truth:", truth)

@@ -10,13 +10,11 @@ all of them.
 import matplotlib.pyplot as plt
 import torch
 
-from torchsoft import Parameters, Reference, simulate
-from torchsoft.excitation import CATALOGUE, begin
-from torchsoft.physics.motion import Sampled
+from torchsoft import Reference, RigFile, Sampled, excite
 
-p = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3, "contact.v_s": 0.05})
-model, y0, _ = begin(CATALOGUE["strokes"], p)  # the loop measures the bracket
-grasp = {name: model.reference[name] for name in ("y_d", "F_ff")}
+coarse = {"pad.elements_x": 60, "pad.elements_y": 3, "contact.v_s": 0.05}
+built = excite(RigFile.ready("paper").override(coarse), "strokes").build()
+grasp = {name: built.rig.reference[name] for name in ("y_d", "F_ff")}
 x_0, times = 60.3e-3, torch.linspace(0.5, 1.1, 9, dtype=torch.float64)
 t = torch.linspace(0, 1.3, 261, dtype=torch.float64)
 
@@ -30,7 +28,7 @@ def loss() -> torch.Tensor:
     optimiser.zero_grad()
     knots = torch.cat((torch.zeros(1), u)).double()
     reference = Reference(x_d=Sampled(times, x_0 + 1e-2 * knots), **grasp)
-    run = simulate(model, t, y0=y0, reference=reference, rtol=1e-3, gradient="discrete")
+    run = built.run(t, reference=reference, rtol=1e-3, gradient="discrete")
     miss = 1e3 * (run["x_C"] - (x_0 - 8e-3))[t > 1.1]
     bend = knots.diff().diff().square().sum()
     value = miss.square().mean() + 1e-3 * run["F_x"].square().mean() + bend

@@ -9,18 +9,14 @@ in the terms of mechanics, and a motion that was held out is rolled out.
 import matplotlib.pyplot as plt
 import torch
 
-from torchsoft import Profile, Reference, SoftGrasp, simulate
+from torchsoft import Profile, Reference, RigFile, simulate
 from torchsoft.physics.motion import Waves, wave
 from torchsoft.reduced import Recipe, Record, assemble, fit, mechanics, record, rollout_of, score
-from torchsoft.scenario import grasp_and_roll
 
-model = SoftGrasp()
-grasp = grasp_and_roll(model)
-held = {"y_d": Profile([0.0], [48.6e-3]), "F_ff": Profile([0.0], [-grasp.grasp_force])}
-still = Reference(
-    x_d=Profile([0.0], [60e-3]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"]
-)
-begin = simulate(model, torch.tensor([0.0, 1.0]).double(), y0=grasp.y0, reference=still).y[-1]
+file = RigFile.ready("paper").override({"motion.x_d": {"kind": "hold"}})  # grasped, not rolled
+rig = file.build().rig
+held = {name: Profile([0.0], file.motion[name].values[-1:]) for name in ("y_d", "F_ff")}
+begin = file.build().run([0.0, 1.0]).y[-1]
 
 
 def tapped(seed: int, size: float, end: float) -> Record:
@@ -30,15 +26,15 @@ def tapped(seed: int, size: float, end: float) -> Record:
     sines = wave([size] * 10, f, [0.0] * 10, (6.28 * torch.rand(10)).tolist())
     y = begin.clone()
     for body, kick in (("disc", [2e-3, 0.0, 0.1]), ("bracket", [2e-3, 0.0])):
-        at = model.layout.slices["velocity", body]
+        at = rig.layout.slices["velocity", body]
         y[at] += (torch.randn(len(kick)) * torch.tensor(kick)).double()
     t = torch.arange(0, end, 2.5e-4, dtype=torch.float64)
     reference = Reference(x_d=Waves(([0.0], [60e-3]), -1.0, end + 1.0, sines), **held)
-    return record(simulate(model, t, y0=y, reference=reference, step=2.5e-4))
+    return record(simulate(rig, t, y0=y, reference=reference, step=2.5e-4))
 
 
 taps = [tapped(seed, 3e-6, 0.3) for seed in range(8)]
-K, R = model.settings.control.K_81, model.settings.control.R_80
+K, R = file.actuators["x"].Kp, file.actuators["x"].Kd
 law = {"F_x": {"x_d": K, "x_d_dot": R, "x_C": -K, "v_C": -R}}  # Eq. 33, 34
 recipe = Recipe(threshold=0.05, width=0.004, window=0.3)
 reduced = fit(assemble(taps, mechanics(r=18.35e-3), recipe), recipe, law)

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from torchsoft import Parameters, Profile, Prony, Reference, SoftGrasp, rest, simulate
+from torchsoft import Prony, RigFile
 from torchsoft.materials.fit import fit
 from torchsoft.materials.measured import Measured, read
 
@@ -34,15 +34,13 @@ rubber = found.material(nu=0.45, rho=1100.0, depth=44e-3)
 assert isinstance(rubber, Prony)
 
 # the same grasp with that rubber, held for ten seconds
-model = SoftGrasp(Parameters().override({"control.senses": "bracket"}), material=rubber)
-y0 = rest(model).detach()
-y_Br = float(model.unpack(y0).pose["bracket"][1])
-hold = Reference(
-    x_d=Profile([0.0], [60e-3]), F_ff=Profile([0.0], [0.0]),
-    y_d=Profile([0.0, 0.1], [y_Br, y_Br - 1.5e-3]),
-)  # fmt: skip
+file = RigFile.ready("paper").override({
+    "control.senses": "bracket.x", "motion.x_d": {"kind": "hold"},
+    "motion.F_ff": {"kind": "hold", "value": 0.0},
+    "motion.y_d": {"kind": "profile", "offset": "start", "times": [0, 0.1], "values": [0, -1.5e-3]},
+})  # fmt: skip
 t = torch.cat((torch.zeros(1), torch.logspace(-2, 1, 150))).double()
-run = simulate(model, t, y0=y0, reference=hold)
+run = file.build({"materials.rubber": rubber}).run(t)
 force = run.force["U"][..., 0].sum(-1)
 print(f"peak of {force.max():.1f} N, {force[-1]:.1f} N after {t[-1]:.0f} s")
 

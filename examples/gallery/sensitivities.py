@@ -9,25 +9,25 @@ sample by a handful of parameters, from one run.
 import matplotlib.pyplot as plt
 import torch
 
-from torchsoft import Parameters, simulate
-from torchsoft.excitation import CATALOGUE, begin
+from torchsoft import RigFile, excite
 
 # where points slip under 25 N each, friction must fall slowly: see Limits
-context = begin(CATALOGUE["deep pressing"], Parameters().override({"contact.v_s": 0.05}))
+file = RigFile.ready("paper").override({"contact.v_s": 0.05})
+built = excite(file, "deep pressing").build()
 names = ["contact.K_n", "contact.R_n", "pad.E", "pad.tau"]
 t = torch.linspace(0, 1.5, 601, dtype=torch.float64)
-run = simulate(context.rig, t, y0=context.y0, gradient="forward", wrt=names, rigid=True)
+run = built.run(t, gradient="forward", wrt=names, rigid=True)
 print("derivatives:", tuple(run.sensitivities.shape), "= times, coordinates and rates, parameters")
 
 # the columns are those of `layout.rigid`: poses and velocities of the bodies
-layout = context.rig.layout
+layout = built.rig.layout
 angle = layout.rigid.index(layout.slices["pose", "disc"].start + 2)
 
 _, (above, below) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
 above.plot(t, run["theta"].detach())
 above.set_ylabel("angle [rad]")
 for i, name in enumerate(names):
-    size = float(context.rig.parameter(name).detach())
+    size = built.rig.parameter(name).item()
     below.plot(t, 1e3 * 0.01 * size * run.sensitivities[:, angle, i], label=name)
 below.set(xlabel="time [s]", ylabel="change for 1 % [mrad]")
 below.legend(ncols=2)

@@ -12,12 +12,12 @@ import matplotlib.pyplot as plt
 import torch
 from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import Parameters, SoftGrasp, press, register_method, simulate
+from torchsoft import RigFile, register_method, simulate
 
-coarse = Parameters().override({"pad.elements_x": 40, "pad.elements_y": 2})
-model = SoftGrasp(coarse)
-y0 = press(model, 48.6e-3).detach()  # the disc in the grip, without friction
-y0[model.layout.slices["velocity", "bracket"]] = torch.tensor([0.0, -0.01], dtype=torch.float64)
+coarse = {"pad.elements_x": 40, "pad.elements_y": 2}
+model = RigFile.ready("paper").override(coarse).build().rig
+bracket = {"x": 60e-3, "y": 48.6e-3, "v_y": -0.01}  # its pad grips the disc, without friction yet
+y0 = model.state(disc={"x": 60e-3, "y": "rest"}, bracket=bracket).detach()
 t = torch.linspace(0, 4e-4, 3, dtype=torch.float64)
 height = model.layout.slices["pose", "bracket"].start + 1  # of the bracket, in the flat state
 

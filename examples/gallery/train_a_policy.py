@@ -11,11 +11,10 @@ import torch
 from torch import nn
 
 import torchsoft as ts
-from torchsoft.excitation import CATALOGUE, begin
 
 torch.manual_seed(0)
 coarse = {"pad.elements_x": 60, "pad.elements_y": 3}
-paper, y0, _ = begin(CATALOGUE["strokes"], ts.Parameters().override(coarse))
+paper, y0, _ = ts.excite(ts.RigFile.ready("paper").override(coarse), "strokes").build()
 
 
 class Policy(nn.Module):

@@ -10,33 +10,25 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from torchsoft import Parameters, simulate
-from torchsoft.excitation import CATALOGUE, begin
+from torchsoft import RigFile, excite
 
-names = [
-    "contact.K_n",
-    "contact.R_n",
-    "contact.K_t",
-    "contact.mu_s",
-    "contact.mu_k",
-    "pad.E",
-    "pad.tau",
-]
+names = [f"contact.{name}" for name in ("K_n", "R_n", "K_t", "mu_s", "mu_k")] + ["pad.E", "pad.tau"]
 motions = ("strokes", "fast strokes", "deep pressing", "light shaking")
 noise = {"x": 1e-5, "y": 1e-5, "theta": 5e-4}  # of the sensors [m, rad]
-p = Parameters().override({"contact.v_s": 0.05, "pad.elements_x": 60, "pad.elements_y": 3})
+coarse = {"contact.v_s": 0.05, "pad.elements_x": 60, "pad.elements_y": 3}
+file = RigFile.ready("paper").override(coarse)
 
 table = np.zeros((len(motions), len(names)))
 for row, motion in enumerate(motions):
-    model, y0, _ = begin(CATALOGUE[motion], p)
+    built = excite(file, motion).build()
     t = torch.arange(0, 1.5, 0.005, dtype=torch.float64)
-    run = simulate(model, t, y0=y0, gradient="forward", wrt=names, rigid=True)
-    sizes = torch.stack([model.parameter(name).detach() for name in names])
+    run = built.run(t, gradient="forward", wrt=names, rigid=True)
+    sizes = torch.stack([built.rig.parameter(name).detach() for name in names])
     J = run.sensitivities.detach() * sizes  # by the logarithms
     measured = {"disc": ("x", "y", "theta"), "bracket": ("x", "y")}
-    rows = []
+    rows, layout = [], built.rig.layout
     for body, axes_ in measured.items():
-        begins = model.layout.rigid.index(model.layout.slices["pose", body].start)
+        begins = layout.rigid.index(layout.slices["pose", body].start)
         rows += [J[:, begins + i] / noise[axis] for i, axis in enumerate(axes_)]
     fisher = sum(one.T @ one for one in rows)
     table[row] = 100 * torch.linalg.inv(fisher).diagonal().sqrt().numpy()
