@@ -1,5 +1,5 @@
-"""Make the recordings of this folder: the paper's rig, its parameters `TRUTH` by the names of
-`Parameters`, measured by noisy sensors. Takes some seconds.
+"""Make the recordings of this folder: the paper's rig with the parameters `TRUTH`, measured by noisy
+sensors. Takes some seconds.
 
 python examples/identify/make.py
 """
@@ -10,23 +10,36 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchsoft import Parameters
-from torchsoft.channels import CHANNELS
-from torchsoft.excitation import Chirp, Excitation, Strokes, begin
+from torchsoft import RigFile
 from torchsoft.sysid import Recording, Sensor, record
 
 HERE = Path(__file__).parent
 
-NOMINAL = Parameters().override({"contact.v_s": 0.05})
+GRASP = {"kind": "profile", "times": [0.0, 0.25], "values": ["start", 48.9e-3]}
+NOMINAL = RigFile.ready("paper").override(
+    {
+        "contact.v_s": 0.05,
+        "control.senses": "bracket.x",
+        "bodies.disc.start.x": 60.3e-3,
+        "bodies.bracket.start": {"x": 60.3e-3, "y": 50.1e-3},
+        "motion.y_d": GRASP,
+        "motion.F_ff": GRASP | {"values": [0.0, "held"]},
+    },
+    outputs={"duration": 1.2, "snapshots": []},
+)
 TRUTH = {
     "contact.K_n": 1.6e5, "contact.mu_s": 0.6, "contact.mu_k": 0.5, "contact.R_t": 300.0,
     "pad.E": 0.9e6, "pad.tau": 12e-3,
 }  # fmt: skip
 SENSORS = {"x_C": 10e-6, "theta": 0.5e-3, "x_Br": 10e-6, "y_Br": 10e-6, "F_x": 0.1, "F_y": 0.1}
-GRASP = {"duration": 1.2, "depth": 1.2e-3, "grasp_time": 0.25, "settle": 0.05, "senses": "bracket"}
-RECORDINGS = {
-    "rolling": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.25), **GRASP),
-    "checking": Excitation(motion=Chirp(amplitude_x=3e-3, start=1.0, end=6.0), **GRASP),
+WAVE = {"kind": "chirp", "first": 1.0, "last": 6.0, "since": 0.3}
+STROKES = {"kind": "strokes", "travel": 12e-3, "stroke_time": 0.25, "since": 0.3}
+MOTIONS = {
+    "rolling": {"x_d": STROKES | {"offset": "start"}},
+    "checking": {
+        "x_d": WAVE | {"amplitude": 3e-3, "offset": "start"},
+        "y_d": GRASP | WAVE | {"amplitude": 1e-4},
+    },
 }
 UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "N": ("N", 1.0), "m/s": ("mm/s", 1e3)}
 
@@ -34,18 +47,12 @@ UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "N": ("N", 1.0), "m/s": ("mm/s"
 def table(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
     """Unit and values in SI by column: time, set-points with their rates, then what was
     measured."""
-    t = recording.times
-    with torch.no_grad():
-        d = (
-            recording.rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff"))
-            .flatten(1)
-            .T.numpy()
-        )
-    reference = dict(zip(("x_d", "x_d_dot", "y_d", "y_d_dot", "F_ff"), d))
-    out = {name: (CHANNELS[name].unit, value) for name, value in reference.items()}
-    return out | {
-        name: (CHANNELS[name].unit, values) for name, (_, values) in recording.samples.items()
-    }
+    signals = recording.rig.reference(torch.from_numpy(recording.times), ("x_d", "y_d", "F_ff"))
+    d = signals.detach().flatten(1).T.numpy()
+    columns = dict(zip(("x_d", "x_d_dot", "y_d", "y_d_dot", "F_ff"), d))
+    columns |= {name: y for name, (_, y) in recording.samples.items()}
+    short = {full: name for name, full in recording.rig.short.items()}
+    return {short.get(name, name): (recording.units[name], y) for name, y in columns.items()}
 
 
 def write(recording: Recording, path: Path, digits: int = 7) -> None:
@@ -63,9 +70,10 @@ def write(recording: Recording, path: Path, digits: int = 7) -> None:
 
 def make(name: str, seed: int) -> Recording:
     sensors = {channel: Sensor(noise=noise) for channel, noise in SENSORS.items()}
-    return record(name, begin(RECORDINGS[name], NOMINAL), TRUTH, sensors, seed=seed)
+    motion = {f"motion.{one}": table for one, table in MOTIONS[name].items()}
+    return record(name, NOMINAL.override(motion).build(), TRUTH, sensors, seed=seed)
 
 
 if __name__ == "__main__":
-    for seed, name in enumerate(RECORDINGS):
+    for seed, name in enumerate(MOTIONS):
         write(make(name, seed), HERE / f"{name}.csv")

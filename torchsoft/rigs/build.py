@@ -176,6 +176,12 @@ class RigFile(Shown, Group):
         full = {name: value for key, value in values.items() for name in file.full(key)}
         return type(self).from_tree(file._still_true(replaced(file, full)), self._folder)
 
+    def changed(self, settings: Mapping[str, Any], /) -> Self:
+        """A copy with some entries replaced as by `override`, names and tables in one. Raises
+        `ValueError`."""
+        names = {key: x for key, x in settings.items() if "." in key or key in self.names}
+        return self.override(names, **{key: x for key, x in settings.items() if key not in names})
+
     def _still_true(self, tree: dict[str, Any]) -> dict[str, Any]:
         """Changed tables of this file, without sources of numbers that are others now and names of
         entries that are gone."""

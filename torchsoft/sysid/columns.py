@@ -26,18 +26,31 @@ from torchsoft.tables import shown
 
 class Vocabulary(NamedTuple):
     """Columns of the recordings of a rig: `units` by column, the names of signals, what `headings`
-    of other names stand for, and the angles that are `unwrapped`."""
+    of other names stand for, the angles that are `unwrapped`, and columns by their `short` names.
+    """
 
     units: Mapping[str, str]
     signals: tuple[str, ...]
     headings: Mapping[str, str] = {}
     unwrapped: tuple[str, ...] = ()
+    short: Mapping[str, str] = {}
+
+    def full(self, name: str) -> str:
+        """The column that a name stands for, itself if it is not a short one."""
+        return self.short.get(name, name)
+
+    @property
+    def written(self) -> dict[str, str]:
+        """Columns by headings that are not, or not only, their own."""
+        short = {a: name for a, name in self.short.items() if name not in self.headings.values()}
+        return {name: name for name in short.values()} | short | dict(self.headings)
 
     def renamed(self, headings: Mapping[str, str], unwrapped: Collection[str]) -> "Vocabulary":
         """With headings of other names, and with angles that are unwrapped, by their headings.
         Raises `ValueError` for one that stands for no column, or for no angle."""
+        headings = {heading: self.full(name) for heading, name in headings.items()}
         for heading in (*headings, *unwrapped):
-            if (name := headings.get(heading, heading)) not in self.units:
+            if (name := headings.get(heading, self.full(heading))) not in self.units:
                 raise ValueError(
                     f"columns.{heading} = {shown(name)} is no channel of the rig; "
                     f"{suggestion(name, self.units, 'there are')}"
@@ -47,7 +60,7 @@ class Vocabulary(NamedTuple):
                     f"columns.{heading}.unwrap: `{name}` is in {self.units[name]}, and only angles "
                     "wrap: leave it out"
                 )
-        turned = tuple(headings.get(heading, heading) for heading in unwrapped)
+        turned = tuple(headings.get(heading, self.full(heading)) for heading in unwrapped)
         return self._replace(headings=headings, unwrapped=turned)
 
     @property
@@ -224,7 +237,7 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
 def read_csv(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
     """A table of numbers under `name [unit]`. Raises `ValueError` naming the row and the column."""
     units = {name: UNITS[unit] for name, unit in known.units.items()}
-    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore, known.headings)
+    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore, known.written)
     return check_table(Columns(path, table.values, table.rows, ignored=table.ignored), known)
 
 
@@ -233,8 +246,9 @@ def read_trajectory(path: Path, ignore: Collection[str], known: Vocabulary) -> C
     0. Raises `ValueError`."""
     data = read_log(path) if path.suffix == ".mcap" else load(path)
     values = read_channels(data, path, known)
-    left_out = tuple(name for name in values if name in ignore)
-    values = {name: column for name, column in values.items() if name not in ignore}
+    left_out = tuple(name for name in ignore if known.full(name) in values)
+    gone = {known.full(name) for name in left_out}
+    values = {name: column for name, column in values.items() if name not in gone}
     table = Columns(path, values, list(range(len(values.get("t", ())))), "sample", left_out)
     for name, column in values.items():
         if (bad := np.flatnonzero(~np.isfinite(column))).size:

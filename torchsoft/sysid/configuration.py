@@ -1,6 +1,6 @@
 """Tables of an identification in TOML: knowns, unknowns, sensors, recordings and the fit."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -201,16 +201,17 @@ class Config(Table):
                 raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         return self
 
-    @model_validator(mode="after")
-    def _recordings_state_what_is_known(self) -> "Config":
+    def check_known(self, full: Callable[[str], str | tuple[str, ...]]) -> None:
+        """Raises `ValueError` for settings of a recording that are unknown, as one or the other
+        name is, which `full` makes whole."""
+        unknown = {full(name): name for name in self.unknowns}
         for i, entry in enumerate(self.recordings):
-            if strange := [x for x, _ in flattened(entry.settings) if x in self.unknowns]:
+            if strange := [unknown[x] for x in map(full, flattened(entry.settings)) if x in unknown]:
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "
                     f'and say by unknowns."{strange[0]}".nominal where the search starts'
                 )
-        return self
 
 
 def read_config(path: str | Path) -> Config:
@@ -219,10 +220,10 @@ def read_config(path: str | Path) -> Config:
     return from_toml(path, Config.model_validate)
 
 
-def flattened(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """Values by their dotted names."""
+def flattened(settings: Mapping[str, Any], within: str = "") -> Iterator[str]:
+    """Dotted names of values."""
     for key, value in settings.items():
         if isinstance(value, dict) and value:
             yield from flattened(value, f"{within}{key}.")
         else:
-            yield within + key, value
+            yield within + key

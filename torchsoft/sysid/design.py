@@ -276,7 +276,7 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
     for entry in entries:
         name = entry.name or Path(entry.paths[0]).stem
         with at_field("settings"):
-            mine = file.override(**stated.settings).override(**entry.settings)
+            mine = file.changed(stated.settings).changed(entry.settings)
         built = mine.build()
         known, rtol = vocabulary(built.rig, stated.columns), FINER * stated.fit.rtol
         try:
@@ -438,13 +438,11 @@ def choose(
     """
     plan = stated.design
     with at_field("settings"):
-        file = RigFile.from_toml(RigFile.path(stated.rig, config.parent)).override(
-            **stated.settings
-        )
+        file = RigFile.from_toml(RigFile.path(stated.rig, config.parent)).changed(stated.settings)
     files, made, failures = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
     for name, settings in ({AS_STATED: {}} | plan.candidates).items():
         with at_field(f"design.candidates.{name}"):
-            files[name] = file.override(**settings)
+            files[name] = file.changed(settings)
             built = files[name].build()
         try:
             made[name] = planned(stated, files[name], built, name, plan.rtol, noise=0.0)

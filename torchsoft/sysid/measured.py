@@ -75,7 +75,8 @@ def vocabulary(rig: Rig, stated: Mapping[str, Column]) -> Vocabulary:
     columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
     headings = {heading: one.of for heading, one in stated.items() if one.of is not None}
     unwrapped = [heading for heading, one in stated.items() if one.unwrap]
-    return Vocabulary(columns, signals).renamed(headings, unwrapped)
+    short = {name: full for name, full in rig.short.items() if full in columns}
+    return Vocabulary(columns, signals, short=short).renamed(headings, unwrapped)
 
 
 def followed(tables: Tables, rig: Rig) -> Reference:
@@ -386,11 +387,16 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     entries, tables = sources(data, config, stated), dict[str, Tables]()
     try:
         file = RigFile.from_toml(RigFile.path(stated.rig, config.parent))
-        columns = vocabulary(file.assemble(), stated.columns)
+        rig = file.assemble()
+        columns = vocabulary(rig, stated.columns)
     except ValueError as error:
         raise ValueError(f"{config}, rig: {error}") from None
     except OSError as error:
         raise ValueError(f"{config}, rig: {stated.rig}: {error.strerror}") from None
+    try:
+        stated.check_known(file.full)
+    except ValueError as error:
+        raise ValueError(f"{config}: {error}") from None
     for name, (entry, paths) in entries.items():
         try:
             tables[name] = read_tables(paths, stated.ignore, columns)
@@ -412,7 +418,7 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
             settings = (stated.settings, entry.settings, law.settings)
             try:
                 with at_field("settings"):
-                    mine = reduce(lambda one, given: one.override(**given), settings, file)
+                    mine = reduce(RigFile.changed, settings, file)
                 start = entry.start or stated.start
                 made.append(rig_recording(mine, tables[name], name, stated.sensors, start))
             except ValueError as error:
@@ -420,8 +426,9 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
                 raise (
                     error if known else ValueError(f"{config}{field}, recording `{name}`: {error}")
                 ) from None
-        unknowns = {k: one for k, one in (stated.unknowns | law.unknowns).items()
-                    if k not in law.without}  # fmt: skip
+        every = [(rig.full(k), one) for k, one in (*stated.unknowns.items(), *law.unknowns.items())]
+        without = {rig.full(name) for name in law.without}
+        unknowns = {name: one for name, one in every if name not in without}
         try:
             return Problem(made, stated.sensors, unknowns)
         except ValueError as error:
