@@ -162,6 +162,9 @@ def by_channel(
     """Sensors by channel. A sensor named after an array of touch of the rigs, such as
     "skin.normal", stands for each of its channels (of those `sampled`, if given) without a sensor
     of its own."""
+    rigs = list(rigs)
+    full = {short: name for rig in rigs for short, name in rig.short.items()}
+    sensors = {full.get(name, name): sensor for name, sensor in sensors.items()}
     arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
     shared, own = dict[str, Sensor](), dict[str, Sensor]()
     for name, sensor in sensors.items():
