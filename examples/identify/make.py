@@ -1,5 +1,5 @@
-"""Make the recordings of this folder: the paper's rig with the parameters `TRUTH`, measured by noisy
-sensors. Takes some seconds.
+"""Make the recordings of this folder: the paper's rig with the parameters `TRUTH`, measured by
+noisy sensors. Takes some seconds.
 
 python examples/identify/make.py
 """
@@ -33,11 +33,10 @@ TRUTH = {
 }  # fmt: skip
 SENSORS = {"x_C": 10e-6, "theta": 0.5e-3, "x_Br": 10e-6, "y_Br": 10e-6, "F_x": 0.1, "F_y": 0.1}
 WAVE = {"kind": "chirp", "first": 1.0, "last": 6.0, "since": 0.3}
-STROKES = {"kind": "strokes", "travel": 12e-3, "stroke_time": 0.25, "since": 0.3}
 MOTIONS = {
-    "rolling": {"x_d": STROKES | {"offset": "start"}},
+    "rolling": {"x_d": {"kind": "strokes", "travel": 12e-3, "stroke_time": 0.25, "since": 0.3}},
     "checking": {
-        "x_d": WAVE | {"amplitude": 3e-3, "offset": "start"},
+        "x_d": WAVE | {"amplitude": 3e-3},
         "y_d": GRASP | WAVE | {"amplitude": 1e-4},
     },
 }

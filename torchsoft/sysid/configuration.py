@@ -196,17 +196,18 @@ class Config(Table):
             raise ValueError(
                 f"compare needs likelihoods: fit.loss must be 'linear', not '{self.fit.loss}'"
             )
-        for law, one in self.compare.items():
-            if strange := [name for name in one.without if name not in self.unknowns]:
-                raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         return self
 
-    def check_known(self, full: Callable[[str], str | tuple[str, ...]]) -> None:
-        """Raises `ValueError` for settings of a recording that are unknown, as one or the other
-        name is, which `full` makes whole."""
+    def check_unknowns(self, full: Callable[[str], object]) -> None:
+        """Raises `ValueError` for a law without what is no unknown, and a recording that states
+        one; `full` gives what a name stands for."""
         unknown = {full(name): name for name in self.unknowns}
+        for law, one in self.compare.items():
+            if strange := [name for name in one.without if full(name) not in unknown]:
+                raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         for i, entry in enumerate(self.recordings):
-            if strange := [unknown[x] for x in map(full, flattened(entry.settings)) if x in unknown]:
+            stated = map(full, flattened(entry.settings))
+            if strange := [unknown[name] for name in stated if name in unknown]:
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "
