@@ -101,7 +101,7 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     series."""
     roll = {"kind": "profile", "times": [0.1, 0.25], "values": [0.0, 4e-3], "offset": "start"}
     built = (
-        excite(PAPER.override(COARSE), Excitation(roll, duration=0.25))
+        excite(PAPER.override(COARSE), Excitation(roll, duration=0.25, depth=1.39e-3))
         .override({"motion.y_d.times": [0.0, 0.1], "motion.F_ff.times": [0.0, 0.1]})
         .build()
     )
