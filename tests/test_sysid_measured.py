@@ -6,7 +6,6 @@ import re
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,25 +14,21 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
+from conftest import PAPER, paper
 
-from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.channels import CHANNELS, UNITS
-from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.paper.rig import NAMES
+from torchsoft.csvfile import UNITS
 from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
-from torchsoft.rigs.build import RigFile
-from torchsoft.solve.trajectory import save
-from torchsoft.sysid import MEASURED, Sensor, record
+from torchsoft.solve.trajectory import measurable, save
+from torchsoft.sysid import Sensor, record
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.initial_state import MovingStart, StartCoordinate
 from torchsoft.sysid.measured import STATED, cost, load, stem, vocabulary
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
-RIG = EXAMPLE.parents[1] / "rigs" / "paper.toml"
-CONFIG = f"""
-rig = "{RIG.as_posix()}"
+CONFIG = """
+rig = "paper"
 [settings]
 laws.steel_on_rubber.friction.v_s = 0.05
 actuators.x.measures = "bracket.x"
@@ -63,15 +58,8 @@ SOLID = (
 COULOMB = f"""[compare.coulomb.settings]
 {LAW}.friction = {{kind = "coulomb", mu_s = 0.8, mu_k = 0.7}}
 """
-FILED = (
-    (r"^contact\.", f"{LAW}."),
-    (r"^pad\.", "materials.rubber."),
-    (r"^control\.", "actuators."),
-    (r"^disc\.|^bracket\.", r"bodies.\g<0>"),
-)
-"""What names of the paper's rig are in its file."""
-
-PAPER = vocabulary(RigFile.from_toml(RIG).assemble(), {})
+KNOWN = vocabulary(PAPER.assemble(), {})
+MEASURED = measurable(PAPER.assemble())
 
 
 def series(kind: str, strengths: str) -> str:
@@ -159,9 +147,9 @@ BAD: dict[str, tuple[Change, str]] = {
         r"row 7 has 13 cells, but there are 12 columns"),
     "text": (put(9, X_C, "n/a"), r"data\.csv, row 9, column `x_C`: 'n/a' is not a finite number; "
                                  r"leave the cell empty"),
-    "nan": (put(9, F_Y, "NaN"), r"row 9, column `F_y`: 'NaN' is not a finite number"),
+    "nan": (put(9, F_Y, "NaN"), r"row 9, column `effort_y`: 'NaN' is not a finite number"),
     "digits of another script": (put(9, F_Y, "１２"),
-        r"row 9, column `F_y`: '１２' is not a finite number"),
+        r"row 9, column `effort_y`: '１２' is not a finite number"),
     "times beyond their digits": (scale(T, 1.0, 5e12),
         r"row 3, column `t`: 5e\+12 s is too far from zero .*; count times from"),
     "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have "
@@ -177,13 +165,14 @@ BAD: dict[str, tuple[Change, str]] = {
     "mm under m": (put(1, X_C, "x_C [m]"),
         r"row 2, column `x_C`: 60.54 m is not plausible, .* between -1.2 and 1.2 m, 10 times as f"
         r"ar as the rig reaches; is the unit in the heading right\?"),
-    "a force in mN": (scale(F_Y, 1e3), r"row \d+, column `F_y`: .* between -1e\+04 and 1e\+04 N"),
+    "a force in mN": (scale(F_Y, 1e3),
+        r"row \d+, column `effort_y`: .* between -1e\+04 and 1e\+04 N"),
     "another start": (scale(X_C, 1.0, 5.0),
         r"row 2, column `x_C`: it begins at 0.065\d* m, but the rig file at 0.0603 m; say so"),
     "another sign": (scale(X_C, -1.0),
         r"it begins at -0.0605\d* m, but the rig file at 0.0603 m; is its sign opposite\?"),
     "turned already": (scale(THETA, 1.0, 500.0),
-        r"row 2, column `theta`: it begins at 0.48\d* rad, but the rig file at 0 rad"),
+        r"row 2, column `theta_C`: it begins at 0.48\d* rad, but the rig file at 0 rad"),
     "another ground": (scale(Y_BR, 1.0, 3.0),
         r"row 2, column `y_Br`: it begins at .*, but the rig file at 0\.04999"),
     "moving": (
@@ -195,7 +184,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "turning": (
         lambda table: [cells.__setitem__(THETA, f"{15.0 * i}") for i,
         cells in enumerate(table[1:])],
-        r"row 3, column `theta` moves already",
+        r"row 3, column `theta_C` moves already",
     ),
     "asked to move": (
         lambda table: [cells.__setitem__(X_D, f"{60.3 + 0.3 * i}") for i,
@@ -215,8 +204,10 @@ BAD: dict[str, tuple[Change, str]] = {
 
 BAD_CONFIG = {
     "no rig": (CONFIG.replace("rig =", "title ="),
-        r'rig\.toml: rig is missing: say rig = "FILE.toml".*; rigs/paper.toml is'),
-    "the paper's settings": (CONFIG.replace("actuators.x.measures", "control.senses"),
+        r'rig\.toml: rig is missing: say rig = "FILE.toml".*, such as "paper"'),
+    "no ready rig": (CONFIG.replace('"paper"', '"papyrus"'),
+        r"rig\.toml, rig: .*papyrus: No such file or directory; the ready rigs are .*, paper, "),
+    "a short name as a table": (CONFIG.replace("actuators.x.measures", "control.senses"),
         r"rig\.toml, recording `data`: settings: `control` is not known .* mean `controllers`"),
     "the paper's pads": (CONFIG + '[pads]\nkind = "kelvin_voigt"\n',
         r"pads is not known: .* material of the rig file: say \[settings\.materials\.NAME\]"),
@@ -235,8 +226,6 @@ BAD_CONFIG = {
         r"rig\.toml: sensors: `F_z` is not a channel"),
     "unknown parameter": (CONFIG.replace("rubber.K_n", "rubber.K"),
         r"rig\.toml: unknowns: `laws.steel_on_rubber.K` cannot be identified"),
-    "the paper's unknown": (CONFIG.replace("laws.steel_on_rubber.K_n", "contact.K_n"),
-        r"rig\.toml: unknowns: `contact.K_n` cannot be identified.*laws\.steel_on_rubber\.K_n"),
     "unknown setting": (CONFIG.replace("friction.v_s", "friction.vs"),
         r"recording `data`: settings: .*friction: `vs` is not known here; did you mean `v_s`"),
     "not a table": (
@@ -329,16 +318,15 @@ def test_empty_cells_are_missing_samples(case):
     made = load([data], config)
     (one,) = made.problem.recordings
     t, x = one.samples["x_C"]
-    assert len(one.samples["F_y"][0]) == 61
+    assert len(one.samples["effort_y"][0]) == 61
     assert len(x) == 58
     assert not {0.015, 0.02} & set(t)
     assert made.tables["data"].near(0.2) == f"{data}, row 43 (t = 0.2 s)"
 
 
-@pytest.mark.parametrize("name", sorted({*SIGNALS, *MEASURED}))
+@pytest.mark.parametrize("name", sorted({*SIGNALS, *MEASURED, "theta", "F_x"}))
 def test_every_unit_is_understood(tmp_path, name):
-    dimension = CHANNELS[name].unit
-    for unit, factor in UNITS[dimension].items():
+    for unit, factor in UNITS[KNOWN.units[KNOWN.full(name)]].items():
         table = [["t [ms]", "x_d [m]", "y_d [m]"]] + [
             [str(5 * i), "0.06", "0.05"] for i in range(10)
         ]
@@ -351,8 +339,8 @@ def test_every_unit_is_understood(tmp_path, name):
             [*cells, f"{name} [{unit}]" if i == 0 else repr(0.03 / factor)]
             for i, cells in enumerate(table)
         ]
-        read = read_table(write(tmp_path / "units.csv", table), (), PAPER)
-        np.testing.assert_allclose(read.values[name], 0.03, rtol=1e-14)
+        read = read_table(write(tmp_path / "units.csv", table), (), KNOWN)
+        np.testing.assert_allclose(read.values[KNOWN.full(name)], 0.03, rtol=1e-14)
         np.testing.assert_allclose(read.values["t"], 5e-3 * np.arange(10), rtol=1e-14)
 
 
@@ -361,12 +349,9 @@ def made():
     """The example's own script, and a short recording."""
     script = SimpleNamespace(**runpy.run_path(str(EXAMPLE / "make.py")))
     sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
-    excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4,
-        depth=1.2e-3, senses="bracket",
-                            grasp_time=0.15, settle=0.0)  # fmt: skip
-    return script, record(
-        "short", begin(excitation, script.NOMINAL), script.TRUTH, sensors, rtol=1e-4
-    )
+    strokes = {"kind": "strokes", "travel": 4e-3, "stroke_time": 0.15, "since": 0.15}
+    short = script.NOMINAL.override({"motion.x_d": strokes}, outputs={"duration": 0.4}).build()
+    return script, record("short", short, script.TRUTH, sensors, rtol=1e-4)
 
 
 def test_a_recording_survives_the_way_through_csv(made, tmp_path):
@@ -391,19 +376,15 @@ def test_the_examples_files_are_what_its_script_makes(made):
     script, _ = made
     case = load([EXAMPLE / "rolling.csv"], EXAMPLE / "rolling.toml")
     assert case.problem.names == ("rolling", "checking")
-    assert {k: s.noise for k, s in case.problem.sensors.items()} == script.SENSORS
-    rig, truth = case.problem.recordings[0].rig, script.NOMINAL.override(script.TRUTH)
-    own = still(truth)
-    text, found = (EXAMPLE / "README.md").read_text(), set()
-    for name, of in NAMES.items():  # the file tells the truth, but for what is unknown
-        filed = reduce(lambda x, pair: re.sub(*pair, x), FILED, of)
-        value = own.parameter(name).item()
-        if filed in case.problem.unknowns:
-            assert re.search(rf"`{re.escape(filed)}` +\| +{value:g} ", text), filed
-            found.add(filed)
-        else:
-            assert rig.parameter(filed).item() == value, name
-    assert found == set(case.problem.unknowns)
+    rig = case.problem.recordings[0].rig
+    noises = {rig.full(name): noise for name, noise in script.SENSORS.items()}
+    assert {name: one.noise for name, one in case.problem.sensors.items()} == noises
+    own = script.NOMINAL.override(script.TRUTH).assemble()
+    text = (EXAMPLE / "README.md").read_text()
+    truth, stated = (one.description()["parameters"] for one in (own, rig))
+    for name in case.problem.unknowns:  # the file tells the truth, but for what is unknown
+        assert re.search(rf"`{re.escape(name)}` +\| +{truth.pop(name):g} ", text), name
+    assert truth.items() <= stated.items()
     for name, pad in own.pads.items():
         assert torch.equal(pad.positions, rig.pads[name].positions)
     for file in EXAMPLE.glob("*.csv"):
@@ -413,11 +394,14 @@ def test_the_examples_files_are_what_its_script_makes(made):
 @pytest.fixture(scope="module")
 def run():
     """A grasp of 60 ms."""
-    excitation = Excitation(
-        motion=Strokes(), senses="bracket", grasp_time=0.05, settle=0.0, depth=1e-3
-    )
-    model, y0, _ = begin(excitation, PAPER.override({"contact.v_s": 0.05}))
-    return simulate(model, torch.linspace(0, 0.06, 31, dtype=torch.float64), y0=y0, step=2e-3)
+    strokes = {"kind": "strokes", "travel": 5e-3, "stroke_time": 0.3, "since": 0.05}
+    changes = {
+        "contact.v_s": 0.05, "control.senses": "bracket.x", "bodies.disc.start.x": 60.3e-3,
+        "bodies.bracket.start.x": 60.3e-3, "motion.x_d": strokes, "motion.y_d.times": [0.0, 0.05],
+        "motion.y_d.values": ["start", 49.1e-3], "motion.F_ff.times": [0.0, 0.05],
+        "motion.F_ff.values": [0.0, "held"],
+    }  # fmt: skip
+    return paper(changes).run(torch.linspace(0, 0.06, 31, dtype=torch.float64), step=2e-3)
 
 
 def test_a_trajectory_file_is_a_recording(run, tmp_path):
@@ -440,12 +424,12 @@ def test_a_trajectory_file_is_a_recording(run, tmp_path):
 
 
 def not_finite(data: xr.Dataset) -> xr.Dataset:
-    data["theta"][7] = np.nan
+    data["theta_C"][7] = np.nan
     return data
 
 
 def in_degrees(data: xr.Dataset) -> xr.Dataset:
-    data["theta"].attrs["units"] = "deg"
+    data["theta_C"].attrs["units"] = "deg"
     return data
 
 
@@ -454,8 +438,8 @@ def in_degrees(data: xr.Dataset) -> xr.Dataset:
     [
         (lambda data: xr.Dataset({"time": ("time", [0.0, 1.0])}),
          r"is not a trajectory file of this rig: it has no time and channels"),
-        (not_finite, r", sample 7, `theta` is not a finite number"),
-        (in_degrees, r", `theta` should be in rad, not 'deg'"),
+        (not_finite, r", sample 7, `theta_C` is not a finite number"),
+        (in_degrees, r", `theta_C` should be in rad, not 'deg'"),
         (lambda data: data.assign(x_d=("time", ["here"] * 31)),
          r"is not a trajectory file: `x_d` should be float64 over time"),
         (lambda data: data.isel(time=[0, 1, 2, 2, *range(3, 31)]),
@@ -470,7 +454,7 @@ def test_a_mistake_in_a_trajectory_file_is_named(run, tmp_path, change, message)
     else:
         save(change(run.to_xarray().copy(deep=True)), path)
     with pytest.raises(ValueError, match=rf"bad\.nc ?{message}"):
-        read_table(path, (), PAPER)
+        read_table(path, (), KNOWN)
 
 
 def test_samples_much_denser_than_the_motion_are_not_all_simulated(
@@ -510,7 +494,7 @@ def test_recordings_have_settings_of_their_own(case, tmp_path):
     first, second = load([data], config).problem.recordings
     mass, v_s = "bodies.disc.mass", f"{LAW}.friction.v_s"
     assert (first.name, first.parameters[mass]) == ("data", 0.5)
-    assert (second.name, second.parameters[mass]) == ("b", PAPER.disc.mass)
+    assert (second.name, second.parameters[mass]) == ("b", PAPER.bodies["disc"].mass)
     assert first.parameters[v_s] == second.parameters[v_s] == 0.05
 
 
@@ -543,6 +527,31 @@ def test_a_laboratorys_headings_stand_for_ours(loaded):
         loaded(change, 'columns."Disc x" = "x_D"\n' + CONFIG)
 
 
+@pytest.mark.parametrize("stated", ["", 'columns.camera = "theta"\n', 'ignore = ["theta"]\n'])
+def test_short_names_stand_for_columns_settings_and_unknowns(loaded, stated):
+    """In the data, in every table of the configuration, and for each other."""
+
+    def change(table: Table) -> None:
+        if "columns" in stated:
+            table[0][THETA] = "camera [mrad]"
+        table[0][F_Y] = "effort_y [N]"
+
+    text = CONFIG.replace(f"{LAW}.friction.v_s = 0.05", '"contact.v_s" = 0.05')
+    text = text.replace("actuators.x.measures", '"control.senses"')
+    text = text.replace(f"{LAW}.K_n", "contact.K_n")
+    more = '[compare.stiff]\nwithout = ["laws.steel_on_rubber.K_n"]\nsettings."pad.E" = 2e6\n'
+    made = loaded(change, stated + text + more)
+    (plain,), (one,) = (case.problem.recordings for case in (loaded(), made))
+    assert one.samples.keys() == plain.samples.keys() - ({"theta_C"} if "ignore" in stated else ())
+    assert one.parameters == plain.parameters
+    assert list(made.problem.unknowns) == [f"{LAW}.K_n", "materials.rubber.E"]
+    assert list(made.laws["stiff"].unknowns) == ["materials.rubber.E"]
+    assert made.laws["stiff"].recordings[0].parameters["materials.rubber.E"] == 2e6
+    known = '[[recordings]]\nname = "data"\nsettings."contact.K_n" = 2e5\n'
+    with pytest.raises(ValueError, match=r"toml: recordings\.0\.settings: contact\.K_n is unknown"):
+        loaded(change, stated + text + known)
+
+
 def test_a_motion_of_the_file_stands_for_a_column_that_is_missing(loaded):
     own = '[[recordings]]\nname = "data"\nsettings.motion.F_ff.values = [-2.5, -2.5]\n'
     none = CONFIG.replace("bodies.disc", "motion.F_ff.values = [0.0, 0.0]\nbodies.disc", 1)
@@ -572,7 +581,7 @@ def test_a_recording_may_stand_in_several_files(example, tmp_path):
     (one,) = made.problem.recordings
     assert one.name == "roll"
     assert {channel: len(t) for channel, (t, _) in one.samples.items()} == {
-        "x_C": 16, "theta": 16, "x_Br": 61, "y_Br": 61, "F_x": 61, "F_y": 61,
+        "x_C": 16, "theta_C": 16, "x_Br": 61, "y_Br": 61, "effort_x": 61, "effort_y": 61,
     }  # fmt: skip
     assert made.tables["roll"].near(0.1) == f"{tmp_path / 'asked.csv'}, row 22 (t = 0.1 s)"
 
@@ -588,7 +597,7 @@ def test_a_recording_may_stand_in_several_files(example, tmp_path):
     write(tmp_path / "camera.csv", parts(example, [T, X_C, F_X])[0])
     with pytest.raises(
         ValueError,
-        match=r"column `F_x` is in .*camera\.csv and in .*force\.csv: one recording has it once",
+        match=r"`effort_x` is in .*camera\.csv and in .*force\.csv: one recording has it once",
     ):
         load([], tmp_path / "rig.toml")
     (tmp_path / "camera.csv").write_text(
@@ -622,13 +631,13 @@ def test_a_file_may_state_everything_that_a_problem_can_have(
     labels = (
         f"{LAW}.K_n in data", f"{LAW}.friction.mu_k / {LAW}.friction.mu_s", "materials.rubber.E",
         "start.disc.x in data",
-        "gain of F_y in data", "drift of F_y in data", "inertia of F_y in data",
-        "misalignment of F_x",
+        "gain of effort_y in data", "drift of effort_y in data", "inertia of effort_y in data",
+        "misalignment of effort_x",
     )  # fmt: skip
     assert sorted(made.coordinates.labels) == sorted(labels)
     assert len(made.coordinates.priors) == 2
-    assert made.sensors["F_y"].colour == "ar"
-    assert made.sensors["F_x"].high == 50.0
+    assert made.sensors["effort_y"].colour == "ar"
+    assert made.sensors["effort_x"].high == 50.0
 
 
 def test_a_recording_may_begin_anywhere_if_that_is_said(loaded):

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
-from conftest import COARSE
+from conftest import COARSE, PAPER
 
-from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Roll, begin
+from torchsoft.rigs.excite import Excitation, excite
 from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.profile import RISE, Optimum, profiles
 
+E, K_N = "materials.rubber.E", "laws.steel_on_rubber.K_n"
 RNG = np.random.default_rng(0)
 STRAIGHT = RNG.standard_normal((20, 3))
 
@@ -99,13 +99,17 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters():
 def test_profile_and_combination_of_stiffnesses_in_series():
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in
     series."""
-    base = PAPER.override(COARSE)
-    roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
+    roll = {"kind": "profile", "times": [0.1, 0.25], "values": [0.0, 4e-3], "offset": "start"}
+    built = (
+        excite(PAPER.override(COARSE), Excitation(roll, duration=0.25, depth=1.39e-3))
+        .override({"motion.y_d.times": [0.0, 0.1], "motion.F_ff.times": [0.0, 0.1]})
+        .build()
+    )
     sensors = {
         name: sensor.model_copy(update={"noise": 4 * sensor.noise}) for name, sensor in RIG.items()
     }
-    data = record("roll", begin(roll, base), {}, sensors, seed=1)
-    problem = Problem([data], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+    data = record("roll", built, {}, sensors, seed=1)
+    problem = Problem([data], sensors, {E: Unknown(), K_N: Unknown()})
     result = identify(
         problem,
         rtol=1e-4,
@@ -115,15 +119,15 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     )
     o = Optimum.of(problem, result)
     np.testing.assert_allclose(o.x, result.x)
-    (E,) = profiles(o, ["pad.E"])
-    low, high = E.ci95
+    (one,) = profiles(o, [E])
+    low, high = one.ci95
     assert low < 0.75e6 < high
-    assert high - E.best > 1.3 * (
-        E.best - low
+    assert high - one.best > 1.3 * (
+        one.best - low
     )  # soft contacts need stiffer pads than stiff contacts need soft ones
-    assert any("no parabola" in notice for notice in E.notices)
-    K = np.array(E.others["contact.K_n"])
+    assert any("no parabola" in notice for notice in one.notices)
+    K = np.array(one.others[K_N])
     assert (np.diff(K) < 0).all()
     (both,) = combinations(o.labels, o.covariance, 0.1)
-    assert both.formula == "pad.E * contact.K_n^0.1"
+    assert both.formula == f"{E} * {K_N}^0.1"
     assert both.sd < 0.2 * min(both.sds.values())

@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,37 +19,36 @@ from torchsoft.sysid.configuration import read_config
 from torchsoft.sysid.design import AS_STATED, planned
 from torchsoft.sysid.runs import Runner
 
-RIG = Path(__file__).parents[1] / "rigs" / "orientation.toml"
-PLAN = f"""
-rig = "{RIG.as_posix()}"
-rehearsal = {{rate = 100.0}}
+PLAN = """
+rig = "orientation"
+rehearsal = {rate = 100.0}
 [settings]
-outputs = {{duration = 0.8, snapshots = []}}
-pads.lower = {{elements_x = 35, elements_y = 2}}
-pads.upper = {{elements_x = 35, elements_y = 2}}
+outputs = {duration = 0.8, snapshots = []}
+pads.lower = {elements_x = 35, elements_y = 2}
+pads.upper = {elements_x = 35, elements_y = 2}
 [settings.motion]
-theta_d = {{times = [0.4, 0.6, 0.7], values = [-0.1, 0.1, -0.1], offset = 0.1}}
+theta_d = {times = [0.4, 0.6, 0.7], values = [-0.1, 0.1, -0.1], offset = 0.1}
 x_d.kind = "hold"
 y_d.kind = "hold"
 y_rate.kind = "hold"
 grip.values = [-5.5, -8.0]
 bear.values = [9.5, 12.0]
 [unknowns]
-"materials.rubber.E" = {{}}
-"actuators.turn_lower.Kp" = {{}}
+"materials.rubber.E" = {}
+"actuators.turn_lower.Kp" = {}
 [sensors]
 theta_disc.noise = 5e-4
 x_lower.noise = 1e-5
-F_lift.noise = 0.05
+effort_lift.noise = 0.05
 [design]
 iterations = 4
 rtol = 1e-3
 limits.x_upper = [-0.03, 0.05]
 [design.candidates]
-twist.motion.theta_d = {{times = [0.4, 0.5, 0.6, 0.7], values = [-0.1, 0.3, -0.5, -0.1]}}
-far.motion.theta_d = {{times = [0.4, 0.7], values = [-0.1, 2.9]}}
+twist.motion.theta_d = {times = [0.4, 0.5, 0.6, 0.7], values = [-0.1, 0.3, -0.5, -0.1]}
+far.motion.theta_d = {times = [0.4, 0.7], values = [-0.1, 2.9]}
 [design.bounds]
-theta_d = {{low = -0.5, high = 0.5, speed = 30.0, after = 0.4}}
+theta_d = {low = -0.5, high = 0.5, speed = 30.0, after = 0.4}
 """
 
 
@@ -70,7 +68,7 @@ def test_candidates_are_ranked_by_what_they_tell(out):
     assert first["value"] < second["value"]
     assert "the body was lost" in last["failure"]
     stated = read_config(out / "fit.toml")
-    file = RigFile.from_toml(RIG).override(**stated.settings)
+    file = RigFile.ready("orientation").override(**stated.settings)
     twisted = file.override(**stated.design.candidates["twist"])
     made = planned(stated, twisted, twisted.build(), "twist", stated.design.rtol, noise=0.0)
     problem = Problem([made], stated.sensors, stated.unknowns)
@@ -104,7 +102,7 @@ def test_the_designed_motion_is_a_rig_file_that_runs(out):
 def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
     column = {"kind": "csv", "file": "x.csv", "column": "x"}
     (tmp_path / "x.csv").write_text("t [s],x [m]\n0,0\n1,0.001\n", encoding="utf-8")
-    file = RigFile.from_toml(RIG)
+    file = RigFile.ready("orientation")
     file._folder = tmp_path
     whole: Any = located(file.override(motion={"x_d": column})).motion["x_d"]
     assert whole.file == str(tmp_path / "x.csv")

@@ -188,9 +188,10 @@ class RigFile(Shown, Group):
         def value(name: str) -> Any:
             node: Any = tree
             for key in place(self, name).keys:
-                if key not in (node if isinstance(node, Mapping) else range(len(node or ()))):
+                many = range(len(node)) if isinstance(node, list | tuple) else ()
+                if key not in (node if isinstance(node, Mapping) else many):
                     return None
-                node = node[key]
+                node = node[key]  # pyright: ignore[reportCallIssue, reportArgumentType]
             return listed(node)
 
         old = {name: value for name, value, _ in entries(self)}

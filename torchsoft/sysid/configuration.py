@@ -125,12 +125,11 @@ class Rehearsal(Table):
 
 
 class DesignTable(Table):
-    """Settings of a design of motions: those of the rig file by the name of a candidate, or the
-    name of an excitation (`torchsoft.rigs.excite`); `bounds` of signals whose knots may move,
-    `limits` (low, high) [SI] of channels, the `criterion` of the unknowns, or of the `parameters`
-    alone."""
+    """Settings of a design of motions: those of the rig file by the name of a candidate, `bounds`
+    of signals whose knots may move, `limits` (low, high) [SI] of channels, the `criterion` of the
+    unknowns, or of the `parameters` alone."""
 
-    candidates: dict[Name, dict[str, Any] | Name] = Field(default_factory=dict)
+    candidates: dict[Name, dict[str, Any]] = Field(default_factory=dict)
     bounds: dict[Name, Bounds] = Field(default_factory=dict)
     limits: dict[Name, Annotated[tuple[float, float], LISTED]] = Field(default_factory=dict)
     criterion: Optimality = "D"
@@ -197,17 +196,18 @@ class Config(Table):
             raise ValueError(
                 f"compare needs likelihoods: fit.loss must be 'linear', not '{self.fit.loss}'"
             )
-        for law, one in self.compare.items():
-            if strange := [name for name in one.without if name not in self.unknowns]:
-                raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         return self
 
-    def check_known(self, full: Callable[[str], str | tuple[str, ...]]) -> None:
-        """Raises `ValueError` for settings of a recording that are unknown, as one or the other
-        name is, which `full` makes whole."""
+    def check_unknowns(self, full: Callable[[str], object]) -> None:
+        """Raises `ValueError` for a law without what is no unknown, and a recording that states
+        one; `full` gives what a name stands for."""
         unknown = {full(name): name for name in self.unknowns}
+        for law, one in self.compare.items():
+            if strange := [name for name in one.without if full(name) not in unknown]:
+                raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         for i, entry in enumerate(self.recordings):
-            if strange := [unknown[x] for x in map(full, flattened(entry.settings)) if x in unknown]:
+            stated = map(full, flattened(entry.settings))
+            if strange := [unknown[name] for name in stated if name in unknown]:
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "

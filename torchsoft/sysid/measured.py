@@ -394,7 +394,7 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     except OSError as error:
         raise ValueError(f"{config}, rig: {stated.rig}: {error.strerror}") from None
     try:
-        stated.check_known(file.full)
+        stated.check_unknowns(file.full)
     except ValueError as error:
         raise ValueError(f"{config}: {error}") from None
     for name, (entry, paths) in entries.items():

@@ -57,7 +57,8 @@ class Prior(Table):
 
 
 class Unknown(Table):
-    """One parameter to identify, by its name in the rig or its file, user-defined laws included.
+    """One parameter to identify, by its name in the rig, user-defined laws included, or by its
+    alias in `Parameters`.
 
     `nominal` is the start of the search, by default the value of the recordings' own rigs; with
     `ratio_to`, value, nominal, bounds and prior are those of the ratio to that other parameter, and
@@ -158,18 +159,19 @@ class Sensor(Table):
 def by_channel(
     rigs: Iterable[Rig], sensors: Mapping[str, Sensor], sampled: Collection[str] | None = None
 ) -> dict[str, Sensor]:
-    """Sensors by the full names of channels. A sensor named after an array of touch of the rigs,
-    such as "skin.normal", stands for each of its channels (of those `sampled`, if given) without a
-    sensor of its own."""
+    """Sensors by channel. A sensor named after an array of touch of the rigs, such as
+    "skin.normal", stands for each of its channels (of those `sampled`, if given) without a sensor
+    of its own."""
     rigs = list(rigs)
-    arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
     full = {short: name for rig in rigs for short, name in rig.short.items()}
+    sensors = {full.get(name, name): sensor for name, sensor in sensors.items()}
+    arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
     shared, own = dict[str, Sensor](), dict[str, Sensor]()
     for name, sensor in sensors.items():
         every = [f"{name}.{i}" for i in range(arrays.get(name, 0))]
         there = [one for one in every if sampled is None or one in sampled]
         shared |= dict.fromkeys(there, sensor)
-        own |= {} if there else {full.get(name, name): sensor}
+        own |= {} if there else {name: sensor}
     return shared | own
 
 
