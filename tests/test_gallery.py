@@ -27,14 +27,14 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "first_run": lambda n: abs(float(n["run"]["x_C"][1000]) - 40e-3) < 1e-6,
     "own_rig": lambda n: abs((n["x"][-1] - n["x"][0]).item() - 5e-3) < 1e-4,
     "rig_from_a_file": lambda n: (
-        float(n["soft_run"]["y_ellipse"].min()) < float(n["run"]["y_ellipse"].min())
+        float(n["softer"]["y_ellipse"].min()) < float(n["run"]["y_ellipse"].min())
     ),
     "shapes": lambda n: 0.5 < float(n["run"]["theta"][-1]) < 0.53,
     "fingertips": lambda n: 9.0 < float(n["force"][-1]) < 13.0,
     "relaxation": lambda n: (
         n["found"].terms == 2 and abs(n["found"].values["E"] / 0.5e6 - 1) < 0.01
     ),
-    "friction_law": lambda n: float(n["model"].parameter("contact.friction.fall").grad) != 0,
+    "friction_law": lambda n: float(n["built"].rig.parameter(f"{n['law']}.fall").grad) != 0,
     "gradient_check": lambda n: abs(n["adjoint"] / n["difference"] - 1) < 1e-5,
     "sensitivities": lambda n: n["run"].sensitivities.shape == (601, 10, 4),
     "batch": lambda n: not n["batch"].failures and bool(n["mu"].grad.isfinite().all()),

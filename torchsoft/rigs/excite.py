@@ -28,7 +28,7 @@ class Excitation(NamedTuple):
     roll: Mapping[str, Any]
     press: Mapping[str, Any] | None = None
     duration: float = 2.0
-    depth: float = 1.5e-3
+    depth: float = 1.4e-3
 
 
 def _sines(amplitude: float, band: tuple[float, float], seed: int) -> dict[str, Any]:
@@ -55,13 +55,13 @@ CATALOGUE: Mapping[str, Excitation] = {
     "fast strokes": Excitation(_strokes(20e-3, 0.25)),
     "shaking": Excitation(_sines(10e-3, (2.0, 15.0), 0), _sines(2e-4, (2.0, 15.0), 1)),
     "pressing": Excitation(_roll(10e-3, 2.0), _chirp(4e-4, 8.0, 8.0)),
-    "deep pressing": Excitation(_roll(30e-3, 2.0), _chirp(8e-4, 25.0, 25.0), depth=2.5e-3),
-    "deep chirp": Excitation(_chirp(5e-3, 1.0, 25.0), _chirp(5e-4, 1.0, 25.0), depth=2.5e-3),
+    "deep pressing": Excitation(_roll(30e-3, 2.0), _chirp(8e-4, 25.0, 25.0), depth=2.4e-3),
+    "deep chirp": Excitation(_chirp(5e-3, 1.0, 25.0), _chirp(5e-4, 1.0, 25.0), depth=2.4e-3),
     "light shaking": Excitation(
-        _sines(6e-3, (4.0, 20.0), 0), _sines(2e-4, (4.0, 20.0), 1), depth=3e-4
+        _sines(6e-3, (4.0, 20.0), 0), _sines(2e-4, (4.0, 20.0), 1), depth=2e-4
     ),
-    "light jerks": Excitation(_strokes(80e-3, 0.25), duration=1.4, depth=2e-4),
-    "hard light jerks": Excitation(_strokes(80e-3, 0.15), duration=1.3, depth=2e-4),
+    "light jerks": Excitation(_strokes(80e-3, 0.25), duration=1.4, depth=1e-4),
+    "hard light jerks": Excitation(_strokes(80e-3, 0.15), duration=1.3, depth=1e-4),
     "deep jerks": Excitation(_strokes(40e-3, 0.1), duration=1.3),
 }
 """Excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
