@@ -24,7 +24,8 @@ class Pressed(nn.Module):
         )
 
     def forward(self, E: torch.Tensor, F_N: torch.Tensor, R: torch.Tensor) -> torch.Tensor:
-        return (E - self.mu * torch.exp(-self.fall * F_N) * F_N).clamp(min=0.0) / (R + 10.0)
+        mu = self.mu * torch.exp(-self.fall * F_N)
+        return (E - mu * F_N).clamp(min=0.0) / (R + F_N / 0.05)
 
 
 # a bench is stood in for by the simulator: a light grasp, jerked, with noise of the sensors

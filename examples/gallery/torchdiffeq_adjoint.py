@@ -43,9 +43,9 @@ def timed(name: str, solve) -> None:
 register_method()  # adds the stepper to torchdiffeq's methods
 parameters = tuple(p for name, p in model.named_parameters() if not name.startswith("reference."))
 timed(
-    "odeint_adjoint, rk4",
+    "odeint_adjoint, sdirk2",
     lambda: odeint_adjoint(
-        model, y0, t, method="rk4", options={"step_size": 5e-5}, adjoint_params=parameters
+        model, y0, t, method="sdirk2", rtol=1e-7, atol=1e-8, adjoint_params=parameters
     ),
 )
 timed("odeint, sdirk2", lambda: odeint(model, y0, t, method="sdirk2", rtol=1e-7, atol=1e-8))
