@@ -58,10 +58,10 @@ CATALOGUE: Mapping[str, Excitation] = {
     "deep pressing": Excitation(_roll(30e-3, 2.0), _chirp(8e-4, 25.0, 25.0), depth=2.5e-3),
     "deep chirp": Excitation(_chirp(5e-3, 1.0, 25.0), _chirp(5e-4, 1.0, 25.0), depth=2.5e-3),
     "light shaking": Excitation(
-        _sines(6e-3, (4.0, 20.0), 0), _sines(2e-4, (4.0, 20.0), 1), depth=3e-4
+        _sines(6e-3, (4.0, 20.0), 0), _sines(2e-4, (4.0, 20.0), 1), depth=2e-4
     ),
-    "light jerks": Excitation(_strokes(80e-3, 0.25), duration=1.4, depth=2e-4),
-    "hard light jerks": Excitation(_strokes(80e-3, 0.15), duration=1.3, depth=2e-4),
+    "light jerks": Excitation(_strokes(80e-3, 0.25), duration=1.4, depth=1e-4),
+    "hard light jerks": Excitation(_strokes(80e-3, 0.15), duration=1.3, depth=1e-4),
     "deep jerks": Excitation(_strokes(40e-3, 0.1), duration=1.3),
 }
 """Excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
