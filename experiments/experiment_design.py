@@ -96,7 +96,7 @@ def row(
 SMOKE = {
     "strokes": Excitation({"kind": "strokes", "travel": 8e-3, "stroke_time": 0.3}, duration=0.9),
     "jerks, light": Excitation(
-        {"kind": "strokes", "travel": 30e-3, "stroke_time": 0.1}, duration=0.9, depth=3e-4
+        {"kind": "strokes", "travel": 30e-3, "stroke_time": 0.1}, duration=0.9, depth=2e-4
     ),
 }
 

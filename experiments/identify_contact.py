@@ -89,7 +89,7 @@ def excitations(config: Config) -> dict[str, Excitation]:
     roll, press = shake | {"amplitude": 6e-3, "seed": 0}, shake | {"amplitude": 1e-4, "seed": 1}
     return {
         "strokes": Excitation(strokes, duration=0.9),
-        "shaking": Excitation(roll, press, duration=0.9, depth=8e-4),
+        "shaking": Excitation(roll, press, duration=0.9, depth=7e-4),
     }
 
 

@@ -21,21 +21,21 @@ anywhere, "cannot tell" where they do not. A quarter of an hour on two cores.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearSolid
-from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes, begin
+from torchsoft import BuiltRig, Coulomb, RigFile, excite
 from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Comparison, Evidence, compare, fitted
 from torchsoft.sysid.runs import Runner
 
-NOMINAL = Parameters().override(
+NOMINAL = RigFile.ready("paper").override(
     {"contact.v_s": 0.05, "contact.mu_s": 0.7, "contact.mu_k": 0.6} | COARSE
 )
 RTOL = 1e-4
@@ -58,66 +58,76 @@ class Amontons(Coulomb):
         self.mu_k = self.mu_s
 
 
-def coulomb(settings: Parameters, reference: Reference) -> SoftGrasp:
-    return SoftGrasp(settings, reference, friction=Amontons(settings.contact.mu_s))
-
-
-def solid(settings: Parameters, reference: Reference) -> SoftGrasp:
-    """The rubber in series with a spring; tau is longer, so that it creeps at low frequencies as
-    the other law does."""
-    p = settings.pad
-    rubber = StandardLinearSolid(
-        E=p.E, E_instant=2.2 * p.E, nu=p.nu, rho=p.rho, tau=1.8 * p.tau, depth=p.depth
-    )
-    return SoftGrasp(settings, reference, material=rubber)
-
-
-BUILDS: dict[str, Callable[[Parameters, Reference], SoftGrasp]] = {
-    "smooth": SoftGrasp, "coulomb": coulomb, "kelvin_voigt": SoftGrasp, "solid": solid,
-}  # fmt: skip
+SLIP = "laws.steel_on_rubber.friction"
+E, TAU, E_INSTANT = (f"materials.rubber.{name}" for name in ("E", "tau", "E_instant"))
+K_N, MU_S, MU_K = "laws.steel_on_rubber.K_n", f"{SLIP}.mu_s", f"{SLIP}.mu_k"
 UNKNOWNS: dict[str, dict[str, Unknown]] = {
     "smooth": {
-        "pad.E": Unknown(), "contact.mu_s": Unknown(low=0.3, high=1.5),
-        "contact.mu_k": Unknown(ratio_to="contact.mu_s", low=0.4, high=FALLS),
+        E: Unknown(), MU_S: Unknown(low=0.3, high=1.5),
+        MU_K: Unknown(ratio_to=MU_S, low=0.4, high=FALLS),
     },
-    "coulomb": {"pad.E": Unknown(), "contact.mu_s": Unknown(low=0.3, high=1.5)},
-    "kelvin_voigt": {"pad.E": Unknown(), "pad.tau": Unknown(), "contact.K_n": Unknown()},
+    "coulomb": {E: Unknown(), MU_S: Unknown(low=0.3, high=1.5)},
+    "kelvin_voigt": {E: Unknown(), TAU: Unknown(), K_N: Unknown()},
     "solid": {
-        "pad.E": Unknown(), "pad.tau": Unknown(), "contact.K_n": Unknown(),
-        "pad.E_instant": Unknown(ratio_to="pad.E", low=STIFFER[0], high=STIFFER[1]),
+        E: Unknown(), TAU: Unknown(), K_N: Unknown(),
+        E_INSTANT: Unknown(ratio_to=E, low=STIFFER[0], high=STIFFER[1]),
     },
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A motion, how much worse the sensors are than good ones, and the two laws that compete."""
+    """A motion, how much worse the sensors are than good ones, the two laws that compete, and other
+    entries of the rig file."""
 
     excitation: Excitation
     laws: tuple[str, str]
     worse: float = 1.0
+    changes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def sensors(self) -> dict[str, Sensor]:
         return {channel: Sensor(noise=self.worse * one.noise) for channel, one in RIG.items()}
 
+    def built(self, law: str) -> BuiltRig:
+        """The nominal rig with a law."""
+        file = excite(NOMINAL, self.excitation).override(self.changes)
+        rubber, parts = dict(file.materials["rubber"]), {}
+        if law == "coulomb":
+            parts = {SLIP: Amontons(file.table()[MU_S]["value"])}
+        if law == "solid":  # tau is longer, so that it creeps at low frequencies as the other does
+            solid = {"kind": "standard_linear_solid", "E_instant": 2.2 * rubber["E"]}
+            solid |= {"tau": 1.8 * rubber["tau"]} | {k: rubber[k] for k in ("E", "nu", "depth")}
+            file = file.override({"materials.rubber": solid})
+        return file.build(parts)
+
 
 FRICTION, RUBBER = ("smooth", "coulomb"), ("kelvin_voigt", "solid")
-LIGHT: dict[str, Any] = {"depth": 2e-4, "grasp_time": 0.15, "settle": 0.05}
-SHAKEN = Excitation(
-    motion=MultiSine(amplitude_x=4e-3, amplitude_y=1e-4, frequency=(4.0, 15.0)),
-    duration=0.7,
-    **LIGHT,
+LIGHT = 0.9e-4
+
+
+def roll(travel: float, since: float, until: float) -> dict[str, Any]:
+    """A roll to the right [m]."""
+    return {"kind": "profile", "times": (since, until), "values": (0, travel), "offset": "start"}
+
+
+def sines(amplitude: float, seed: int) -> dict[str, Any]:
+    return {"kind": "multi_sine", "amplitude": amplitude, "band": (4.0, 15.0), "seed": seed}
+
+
+SHAKEN = Excitation(sines(4e-3, 0), sines(1e-4, 1), duration=1.0, depth=LIGHT)
+STROKE = Excitation(
+    {"kind": "strokes", "travel": 25e-3, "stroke_time": 0.15}, duration=0.8, depth=LIGHT
 )
-STROKE = Excitation(motion=Strokes(travel=25e-3, stroke_time=0.15), duration=0.5, **LIGHT)
-GENTLE = Excitation(motion=Roll(travel=3e-3), duration=0.6, depth=1e-3, grasp_time=0.2, settle=0.05)
+GENTLE = Excitation(roll(3e-3, 0.5, 0.85), duration=0.85, depth=0.9e-3)
 PRESSED = Excitation(
-    motion=Press(amplitude=4e-4, frequency=8.0, travel=5e-3),
-    duration=0.6,
-    grasp_time=0.15,
-    settle=0.05,
-)
-SLOW = Excitation(motion=Roll(travel=3e-3), duration=1.0, grasp_time=0.6, settle=0.1)
+    roll(5e-3, 0.5, 0.9), {"kind": "chirp", "amplitude": 4e-4, "first": 8.0, "last": 8.0},
+    duration=0.9,
+)  # fmt: skip
+SLOW = Excitation(roll(3e-3, 0.7, 1.0), duration=1.0)
+SLOWLY = {f"motion.{name}.times": (0.0, 0.6) for name in ("y_d", "F_ff")}
+"""A slower grasp."""
+
 SETTINGS = {
     "shaken until it slips": Setting(SHAKEN, FRICTION),
     "one stroke that slips": Setting(STROKE, FRICTION),
@@ -125,7 +135,7 @@ SETTINGS = {
     "one stroke that slips, cheap sensors": Setting(STROKE, FRICTION, worse=4.0),
     "pressed at 8 Hz, cheap sensors": Setting(PRESSED, RUBBER, worse=5.0),
     "rolled gently": Setting(GENTLE, FRICTION),
-    "rolled slowly, cheap sensors": Setting(SLOW, RUBBER, worse=10.0),
+    "rolled slowly, cheap sensors": Setting(SLOW, RUBBER, 10.0, SLOWLY),
 }
 
 
@@ -145,23 +155,27 @@ def draw(setting: str, number: int, seed: int) -> Case:
     table = NOMINAL.table()
     truth = {
         name: table[name]["value"] * float(np.exp(0.1 * rng.standard_normal()))
-        for name in ("pad.E", "contact.mu_s", "pad.tau", "contact.K_n") if name in UNKNOWNS[law]
+        for name in (E, MU_S, TAU, K_N) if name in UNKNOWNS[law]
     }  # fmt: skip
     if law == "smooth":
-        truth["contact.mu_k"] = truth["contact.mu_s"] * float(rng.uniform(0.6, 0.85))
+        truth[MU_K] = truth[MU_S] * float(rng.uniform(0.6, 0.85))
     if law == "solid":
-        truth["pad.tau"] *= 1.8
-        truth["pad.E_instant"] = truth["pad.E"] * float(rng.uniform(1.5, 3.5))
+        truth[TAU] *= 1.8
+        truth[E_INSTANT] = truth[E] * float(rng.uniform(1.5, 3.5))
     return Case(setting, law, truth, int(rng.integers(2**31)))
 
 
 def data(case: Case, noise: float) -> Recording:
     """What a rig with the true law gives; the true law's nominal rig is in it."""
     setting = SETTINGS[case.setting]
-    planned = begin(setting.excitation, NOMINAL)
-    planned = planned._replace(rig=BUILDS[case.law](planned.rig.settings, planned.rig.reference))
     return record(
-        "motion", planned, case.truth, setting.sensors, rtol=DATA_RTOL, noise=noise, seed=case.seed
+        "motion",
+        setting.built(case.law),
+        case.truth,
+        setting.sensors,
+        rtol=DATA_RTOL,
+        noise=noise,
+        seed=case.seed,
     )
 
 
@@ -169,7 +183,8 @@ def problems(case: Case, recording: Recording) -> dict[str, Problem]:
     """Both laws, begun with nominal parameters."""
     setting, out = SETTINGS[case.setting], {}
     for law in setting.laws:
-        rig = BUILDS[law](setting.excitation.settings(NOMINAL), recording.rig.reference)
+        rig = setting.built(law).rig
+        rig.reference = recording.rig.reference
         out[law] = Problem([replace(recording, rig=rig)], setting.sensors, UNKNOWNS[law])
     return out
 

@@ -35,8 +35,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import nn
 
-from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
-from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft import Profile, Reference, Rig, RigFile, Trajectory, excite, hold, simulate
 from torchsoft.experiment import COARSE, at_the_points, grid, numbers, options, write
 from torchsoft.files import finite
 from torchsoft.physics.motion import Waves, wave
@@ -44,7 +43,7 @@ from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, rollout_o
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics
-from torchsoft.scenario import Manipulation, grasp_and_roll
+from torchsoft.rigs.excite import Excitation
 from torchsoft.solve.diagnostics import linearised
 
 WAVE, KICK, BAND = 1e-5, 2e-3, (3.0, 150.0)
@@ -54,8 +53,12 @@ WAVE, KICK, BAND = 1e-5, 2e-3, (3.0, 150.0)
 SETTLED = 1.0
 """Time [s] at which the grasp has settled."""
 
-DEPTH = 3e-4
+DEPTH = 2e-4
 """Of the light grasp [m]."""
+
+PAPER = RigFile.ready("paper")
+X_0, Y_D, F_FF = PAPER.bodies["disc"].start.x, 48.6e-3, PAPER.motion["F_ff"].values[-1]
+"""Place of the disc [m], and what holds the bracket in the grasp [m, N]."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-def slipping(model: SoftGrasp, run: Trajectory) -> float:
+def slipping(model: Rig, run: Trajectory) -> float:
     """Part of the touching nodes of the upper pad that slip faster than 1 mm/s, over time."""
     every = at_the_points(model, run.t[::20], run.y[::20])
     depth, speed = (x.chunk(2, -1)[list(model.contacts).index("U")] for x in every)
@@ -113,7 +116,7 @@ def rollout_time(model: ReducedModel, on: Record, repeats: int = 9) -> float:
 class Grasp:
     """The paper's grasp, settled: the model, its state, and what holds it there."""
 
-    model: SoftGrasp
+    model: Rig
     y: torch.Tensor
     still: Reference
 
@@ -124,13 +127,11 @@ class Grasp:
         return record(simulate(self.model, t, y0=self.y, reference=reference, step=step))
 
 
-def settle(model: SoftGrasp) -> tuple[Grasp, Manipulation]:
-    """The grasp, and the manipulation that begins in it."""
-    whole, scenario = grasp_and_roll(model), model.settings.scenario
-    still = hold(x_d=scenario.x_C0, y_d=scenario.y_Br_grasp, F_ff=-whole.grasp_force)
-    pressed = Reference(**{**model.reference.signals, "x_d": still["x_d"]})
-    t = torch.tensor([0.0, SETTLED], dtype=torch.float64)
-    return Grasp(model, simulate(model, t, y0=whole.y0, reference=pressed).y[-1], still), whole
+def settled(file: RigFile) -> Grasp:
+    """The grasp in which the manipulation of a rig file begins."""
+    grasp = file.override({"motion.x_d": {"kind": "hold"}}).build()
+    still = hold(x_d=X_0, y_d=Y_D, F_ff=F_FF)
+    return Grasp(grasp.rig, grasp.run([0.0, SETTLED]).y[-1], still)
 
 
 def sines(x: float, size: float, band: tuple[float, float], seed: int, duration: float) -> Waves:
@@ -144,17 +145,17 @@ def sines(x: float, size: float, band: tuple[float, float], seed: int, duration:
 def tapped(grasp: Grasp, config: Config) -> list[Record]:
     """Small random velocities of disc and bracket, and a broad multi-sine."""
     rng, (_, v, _), out = np.random.default_rng(0), indices(grasp.model), []
-    settings = grasp.model.settings
+    radius = PAPER.bodies["disc"].shape.radius
     for i in range(config.taps):
-        kick = KICK * rng.standard_normal(3) / (1.0, settings.disc.radius, 1.0)
+        kick = KICK * rng.standard_normal(3) / (1.0, radius, 1.0)
         y = grasp.y.clone()
         y[v] += torch.from_numpy(kick)
-        x = sines(settings.scenario.x_C0, WAVE, BAND, i, config.tap_time)
+        x = sines(X_0, WAVE, BAND, i, config.tap_time)
         out.append(replace(grasp, y=y).move(x, config.tap_time, step=2.5e-4))
     return out
 
 
-def indices(model: SoftGrasp) -> tuple[list[int], list[int], int]:
+def indices(model: Rig) -> tuple[list[int], list[int], int]:
     """Indices of x_C, theta, x_Br and of their rates in the state, and the number of internal
     states before them."""
     at = model.layout.slices
@@ -201,16 +202,14 @@ def by_mechanics(e: dict[str, float]) -> dict[tuple[str, str], float]:
 
 
 def study_stick(config: Config) -> dict[str, Any]:
-    times = {"roll_time": 10.0, "hold_time": 5.0, "rest_time": 5.0}
-    changes = {f"scenario.{name}": config.scenario * value for name, value in times.items()}
-    p = Parameters().override(changes | (COARSE if config.smoke else {}))
-    model = SoftGrasp(p)
-    grasp, whole = settle(model)
-    x_0, time = p.scenario.x_C0, 5.0 * max(config.scenario, 0.2)
-    far = Profile([0.0, time], [x_0, x_0 + 20e-3])
+    file = PAPER.override(COARSE if config.smoke else {})
+    times = [config.scenario * time for time in file.motion["x_d"].times]
+    whole = file.override({"motion.x_d.times": times}).build()
+    grasp, time = settled(file), 5.0 * max(config.scenario, 0.2)
+    far = Profile([0.0, time], [X_0, X_0 + 20e-3])
     r = rolling_radius([grasp.move(far, 1.1 * time, step=2e-3, sample=4e-3)])
-    aside = Profile([0.0, 1.0], [x_0, x_0 + 6e-3])
-    waves = sines(x_0, config.validation, (2.0, 60.0), 1000, 1.0)
+    aside = Profile([0.0, 1.0], [X_0, X_0 + 6e-3])
+    waves = sines(X_0, config.validation, (2.0, 60.0), 1000, 1.0)
     tests = [
         grasp.move(waves, 1.0, step=5e-4, sample=1e-3),
         grasp.move(aside, 1.2, step=2e-3, sample=4e-3),
@@ -220,7 +219,7 @@ def study_stick(config: Config) -> dict[str, Any]:
     choice = choose(problem, tests, recipe, config.thresholds, loop(taps))
     reduced = refit(taps, choice.model, recipe, config)
     full = [
-        simulate(model, grid(p.scenario.duration, 2e-3), y0=whole.y0)
+        whole.run(grid(config.scenario * file.outputs.duration, 2e-3))
         for _ in range(1 if config.smoke else 3)
     ]
     parts, held = expected(grasp), record(full[0])
@@ -245,17 +244,14 @@ class Stroke(NamedTuple):
 
 def strokes(config: Config, travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
     """Strokes there and back from a light grasp with the horizontal loop on the bracket."""
-    e = Excitation(
-        motion=Strokes(travel=travel, stroke_time=stroke_time), depth=depth, senses="bracket",
-        duration=0.5 + 4 * stroke_time + 0.01,
-    )  # fmt: skip
-    changes: dict[str, Any] = {"contact.v_s": 0.05} | (COARSE if config.smoke else {})
-    model, y0, _ = begin(e, Parameters().override(changes))
-    t, start = grid(e.duration, 5e-4), 1000
-    run = simulate(model, t[: start + 1], y0=y0, step=5e-4)
-    rest = simulate(model, t[start:], y0=run.y[-1], step=5e-4)
+    roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
+    e = Excitation(roll, duration=0.5 + 4 * stroke_time + 0.01, depth=depth)
+    file = PAPER.override({"contact.v_s": 0.05} | (COARSE if config.smoke else {}))
+    built, t, start = excite(file, e).build(), grid(e.duration, 5e-4), 1000
+    run = built.run(t[: start + 1], step=5e-4)
+    rest = built.run(t[start:], y0=run.y[-1], step=5e-4)
     peak = float(np.abs(np.gradient(rest["v_x_Br"].numpy(), 5e-4)).max())
-    return Stroke(record(rest), peak, slipping(model, rest), rest.stats.wall_s)
+    return Stroke(record(rest), peak, slipping(built.rig, rest), rest.stats.wall_s)
 
 
 def sticking(model: ReducedModel) -> ReducedModel:
@@ -296,7 +292,7 @@ def study_slip(config: Config) -> dict[str, Any]:
         }
         for T, one in sorted(other.items(), reverse=True)
     ]  # fmt: skip
-    deep = strokes(config, 15e-3, 0.04, depth=5 / 3 * DEPTH)
+    deep = strokes(config, 15e-3, 0.04, depth=2 * DEPTH)
     return {
         "terms": len(model.terms),
         "heldout_nrmse": float(np.mean([one["nrmse"] for one in by_stroke if one["held_out"]])),

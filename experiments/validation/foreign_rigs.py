@@ -26,10 +26,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torchsoft import Parameters, Reference, SoftGrasp
-from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin, start
+from torchsoft import Reference, RigFile, excite
 from torchsoft.experiment import COARSE, coloured, markdown, options, repeated, write
 from torchsoft.physics.motion import Profile, Sampled
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import (
     RIG,
     IdentificationResult,
@@ -46,11 +46,13 @@ TESTS = Path(__file__).parents[2] / "tests"
 sys.path[:0] = str(TESTS), str(Path(__file__).parents[1])
 
 from foreign import Numbers, simulate  # noqa: E402  # pyright: ignore[reportMissingImports]
-from identify_contact import TRUTH, problem  # noqa: E402
+from identify_contact import LAW, MU_S, RUBBER, TRUTH, problem  # noqa: E402
 
-SMOKE_UNKNOWNS = ("contact.mu_s", "contact.K_n", "pad.E", "pad.tau")
+SMOKE_UNKNOWNS = MU_S, f"{LAW}.K_n", f"{RUBBER}.E", f"{RUBBER}.tau"
 
 SIGNALS = ("x_d", "y_d", "F_ff")
+CALLED = {"theta_C": "theta", "effort_x": "F_x", "effort_y": "F_y"}
+"""Channels as the stranger calls them."""
 
 SETTLE = 0.2
 """Time [s] that the rig is simulated before the first sample: the disc has been put down then."""
@@ -62,42 +64,46 @@ RATE = 200.0
 """Samples a second."""
 
 
-SHAKEN = MultiSine(amplitude_x=12.5e-3, amplitude_y=2e-4, frequency=(4.0, 20.0))
+def sines(roll: float, band: tuple[float, float], duration: float, depth: float) -> Excitation:
+    """Shaken along [m] and across the pads."""
+    sums = [
+        {"kind": "multi_sine", "amplitude": size, "band": band, "seed": seed}
+        for seed, size in enumerate((roll, 2e-4))
+    ]
+    return Excitation(*sums, duration, depth)
+
+
+def strokes(travel: float, stroke_time: float, duration: float, depth: float) -> Excitation:
+    motion = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
+    return Excitation(motion, None, duration, depth)
+
+
+def sweep(amplitude: float, first: float, last: float) -> dict[str, Any]:
+    return {"kind": "chirp", "amplitude": amplitude, "first": first, "last": last}
+
+
+def pressing(
+    travel: float, amplitude: float, frequency: float, duration: float, depth: float
+) -> Excitation:
+    """Pressed at a frequency [Hz] while the disc rolls."""
+    times, values = (0.5, duration), (0.0, travel)
+    roll = {"kind": "profile", "times": times, "values": values, "offset": "start"}
+    return Excitation(roll, sweep(amplitude, frequency, frequency), duration, depth)
+
+
 EXCITATIONS = {
-    "deep pressing": Excitation(
-        motion=Press(amplitude=8e-4, frequency=17.0, travel=20e-3), duration=1.2, depth=2.5e-3
-    ),
-    "light shaking": Excitation(
-        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)),
-        duration=1.2, depth=3e-4,
-    ),
-    "light jerks": Excitation(
-        motion=Strokes(travel=80e-3, stroke_time=0.2), duration=1.0, depth=2e-4
-    ),
-    "deep chirp": Excitation(
-        motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0),
-        duration=1.3, depth=2.5e-3,
-    ),
-    "hard shaking": Excitation(motion=SHAKEN, duration=1.2, depth=3e-4),
-    "long shaking": Excitation(motion=SHAKEN, duration=1.5, depth=3e-4),
-    "gentle roll": Excitation(motion=Strokes(travel=10e-3, stroke_time=0.6), duration=1.5),
-    "pressing": Excitation(
-        motion=Press(amplitude=4e-4, frequency=12.0, travel=8e-3), duration=0.7, grasp_time=0.15
-    ),
-    "shaking": Excitation(
-        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)),
-        duration=0.7, depth=4e-4, grasp_time=0.15,
-    ),
-}  # fmt: skip
+    "deep pressing": pressing(20e-3, 8e-4, 17.0, 1.2, 2.4e-3),
+    "light shaking": sines(6e-3, (4.0, 20.0), 1.2, 2e-4),
+    "light jerks": strokes(80e-3, 0.2, 1.0, 1e-4),
+    "deep chirp": Excitation(sweep(5e-3, 1.0, 25.0), sweep(5e-4, 1.0, 25.0), 1.3, 2.4e-3),
+    "hard shaking": sines(12.5e-3, (4.0, 20.0), 1.2, 2e-4),
+    "long shaking": sines(12.5e-3, (4.0, 20.0), 1.5, 2e-4),
+    "gentle roll": strokes(10e-3, 0.6, 1.5, 1.4e-3),
+    "pressing": pressing(8e-3, 4e-4, 12.0, 0.9, 1.4e-3),
+    "shaking": sines(6e-3, (4.0, 17.0), 0.9, 3e-4),
+}
 """Motions of a second or so: three gentle ones, which show all eight parameters together, hard
 ones, and the two of the smoke size."""
-
-
-def nominal(smoke: bool) -> Parameters:
-    """What the laboratory knows; the unknown numbers are the usual ones."""
-    known = [name for name in TRUTH if name not in SMOKE_UNKNOWNS]
-    less = COARSE | {name: TRUTH[name] for name in known} if smoke else {}
-    return Parameters().override({"contact.v_s": 0.05} | less)
 
 
 class Made(NamedTuple):
@@ -117,28 +123,32 @@ class Order(NamedTuple):
     smoke: bool = False
 
 
-def planned(excitation: str, smoke: bool) -> tuple[Parameters, Reference]:
-    """What the laboratory has planned with the nominal numbers: settings and reference."""
-    model = begin(EXCITATIONS[excitation], nominal(smoke)).rig
-    return model.settings, model.reference
+def planned(excitation: str, smoke: bool) -> RigFile:
+    """What the laboratory knows and has planned; the unknown numbers are the usual ones."""
+    known = {name: value for name, value in TRUTH.items() if name not in SMOKE_UNKNOWNS}
+    less = COARSE | known if smoke else {}
+    file = RigFile.ready("paper").override({"contact.v_s": 0.05} | less)
+    return excite(file, EXCITATIONS[excitation])
 
 
-def numbers(settings: Parameters, differs: Mapping[str, Any]) -> Numbers:
+def numbers(file: RigFile, differs: Mapping[str, Any]) -> Numbers:
     """The stranger's rig: the known numbers, the truth of the unknown ones, and what differs."""
-    pad, contact, control = settings.pad, settings.contact, settings.control
+    stated = {name: row["value"] for name, row in file.table().items()}
     known = {
-        "v_s": contact.v_s, "spacing": contact.node_spacing, "nu": pad.nu,
-        "length": pad.length, "height": pad.height,
-        "depth": pad.depth, "across": pad.elements_x, "through": pad.elements_y,
-        "radius": settings.disc.radius, "mass": settings.disc.mass,
-        "bracket_mass": settings.bracket.mass, "cm_height": settings.bracket.cm_height,
-        "gravity": settings.scenario.gravity, "x_C0": settings.scenario.x_C0, "K_x": control.K_81,
-        "R_x": control.R_80, "K_y": control.K_98, "R_y": control.R_99,
-        "senses_disc": control.senses == "disc",
+        "v_s": f"{LAW}.friction.v_s", "nu": f"{RUBBER}.nu", "depth": f"{RUBBER}.depth",
+        "length": "pads.U.length", "height": "pads.U.height", "across": "pads.U.elements_x",
+        "through": "pads.U.elements_y", "radius": "bodies.disc.shape.radius",
+        "mass": "bodies.disc.mass", "bracket_mass": "bodies.bracket.mass", "gravity": "gravity",
+        "x_C0": "bodies.disc.start.x", "K_x": "actuators.x.Kp", "R_x": "actuators.x.Kd",
+        "K_y": "actuators.y.Kp", "R_y": "actuators.y.Kd",
     }  # fmt: skip
-    return Numbers(
-        **known | {name.split(".")[1]: value for name, value in TRUTH.items()} | dict(differs)
-    )
+    return Numbers(**{
+        **{own: stated[name] for own, name in known.items()},
+        **{name.rpartition(".")[2]: value for name, value in TRUTH.items()},
+        "cm_height": -stated["pads.U.origin"][1], "spacing": 1e-3,
+        "senses_disc": file.actuators["x"].measures == "disc.x",
+        **differs,
+    })  # fmt: skip
 
 
 def make(order: Order, step: float) -> Made:
@@ -156,11 +166,11 @@ def make(order: Order, step: float) -> Made:
 
 def stepped(order: Order, step: float) -> Made:
     """A run of the stranger's simulator on steps of `step` [s]."""
-    settings, reference = planned(order.excitation, order.smoke)
-    count = round((EXCITATIONS[order.excitation].duration + SETTLE) / step)
+    file = planned(order.excitation, order.smoke)
+    count = round((file.outputs.duration + SETTLE) / step)
     t = step * (np.arange(count + 1) - round(SETTLE / step))
-    signals = reference(torch.from_numpy(t), SIGNALS).detach().numpy()
-    run = simulate(numbers(settings, dict(order.differs)), t, signals, round(KEPT / step))
+    signals = file.build().rig.reference(torch.from_numpy(t), SIGNALS).detach().numpy()
+    run = simulate(numbers(file, dict(order.differs)), t, signals, round(KEPT / step))
     return Made(run.t, run.channels, float(np.max(run.slip)))
 
 
@@ -187,7 +197,9 @@ def sampled(made: Made, seed: int, delay: Mapping[str, float], colour: float) ->
     for channel, sensor in RIG.items():
         at = np.arange(first, len(made.t), every)
         noise = coloured(len(at), colour, rng)
-        exact = made.channels[channel][at - round(delay.get(channel, 0.0) / KEPT)]
+        exact = made.channels[CALLED.get(channel, channel)][
+            at - round(delay.get(channel, 0.0) / KEPT)
+        ]
         out[channel] = (made.t[at], exact + sensor.noise * noise)
     return out
 
@@ -218,9 +230,10 @@ class Case:
 
     def recording(self, excitation: str, made: Made, seed: int, smoke: bool = False) -> Recording:
         """One run as the laboratory hands it over, sampled by its sensors."""
-        settings, reference = planned(excitation, smoke)
+        file = planned(excitation, smoke)
+        reference = file.build().rig.reference
         if self.sparse:
-            reference = at_samples(reference, EXCITATIONS[excitation].duration)
+            reference = at_samples(reference, file.outputs.duration)
         if self.no_feed_forward:
             signals = {name: reference[name] for name in ("x_d", "y_d")}
             reference = Reference(**signals, F_ff=Profile([0.0], [0.0]))
@@ -228,8 +241,9 @@ class Case:
         for channel, (t, y) in samples.items():
             sign = -1.0 if channel in self.flipped else 1.0
             samples[channel] = t, sign * (y + self.offset.get(channel, 0.0))
-        rig = SoftGrasp(settings.override(dict(self.noted)), reference)
-        at_rest = Standing.of(rig, start(rig), rests={"disc": [1]})
+        rig, y0, _ = file.override(self.noted).build()
+        rig.reference = reference
+        at_rest = Standing.of(rig, y0, rests={"disc": [1]})
         return Recording(excitation, rig, samples, at_rest)
 
 
@@ -247,13 +261,13 @@ CASES = (
     Case("mesh 240 x 6", ("mesh", "element"), differs={"across": 240, "through": 6}),
     Case("literal Coulomb", ("friction", "Coulomb", "slip law"), differs={"literal": True}),
     Case("x_C0 off by 40 um", ("disc begins",), differs={"x_C0": 60.34e-3}),
-    Case("theta zeroed elsewhere", ("theta",), offset={"theta": 0.02}),
+    Case("theta zeroed elsewhere", ("theta",), offset={"theta_C": 0.02}),
     Case("set-points at 200 Hz", ("set-point", "setpoint"), sparse=True),
     Case("F_ff left out", ("F_ff", "fed forward", "feed-forward"), no_feed_forward=True),
-    Case("loop convention wrong", ("senses", "x_d"), noted={"control.senses": "disc"}),
-    Case("sign of F_x flipped", ("sign",), flipped=("F_x",)),
+    Case("loop convention wrong", ("senses", "x_d"), noted={"control.senses": "disc.x"}),
+    Case("sign of F_x flipped", ("sign",), flipped=("effort_x",)),
     Case("AR(1) noise of 0.9", ("colour", "white", "AR(", "autocorrel"), colour=0.9),
-    Case("camera 2 ms late", ("delay", "late"), delay={"x_C": 2e-3, "y_C": 2e-3, "theta": 2e-3}),
+    Case("camera 2 ms late", ("delay", "late"), delay={"x_C": 2e-3, "y_C": 2e-3, "theta_C": 2e-3}),
     Case("radius off by 0.5 %", ("radius",), differs={"radius": 1.005 * 19.37e-3}),
 )
 
@@ -360,7 +374,7 @@ def table(outcomes: list[Outcome]) -> str:
         errors = " ".join(cells)
         rows.append((one.name, errors, chi2, one.verdict, f"{one.wall_s:.0f}", warnings or "-"))
     names = max((one.parameters for one in outcomes), key=len)
-    short = " ".join(name.split(".")[1] for name in names)
+    short = " ".join(name.rpartition(".")[2] for name in names)
     head = ("case", f"errors [%] of {short}", "chi2", "verdict", "wall [s]", "warnings")
     return markdown(head, rows)
 

@@ -37,9 +37,12 @@ from torchsoft.sysid.suspects import LIKELY
 sys.path.insert(0, str(Path(__file__).parent))
 
 import foreign_rigs
-from foreign_rigs import TRUTH, Made, Order, chosen, make_all, stated
+from foreign_rigs import LAW, RUBBER, TRUTH, Made, Order, chosen, make_all, stated
 
-SIX = ("contact.K_n", "contact.K_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
+SIX = tuple(f"{LAW}.{name}" for name in ("K_n", "K_t", "friction.mu_s", "friction.mu_k")) + (
+    f"{RUBBER}.E",
+    f"{RUBBER}.tau",
+)
 KNOWN = {name: value for name, value in TRUTH.items() if name not in SIX}
 
 OFF = 3.0
@@ -61,7 +64,7 @@ def reading(channel: str, fault: Callable[[Array, np.random.Generator], Array]) 
 
 def with_outliers(y: Array, rng: np.random.Generator) -> Array:
     y, hit = y.copy(), rng.choice(len(y), 4, replace=False)
-    y[hit] += 15 * RIG["F_y"].noise * rng.choice([-1.0, 1.0], 4)
+    y[hit] += 15 * RIG["effort_y"].noise * rng.choice([-1.0, 1.0], 4)
     return y
 
 
@@ -93,21 +96,21 @@ class Case:
 CASES = (
     Case("nothing"),
     Case("upper pad 10 % stiffer", ("pads.U.E_ratio", "pads.L.E_ratio"), differs={"upper": 1.1}),
-    Case("penalty force ~ g^1.5", ("contact.power",), differs={"power": 1.5}),
-    Case("second time, 1 % of compliance", ("pad.slow",), differs={"slow": 0.01}),
+    Case("penalty force ~ g^1.5", (f"{LAW}.power",), differs={"power": 1.5}),
+    Case("second time, 1 % of compliance", (f"{RUBBER}.slow",), differs={"slow": 0.01}),
     Case("2 N of friction on the guide", ("guides.bracket.x.friction",), differs={"friction": 2.0}),
-    Case("inertia +5 %", ("disc.inertia_ratio",), differs={"inertia": 1.05}),
+    Case("inertia +5 %", ("bodies.disc.inertia_ratio",), differs={"inertia": 1.05}),
     Case("tilt of 2 mrad", ("gravity_tilt",), differs={"tilt": 2e-3}),
-    Case("nu +4.44 %", ("pad.nu",), differs={"nu": 0.47}),
-    Case("disc mass +5 %", ("disc.mass",), differs={"mass": 1.05 * 0.4065}),
-    Case("gain of F_x 3 %", ("gain F_x",), alter=reading("F_x", lambda y, _: 1.03 * y)),
+    Case("nu +4.44 %", (f"{RUBBER}.nu",), differs={"nu": 0.47}),
+    Case("disc mass +5 %", ("bodies.disc.mass",), differs={"mass": 1.05 * 0.4065}),
+    Case("gain of F_x 3 %", ("gain effort_x",), alter=reading("effort_x", lambda y, _: 1.03 * y)),
     Case("set-points 1.5 ms late", ("clock of the set-points",), alter=late),
     Case(
         "theta in steps of 2 mrad",
-        words=("theta comes in steps",),
-        alter=reading("theta", lambda y, _: 2e-3 * np.round(y / 2e-3)),
+        words=("theta_C comes in steps",),
+        alter=reading("theta_C", lambda y, _: 2e-3 * np.round(y / 2e-3)),
     ),
-    Case("outliers in F_y", words=("outliers",), alter=reading("F_y", with_outliers)),
+    Case("outliers in F_y", words=("outliers",), alter=reading("effort_y", with_outliers)),
     Case("gentle roll", excitation="gentle roll"),
 )
 SMOKE = ("inertia +5 %",)
