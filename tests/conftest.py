@@ -21,6 +21,7 @@ from torchsoft import (
     register_method,
 )
 from torchsoft.physics.state import State
+from torchsoft.rigs.excite import Excitation
 
 register_method()
 
@@ -57,6 +58,18 @@ def still(changes: Mapping[str, Any] | None = None, **parts: Any) -> Rig:
 def excited(name: str, changes: Mapping[str, Any] | None = None, **how: Any) -> BuiltRig:
     """The paper's rig under an excitation of the catalogue."""
     return excite(PAPER.override(changes), name, **how).build()
+
+
+def stroked(
+    file: RigFile, travel: float, stroke_time: float, duration: float, *,
+    grasp: float, since: float, depth: float = 1.39e-3,
+) -> BuiltRig:  # fmt: skip
+    """The paper's rig, rolled to and fro [m] after a grasp [s] that is quicker than those of the
+    catalogue, by default to the height of the paper's."""
+    roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
+    soon = {f"motion.{name}.times": [0.0, grasp] for name in ("y_d", "F_ff")}
+    excited = excite(file, Excitation(roll, duration=duration, depth=depth))
+    return excited.override(soon | {"motion.x_d.since": since}).build()
 
 
 def rest(rig: Rig, x: float = 60e-3) -> Tensor:

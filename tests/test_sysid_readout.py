@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, RUBBER, dry, f64
+from conftest import COARSE, PAPER, RUBBER, dry, f64, stroked
 from scipy import stats
 from scipy.optimize import least_squares
 from test_sysid import check_derivatives
@@ -19,13 +19,11 @@ from torchsoft import (
     KelvinVoigt,
     Pad,
     PadMesh,
-    Parameters,
     Profile,
     Reference,
     Rig,
     simulate,
 )
-from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import (
     Known,
     Prior,
@@ -41,22 +39,21 @@ from torchsoft.sysid.prediction import Readout
 from torchsoft.sysid.residual_tests import CLEAR, parts, predicted
 from torchsoft.sysid.runs import Runner
 
-BASE = PAPER.override(COARSE)
-STROKES = Excitation(
-    motion=Strokes(travel=8e-3, stroke_time=0.15), duration=0.45, grasp_time=0.15, settle=0.05
-)
+E, LAW = "materials.rubber.E", "laws.steel_on_rubber"
+MU_S, MU_K = f"{LAW}.friction.mu_s", f"{LAW}.friction.mu_k"
 FAULTY = {
     "x_C": Sensor(noise=1e-5, gain=0.05, drift=1e-3),
     "y_C": Sensor(noise=1e-5, misalignment=0.05),
-    "theta": Sensor(noise=5e-4, bias=1e-2, per="recording", delay=4e-3),
-    "F_x": Sensor(noise=0.1, inertia=0.5, misalignment=0.02, high=1.0),
-    "F_y": Sensor(noise=0.1),
+    "theta_C": Sensor(noise=5e-4, bias=1e-2, per="recording", delay=4e-3),
+    "effort_x": Sensor(noise=0.1, inertia=0.5, misalignment=0.02, high=1.0),
+    "effort_y": Sensor(noise=0.1),
 }
 
 
 @pytest.fixture(scope="module")
 def strokes():
-    return record("strokes", begin(STROKES, BASE), {"pad.E": 0.9e6}, FAULTY)
+    built = stroked(PAPER.override(COARSE), 8e-3, 0.15, 0.45, grasp=0.15, since=0.2)
+    return record("strokes", built, {E: 0.9e6}, FAULTY)
 
 
 @pytest.mark.slow
@@ -67,22 +64,22 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes):
         strokes, name="moved", start=strokes.start._replace(position_sd={"disc.x": 1e-4})
     )
     unknowns = {
-        "pad.E": Unknown(prior=Prior(median=8e5, sd=1e5)),
-        "contact.v_s": Unknown(prior=Prior(median=5e-3, sd=1.0, kind="log-normal")),
-        "contact.R_n": Unknown(per="recording"),
-        "contact.mu_s": Unknown(),
-        "contact.mu_k": Unknown(ratio_to="contact.mu_s", high=1.0, low=0.3),
-        "disc.mass": Unknown(scale="linear", low=0.3, high=0.5),
-        "control.R_80": Unknown(),
+        E: Unknown(prior=Prior(median=8e5, sd=1e5)),
+        f"{LAW}.friction.v_s": Unknown(prior=Prior(median=5e-3, sd=1.0, kind="log-normal")),
+        f"{LAW}.R_n": Unknown(per="recording"),
+        MU_S: Unknown(),
+        MU_K: Unknown(ratio_to=MU_S, high=1.0, low=0.3),
+        "bodies.disc.mass": Unknown(scale="linear", low=0.3, high=0.5),
+        "actuators.x.Kd": Unknown(),
     }
     problem = Problem([strokes, moved], FAULTY, unknowns)
     c = problem.coordinates
     assert c.labels == (
-        "pad.E", "contact.v_s", "contact.R_n in strokes", "contact.R_n in moved",
-        "contact.mu_s", "contact.mu_k / contact.mu_s", "disc.mass", "control.R_80",
+        E, f"{LAW}.friction.v_s", f"{LAW}.R_n in strokes", f"{LAW}.R_n in moved",
+        MU_S, f"{MU_K} / {MU_S}", "bodies.disc.mass", "actuators.x.Kd",
         "start.disc.x in moved", "gain of x_C", "drift of x_C", "misalignment of y_C",
-        "bias of theta in strokes", "bias of theta in moved", "delay of theta in strokes",
-        "delay of theta in moved", "misalignment of F_x", "inertia of F_x",
+        "bias of theta_C in strokes", "bias of theta_C in moved", "delay of theta_C in strokes",
+        "delay of theta_C in moved", "misalignment of effort_x", "inertia of effort_x",
     )  # fmt: skip
     low, high = c.bounds
     x = c.start + 0.05 * np.random.default_rng(0).standard_normal(len(c)) * np.minimum(
@@ -96,24 +93,22 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes):
 
 def test_a_prior_is_one_more_measurement(strokes):
     prior = Prior(median=7e5, sd=0.02, kind="log-normal")
-    problem = Problem([strokes], {"x_C": Sensor(noise=1e-2)}, {"pad.E": Unknown(prior=prior)})
-    answer = identify(
-        problem, plan=[Stage("all", ("strokes",), ("pad.E",), 1e-3)], assumptions="trusted"
-    )
-    assert answer["pad.E"].last == pytest.approx(7e5, rel=5e-3)  # the sensor says nothing
-    assert answer["pad.E"].relative_sd == pytest.approx(0.02, rel=0.05)
+    problem = Problem([strokes], {"x_C": Sensor(noise=1e-2)}, {E: Unknown(prior=prior)})
+    answer = identify(problem, plan=[Stage("all", ("strokes",), (E,), 1e-3)], assumptions="trusted")
+    assert answer[E].last == pytest.approx(7e5, rel=5e-3)  # the sensor says nothing
+    assert answer[E].relative_sd == pytest.approx(0.02, rel=0.05)
 
 
 @pytest.mark.parametrize(
     ("channel", "sensor", "sentence"),
     [
-        ("theta", Sensor(noise=1e-3, misalignment=0.1), "no channel at right angles"),
+        ("theta_C", Sensor(noise=1e-3, misalignment=0.1), "no channel at right angles"),
         ("x_C", Sensor(noise=1e-3, inertia=0.1), "not the force of an actuator"),
     ],
 )
 def test_what_a_channel_cannot_have_is_refused(strokes, channel, sensor, sentence):
     with pytest.raises(ValueError, match=rf"sensors\.{channel}\..*{sentence}"):
-        Problem([strokes], {channel: sensor}, {"pad.E": Unknown()})
+        Problem([strokes], {channel: sensor}, {E: Unknown()})
 
 
 def test_tables_that_make_no_sense_are_refused():
@@ -184,7 +179,7 @@ def test_saturated_samples_have_tobins_likelihood():
     distribution function, and with many seeds errors are standard normal."""
     t, limit, noise = np.arange(200) * 5e-3, 0.9, 0.1
     shape, z = np.sin(4 * np.pi * t), []
-    one = Readout("F_x", noise, -limit, limit, 1.0, 0.0, 0.0, 0.0, 0.0, ())
+    one = Readout("effort_x", noise, -limit, limit, 1.0, 0.0, 0.0, 0.0, 0.0, ())
     for seed in range(200):
         y = np.clip(
             shape + noise * np.random.default_rng(seed).standard_normal(len(t)), -limit, limit
@@ -212,26 +207,30 @@ def test_saturated_samples_have_tobins_likelihood():
 
 
 def test_saturated_samples_cannot_have_coloured_noise(strokes):
-    sensors = {"F_x": Sensor(noise=0.1, high=float(strokes.samples["F_x"][1].max()), colour="ar")}
+    sensors = {
+        "effort_x": Sensor(noise=0.1, high=float(strokes.samples["effort_x"][1].max()), colour="ar")
+    }
     with pytest.raises(
-        ValueError, match=r"sensors\.F_x: in `strokes` samples are at its `low` or `high`"
+        ValueError, match=r"sensors\.effort_x: in `strokes` samples are at its `low` or `high`"
     ):
-        Problem([strokes], sensors, {"pad.E": Unknown()})
+        Problem([strokes], sensors, {E: Unknown()})
 
 
 def test_what_saturation_has_changed_is_not_judged(strokes):
     """Noise as stated and a sensor that is saturated most of the time: residuals near its range's
     end are not normal, those well inside are; and one far from the prediction counts wherever it
     is."""
-    t, y = strokes.samples["F_x"]
+    t, y = strokes.samples["effort_x"]
     limit = float(np.quantile(np.abs(y), 0.4))
     noise = limit / 20
     sensor, rng = Sensor(noise=noise, low=-limit, high=limit), np.random.default_rng(0)
     measured = np.clip(y + noise * rng.standard_normal(len(t)), -limit, limit)
     measured[np.argmax(y)] = 0.0  # a sample that is lost
-    cut = replace(strokes, samples={"F_x": (t, measured)})
-    problem = Problem([cut], {"F_x": sensor}, {"pad.E": Unknown()})
-    r, _ = Readout("F_x", noise, -limit, limit, 1.0, 0.0, 0.0, 0.0, 0.0, ()).residuals(y, measured)
+    cut = replace(strokes, samples={"effort_x": (t, measured)})
+    problem = Problem([cut], {"effort_x": sensor}, {E: Unknown()})
+    r, _ = Readout("effort_x", noise, -limit, limit, 1.0, 0.0, 0.0, 0.0, 0.0, ()).residuals(
+        y, measured
+    )
     (part,) = parts(problem, r, ["strokes"])
     assert part.saturated > 0.5 * len(t)
     inside = np.flatnonzero(np.abs(y) < limit - CLEAR * noise)

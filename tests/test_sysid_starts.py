@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import RUBBER, dry
+from conftest import COARSE, PAPER, RUBBER, dry, still, stroked
 from test_experiments import experiment
 from test_sysid import check_derivatives
 from torch import Tensor
@@ -19,27 +19,20 @@ from torchsoft import (
     Contact,
     Pad,
     PadMesh,
-    Parameters,
     Rig,
     SimulationFailed,
     SmoothSlip,
     SoftContact,
     hold,
 )
-from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.motion import Profile, Reference
-from torchsoft.solve.simulate import simulate
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Stage, Unknown, identify
 from torchsoft.sysid.first_samples import WIDER, beginning, estimate_initial_state, lasting_stretch
 from torchsoft.sysid.initial_state import SETTLE, MovingStart, Standing, Stretch
 from torchsoft.sysid.runs import Runner
 
-MOTION = Excitation(
-    motion=Strokes(travel=12e-3, stroke_time=0.3), duration=0.86, grasp_time=0.2, settle=0.05
-)
-COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
+E, TAU, MU_S = "materials.rubber.E", "materials.rubber.tau", "laws.steel_on_rubber.friction.mu_s"
 SINCE = 0.4
 """When the recording begins [s]: in the middle of the first stroke."""
 
@@ -49,9 +42,10 @@ Cut = tuple[Recording, Tensor]
 @pytest.fixture(scope="module")
 def cut():
     """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
-    model, y0, _ = begin(MOTION, PAPER.override(COARSE))
-    at = np.arange(SINCE, MOTION.duration, 5e-3)
-    run = simulate(model, torch.from_numpy(np.append(-SETTLE, at)), y0=y0, rtol=1e-6)
+    built = stroked(PAPER.override(COARSE), 12e-3, 0.3, 0.86, grasp=0.2, since=0.25)
+    model, y0, t = built
+    at = np.arange(SINCE, float(t[-1]), 5e-3)
+    run = built.run(torch.from_numpy(np.append(-SETTLE, at)), rtol=1e-6)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
     at_rest = Standing.of(model, y0, rests={"disc": [1]})
     return Recording("roll", model, samples, at_rest), run.y[1].detach()
@@ -132,7 +126,7 @@ def test_samples_out_of_a_sensors_range_say_nothing():
 def test_what_no_sensor_measures_is_assumed(cut):
     recording, y0 = cut
     truth = true_bodies(recording, y0)
-    few = {channel: RIG[channel] for channel in ("x_C", "F_x", "F_y")}
+    few = {channel: RIG[channel] for channel in ("x_C", "effort_x", "effort_y")}
     start = underway(estimate_initial_state(noisy(recording), few))
     assert start.bodies["disc.theta"] == (0.0, 0.0)  # a circle has no angle
     for name in ("disc.y", "bracket.x", "bracket.y", "disc.v_theta", "disc.v_y", "bracket.v_x"):
@@ -144,7 +138,7 @@ def test_what_no_sensor_measures_is_assumed(cut):
         estimate_initial_state(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)})
     )
     assert given.bodies["disc.y"] == (0.0233, 1e-3)
-    none = {"F_x": RIG["F_x"], "theta": RIG["theta"]}
+    none = {name: RIG[name] for name in ("effort_x", "theta_C")}
     with pytest.raises(ValueError, match=r"no sensor tells where `disc\.x` is"):
         estimate_initial_state(recording, none)
 
@@ -167,9 +161,9 @@ def test_derivatives_of_the_state_are_those_of_differences(cut):
     weights = torch.linspace(-1, 1, begun.rig.layout.size, dtype=torch.float64)
     means = {c.name: c.mean for c in out.start_coordinates}
     names = ("start.disc.x", "start.bracket.y", "start.disc.v_theta", "start.L.stretch.3")
-    values, E = tensors(means), begun.rig.parameter("pad.E")
+    values, modulus = tensors(means), begun.rig.parameter(E)
     *exact, by_E = torch.autograd.grad(
-        weights @ begun.y0(values), [*(values[name] for name in names), E]
+        weights @ begun.y0(values), [*(values[name] for name in names), modulus]
     )
 
     def value(name: str, by: float) -> float:
@@ -187,22 +181,21 @@ def test_derivatives_of_the_state_are_those_of_differences(cut):
 def test_residuals_and_gradient_know_the_start(cut):
     recording, _ = cut
     out = estimate_initial_state(noisy(recording), RIG)
-    problem = Problem([out], RIG, {"pad.E": Unknown(), "contact.mu_s": Unknown()})
+    problem = Problem([out], RIG, {E: Unknown(), MU_S: Unknown()})
     c, runner = problem.coordinates, Runner(problem.recordings)
     r = problem.residuals(runner, c.start, problem.names, 1e-3).r
     assert len(r) == problem.samples() + len(out.start_coordinates)
     assert r[problem.samples() :] == pytest.approx(0.0, abs=1e-12)  # from the priors' means
     moved = [f"start.{name} in roll" for name in ("disc.y", "disc.v_x", "U.stretch.4")]
-    check_derivatives(problem, c.start + 1e-3, 1e-4, 1e-3, only=["pad.E", *moved], adjoint=1e-5)
+    check_derivatives(problem, c.start + 1e-3, 1e-4, 1e-3, only=[E, *moved], adjoint=1e-5)
 
 
 def test_the_start_does_not_depend_on_the_mesh(cut):
     recording, _ = cut
     out = estimate_initial_state(recording, RIG)
     rig = recording.rig
-    finer = still(
-        rig.settings.override({"pad.elements_x": 120, "contact.points": 2}), rig.reference
-    )
+    finer = still(COARSE | {"pad.elements_x": 120, "contact.points": 2})
+    finer.reference = rig.reference
     other = replace(out, rig=finer)
     assert other.start_coordinates == out.start_coordinates
     values = {
@@ -253,7 +246,9 @@ def test_a_run_that_cannot_begin_is_lost(cut):
 
 def test_parameters_are_found_from_the_middle_of_a_roll(cut):
     out = estimate_initial_state(noisy(cut[0], seed=3), RIG)
-    truth = {name: float(cut[0].rig.parameter(name).detach()) for name in ("pad.E", "pad.tau")}
+    truth = {
+        name: float(cut[0].rig.parameter(name).detach()) for name in (E, "materials.rubber.tau")
+    }
     problem = Problem(
         [out], RIG, {name: Unknown(nominal=1.1 * value) for name, value in truth.items()}
     )
@@ -306,7 +301,7 @@ def test_unknown_start_smoke(tmp_path):
     result = module.run(module.Config(out=tmp_path, smoke=True))
     ((case, (found,)),) = result.found.items()
     price = result.prices[case]
-    assert list(price.unknown) == ["contact.K_n", "pad.E", "pad.tau"]
+    assert list(price.unknown) == ["laws.steel_on_rubber.K_n", E, TAU]
     for name, sd in price.unknown.items():
         assert abs(np.log(found[name].last / module.TRUTH[name])) < 4 * sd, name
         assert 1.0 < sd / price.known[name] < 5.0, name
