@@ -50,7 +50,8 @@ def table(recording: Recording) -> dict[str, np.ndarray]:
         for i, name in enumerate(names) for k, rate in enumerate(("", "_dot"))
     }  # fmt: skip
     columns.pop("F_ff_dot")
-    return columns | {name: recording.samples[recording.rig.full(name)][1] for name in SENSORS}
+    short = {full: name for name, full in recording.rig.short.items()}
+    return columns | {short.get(name, name): y for name, (_, y) in recording.samples.items()}
 
 
 def write(recording: Recording, path: Path, digits: int = 7) -> None:
