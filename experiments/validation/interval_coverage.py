@@ -34,9 +34,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
+from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 
 from torchsoft import Parameters, csvfile
-from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, repeated, write
 from torchsoft.rigs import RigFile
 from torchsoft.sysid import RIG, Problem, Sensor, Stage, identify, record
