@@ -221,7 +221,7 @@ def test_orientation_rig_has_the_gains_of_its_design():
     """The gains in the file are those of the experiment's bandwidth; rigid statics are the closed
     form of an ellipse."""
     module = experiment("orientation")
-    file = module.RigFile.from_toml(module.FILE)
+    file = module.READY
     for name, gains in module.design(file, 150.0).items():
         assert file.actuators[name].Kp == pytest.approx(gains["Kp"], rel=1e-2)
         assert file.actuators[name].Kd == pytest.approx(gains["Kd"], rel=1e-2)
