@@ -2,10 +2,10 @@
 carry it with its orientation held, within 0.1 mm and 0.5 degrees; and where do loops alone no
 longer do it?
 
-The rig is `rigs/orientation.toml`: each pad on a jaw of its own; the loop on disc.x pushes both
-jaws the same way, the loop on disc.theta pushes them against each other, the loop on disc.y lifts
-the lower jaw, and a force grips from above. Gains by design: one bandwidth w, damping 1, for the
-masses of rigid parts that roll. Errors count from the closed grip on.
+The ready rig `orientation` has each pad on a jaw of its own; the loop on disc.x pushes both jaws
+the same way, the loop on disc.theta pushes them against each other, the loop on disc.y lifts the
+lower jaw, and a force grips from above. Gains by design: one bandwidth w, damping 1, for the masses
+of rigid parts that roll. Errors count from the closed grip on.
   kinematics  jaws under loops of their own, driven as a rigid disc would roll: what it costs not to
               see the disc
   speed       everything after the grip faster; rigid parts lag behind by a / w^2
@@ -55,7 +55,7 @@ from torchsoft.plot.animation import animate
 from torchsoft.plot.figures import snapshots
 from torchsoft.rigs import RigFile
 
-FILE = Path(__file__).parents[1] / "rigs" / "orientation.toml"
+READY = RigFile.ready("orientation")
 
 GRIPPED = 0.5
 """Time [s] from which errors count: the grip is closed, and the turn begins."""
@@ -130,7 +130,7 @@ def file_of(gains: Gains, **groups: dict[str, Any]) -> RigFile:
     zero at first."""
     loops = {loop: {"feed_forward": f"known_{loop}"} for loop in LOOPS}
     zero = {f"known_{loop}": {"kind": "profile", "times": [0.0], "values": [0.0]} for loop in LOOPS}
-    file = RigFile.from_toml(FILE).override(**groups)
+    file = READY.override(**groups)
     return file.override(actuators=loops, motion=zero).override(actuators=gains)
 
 
@@ -184,7 +184,9 @@ def rubbed(case: Case, mu: float) -> None:
 
 def fed(case: Case, run: Trajectory) -> Case:
     """The same, with the efforts of a run before fed forward."""
-    efforts = {f"known_{loop}": run[f"F_{loop}"] for loop in LOOPS} | {"bear": run["F_lift"]}
+    efforts = {f"known_{loop}": run[f"effort_{loop}"] for loop in LOOPS} | {
+        "bear": run["effort_lift"]
+    }
     known = {k: Sampled(run.t, v.detach()) for k, v in efforts.items()}
     return replace(case, signals=case.signals | known)
 
@@ -234,7 +236,9 @@ def outcome(case: Case, run: Trajectory, stopped: str, config: Config) -> Outcom
     later = run.t >= GRIPPED - 1e-9
     angle, effort = (
         angle.abs(),
-        run["F_turn_lower"] if "F_turn_lower" in run.channels else torch.zeros_like(run.t),
+        run["effort_turn_lower"]
+        if "effort_turn_lower" in run.channels
+        else torch.zeros_like(run.t),
     )
     turn, end = case.signals["x_d"], float(run.t[-1])
     assert isinstance(turn, Piecewise)
@@ -362,7 +366,7 @@ def run(config: Config) -> Result:
         config = replace(config, speeds=(6.0,), aspects=(1.3,), frictions=(0.2,),
                          passes=1, rtol=1e-3)  # fmt: skip
     mesh = {"elements_x": 35, "elements_y": 2}
-    gains = design(RigFile.from_toml(FILE), config.bandwidth)
+    gains = design(READY, config.bandwidth)
     file = file_of(gains, pads={"lower": mesh, "upper": mesh}) if config.smoke else file_of(gains)
     base = case_of(file)
     disc = base.rig.bodies["disc"]

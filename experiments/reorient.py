@@ -110,8 +110,8 @@ def goal(file: RigFile, degrees: float, rtol: float) -> Goal:
             "y": {"channel": "y_object", "value": 0.0, "tolerance": PLACE},
         },
         "limits": {
-            "left grip": {"channel": "F_left_x", "low": GRIP, "since": 0.1},
-            "right grip": {"channel": "F_right_x", "high": -GRIP, "since": 0.1},
+            "left grip": {"channel": "effort_left_x", "low": GRIP, "since": 0.1},
+            "right grip": {"channel": "effort_right_x", "high": -GRIP, "since": 0.1},
         },
         "rtol": rtol,
     })  # fmt: skip

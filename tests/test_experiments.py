@@ -67,10 +67,10 @@ def test_pad_fidelity_smoke(tmp_path):
     result = module.run(module.Config(out=tmp_path, smoke=True))
     slow, fast, mesh = result.values()
     assert slow["y_C"]["difference"] < 0.02  # [um]
-    assert slow["F_y"]["difference"] < 10  # [mN]
+    assert slow["effort_y"]["difference"] < 10  # [mN]
     assert fast["x_C"]["difference"] > slow["x_C"]["difference"]
     assert mesh["y_C"]["difference"] < 30  # [um]
-    assert "| F_y | mN |" in module.table(result)
+    assert "| effort_y | mN |" in module.table(result)
 
 
 def test_step_accuracy_smoke(tmp_path):
@@ -78,7 +78,7 @@ def test_step_accuracy_smoke(tmp_path):
     module = experiment("step_accuracy")
     (rows,) = module.run(module.Config(out=tmp_path, smoke=True)).values()
     loose, tight, equal = rows.values()
-    for name in ("x_C", "F_y", "gradient"):
+    for name in ("x_C", "effort_y", "gradient"):
         assert tight[name] < loose[name]
     usual = median(tight["gradients"].values())  # the worst, of mu_s, is as rough as the roundings
     assert usual < 0.02
@@ -221,7 +221,7 @@ def test_orientation_rig_has_the_gains_of_its_design():
     """The gains in the file are those of the experiment's bandwidth; rigid statics are the closed
     form of an ellipse."""
     module = experiment("orientation")
-    file = module.RigFile.from_toml(module.FILE)
+    file = module.READY
     for name, gains in module.design(file, 150.0).items():
         assert file.actuators[name].Kp == pytest.approx(gains["Kp"], rel=1e-2)
         assert file.actuators[name].Kd == pytest.approx(gains["Kd"], rel=1e-2)

@@ -34,15 +34,12 @@ from step_accuracy import EIGHT, errors
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Parameters, SoftGrasp, simulate, simulate_batch
+from torchsoft import BuiltRig, Rig, RigFile, simulate, simulate_batch
 from torchsoft.experiment import grid, markdown, numbers, options, timed, write
-from torchsoft.scenario import Manipulation, grasp_and_roll
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.system import Rates
 
 T = TypeVar("T")
-
-GRASP_FORCE = 80.66  # That holds the grasp of the usual rig [N]; it need not be searched for.
 
 
 @dataclass(frozen=True)
@@ -65,10 +62,10 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-def prepare(elements_x: int = 120) -> Manipulation:
+def prepare(elements_x: int = 120) -> BuiltRig:
     """The manipulation on a mesh of so many elements."""
     mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
-    return grasp_and_roll(SoftGrasp(Parameters().override(mesh)), grasp_force=GRASP_FORCE)
+    return RigFile.ready("paper").override(mesh).build()
 
 
 def ways(config: Config) -> dict[str, dict[str, Any]]:
@@ -78,21 +75,19 @@ def ways(config: Config) -> dict[str, dict[str, Any]]:
 
 
 def tasks(
-    m: Manipulation, t: torch.Tensor, steps: Mapping[str, Any]
+    m: BuiltRig, t: torch.Tensor, steps: Mapping[str, Any]
 ) -> dict[str, Callable[[], object]]:
     """The run, the run with its gradient by all parameters, the run with its Jacobian by eight."""
 
     def gradient() -> None:
-        m.model.zero_grad()
-        run = simulate(m.model, t, y0=m.y0, gradient="discrete", **steps)
-        (run["theta"].square().sum() + 1e3 * run.together("x_C", "y_C").square().sum()).backward()
+        m.rig.zero_grad()
+        run = m.run(t, gradient="discrete", **steps)
+        (run["theta_C"].square().sum() + 1e3 * run.together("x_C", "y_C").square().sum()).backward()
 
     return {
-        "run": lambda: simulate(m.model, t, y0=m.y0, **steps),
+        "run": lambda: m.run(t, **steps),
         "gradient": gradient,
-        "jacobian": lambda: simulate(
-            m.model, t, y0=m.y0, gradient="forward", wrt=EIGHT, rigid=True, **steps
-        ),
+        "jacobian": lambda: m.run(t, gradient="forward", wrt=EIGHT, rigid=True, **steps),
     }
 
 
@@ -109,18 +104,18 @@ def interleaved(tasks: Mapping[str, Callable[[], T]], repeats: int) -> dict[str,
 
 
 def batch(
-    m: Manipulation, config: Config, count: int, duration: float, threads: int
+    m: BuiltRig, config: Config, count: int, duration: float, threads: int
 ) -> tuple[int, float]:
     """Failures and wall time [s] of a batch in which every run has its own stiffness, dashpot and
     retardation time, up to 20 % to either side of the model's."""
     part, t = torch.linspace(0.8, 1.2, count, dtype=torch.float64), grid(duration)
     own = {
-        name: m.model.parameter(name).detach() * part.roll(i * count // 3)
+        name: m.rig.parameter(name).detach() * part.roll(i * count // 3)
         for i, name in enumerate(("contact.K_n", "contact.R_t", "pad.tau"))
     }
     run, wall = timed(
         lambda: simulate_batch(
-            m.model, t, y0=m.y0, parameters=own, threads=threads, rtol=config.rtols[0]
+            m.rig, t, y0=m.y0, parameters=own, threads=threads, rtol=config.rtols[0]
         )
     )
     return len(run.failures), wall
@@ -152,7 +147,7 @@ def growth(config: Config) -> dict[str, Any]:
 
     def run(elements_x: int) -> Callable[[], float]:
         m, t = prepare(elements_x), grid(config.batch_duration)
-        return lambda: timed(lambda: simulate(m.model, t, y0=m.y0, rtol=config.rtols[0]))[1]
+        return lambda: timed(lambda: m.run(t, rtol=config.rtols[0]))[1]
 
     times = interleaved({str(n + 1): run(n) for n in config.elements_x}, min(config.repeats, 3))
     wall = {nodes: median(some) for nodes, some in times.items()}
@@ -191,9 +186,8 @@ class Window:
 
     def __init__(self, config: Config) -> None:
         m = prepare()
-        self.model: SoftGrasp = m.model
-        to_begin = torch.tensor([0.0, BEGIN], dtype=torch.float64)
-        self.y0: Tensor = simulate(self.model, to_begin, y0=m.y0, rtol=1e-6).y[-1]
+        self.model: Rig = m.rig
+        self.y0: Tensor = m.run([0.0, BEGIN], rtol=1e-6).y[-1]
         self.t = torch.linspace(BEGIN, BEGIN + config.window, 11, dtype=torch.float64)
         self.exact: Array = simulate(self.model, self.t, y0=self.y0, rtol=1e-8).y.numpy()
         slices = self.model.layout.slices
@@ -335,7 +329,7 @@ def peers_table(found: dict[str, Any]) -> str:
 def costs(config: Config) -> dict[str, Any]:
     """Times of the three tasks by every way, with errors."""
     m, t = prepare(), grid(config.duration)
-    exact = simulate(m.model, t, y0=m.y0, rtol=config.exact)
+    exact = m.run(t, rtol=config.exact)
     times = interleaved(
         {
             f"{way}, {name}": lambda task=task: timed(task)[1]
@@ -346,7 +340,7 @@ def costs(config: Config) -> dict[str, Any]:
     )
     out: dict[str, Any] = {}
     for way, steps in ways(config).items():
-        one = simulate(m.model, t, y0=m.y0, **steps)
+        one = m.run(t, **steps)
         run, gradient, jacobian = (
             median(times[f"{way}, {name}"]) for name in ("run", "gradient", "jacobian")
         )

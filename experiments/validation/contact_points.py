@@ -17,16 +17,14 @@ apart: 16 mN. Some three minutes on one core.
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Parameters, SoftGrasp, press, simulate
+from torchsoft import BuiltRig, Rig, RigFile
 from torchsoft.experiment import grid, numbers, options, write
-from torchsoft.scenario import grasp_and_roll
 
 Key = tuple[int, int]  # elements along the pad, contact points an element
 
@@ -46,13 +44,9 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-def build(elements_x: int, points: int, changes: dict[str, Any] | None = None) -> SoftGrasp:
-    mesh = {
-        "pad.elements_x": elements_x,
-        "pad.elements_y": elements_x // 30,
-        "contact.points": points,
-    }
-    return SoftGrasp(Parameters().override(mesh | (changes or {})))
+def build(elements_x: int, points: int) -> BuiltRig:
+    mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
+    return RigFile.ready("paper").override(mesh | {"contact.points": points}).build()
 
 
 def ripple(t: Tensor, x: Tensor, window: tuple[float, float]) -> float:
@@ -62,12 +56,14 @@ def ripple(t: Tensor, x: Tensor, window: tuple[float, float]) -> float:
 
 
 @torch.no_grad()
-def static(config: Config, case: Key) -> dict[str, float]:
+def static(config: Config, rig: Rig) -> dict[str, float]:
     """Ripples of the force along the lower pad and of the height of the disc pressed at the
     places."""
     places = np.linspace(config.node_mm, config.node_mm + 1, config.places)
-    models = [build(*case, {"scenario.x_C0": 1e-3 * x}) for x in places.tolist()]
-    states = [model.unpack(press(model, model.settings.scenario.y_Br_grasp)) for model in models]
+    states = [
+        rig.unpack(rig.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": 48.6e-3}))
+        for x in (1e-3 * places).tolist()
+    ]
     force, y_C = (
         torch.stack(x)
         for x in zip(*((s.pads["L"][0, :, 0].sum(), s.pose["disc"][1]) for s in states))
@@ -85,13 +81,13 @@ def run(config: Config) -> dict[str, dict[str, float]]:
                          window=(0.5, 0.8))  # fmt: skip
     out = {}
     for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
-        m = grasp_and_roll(build(*case))
-        rolled = simulate(m.model, grid(config.duration, 5e-3), y0=m.y0)
-        F_x = rolled["F_x"]
-        out[f"{120 / case[0]:g} mm, {case[1] or 'nodes'}"] = static(config, case) | {
+        built = build(*case)
+        rolled = built.run(grid(config.duration, 5e-3))
+        F_x = rolled["effort_x"]
+        out[f"{120 / case[0]:g} mm, {case[1] or 'nodes'}"] = static(config, built.rig) | {
             "peak of F_x [mN]": 1e3 * F_x.abs().max().item(),
             "ripple of F_x [mN]": 1e3 * ripple(rolled.t, F_x, config.window),
-            "theta at the end [rad]": rolled["theta"][-1].item(),
+            "theta at the end [rad]": rolled["theta_C"][-1].item(),
             "energy residual, relative": rolled.energy_residual_rel,
             "points that touch at the end": sum(
                 (force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()

@@ -30,10 +30,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Parameters, Profile, Reference, SoftGrasp, hold, press, simulate
+from torchsoft import Rig, RigFile, simulate
 from torchsoft.experiment import COARSE, at_the_points, grid, markdown, options, write
-from torchsoft.paper.equilibrium import holding_force
-from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.solve.trajectory import channels
 
 NEWTON = 1e-10  # Newton's tolerance of every run here [N].
@@ -43,16 +41,16 @@ FLOOR = (1e-7, 1e-7, 1e-6, 1e-6, 1e-6, 1e-5, 1e-7, 1e-7, 1e-3, 1e-3)
 """Smallest scale of each signal in the loss: m, m, rad, m/s, m/s, rad/s, m, m, N, N."""
 
 
-CHANNELS = ("x_C", "y_C", "theta", "v_x", "v_y", "omega", "x_Br", "y_Br", "F_x", "F_y")
+CHANNELS = (
+    "x_C", "y_C", "theta_C", "v_x_C", "v_y_C", "omega_C", "x_Br", "y_Br", "effort_x", "effort_y",
+)  # fmt: skip
 
 
-INERT = ("pad.rho",)  # Parameters that massless pads do not use.
+FEW = "laws.steel_on_rubber.K_n", "laws.steel_on_rubber.friction.mu_s", "materials.rubber.E"
+"""Parameters of the smoke size."""
 
 
-FEW = ("contact.K_n", "contact.mu_s", "pad.E")  # Parameters of the smoke size.
-
-
-FINER = {"disc.radius": 1e-2}  # Factors on the relative steps of central differences.
+FINER = {"bodies.disc.shape.radius": 1e-2}  # Factors on the relative steps of central differences.
 
 
 Gradient = dict[str, float]
@@ -75,7 +73,7 @@ class Window:
     `step` [s]."""
 
     name: str
-    model: SoftGrasp
+    model: Rig
     y0: Tensor
     t: Tensor
     step: float
@@ -87,7 +85,7 @@ def states(window: Window) -> Tensor:
     return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient="discrete").y
 
 
-def signals(model: SoftGrasp, y: Tensor, t: Tensor) -> Tensor:
+def signals(model: Rig, y: Tensor, t: Tensor) -> Tensor:
     """(T, 10): pose and velocity of the disc, pose of the bracket, control force."""
     follow = model.follow(t)
     values = channels(model, model.unpack(y, follow), follow)
@@ -112,13 +110,12 @@ def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
     return loss
 
 
-def scalars(model: SoftGrasp, config: Config) -> dict[str, Tensor]:
-    """The trained scalar parameters, called as in `Parameters`."""
-    own = dict(model.named_parameters())
-    every = {name: own[path] for name, path in model.aliases.items() if path in own}
+def scalars(model: Rig, config: Config) -> dict[str, Tensor]:
+    """The trained scalar parameters, called as in the rig file."""
+    every = {name: model.parameter(name) for name in model.description()["parameters"]}
     return {
         name: p for name, p in every.items()
-        if p.requires_grad and name not in INERT and (not config.smoke or name in FEW)
+        if p.requires_grad and (not config.smoke or name in FEW)
     }  # fmt: skip
 
 
@@ -176,38 +173,36 @@ def events(window: Window, y: Tensor) -> dict[str, Any]:
     return {name: some.sum().item() for name, some in changes.items()}
 
 
-def stroke(mesh: dict[str, Any]) -> Window:
+def stroke(file: RigFile) -> Window:
     """A 2 mm stroke in 20 ms out of a frictionless grasp, with little friction: nodes break away
     one after another."""
     slippery = {"contact.v_s": 0.05, "contact.mu_s": 0.3, "contact.mu_k": 0.2}
-    model = SoftGrasp(Parameters().override(slippery | mesh))
-    y0 = press(model, height := model.settings.scenario.y_Br_grasp).detach()
-    x = model.unpack(y0).pose["disc"][0].item()
-    still = hold(y_d=height, F_ff=-holding_force(model, y0))
-    model.reference = Reference(**{**still.signals, "x_d": Profile([0.0, 0.02], [x, x - 2e-3])})
+    roll = {"kind": "profile", "times": [0.0, 0.02], "values": [0.0, -2e-3], "offset": "start"}
+    motions = {
+        "motion.x_d": roll, "motion.y_d": {"kind": "hold"},
+        "motion.F_ff": {"kind": "hold", "value": "held"},
+    }  # fmt: skip
+    grasped = {"bodies.bracket.start.y": file.motion["y_d"].values[-1]}
+    model, y0, _ = file.override(slippery | motions | grasped).build()
     return Window("slip", model, y0, grid(6e-3, 2.5e-4), 2.5e-4)
 
 
 def windows(config: Config) -> list[Window]:
     """The five windows."""
-    mesh = COARSE if config.smoke else {}
+    file = RigFile.ready("paper").override(COARSE if config.smoke else {})
     early, roll, stick, broken, grasp = (
         (0.5, 0.5, 0.01, 0.05, 0.2) if config.smoke else (0.6, 4.5, 0.05, 0.5, 0.4)
     )
-    model = SoftGrasp(Parameters().override(mesh))
-    manipulation = grasp_and_roll(model, grasp_force=75.0 if config.smoke else None)
-    y0 = manipulation.y0
+    model, y0, _ = file.build()
     with torch.no_grad():
         path = states(Window("path", model, y0, grid(roll, 0.01), 2e-3))
-    above = y0.clone()
-    above[model.layout.slices["pose", "bracket"].stop - 1] += 2e-5
-    lowered = SoftGrasp(model.settings)
-    lowered.reference = reference(lowered, above, manipulation.grasp_force)
+    above = float(model.unpack(y0).pose["bracket"][1]) + 2e-5
+    lowered, y_above, _ = file.override({"bodies.bracket.start.y": above}).build()
     return [
         Window("stick", model, path[round(100 * early)], early + grid(stick, 1e-3), 1e-3),
-        stroke(mesh),
+        stroke(file),
         Window("make-break", model, path[-1], roll + grid(broken, 2e-3), 2e-3),
-        Window("grasp", lowered, above, grid(grasp, 2e-3), 2e-3),
+        Window("grasp", lowered, y_above, grid(grasp, 2e-3), 2e-3),
         Window("full", model, y0, grid(config.duration, 0.01), 2e-3),
     ]
 

@@ -35,10 +35,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from torchsoft import Parameters, csvfile
-from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
+from torchsoft import RigFile, csvfile, excite
 from torchsoft.experiment import COARSE, markdown, options, repeated, write
-from torchsoft.rigs import RigFile
+from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.sysid import RIG, Problem, Sensor, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
@@ -50,9 +49,7 @@ from torchsoft.tables import toml_row
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import identify_contact
-from identify_contact import FITTED, noisy, truths
-
-RIGS = Path(__file__).parents[2] / "rigs"
+from identify_contact import FITTED, MU_K, noisy, truths
 
 OFF = 1.002
 """Where a fit of the paper's rig begins, over the truth."""
@@ -109,24 +106,23 @@ def judged(found: Mapping[str, Estimate], truth: Mapping[str, float]) -> dict[st
 def papers(config: Config, rho: float, way: Callable[..., Repetition]) -> Case:
     """Repetitions of the paper's rig with noise whose neighbouring samples correlate by rho."""
     truth = truths(config.smoke)
-    nominal = Parameters().override(
-        {"contact.v_s": 0.05} | ({"contact.mu_k": 0.5} if config.smoke else {}) | COARSE
+    nominal = RigFile.ready("paper").override(
+        {"contact.v_s": 0.05} | ({MU_K: 0.5} if config.smoke else {}) | COARSE
     )
     motions = {
-        name: CATALOGUE[name].model_copy(
-            update={"duration": min(CATALOGUE[name].duration, LONGEST)}
-        )
+        name: CATALOGUE[name]._replace(duration=min(CATALOGUE[name].duration, LONGEST))
         for name in FITTED
     }
     if config.smoke:
-        shake = MultiSine(amplitude_x=8e-3, amplitude_y=2e-4, frequency=(2.0, 12.0))
-        short: dict[str, Any] = {"duration": 0.9, "senses": "bracket"}
+        strokes = {"kind": "strokes", "travel": 12e-3, "stroke_time": 0.2}
+        shake = {"kind": "multi_sine", "band": (2.0, 12.0)}
+        shaking = shake | {"amplitude": 8e-3, "seed": 0}, shake | {"amplitude": 2e-4, "seed": 1}
         motions = {
-            "strokes": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.2), **short),
-            "shaking": Excitation(motion=shake, **short),
+            "strokes": Excitation(strokes, duration=0.9),
+            "shaking": Excitation(*shaking, duration=0.9),
         }
     exact = [
-        record(name, begin(e, nominal), truth, RIG, rtol=1e-2 * config.rtol, noise=0.0)
+        record(name, excite(nominal, e).build(), truth, RIG, rtol=1e-2 * config.rtol, noise=0.0)
         for name, e in motions.items()
     ]
 
@@ -168,7 +164,7 @@ def noises(places: str, angles: str, forces: str) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Laboratory:
-    """A rig file, the settings that are known, the truth of what is not over what the file states
+    """A ready rig, the settings that are known, the truth of what is not over what the file states
     (the first three for the smoke test), and the noise of sensors."""
 
     file: str
@@ -178,7 +174,7 @@ class Laboratory:
 
 
 FINGERS = Laboratory(
-    "two_fingers.toml",
+    "two_fingers",
     {
         "pads": {
             "table": {"elements_x": 25, "elements_y": 3},
@@ -193,11 +189,11 @@ FINGERS = Laboratory(
     },
     noises(
         "x_disc y_disc x_left y_left x_right y_right", "theta_disc theta_left theta_right",
-        "F_left_x F_left_y F_right_x F_right_y",
+        "effort_left_x effort_left_y effort_right_x effort_right_y",
     ),
 )  # fmt: skip
 JAWS = Laboratory(
-    "orientation.toml",
+    "orientation",
     {
         "pads": {jaw: {"elements_x": 35, "elements_y": 3} for jaw in ("lower", "upper")},
         "motion": {
@@ -217,7 +213,7 @@ JAWS = Laboratory(
     },
     noises(
         "x_disc y_disc x_lower y_lower x_upper y_upper", "theta_disc",
-        "F_turn_lower F_turn_upper F_carry_lower F_lift F_grip",
+        "effort_turn_lower effort_turn_upper effort_carry_lower effort_lift effort_grip",
     ),
 )  # fmt: skip
 
@@ -226,11 +222,11 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
     """Repetitions of a rig file: recordings and identification are files, as a user's are."""
     shorter = {"outputs": {"duration": 0.8, "snapshots": []}} if config.smoke else {}
     settings = lab.settings | shorter
-    file = RigFile.from_toml(RIGS / lab.file).override(**settings)
+    file = RigFile.ready(lab.file).override(**settings)
     rig = file.assemble()
     some = islice(lab.truth.items(), 3 if config.smoke else None)
     truth = {name: factor * rig.parameter(name).item() for name, factor in some}
-    folder = config.out / lab.file.removesuffix(".toml")
+    folder = config.out / lab.file
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "fit.toml").write_text(stated(lab, settings, truth), encoding="utf-8")
     sensors = {channel: Sensor(noise=sd) for channel, sd in lab.noise.items()}
@@ -258,7 +254,7 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
 
 def stated(lab: Laboratory, settings: Mapping[str, Any], truth: Mapping[str, float]) -> str:
     """The identification, as a user would write it."""
-    lines = [toml_row("rig", (RIGS / lab.file).as_posix()), "[settings]"]
+    lines = [toml_row("rig", lab.file), "[settings]"]
     lines += [toml_row(name, one) for name, one in settings.items()]
     lines += ["[unknowns]", *(f'"{name}" = {{}}' for name in truth)]
     return "\n".join([*lines, "[sensors]", *(f"{k}.noise = {v}" for k, v in lab.noise.items())])

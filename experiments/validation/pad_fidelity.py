@@ -18,15 +18,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsoft import Parameters, Profile, SoftGrasp, Trajectory, simulate
+from torchsoft import RigFile, Trajectory
 from torchsoft.experiment import grid, markdown, options, write
-from torchsoft.scenario import grasp_and_roll
 
 UNITS = {
-    "x_C": ("um", 1e6), "y_C": ("um", 1e6), "theta": ("urad", 1e6), "x_Br": ("um", 1e6),
-    "y_Br": ("um", 1e6), "v_x": ("um/s", 1e6), "omega": ("urad/s", 1e6), "F_x": ("mN", 1e3),
-    "F_y": ("mN", 1e3), "M_Br": ("mN.m", 1e3), "nodal normal force": ("mN", 1e3),
-    "nodal friction": ("mN", 1e3),
+    "x_C": ("um", 1e6), "y_C": ("um", 1e6), "theta_C": ("urad", 1e6), "x_Br": ("um", 1e6),
+    "y_Br": ("um", 1e6), "v_x_C": ("um/s", 1e6), "omega_C": ("urad/s", 1e6),
+    "effort_x": ("mN", 1e3), "effort_y": ("mN", 1e3), "M_U": ("mN.m", 1e3),
+    "nodal normal force": ("mN", 1e3), "nodal friction": ("mN", 1e3),
 }  # fmt: skip
 
 
@@ -39,32 +38,24 @@ class Config:
 
 
 def signals(run: Trajectory) -> dict[str, Tensor]:
-    out = {
-        name: run["bracket_moment" if name == "M_Br" else name]
-        for name in UNITS
-        if not name.startswith("nodal")
-    }
+    out = {name: run[name] for name in UNITS if not name.startswith("nodal")}
     normal, friction = torch.cat(list(run.force.values()), 1).unbind(-1)
     return out | {"nodal normal force": normal, "nodal friction": friction}
 
 
 def compare(
-    changes: dict[str, Any], duration: float, step: float, grasp_force: float,
-    stroke: float | None = None,
+    changes: dict[str, Any], duration: float, step: float, stroke: float | None = None
 ) -> dict[str, dict[str, float]]:  # fmt: skip
     """Largest difference that changed parameters make to every output, beside the output's range;
     nodal ones where the nodes are the same.
 
     `stroke` [s] replaces the roll by one of 20 mm in that time, from 0.6 s on.
     """
-    runs = []
-    for own in ({}, changes):
-        model = SoftGrasp(Parameters().override(own))
-        manipulation = grasp_and_roll(model, grasp_force=grasp_force)
-        if stroke is not None:
-            model.reference.signals["x_d"] = Profile([0.6, 0.6 + stroke], [0.06, 0.04])
-        run = simulate(model, grid(duration), y0=manipulation.y0, step=step, progress=True)
-        runs.append(signals(run))
+    roll = {} if stroke is None else {
+        "motion.x_d.times": [0.6, 0.6 + stroke], "motion.x_d.values": ["start", 40e-3]
+    }  # fmt: skip
+    files = (RigFile.ready("paper").override(roll | own) for own in ({}, changes))
+    runs = [signals(file.build().run(grid(duration), step=step, progress=True)) for file in files]
     out = {}
     for name, (_, scale) in UNITS.items():
         usual, changed = (run[name] for run in runs)
@@ -81,12 +72,12 @@ def compare(
 
 def run(config: Config) -> dict[str, dict[str, dict[str, float]]]:
     duration, fine = (0.8, config.step) if config.smoke else (config.duration, config.step / 4)
-    force, inertial = grasp_and_roll(SoftGrasp()).grasp_force, {"pad.fidelity": "inertial"}
-    finer, some = {"pad.elements_x": 240, "pad.elements_y": 8}, min(duration, 10.0)
+    inertial, some = {"pad.inertial": True}, min(duration, 10.0)
+    finer = {"pad.elements_x": 240, "pad.elements_y": 8}
     return {
-        "manipulation": compare(inertial, duration, config.step, force),
-        "stroke of 20 mm in 0.5 s": compare(inertial, 1.6, fine, force, 0.5),
-        "240 x 8 elements": compare(finer, some, config.step, force),
+        "manipulation": compare(inertial, duration, config.step),
+        "stroke of 20 mm in 0.5 s": compare(inertial, 1.6, fine, 0.5),
+        "240 x 8 elements": compare(finer, some, config.step),
     }
 
 

@@ -25,11 +25,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Parameters, SoftGrasp, press
+from torchsoft import RigFile
 from torchsoft.experiment import numbers, options, write
-from torchsoft.paper.equilibrium import holding_force
 
 MILLI, MICRO = 1e3, 1e6
+PAPER = RigFile.ready("paper")
+TOUCH, GRASP = 50.1e-3, 48.6e-3
+"""Height of the bracket [m] where undeformed pads just touch the disc, and in the full grasp."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class Result:
     def families(self) -> dict[str, Family]:
         """Both families of curves: node spacing [mm], second order; default K_n over K_n, first
         order."""
-        length = MILLI * Parameters().pad.length
+        length = MILLI * PAPER.pads["U"].length
         return {
             "mesh": Family(self.meshes, [length / n for n in self.config.elements_x], 2),
             "penalty": Family(self.penalties, [1 / k for k in self.config.stiffenings], 1),
@@ -111,18 +113,16 @@ def half_width(x: Tensor, g: Tensor) -> Tensor:
 @torch.no_grad()
 def indent(elements_x: int, stiffening: float, compressions: Tensor) -> Curve:
     """Press the disc to each of the compressions (points,) [m]."""
-    K_n = stiffening * Parameters().contact.K_n
-    p = Parameters().override(
-        {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.K_n": K_n}
-    )
-    model = SoftGrasp(p)
+    K_n = stiffening * PAPER.laws["steel_on_rubber"].K_n
+    mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
+    model = PAPER.override(mesh | {"contact.K_n": K_n}).build().rig
     pad, rows = model.pads["U"], []
     for compression in compressions.tolist():
-        y = press(model, p.scenario.y_Br_grasp + p.compression - compression)
-        state = model.unpack(y)
+        bracket = {"x": 60e-3, "y": TOUCH - compression}
+        state = model.unpack(model.state(disc={"x": 60e-3, "y": "rest"}, bracket=bracket))
         disc, bracket, g = state.pose["disc"], state.pose["bracket"], model.penetration("U", state)
         x = (pad.positions + model.displacement("U", state))[:, 0] + bracket[0] - disc[0]
-        force = torch.tensor(holding_force(model, y), dtype=torch.float64)
+        force = state.pads["U"][0, :, 1].sum()
         rows.append((force, half_width(x, g), g.max(), disc[1], (g > 0).sum()))
     force, width, penetration, y_C, touching = (torch.stack(column) for column in zip(*rows))
     return Curve(compressions, force, width, penetration, y_C, touching)
@@ -134,8 +134,8 @@ def run(config: Config) -> Result:
             out=config.out, elements_x=(60, 120), stiffenings=(1.0, 4.0), points=3, smoke=True
         )
     fraction = torch.arange(1, config.points + 1, dtype=torch.float64) / config.points
-    compressions = fraction * Parameters().compression
-    default = Parameters().pad.elements_x
+    compressions = fraction * (TOUCH - GRASP)
+    default = PAPER.pads["U"].elements_x
     cases = [(n, 1.0) for n in config.elements_x] + [(default, k) for k in config.stiffenings]
     curves = {
         case: indent(*case, compressions) for case in tqdm(dict.fromkeys(cases), unit="curve")

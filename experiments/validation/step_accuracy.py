@@ -16,27 +16,21 @@ than others, at 1e-7 (200 % at 2 ms). About two minutes on one core.
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
-from torchsoft.excitation import Excitation, MultiSine, Strokes, begin
-from torchsoft.experiment import grid, numbers, options, timed, write
-from torchsoft.scenario import grasp_and_roll
+from torchsoft import BuiltRig, RigFile, Trajectory, excite
+from torchsoft.experiment import COARSE, numbers, options, timed, write
+from torchsoft.rigs.excite import Excitation
 
 EIGHT = (
-    "contact.K_n",
-    "contact.R_n",
-    "contact.K_t",
-    "contact.R_t",
-    "contact.mu_s",
-    "contact.mu_k",
-    "pad.E",
-    "pad.tau",
+    *(f"contact.{name}" for name in ("K_n", "R_n", "K_t", "R_t", "mu_s", "mu_k")),
+    *("pad.E", "pad.tau"),
 )
+SIGNALS = "x_C", "y_C", "theta_C", "effort_x", "effort_y"
 
 
 @dataclass(frozen=True)
@@ -56,42 +50,32 @@ class Config:
     smoke: bool = False  # a size that takes seconds
 
 
-class Motion(NamedTuple):
-    """A model that follows its reference from y0 (size,) through the times t (T,)."""
-
-    model: SoftGrasp
-    y0: Tensor
-    t: Tensor
-
-
-def motions(config: Config) -> dict[str, Motion]:
+def motions(config: Config) -> dict[str, BuiltRig]:
     """The three motions; with `smoke` the stroke on a coarse mesh alone."""
-    stroke = Excitation(motion=Strokes(travel=2e-3, stroke_time=0.02), duration=0.54)
-    if config.smoke:
-        begun = begin(stroke, Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
-        return {"stroke of 2 mm in 20 ms": Motion(begun.rig, begun.y0, grid(0.54, 0.005))}
-    made = grasp_and_roll(SoftGrasp(Parameters()), grasp_force=80.66)
-    out = {"grasp and roll out": Motion(made.model, made.y0, grid(config.roll))}
-    shaking = Excitation(
-        motion=MultiSine(amplitude_x=1e-3, amplitude_y=5e-5, frequency=(2.0, 10.0)), duration=1.0
-    )
-    for name, excitation in (("light shaking", shaking), ("stroke of 2 mm in 20 ms", stroke)):
-        begun = begin(excitation, Parameters())
-        out[name] = Motion(begun.rig, begun.y0, grid(excitation.duration, 0.005))
-    return out
+    paper = RigFile.ready("paper").override(COARSE if config.smoke else {})
+    roll = {"kind": "strokes", "travel": 2e-3, "stroke_time": 0.02}
+    shake = {"kind": "multi_sine", "band": (2.0, 10.0)}
+    shaking = shake | {"amplitude": 1e-3, "seed": 0}, shake | {"amplitude": 5e-5, "seed": 1}
+    stroke, fine = "stroke of 2 mm in 20 ms", {"outputs.interval": 5e-3}
+    files = {
+        "grasp and roll out": paper.override(outputs={"duration": config.roll, "snapshots": []}),
+        "light shaking": excite(paper, Excitation(*shaking, duration=1.0)).override(fine),
+        stroke: excite(paper, Excitation(roll, duration=0.54)).override(fine),
+    }
+    return {name: files[name].build() for name in ([stroke] if config.smoke else files)}
 
 
-def gradient(motion: Motion, **steps: Any) -> Tensor:
+def gradient(built: BuiltRig, **steps: Any) -> Tensor:
     """d theta(end) / d log p of the eight parameters."""
-    run = simulate(motion.model, motion.t, y0=motion.y0, gradient="discrete", **steps)
-    p = [motion.model.parameter(name) for name in EIGHT]
-    parts = torch.autograd.grad(run["theta"][-1], p)
+    run = built.run(gradient="discrete", **steps)
+    p = [built.rig.parameter(name) for name in EIGHT]
+    parts = torch.autograd.grad(run["theta_C"][-1], p)
     return torch.stack([part * value.detach() for part, value in zip(parts, p)])
 
 
 def errors(run: Trajectory, exact: Trajectory) -> dict[str, float]:
     """Largest error of every signal over its range."""
-    pairs = {name: (run[name], exact[name]) for name in ("x_C", "y_C", "theta", "F_x", "F_y")}
+    pairs = {name: (run[name], exact[name]) for name in SIGNALS}
     return {
         name: ((x - y).abs().max() / (y.max() - y.min())).item() for name, (x, y) in pairs.items()
     }
@@ -107,12 +91,11 @@ def run(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     every = motions(config)
     out: dict[str, dict[str, dict[str, Any]]] = {}
     for title, motion in tqdm(every.items(), unit="motion"):
-        exact = simulate(motion.model, motion.t, y0=motion.y0, rtol=config.exact)
+        exact = motion.run(rtol=config.exact)
         wanted = gradient(motion, rtol=config.exact)
         out[title] = {}
         for key, steps in ways.items():
-            simulated = lambda: simulate(motion.model, motion.t, y0=motion.y0, **steps)  # noqa: B023
-            runs = [simulated() for _ in range(config.repeats)]
+            runs = [motion.run(**steps) for _ in range(config.repeats)]
             got, wall = timed(lambda: gradient(motion, **steps))  # noqa: B023
             off = ((got - wanted) / wanted).abs()
             out[title][key] = {
@@ -128,18 +111,7 @@ def run(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     return out
 
 
-COLUMNS = (
-    "steps",
-    "wall_s",
-    "with_gradient_s",
-    "x_C",
-    "y_C",
-    "theta",
-    "F_x",
-    "F_y",
-    "energy_residual",
-    "gradient",
-)
+COLUMNS = "steps", "wall_s", "with_gradient_s", *SIGNALS, "energy_residual", "gradient"
 
 
 def table(rows: dict[str, dict[str, Any]]) -> str:

@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import Parameters, SoftGrasp, register_method, simulate
-from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft import Rig, RigFile, excite, register_method, simulate
 from torchsoft.experiment import COARSE, numbers, options, write
+from torchsoft.rigs.excite import Excitation
 
 CASES: tuple[tuple[str, str, float, float], ...] = (  # verb, method, rtol, longest window [s]
     ("odeint", "sdirk2", 1e-4, 0.4), ("odeint_adjoint", "sdirk2", 1e-4, 0.4),
@@ -42,7 +42,7 @@ class Config:
     smoke: bool = False  # a size of seconds
 
 
-def slope(model: SoftGrasp, end: Tensor) -> float:
+def slope(model: Rig, end: Tensor) -> float:
     """d x_C / d ln E [m] of a state at the end."""
     E = model.parameter("pad.E")
     (by_E,) = torch.autograd.grad(model.unpack(end).pose["disc"][0], E)
@@ -51,8 +51,9 @@ def slope(model: SoftGrasp, end: Tensor) -> float:
 
 def run(config: Config) -> list[dict[str, Any]]:
     register_method()
-    strokes = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.1), duration=1.0)
-    model, y0, _ = begin(strokes, Parameters().override(COARSE))
+    roll = {"kind": "strokes", "travel": 4e-3, "stroke_time": 0.1}
+    file = RigFile.ready("paper").override(COARSE)
+    model, y0, _ = excite(file, Excitation(roll, duration=1.0)).build()
     start = simulate(model, [0.0, 0.55], y0=y0).y[-1].detach()
     start[model.layout.slices["velocity", "disc"]] += torch.tensor([2e-3, 0.0, 0.0]).double()
     rows = []
