@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchsoft import (
     Body,
     BuiltRig,
+    Profile,
     Reference,
     Rig,
     RigFile,
@@ -21,6 +22,7 @@ from torchsoft import (
     register_method,
 )
 from torchsoft.physics.state import State
+from torchsoft.rigs.excite import Excitation
 from torchsoft.rigs.excite import Excitation
 
 register_method()
@@ -55,26 +57,38 @@ def still(changes: Mapping[str, Any] | None = None, **parts: Any) -> Rig:
     return rig
 
 
-def excited(name: str, changes: Mapping[str, Any] | None = None, **how: Any) -> BuiltRig:
-    """The paper's rig under an excitation of the catalogue."""
-    return excite(PAPER.override(changes), name, **how).build()
+def excited(
+    excitation: str | Excitation, file: RigFile | None = None, F_ff: float | None = None, **how: Any
+) -> BuiltRig:
+    """The paper's rig, or that of a file of it, under an excitation; F_ff [N] is the force fed
+    forward to the bracket, by default that which holds it."""
+    made = excite(PAPER if file is None else file, excitation, **how)
+    return made.override({} if F_ff is None else {"motion.F_ff.values": [0.0, F_ff]}).build()
 
 
-def stroked(
-    file: RigFile, travel: float, stroke_time: float, duration: float, *,
-    grasp: float, since: float, depth: float = 1.39e-3,
-) -> BuiltRig:  # fmt: skip
-    """The paper's rig, rolled to and fro [m] after a grasp [s] that is quicker than those of the
-    catalogue, by default to the height of the paper's."""
+def strokes(travel: float, stroke_time: float, **more: Any) -> Excitation:
+    """Strokes there and back [m, s]."""
     roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
-    soon = {f"motion.{name}.times": [0.0, grasp] for name in ("y_d", "F_ff")}
-    excited = excite(file, Excitation(roll, duration=duration, depth=depth))
-    return excited.override(soon | {"motion.x_d.since": since}).build()
+    return Excitation(roll, **more)
 
 
 def rest(rig: Rig, x: float = 60e-3) -> Tensor:
     """The paper's disc at rest on the lower pad, the upper one just touching it."""
     return rig.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": "touch"})
+
+
+def manipulate(model: Rig, force: float, **motions: nn.Module) -> Tensor:
+    """The paper's start at rest, after the model was given the paper's motion, with a force [N]
+    fed forward; or other motions."""
+    y0 = rest(model).detach()
+    top = float(model.unpack(y0).pose["bracket"][1])
+    own = {
+        "x_d": Profile([0.0, 10.0, 15.0, 25.0], [60e-3, 40e-3, 40e-3, 60e-3]),
+        "y_d": Profile([0.0, 0.375], [top, GRASPED]),
+        "F_ff": Profile([0.0, 0.375], [0.0, -force]),
+    }
+    model.reference = Reference(**own | motions)
+    return y0
 
 
 def press(rig: Rig, height: float = GRASPED) -> Tensor:

@@ -6,7 +6,6 @@ from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
 from skfem.helpers import ddot, div, dot, sym_grad
 from torch import Tensor
 
-from torchsoft.paper.parameters import PadParameters
 from torchsoft.physics.mesh import Array, lame_moduli
 
 CM_HEIGHT = 2.18e-3

@@ -17,7 +17,7 @@ print(*sorted(f"{one.name} {one.version}" for one in distributions() if "nvidia"
 EXTRAS = "reduced,datasets,posterior,export,learn"
 GRADIENT = """
 import torch
-from torchsoft import Circle, SoftGrasp, rest, simulate
+from torchsoft import Circle, simulate
 model = still()
 t = torch.linspace(0, 0.05, 6, dtype=torch.float64)
 run = simulate(model, t, y0=rest(model).detach(), gradient="discrete")

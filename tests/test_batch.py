@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import coarse, f64, grasped, still, times
 from torch import Tensor
 
 from torchsoft import (
     Batch,
     Circle,
     Reference,
+    Rig,
     SamplesFailed,
     SimulationFailed,
-    SoftGrasp,
     hold,
     simulate,
     simulate_batch,
@@ -35,7 +35,7 @@ def start():
     return model, torch.stack([y0, y0, y0])
 
 
-def alone(model: SoftGrasp, i: int, y0: Tensor, **options: Any) -> Any:
+def alone(model: Rig, i: int, y0: Tensor, **options: Any) -> Any:
     with torch.no_grad():
         for name, values in (("contact.K_n", K_n), ("contact.mu_s", mu_s)):
             model.parameter(name).fill_(values[i])

@@ -8,7 +8,6 @@ from conftest import coarse, f64, random_state, times
 from torchsoft import simulate
 from torchsoft.physics.energy import stored
 from torchsoft.rigs import RigFile
-from torchsoft.scenario import grasp_and_roll
 
 
 def test_stored_energies_by_hand():
@@ -41,10 +40,10 @@ def test_stored_energies_by_hand():
 
 def test_a_run_balances_its_energies_better_with_smaller_steps():
     """To 1e-3 of the energy injected at 2 ms over grasp and first stroke, and better at 0.5 ms."""
-    manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
+    y0 = manipulate(coarse(), 75.0)
     t = times(0.6, 61)
     residual = [
-        simulate(manipulation.model, t, y0=manipulation.y0, step=h).energy_residual_rel
+        simulate(manipulation.model, t, y0=y0, step=h).energy_residual_rel
         for h in (2e-3, 1e-3, 5e-4)
     ]
     assert residual[0] < 1e-3

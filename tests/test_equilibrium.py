@@ -3,12 +3,11 @@ refusals."""
 
 import pytest
 import torch
+from conftest import PAPER, f64, holding_force, press, rest
 from conftest import coarse as build
-from conftest import f64
 from torch import Tensor
 
-from torchsoft import NoEquilibrium, Parameters, SoftGrasp, press, rest
-from torchsoft.paper.equilibrium import holding_force
+from torchsoft import NoEquilibrium, Rig
 from torchsoft.physics.multibond import net_efforts
 
 GRASP = 48.6e-3
@@ -18,7 +17,7 @@ BALANCE = 1e-9
 """Of forces, relative to the weight: residuals are below 1e-13 m, against springs of 1e5 N/m."""
 
 
-def contact_force(model: SoftGrasp, y: Tensor, which: str) -> Tensor:
+def contact_force(model: Rig, y: Tensor, which: str) -> Tensor:
     """Force of one pad's contact on the disc (2,) [N], by the multibond graph and not by the
     equilibrium solver."""
     port = model.evaluate(0.0, model.unpack(y)).ports[f"contact_{which}"]
@@ -29,7 +28,7 @@ def contact_force(model: SoftGrasp, y: Tensor, which: str) -> Tensor:
 @pytest.mark.parametrize("at", ["rest", "grasp"])
 @torch.no_grad()
 def test_nothing_but_the_bracket_accelerates(fidelity, at):
-    model = build(pad__fidelity=fidelity)
+    model = build(pad__inertial=fidelity == "inertial")
     y = rest(model) if at == "rest" else press(model, GRASP)
     rate = model.unpack(model(0.0, y))
     gravity = float(model.gravity)
@@ -82,7 +81,7 @@ def test_fidelities_agree():
 PARAMETERS = ("pad.E", "pad.nu", "pad.depth", "contact.K_n", "disc.radius", "disc.mass")
 
 
-def outcome(model: SoftGrasp, at: str) -> Tensor:
+def outcome(model: Rig, at: str) -> Tensor:
     """Disc and bracket height, a surface displacement, and the force on the disc from below: in um
     and N."""
     y = rest(model) if at == "rest" else press(model, GRASP)
@@ -149,7 +148,7 @@ def test_no_equilibrium_is_reported_when_newton_does_not_converge(
 
 @pytest.mark.parametrize("fidelity", ["massless", "inertial"])
 def test_holding_force_is_what_the_upper_contact_presses_with(fidelity):
-    model = build(pad__fidelity=fidelity)
+    model = build(pad__inertial=fidelity == "inertial")
     y = press(model, GRASP)
     assert holding_force(model, y) == pytest.approx(
         -float(contact_force(model, y, "U")[1].detach()), rel=1e-9

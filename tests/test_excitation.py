@@ -1,11 +1,9 @@
 """Excitations: what cannot be carried out is refused by its field before anything is simulated."""
 
 import pytest
-from conftest import f64
+from conftest import PAPER, excited, f64
 
-from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, Knots, begin
-from torchsoft.paper.rig import apart
+from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.tables import InvalidTable
 
 ROLL = {"kind": "slow_roll"}
@@ -41,7 +39,7 @@ def test_knots_are_reached_from_the_grasp():
     """At rest at each, on top of where the grasp ended."""
     knots, p = Knots(x=((0.1, 4e-3), (0.3, -2e-3)), y=((0.2, -1e-4),)), PAPER
     excitation = Excitation(motion=knots, grasp_time=0.2, settle=0.1, duration=0.8, depth=1e-3)
-    reference, since = begin(excitation, p).rig.reference, 0.3
+    reference, since = excited(excitation, p).rig.reference, 0.3
     t = f64(0.0, since, since + 0.1, since + 0.2, since + 0.3, 5.0)
     value, rate = reference(t, ["x_d", "y_d"]).unbind(-1)
     x, y = 60.3e-3, apart(p)

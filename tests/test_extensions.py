@@ -4,13 +4,11 @@ an identification."""
 from copy import deepcopy
 
 import pytest
-from conftest import COARSE, times
+from conftest import COARSE, rest, still, times
 
-from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.paper.equilibrium import rest
+from torchsoft import simulate
 from torchsoft.physics.extensions import extend, extensions
 from torchsoft.rigs.build import RigFile
-from torchsoft.scenario import grasp_and_roll
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
 MODEL = still(COARSE)

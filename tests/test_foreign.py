@@ -10,14 +10,15 @@ import foreign
 import numpy as np
 import pytest
 import torch
+from conftest import PAPER, excited
 from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, TAKEN_IN, node
 
-from torchsoft import PadMesh, Parameters, SoftGrasp, Trajectory, simulate
-from torchsoft.excitation import Excitation, MultiSine, begin
+from torchsoft import PadMesh, Rig, Trajectory, simulate
 from torchsoft.physics.mesh import unit_compliance
 from torchsoft.physics.statics import BuiltRig
+from torchsoft.rigs.excite import Excitation
 
 SETTLE, STEP = 0.02, 20e-6
 SHAKEN = Excitation(
@@ -37,8 +38,8 @@ CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 
 @cache
-def begun() -> BuiltRig[SoftGrasp]:
-    return begin(SHAKEN, PAPER.override(RIG))
+def begun() -> BuiltRig[Rig]:
+    return excited(SHAKEN, PAPER.override(RIG))
 
 
 @cache

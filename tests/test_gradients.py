@@ -7,10 +7,10 @@ from rig_tester import assert_gradients_exact
 from torch import Tensor
 
 import torchsoft.solve.gradients
-from torchsoft import SoftGrasp, simulate
+from torchsoft import Rig, simulate
 from torchsoft.solve.gradients import GradientFailed
 
-Window = tuple[SoftGrasp, Tensor, float]
+Window = tuple[Rig, Tensor, float]
 """A model, its initial state (size,), and how long it runs [s]."""
 
 

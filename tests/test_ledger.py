@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times, towards
+from conftest import coarse, excited, f64, grasped, still, times, towards
 from torch import Tensor, nn
 
 from torchsoft import (
@@ -21,12 +21,11 @@ from torchsoft import (
     Rig,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
     hold,
     simulate,
     simulate_batch,
 )
-from torchsoft.excitation import CATALOGUE, begin
+from torchsoft.rigs.excite import CATALOGUE
 from torchsoft.solve.diagnostics import RESIDUAL, doubts
 
 
@@ -42,7 +41,7 @@ def told(model: Rig, run: Callable[..., object] = simulate, **options: object) -
 def test_hard_motions_pass_at_the_default_step_and_at_what_is_advised(name):
     """The hardest of the ready excitations, and the same as coarse as nobody should take them."""
     excitation = CATALOGUE[name]
-    begun = begin(excitation, coarse(contact__v_s=5e-3).settings)
+    begun = excited(excitation, coarse(contact__v_s=5e-3).settings)
     t = times(excitation.duration, 2)
     assert told(begun.rig, t=t, y0=begun.y0) == []
     begun.rig.reference = towards(begun.rig, Profile([0.6, 0.68, 0.76], [0.06, 0.08, 0.06]))

@@ -27,7 +27,7 @@ def test_bracket_moment_is_the_bonded_nodes_sum():
     """Eq. 35: the moment at the constrained rotation is the sum over bonded nodes of r x F, plus
     that of the displacements with the forces on the nodes that move, which linear elasticity leaves
     out."""
-    model = coarse(pad__fidelity="inertial")
+    model = coarse(pad__inertial=True)
     state = model.unpack(random_state(model, 3))
     graph = model.evaluate(0.0, state)
     moment = float(net_efforts(graph.ports, model.junctions)["bracket_spin"])

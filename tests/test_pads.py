@@ -12,7 +12,6 @@ from fem_oracle import CM_HEIGHT, matching, world_stiffness
 from torch import Tensor
 
 from torchsoft import KelvinVoigt, Pad, PadMesh
-from torchsoft.paper.parameters import PadParameters
 
 ROUNDING = 1e-13
 """Relative to the largest entry: two assemblies of the same integrals, in another order of

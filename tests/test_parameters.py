@@ -6,11 +6,10 @@ import warnings
 from typing import Any
 
 import pytest
+from conftest import PAPER, still
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchsoft.paper.parameters import Parameters, check
-from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.tables import InvalidTable
 
 NAN, INF = math.nan, math.inf

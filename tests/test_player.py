@@ -19,7 +19,6 @@ from torchsoft import simulate
 from torchsoft.plot.animation import charts, frame_rows, packed, player
 from torchsoft.plot.scene import Scene, instants
 from torchsoft.rigs import RigFile
-from torchsoft.scenario import grasp_and_roll
 
 ROOT = Path(__file__).parents[1]
 
@@ -36,8 +35,8 @@ return [r.x + q[0], r.y + q[1]]"""
 @pytest.fixture(scope="module")
 def run():
     model = coarse()
-    start = grasp_and_roll(model, grasp_force=80.0)
-    return simulate(model, times(0.5, 51), y0=start.y0)
+    y0 = manipulate(model, 80.0)
+    return simulate(model, times(0.5, 51), y0=y0)
 
 
 def test_a_title_does_not_hold_the_script_open(run, tmp_path):

@@ -24,7 +24,6 @@ from torchsoft import (
     Rig,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
     Trajectory,
     simulate,
 )
@@ -35,16 +34,15 @@ from torchsoft.plot.animation import animate, pace
 from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
 from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
 from torchsoft.plot.scene import Scene, instants, straight_up
-from torchsoft.scenario import grasp_and_roll
 
-Done = tuple[SoftGrasp, Trajectory]
+Done = tuple[Rig, Trajectory]
 
 
 def manipulated(**changes: object) -> Done:
     """The first 0.2 s of the grasp on a coarse mesh, with a force that need not be looked for."""
     model = coarse(**changes)
-    start = grasp_and_roll(model, grasp_force=80.0)
-    return model, simulate(model, times(0.2, 21), y0=start.y0)
+    y0 = manipulate(model, 80.0)
+    return model, simulate(model, times(0.2, 21), y0=y0)
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +116,8 @@ def test_stress_of_a_uniform_strain_is_hookes(done):
 def test_the_stress_under_a_contact_carries_its_force(done):
     """In a held grasp s_yy, summed along the bonded layer, balances the nodal forces."""
     model = coarse(pad__elements_x=120, pad__elements_y=6)
-    start = grasp_and_roll(model, grasp_force=80.0)
-    run = simulate(model, times(0.6, 4), y0=start.y0)
+    y0 = manipulate(model, 80.0)
+    run = simulate(model, times(0.6, 4), y0=y0)
     pad = run.setup.pads["L"]
     stress = pad.stress(pad.strain(pad.displacement(run.displacement["L"][-1].numpy())))
     nodes = pad.mesh.nodes[pad.mesh.elements]
@@ -310,12 +308,12 @@ def test_save_writes_the_whole_file_or_none(done, tmp_path):
         assert picture.format == "PNG"
 
 
-@pytest.mark.parametrize("build", [coarse, lambda: coarse(pad__fidelity="inertial"), hand])
+@pytest.mark.parametrize("build", [coarse, lambda: coarse(pad__inertial=True), hand])
 def test_diagram_places_every_node_of_the_graph_by_itself(build):
     rig = build()
     graph = graph_of(rig)
     assert {"egg_spin", "contact_egg_at_tip", "pad_tip: field"} <= set(graph) or isinstance(
-        rig, SoftGrasp
+        rig, Rig
     )
     at = positions(graph)
     assert set(at) == set(graph)

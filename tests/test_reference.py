@@ -6,14 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import times
+from conftest import PAPER, excited, holding_force, manipulate, press, rest, still, times
 from torch import Tensor
 
-from torchsoft import Parameters, SoftGrasp, Trajectory, press, rest, simulate
-from torchsoft.excitation import CATALOGUE, begin
-from torchsoft.excitation import reference as excited
-from torchsoft.paper.equilibrium import holding_force
-from torchsoft.scenario import grasp_and_roll
+from torchsoft import Rig, Trajectory, simulate
+from torchsoft.rigs.excite import CATALOGUE
 from torchsoft.solve.diagnostics import NEUTRAL, loop_modes
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
@@ -24,7 +21,7 @@ RELATIVE = 1e-8
 """Of a gradient, where the reference itself is that good."""
 
 
-def held_displacements(model: SoftGrasp, y0: Tensor) -> Tensor:
+def held_displacements(model: Rig, y0: Tensor) -> Tensor:
     """y0 as a function of E, nu and depth that leaves the pads where they are: the reference's
     gradients hold displacements."""
     y = y0.clone()
@@ -51,9 +48,9 @@ def series(run: Trajectory) -> dict[str, Tensor]:
 @pytest.fixture(scope="module")
 def manipulation():
     """The 30 s with the gradient behind them, pads' initial displacements held."""
-    made = grasp_and_roll(still(), grasp_force=REFERENCE["manipulation"]["grasp_force"])
+    y0 = manipulate(still(), REFERENCE["manipulation"]["grasp_force"])
     t = times(30, 3001)
-    y0 = held_displacements(made.model, made.y0)
+    y0 = held_displacements(made.model, y0)
     return made.model, simulate(made.model, t, y0=y0, step=2e-3, gradient="discrete")
 
 
@@ -99,7 +96,7 @@ def test_light_shaking_is_the_reference():
         CATALOGUE["light shaking"],
         reference["y_Br_start"],
     )  # to seven digits `apart`
-    model, y0, _ = begin(
+    model, y0, _ = excited(
         excitation,
         PAPER.override({"contact.v_s": 0.05}),
         grasp_force=reference["grasp_force"],

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, RUBBER, coarse, f64, grasped, random_state, times
+from conftest import COARSE, RUBBER, coarse, f64, grasped, press, random_state, rest, still, times
 from torch import Tensor, nn
 from torchdiffeq import odeint
 
@@ -29,7 +29,6 @@ from torchsoft import (
     NoEquilibrium,
     Pad,
     PadMesh,
-    Parameters,
     Profile,
     Prony,
     QuadMesh,
@@ -42,14 +41,11 @@ from torchsoft import (
     SimulationFailed,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
     StandardLinearSolid,
     StateFeedback,
     Superellipse,
     controller,
     hold,
-    press,
-    rest,
     simulate,
 )
 from torchsoft.physics.material import Material
@@ -522,7 +518,7 @@ RUNS: list[tuple[dict[str, Any], str]] = [
     ({"y0": f64(0.0, 0.0, 0.0)}, "must be float64 of shape"),
     ({"y0": torch.full((376,), NAN).double()}, "must be finite, but component 0"),
     ({"y0": np.full(376, "0")}, "`y0` must be numbers"),
-    ({"rig": SoftGrasp}, "`rig` must be a Rig"),
+    ({"rig": Rig}, "`rig` must be a Rig"),
     ({"reference": {}}, "`reference` must be a Reference, but is dict"),
     *(({name: value}, f"`{name}` must be positive") for name in ("step",
     "tolerance") for value in (0.0, -1e-3, NAN)),
@@ -567,11 +563,11 @@ def test_a_run_that_is_none_is_refused(row, start):
         simulate(**{"rig": start[0], "t": T, "y0": start[1]} | changes)
 
 
-def filled(name: str, value: float) -> Callable[[SoftGrasp], object]:
+def filled(name: str, value: float) -> Callable[[Rig], object]:
     return lambda model: model.parameter(name).detach().fill_(value)
 
 
-SPOILT: list[tuple[Callable[[SoftGrasp], object], str]] = [
+SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (filled("pad.E", 0.0), r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
     (filled("pad.E", 1e308), r"parameter `pad.E` must be below 1e\+100"),
     (
@@ -666,7 +662,7 @@ def test_a_slip_law_that_supplies_power_is_told_of():
 def test_compiled_rates_refuse_what_they_cannot_give(start):
     """Inertial pads, and states at which there are no forces; they go on after that."""
     with pytest.raises(NotImplementedError, match="inertial pads"):
-        Rates(coarse(pad__fidelity="inertial"))
+        Rates(coarse(pad__inertial=True))
     rates, y = Rates(start[0]), random_state(start[0], 0).numpy()
     fine = rates(0.0, y)
     with pytest.raises(SimulationFailed, match="no forces"):

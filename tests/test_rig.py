@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, turning
+from conftest import PAPER, coarse, f64, grasped, still, turning
 
 from torchsoft import (
     Body,
@@ -10,11 +10,8 @@ from torchsoft import (
     Ellipse,
     Rig,
     RoundedBox,
-    SoftGrasp,
     hold,
 )  # fmt: skip
-from torchsoft.paper.parameters import Parameters
-from torchsoft.paper.rig import NAMES
 
 # names
 # ----------------------------------------------------------------------
@@ -88,7 +85,7 @@ def test_sizes_of_the_papers_rig():
     assert layout.size == 2 * (2 * 61 + 61) + 2 * 5
     assert layout.shapes["pads", "L"] == (1, 61, 2)
     assert layout.free == {"disc": [0, 1, 2], "bracket": [0, 1]}
-    inertial = coarse(pad__fidelity="inertial").layout
+    inertial = coarse(pad__inertial=True).layout
     assert (
         inertial.shapes["pads", "U"] == inertial.shapes["rates", "U"] == (122, 2)
     )  # two elements high, the base held

@@ -13,21 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import f64, nested, times
+from conftest import f64, holding_force, manipulate, nested, press, rest, still, times
 from PIL import Image
 from test_rig_parts import STONE
 
-from torchsoft import Parameters, SoftGrasp, press, rest, simulate
+from torchsoft import simulate
 from torchsoft.cli import main
 from torchsoft.materials.presets import from_shore_a
-from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.written import template, to_toml
-from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.diagnostics import linearised, loop_modes, modes
 from torchsoft.solve.simulate import Interrupted
 from torchsoft.solve.trajectory import load
@@ -109,16 +107,16 @@ def test_a_loop_that_is_about_to_close_is_not_judged(gap):
 def test_the_papers_rig_is_soft_grasp():
     """The same start to rounding, and from the same start the same bits."""
     model = still({"pad.elements_x": 60, "pad.elements_y": 2})
-    manipulation = grasp_and_roll(model, grasp_force=80.0)
+    y0 = manipulate(model, 80.0)
     file = coarse(ready_rig("paper"))
-    assert torch.allclose(file.build().y0, manipulation.y0, rtol=0, atol=1e-11)
-    top = float(model.unpack(manipulation.y0).pose["bracket"][1])
+    assert torch.allclose(file.build().y0, y0, rtol=0, atol=1e-11)
+    top = float(model.unpack(y0).pose["bracket"][1])
     file = changed(file, bodies__bracket__start__y=top, motion__F_ff__values=(0.0, -80.0))
     ready = file.build()
     t = times(0.6, 61)
     with torch.no_grad():
-        assert torch.equal(ready.rig(0.1, manipulation.y0), model(0.1, manipulation.y0))
-    runs = [simulate(rig, t, y0=manipulation.y0) for rig in (model, ready.rig)]
+        assert torch.equal(ready.rig(0.1, y0), model(0.1, y0))
+    runs = [simulate(rig, t, y0=y0) for rig in (model, ready.rig)]
     assert torch.equal(runs[0].y, runs[1].y)
     for name in ("x_C", "theta", "F_x", "F_y", "bracket_moment"):
         assert torch.equal(runs[0][name], runs[1][name])

@@ -5,21 +5,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from conftest import RUBBER, coarse, dry, f64, turning
+from conftest import RUBBER, coarse, dry, f64, press, turning
 from torch import Tensor
 
-from torchsoft import (
-    Body,
-    Circle,
-    Contact,
-    NoEquilibrium,
-    Pad,
-    PadMesh,
-    Rig,
-    SoftGrasp,
-    press,
-)
-from torchsoft.paper.rig import NAMES
+from torchsoft import Body, Circle, Contact, NoEquilibrium, Pad, PadMesh, Rig
 from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import settled
@@ -28,7 +17,7 @@ HEIGHT = 48.6e-3
 """Of the bracket in the grasp [m]."""
 
 
-def shaken(model: SoftGrasp, seed: int = 0, stretch: float = 5e-5) -> State:
+def shaken(model: Rig, seed: int = 0, stretch: float = 5e-5) -> State:
     """The grasp with bodies displaced by tenths of a millimetre and stretched points, sticking and
     slipping; nothing moves."""
     generator, state = (
@@ -157,7 +146,7 @@ def test_refusals():
     model = coarse()
     state = shaken(model)
     with pytest.raises(NotImplementedError, match="inertial"):
-        around(coarse(pad__fidelity="inertial"), state)
+        around(coarse(pad__inertial=True), state)
     unknown = state.stretch | {"L": torch.full((61,), torch.nan).double()}
     far = {name: torch.full_like(s, 1e-3) for name, s in state.stretch.items()}
     away = state.pose | {"disc": f64(0.06, 0.01, 0.0)}

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from conftest import f64, times
+from conftest import PAPER, f64, rest, still, times
 from matplotlib.path import Path as Polygon
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline
@@ -19,13 +19,10 @@ from torchsoft import (
     Circle,
     Contour,
     Ellipse,
-    Parameters,
     RoundedBox,
     RoundedPolygon,
     Shape,
-    SoftGrasp,
     Superellipse,
-    rest,
 )
 from torchsoft.physics.shapes.shape import moments
 from torchsoft.physics.validity import check_shape
@@ -459,5 +456,5 @@ def test_a_long_box_rests_on_its_whole_side():
     x = model.pads["L"].positions[:, 0] - state.pose["disc"][0]
     assert torch.equal(g > 0, x.abs() < 29.5e-3)
     assert float(state.pads["L"][0, :, 1].sum()) == pytest.approx(
-        -float(model.disc.mass.detach()) * 9.81, rel=1e-9
+        -float(model.bodies["disc"].mass.detach()) * 9.81, rel=1e-9
     )

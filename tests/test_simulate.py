@@ -4,7 +4,7 @@ nothing unphysical runs."""
 import numpy as np
 import pytest
 import torch
-from conftest import Exp, coarse, f64, grasped, times, towards
+from conftest import Exp, coarse, excited, f64, grasped, still, times, towards
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
@@ -13,15 +13,15 @@ from torchsoft import (
     Coulomb,
     Ellipse,
     Profile,
+    Rig,
     Shape,
     SmoothSlip,
-    SoftGrasp,
     StandardLinearSolid,
     hold,
     rest,
     simulate,
 )  # fmt: skip
-from torchsoft.excitation import Excitation, MultiSine, begin
+from torchsoft.rigs.excite import Excitation
 from torchsoft.solve import stepper, system
 from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
@@ -29,7 +29,7 @@ from torchsoft.solve.progress import SimulationFailed
 T = times(0.02, 11)
 
 
-def rolled(model: SoftGrasp, **options: object):
+def rolled(model: Rig, **options: object):
     """A short run from the grasp, the disc moving."""
     return simulate(model, T, y0=grasped(model, (0.05, 0.0)), step=2e-3, **options)
 
@@ -126,7 +126,7 @@ def test_what_becomes_of_the_reference_and_the_model_does_not_change_the_gradien
 class Simulated(nn.Module):
     """A run as a module, for functional_call."""
 
-    def __init__(self, model: SoftGrasp, **options: object) -> None:
+    def __init__(self, model: Rig, **options: object) -> None:
         super().__init__()
         self.model, self.options = model, options
 
@@ -277,7 +277,7 @@ def test_what_is_saved_is_what_ran():
 def made_and_run() -> list[Tensor]:
     """Parts made, a motion begun and run with gradients and sensitivities."""
     motion = MultiSine(amplitude_x=1e-3, frequency=(5.0, 20.0))
-    begun = begin(
+    begun = excited(
         Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings
     )
     run = simulate(begun.rig, times(0.1, 6), y0=begun.y0, gradient="discrete")

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from conftest import f64
+from conftest import PAPER, f64, holding_force, still
 from fem_oracle import dilatation, shear, world_stiffness
 from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, condense, solve
 from test_experiments import experiment
@@ -20,17 +20,14 @@ from torchsoft import (
     KelvinVoigt,
     Pad,
     PadMesh,
-    Parameters,
     Profile,
     Reference,
     Rig,
     RoundedBox,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
     press,
 )  # fmt: skip
-from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import resting
@@ -93,7 +90,7 @@ DEPTH = 1e-4
 """By how much [m] it is pressed into each of two pads."""
 
 
-def punched(K_n: float, elements_x: int) -> tuple[SoftGrasp, State, float]:
+def punched(K_n: float, elements_x: int) -> tuple[Rig, State, float]:
     """The box pressed between the pads without weight; the force [N] on the bracket."""
     changes = {"scenario.gravity": 0.0, "contact.K_n": K_n}
     mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}

@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, grasped, times, towards
+from conftest import COARSE, coarse, grasped, still, times, towards
 
-from torchsoft import (
-    Parameters,
-    Profile,
-    Reference,
-    Rig,
-    SimulationFailed,
-    SoftGrasp,
-    simulate,
-)
-from torchsoft.scenario import grasp_and_roll
+from torchsoft import Profile, Reference, Rig, SimulationFailed, simulate
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
 
@@ -22,7 +13,7 @@ from torchsoft.solve.stepper import ImplicitStepper
 def test_second_order_on_a_smooth_motion(fidelity):
     """A grasped disc set moving so gently that no node slips, touches or leaves: observed order >=
     1.8."""
-    model = coarse(pad__fidelity=fidelity)
+    model = coarse(pad__inertial=fidelity == "inertial")
     y0, t = grasped(model, (1e-4, 5e-5)), times(0.032, 2)
     place = lambda h: simulate(model, t, y0=y0, step=h).state.pose["disc"][-1, :2]
     fine = place(3.2e-2 / 2048)

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, PAPER, excited, strokes
 
-from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
+from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.sysid import (
     RIG,
     Problem,
@@ -56,7 +55,7 @@ TRUSTED: dict[str, Any] = {"assumptions": "trusted"}
 SENSORS = RIG
 RATIO = "contact.mu_k / contact.mu_s"
 GRASP: dict[str, Any] = {"grasp_time": 0.2, "settle": 0.05, "senses": "bracket"}
-STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.65, **GRASP)
+STROKES = strokes(travel=8e-3, stroke_time=0.2, duration=0.65, **GRASP)
 SHAKE = Excitation(
     motion=MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2, 12)),
     duration=0.65,
@@ -76,12 +75,12 @@ FOUR = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
 @pytest.fixture(scope="module")
 def strokes():
     """Without noise, of parameters up to a half away from the nominal ones."""
-    return record("strokes", begin(STROKES, BASE), TRUTH, SENSORS, noise=0.0)
+    return record("strokes", excited(STROKES, BASE), TRUTH, SENSORS, noise=0.0)
 
 
 @pytest.fixture(scope="module")
 def shake():
-    return record("shake", begin(SHAKE, BASE), TRUTH, SENSORS, noise=0.0)
+    return record("shake", excited(SHAKE, BASE), TRUTH, SENSORS, noise=0.0)
 
 
 def four(**changes: Unknown) -> dict[str, Unknown]:
@@ -129,16 +128,14 @@ def check_derivatives(
     )
 
 
-SHORT = Excitation(
-    motion=Strokes(travel=8e-3, stroke_time=0.1), duration=0.25, grasp_time=0.1, settle=0.0
-)
+SHORT = strokes(travel=8e-3, stroke_time=0.1, duration=0.25, grasp_time=0.1, settle=0.0)
 
 
 @pytest.mark.parametrize("fidelity", ["massless", pytest.param("inertial", marks=pytest.mark.slow)])
 def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity):
     """The starting displacements are held, also where a pad's elasticity changes."""
     p = BASE.override({"pad.fidelity": fidelity})
-    data = record("short", begin(SHORT, p), {"pad.E": 0.9e6}, SENSORS)
+    data = record("short", excited(SHORT, p), {"pad.E": 0.9e6}, SENSORS)
     unknowns = {"pad.E": Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), "pad.tau": Unknown()}
     problem = Problem([data], SENSORS, unknowns)
     check_derivatives(problem, problem.coordinates.start, RTOL, 1e-5, h=3e-6)
@@ -185,8 +182,8 @@ def rest_known() -> dict[str, Unknown]:
 
 
 def test_what_the_data_do_not_determine_is_not_a_number():
-    gentle = Excitation(motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.65, **GRASP)
-    data = record("gentle", begin(gentle, BASE), {}, SENSORS, seed=1)
+    gentle = strokes(travel=1e-3, stroke_time=0.4, duration=0.65, **GRASP)
+    data = record("gentle", excited(gentle, BASE), {}, SENSORS, seed=1)
     answer = identify(
         Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), rtol=RTOL,
         plan=[Stage("all", ("gentle",), ("pad.E", "contact.mu_k"), RTOL)],
@@ -239,7 +236,7 @@ def shaking():
         duration=0.65,
         **GRASP,
     )
-    return record("shaking", begin(hard, BASE), {}, SENSORS, rtol=1e-7, noise=0.0)
+    return record("shaking", excited(hard, BASE), {}, SENSORS, rtol=1e-7, noise=0.0)
 
 
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking):
@@ -406,7 +403,7 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes):
 @pytest.mark.slow
 def test_data_out_of_reach_name_the_recording():
     about_disc = STROKES.model_copy(update={"senses": "disc", "x_C0": 60e-3})
-    data = record("strokes", begin(about_disc, BASE), {}, SENSORS)
+    data = record("strokes", excited(about_disc, BASE), {}, SENSORS)
     problem = Problem(
         [data], SENSORS, {"pad.E": Unknown(nominal=4e4)}
     )  # so soft that the loop is unstable
@@ -427,7 +424,7 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
     few = lambda *given: [one for one in assumptions(*given) if one.name in tried]
     tried = "mesh", "clock of the set-points", "disc.mass"
     monkeypatch.setattr(sensitivity, "assumptions", few)
-    data = record("strokes", begin(SHORT, BASE), {"pad.E": TRUTH["pad.E"]}, SENSORS, noise=0.0)
+    data = record("strokes", excited(SHORT, BASE), {"pad.E": TRUTH["pad.E"]}, SENSORS, noise=0.0)
     problem = Problem([data], SENSORS, {"pad.E": Unknown(nominal=0.8e6)})
     plan = [Stage(f"by {rtol}", ("strokes",), ("pad.E",), rtol) for rtol in (1e-3, 1e-4)]
     answer = identify(problem, plan=plan)
@@ -555,7 +552,7 @@ def test_visible_drops_what_cannot_be_separated_from_the_others():
 def test_catalogue_begins_at_rest_and_can_be_written_down():
     for name, excitation in CATALOGUE.items():
         assert Excitation.model_validate_json(excitation.model_dump_json()) == excitation, name
-        model, y0, _ = begin(excitation, BASE, grasp_force=10.0)
+        model, y0, _ = excited(excitation, BASE, grasp_force=10.0)
         state = model.unpack(y0)
         assert not model.penetration("U", state).gt(0).any(), name
         assert model.penetration("L", state).gt(0).any(), name

@@ -14,12 +14,10 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, times
+from conftest import COARSE, PAPER, still, times
 from test_sysid_friction import Viscous
 
-from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.excitation import start as start_of
+from torchsoft import Rig, simulate
 from torchsoft.physics.motion import Reference
 from torchsoft.sysid import (
     IdentificationResult,
@@ -45,7 +43,7 @@ SENSORS = {
     "y_Br": Sensor(noise=1e-5),
     "F_y": Sensor(noise=0.1),
 }
-GRASP = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
+GRASP = strokes(, duration=0.25, depth=1.2e-3, grasp_time=0.15)
 UNKNOWNS = {
     "contact.R_n": Unknown(per="recording"), "pad.E": Unknown(), "contact.v_s": Unknown(),
     "pad.tau": Unknown(prior=Prior(median=0.01, sd=0.3, kind="log-normal")),
@@ -85,7 +83,7 @@ def example(kind: Any) -> Any:
 def problem():
     """Two short grasps, one of them from a place that is not known well."""
     recordings = [
-        record(name, begin(GRASP, BASE), {"contact.K_n": 1.6e5}, SENSORS, rtol=1e-3, seed=seed)
+        record(name, excited(GRASP, BASE), {"contact.K_n": 1.6e5}, SENSORS, rtol=1e-3, seed=seed)
         for seed, name in enumerate(("first", "second"))
     ]
     start = recordings[1].start._replace(position_sd={"disc.x": 2e-5})
@@ -306,16 +304,14 @@ def slippery(problem, result):
     )  # fmt: skip
 
 
-def slide(settings: Parameters, reference: Reference) -> SoftGrasp:
+def slide(settings: Parameters, reference: Reference) -> Rig:
     return still(settings, reference, friction=Viscous(0.6, 30.0))
 
 
 def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
     slippery.save(tmp_path / "answer.json")
     answer, reference = load_answer(tmp_path / "answer.json"), slippery.rigs["first"].reference
-    said = (
-        r"SoftGrasp with parts of its own, which the answer does not hold: .* `applied_to\(rig\)`"
-    )
+    said = r"Rig with parts of its own, which the answer does not hold: .* `applied_to\(rig\)`"
     with pytest.raises(ValueError, match=said):
         answer.model()
     mine, weak = (

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
+from conftest import COARSE, PAPER, excited, strokes
 
-from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import (
     RIG,
     Problem,
@@ -64,17 +63,15 @@ from torchsoft.sysid.suspects import assumption_notices
 
 BASE = PAPER.override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
-STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9)
-BRIEF = Excitation(
-    motion=Strokes(travel=8e-3, stroke_time=0.15), duration=0.3, grasp_time=0.12, settle=0.03
-)
+STROKES = strokes(travel=8e-3, stroke_time=0.2, duration=0.9)
+BRIEF = strokes(travel=8e-3, stroke_time=0.15, duration=0.3, grasp_time=0.12, settle=0.03)
 SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 RTOL = 1e-4
 
 
 def recorded(truth: dict[str, float] | None = None, excitation: Excitation = STROKES) -> Recording:
     return record(
-        "strokes", begin(excitation, BASE), TRUTH | (truth or {}), SENSORS, rtol=1e-6, seed=4
+        "strokes", excited(excitation, BASE), TRUTH | (truth or {}), SENSORS, rtol=1e-6, seed=4
     )
 
 
@@ -197,7 +194,7 @@ def test_a_finer_mesh_is_asked_for_by_data_that_one_made():
     assert any("elements" in sentence for sentence in assumption_notices(found))
 
 
-LIGHT = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.15), duration=0.9, depth=3e-4)
+LIGHT = strokes(travel=30e-3, stroke_time=0.15, duration=0.9, depth=3e-4)
 QUIET = {name: Sensor(noise=0.2 * one.noise) for name, one in SENSORS.items()}
 
 
@@ -206,7 +203,7 @@ def far_off():
     """Data of Coulomb's friction, with coordinates and residuals at which a fit with smooth
     friction has ended where nothing can be learnt."""
     known = BASE.override({"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1})
-    data = record("light", begin(LIGHT, known), TRUTH, SENSORS, rtol=1e-5, noise=0.0)
+    data = record("light", excited(LIGHT, known), TRUTH, SENSORS, rtol=1e-5, noise=0.0)
     problem = Problem([made_by(coulomb(data), data)], SENSORS, {name: Unknown() for name in TRUTH})
     x, free = problem.coordinates.start + [0.5, -0.7], problem.coordinates.free
     at, _ = problem.freeze(Runner(problem.recordings), x, problem.names, RTOL, free)
@@ -251,7 +248,7 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
 def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     """A heavier disc: at the end of a fit without it, other numbers explain more to first order."""
     truth = TRUTH | {"disc.mass": 1.08 * BASE.disc.mass}
-    data = record("strokes", begin(STROKES, BASE), truth, QUIET, rtol=1e-6, seed=4)
+    data = record("strokes", excited(STROKES, BASE), truth, QUIET, rtol=1e-6, seed=4)
     problem = Problem([data], QUIET, {name: Unknown() for name in TRUTH})
     runner, c = Runner(problem.recordings), problem.coordinates
     x = c.start + [0.7, -0.7]
@@ -273,7 +270,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
 @pytest.mark.slow
 def test_faults_that_only_together_explain_the_data_are_named_together():
     """A camera that is late: two channels are, by the same time."""
-    data = record("strokes", begin(STROKES, BASE), TRUTH, QUIET, rtol=1e-6, seed=4)
+    data = record("strokes", excited(STROKES, BASE), TRUTH, QUIET, rtol=1e-6, seed=4)
     other = {
         channel: (t, np.interp(t - 2e-3, t, y)) if channel in ("x_C", "theta") else (t, y)
         for channel, (t, y) in data.samples.items()

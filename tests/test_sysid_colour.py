@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import COARSE
+from conftest import COARSE, PAPER, excited, strokes
 from test_sysid_noise import made
 
-from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.colour import rewhitened
 from torchsoft.sysid.noise import Autoregression
@@ -19,7 +17,7 @@ from torchsoft.sysid.runs import Runner
 BASE = PAPER.override(COARSE)
 TRUTH = {"pad.E": 0.8e6, "pad.tau": 0.011}
 NOISE = {"x_C": 1e-5, "theta": 5e-4, "F_x": 0.1}
-STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.6, senses="bracket")
+STROKES = strokes(travel=8e-3, stroke_time=0.2, duration=0.6)
 AR = Autoregression.stated((0.8,), 5e-3)
 STAGE = Stage("all", ("strokes",), ("pad.E", "pad.tau"), 1e-4)
 
@@ -30,7 +28,7 @@ def sensors(colour: str = "white") -> dict[str, Sensor]:
 
 @pytest.fixture(scope="module")
 def exact():
-    return record("strokes", begin(STROKES, BASE), TRUTH, sensors(), rtol=1e-6, noise=0.0)
+    return record("strokes", excited(STROKES, BASE), TRUTH, sensors(), rtol=1e-6, noise=0.0)
 
 
 def noisy(

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE, towards
+from conftest import COARSE, PAPER, excited, still, strokes, towards
 from scipy import stats
 from test_sysid_friction import Viscous
 
-from torchsoft import Parameters, Profile, Reference, SoftGrasp
-from torchsoft.excitation import Excitation, Roll, Strokes, begin
+from torchsoft import Profile, Reference, Rig
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Density, LawFit, compare, density, judged, ratio, versus
 from torchsoft.sysid.noise import Autoregression
@@ -137,7 +137,7 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
 BASE = PAPER.override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
 SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
 BRIEF: dict[str, Any] = {"duration": 0.4, "grasp_time": 0.15, "settle": 0.05}
-STROKE = Excitation(motion=Strokes(travel=25e-3, stroke_time=0.15), depth=2e-4, **BRIEF)
+STROKE = strokes(travel=25e-3, stroke_time=0.15, depth=2e-4, **BRIEF)
 GENTLE = Excitation(motion=Roll(travel=1e-3), depth=1e-3, **BRIEF)
 UNKNOWNS = {
     "smooth": {"contact.mu_s": Unknown(low=0.4, high=1.2),
@@ -146,11 +146,11 @@ UNKNOWNS = {
 }  # fmt: skip
 
 
-def viscous(settings: Parameters, reference: Reference) -> SoftGrasp:
+def viscous(settings: Parameters, reference: Reference) -> Rig:
     return still(settings, reference, friction=Viscous(0.6, 5.0))
 
 
-BUILDS = {"smooth": SoftGrasp, "viscous": viscous}
+BUILDS = {"smooth": Rig, "viscous": viscous}
 
 
 def laws(recording: Recording, excitation: Excitation) -> dict[str, Problem]:
@@ -165,7 +165,7 @@ def laws(recording: Recording, excitation: Excitation) -> dict[str, Problem]:
 def made(
     excitation: Excitation, build: Any, values: dict[str, float], noise: float = 1.0
 ) -> dict[str, Problem]:
-    planned = begin(excitation, BASE)
+    planned = excited(excitation, BASE)
     planned = planned._replace(rig=build(planned.rig.settings, planned.rig.reference))
     recording = record("one", planned, values, SENSORS, rtol=1e-5, noise=noise, seed=1)
     return laws(recording, excitation)

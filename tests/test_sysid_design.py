@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, grasp, turning
+from conftest import COARSE, PAPER, excited, grasp, turning
 
-from torchsoft import Parameters, Profile, Reference
-from torchsoft.excitation import Excitation, Knots, Strokes, begin
+from torchsoft import Profile, Reference
 from torchsoft.plan.knots import Bounds, Moves, profile
+from torchsoft.rigs.excite import Excitation
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.design import BENT, design, rank
@@ -36,7 +36,7 @@ SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 
 @pytest.fixture(scope="session")
 def plan():
-    return record("plan", begin(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    return record("plan", excited(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
 
 
 @pytest.fixture(scope="session")
@@ -278,7 +278,7 @@ def test_an_interruption_leaves_the_best_so_far(problem, monkeypatch):
 def test_the_next_recording_is_predicted(plan, problem):
     """What a recording would add is what it does add; one that cannot be made comes last."""
     strokes = PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)})
-    roll = record("roll", begin(strokes, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    roll = record("roll", excited(strokes, P), {}, SENSORS, rtol=1e-3, noise=0.0)
     same = replace(plan, name="same")
     ranked = rank([plan], [same, roll], SENSORS, problem.unknowns, rtol=1e-3)
     assert ranked[0].score < ranked[1].score

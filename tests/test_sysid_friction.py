@@ -8,12 +8,11 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from conftest import COARSE
+from conftest import COARSE, PAPER, excited, still, strokes
 from test_sysid import check_derivatives
 from torch import Tensor, nn
 
-from torchsoft import Parameters, Reference, SoftGrasp
-from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft import Reference, Rig
 from torchsoft.physics.contact import SlipLaw
 from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import RIG, Problem, Recording, Stage, Unknown, identify, record
@@ -23,8 +22,9 @@ SENSORS = {
     name: RIG[name].model_copy(update={"noise": 0.7 * RIG[name].noise})
     for name in ("x_C", "theta", "F_x")
 }
-JERKS = Excitation(
-    motion=Strokes(travel=30e-3, stroke_time=0.1),
+JERKS = strokes(
+    travel=30e-3,
+    stroke_time=0.1,
     duration=0.6,
     depth=5e-4,
     grasp_time=0.2,
@@ -44,11 +44,11 @@ class Viscous(nn.Module):
         return (E - self.alpha * F_N).clamp(min=0.0) / (R + self.beta * F_N)
 
 
-def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftGrasp:
+def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> Rig:
     return still(settings, reference, friction=Viscous(alpha, 100.0))
 
 
-def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGrasp]) -> Recording:
+def built(recording: Recording, build: Callable[[Parameters, Reference], Rig]) -> Recording:
     """The same samples, of another rig."""
     return replace(recording, rig=build(recording.rig.settings, recording.rig.reference))
 
@@ -56,7 +56,7 @@ def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGra
 @pytest.fixture(scope="module")
 def jerks():
     """Without noise, of the true law; the recording's own model has other numbers."""
-    planned = begin(JERKS, BASE)
+    planned = excited(JERKS, BASE)
     planned = planned._replace(rig=rig(planned.rig.settings, planned.rig.reference))
     return record("jerks", planned, TRUTH | {"pad.E": 0.9e6}, SENSORS, noise=0.0)
 
@@ -107,7 +107,7 @@ def frictionless(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
     return E / R
 
 
-def plain(settings: Parameters, reference: Reference, law: SlipLaw = frictionless) -> SoftGrasp:
+def plain(settings: Parameters, reference: Reference, law: SlipLaw = frictionless) -> Rig:
     return still(settings, reference, friction=law)
 
 
@@ -122,7 +122,7 @@ def weighted(E: Tensor, F_N: Tensor, R: Tensor, factor: float) -> Tensor:
 def test_a_checkpoint_of_another_law_is_not_read(jerks, tmp_path):
     """Neither of other numbers, nor of another function, of one that holds others, nor of a changed
     one."""
-    builds = [rig, SoftGrasp, partial(rig, alpha=0.61), plain]
+    builds = [rig, Rig, partial(rig, alpha=0.61), plain]
     for factor in (0.5, 0.25):
         builds += [
             partial(plain, law=law) for law in (scaled(factor), partial(weighted, factor=factor))

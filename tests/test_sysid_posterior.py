@@ -9,11 +9,10 @@ import threading
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
-from conftest import COARSE
+from conftest import COARSE, PAPER, excited
 from scipy import stats
 
-from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Roll, begin
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, record
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.posterior import Whitened, laplace, nuts
@@ -206,7 +205,7 @@ def rolling():
     base = PAPER.override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
     sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
-    data = record("roll", begin(roll, base), {}, sensors, noise=0.0)
+    data = record("roll", excited(roll, base), {}, sensors, noise=0.0)
     prior = Prior(median=0.75e6, sd=0.1, kind="log-normal")
     unknowns = {"pad.E": Unknown(prior=prior), "pad.tau": Unknown(low=5e-3, high=20e-3)}
     return Problem([data], sensors, unknowns, {"F_x": Autoregression.stated((0.8,), 5e-3)})

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, paper_settings
+from conftest import COARSE, PAPER, excited, paper_settings, still, strokes
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from torchsoft import Parameters, Reference, SoftGrasp
+from torchsoft import Reference
 from torchsoft.diagnostic import Diagnostic
-from torchsoft.excitation import Excitation, MultiSine, Press, Strokes, begin
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prechecks import (
@@ -41,14 +41,13 @@ FAR = {
 """How far the truth is from where a fit would start."""
 
 MOTIONS = {
-    "rolling": Excitation(motion=Strokes(travel=15e-3, stroke_time=0.2), duration=0.9,
+    "rolling": strokes(travel=15e-3, stroke_time=0.2, duration=0.9,
     grasp_time=0.2, settle=0.05), "shaking": Excitation(
         motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.9,
         depth=4e-4, grasp_time=0.2
     ),
     "pressing": Excitation(motion=Press(amplitude=5e-4, frequency=12.0, travel=10e-3), duration=0.9,
-    grasp_time=0.2), "about the disc": Excitation(
-        motion=Strokes(travel=8e-3, stroke_time=0.25), duration=0.9, grasp_time=0.2, settle=0.05,
+    grasp_time=0.2), "about the disc": strokes(travel=8e-3, stroke_time=0.25, duration=0.9, grasp_time=0.2, settle=0.05,
         senses="disc", x_C0=60e-3
     ),
 }  # fmt: skip
@@ -60,7 +59,7 @@ def recordings():
     table = NOMINAL.table()
     truth = {name: factor * table[name]["value"] for name, factor in FAR.items()}
     return {
-        name: record(name, begin(motion, NOMINAL), truth, SENSORS, seed=k, rtol=1e-4)
+        name: record(name, excited(motion, NOMINAL), truth, SENSORS, seed=k, rtol=1e-4)
         for k, (name, motion) in enumerate(MOTIONS.items())
     }
 

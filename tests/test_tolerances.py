@@ -10,7 +10,6 @@ from torchdiffeq import odeint, odeint_adjoint
 
 from torchsoft import SimulationFailed, Trajectory, simulate
 from torchsoft.physics.motion import Profile, Sampled
-from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.steps import given_steps
 
 T = times(0.4, 9)
@@ -26,8 +25,8 @@ def start():
         scenario__hold_time=0.1,
         scenario__travel=4e-3,
     )
-    made = grasp_and_roll(model, grasp_force=80.0)
-    return made.model, made.y0
+    y0 = manipulate(model, 80.0)
+    return model, y0
 
 
 @pytest.fixture(scope="module")
@@ -206,14 +205,14 @@ def test_no_step_passes_a_knot_of_the_reference():
 
 
 def test_inertial_pads_take_steps_by_tolerance():
-    model = coarse(pad__fidelity="inertial", scenario__grasp_time=0.1)
-    made = grasp_and_roll(model, grasp_force=80.0)
+    model = coarse(pad__inertial=True, scenario__grasp_time=0.1)
+    y0 = manipulate(model, 80.0)
     t = times(0.15, 7)
-    loose, tight = (simulate(made.model, t, y0=made.y0, rtol=rtol) for rtol in (1e-3, 1e-5))
+    loose, tight = (simulate(model, t, y0=y0, rtol=rtol) for rtol in (1e-3, 1e-5))
     assert float((loose["y_C"] - tight["y_C"]).abs().max()) < 1e-6
     h = loose.knots.diff()
     assert np.allclose(np.log2(h.numpy()), np.round(np.log2(h.numpy())), atol=1e-6)
-    again = simulate(made.model, t, y0=made.y0, knots=loose.knots)
+    again = simulate(model, t, y0=y0, knots=loose.knots)
     assert float((again.y - loose.y).abs().max()) < 1e-9
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import coarse, excited, f64, grasped, still, times
 from rig_tester import assert_gradients_exact
 from scipy.integrate import quad
 from scipy.stats import norm
@@ -27,12 +27,10 @@ from torchsoft import (
     Pad,
     PadMesh,
     Rig,
-    SoftGrasp,
     Taxels,
     simulate,
     simulate_batch,
 )
-from torchsoft.excitation import begin
 from torchsoft.rigs.build import RigFile
 from torchsoft.solve.trajectory import LIGHT
 from torchsoft.sysid import Problem, Sensor, Unknown, record
@@ -41,7 +39,7 @@ from torchsoft.sysid.measured import load
 SKIN = {"skin": Taxels("L", 3e-3, count=40, spread=1e-3)}
 
 
-def pressed(speed: float = 0.02) -> tuple[SoftGrasp, Tensor]:
+def pressed(speed: float = 0.02) -> tuple[Rig, Tensor]:
     model = coarse()
     model.taxels |= SKIN
     return model, grasped(model, (speed, 0.0))
@@ -178,7 +176,7 @@ def test_taxels_are_sensors_of_a_fit():
     delay and a gain of its own but one."""
     felt = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
     centre = {"L.centre": Sensor(noise=1e-4), "bracket_moment": Sensor(noise=1e-3)}
-    planned = begin(SHAKE, BASE)
+    planned = excited(SHAKE, BASE)
     rig = still(planned.rig.settings, planned.rig.reference, taxels=SKIN)
     data = record("shake", planned._replace(rig=rig), TRUTH, SENSORS | felt | centre, noise=0.0)
     assert data.channels[-6:] == (*felt, *centre)

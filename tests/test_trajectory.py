@@ -12,23 +12,16 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
-from conftest import coarse, f64, times
+from conftest import coarse, f64, rest, times
 from torch import Tensor
 
 import torchsoft
-from torchsoft import (
-    SoftGrasp,
-    Trajectory,
-    rest,
-    simulate,
-    simulate_batch,
-)
+from torchsoft import Rig, Trajectory, simulate, simulate_batch
 from torchsoft.display import hidden
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.setup import von_mises
 from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.rigs.written import template
-from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.simulate import SharedStart
 from torchsoft.solve.trajectory import Stats, load, save
 from torchsoft.sysid.columns import read_csv
@@ -37,10 +30,10 @@ from torchsoft.sysid.measured import vocabulary
 T = times(0.1, 11)
 
 
-def ran(**changes: object) -> tuple[SoftGrasp, Trajectory]:
+def ran(**changes: object) -> tuple[Rig, Trajectory]:
     model = coarse(**changes)
-    start = grasp_and_roll(model, grasp_force=80.0)
-    return model, simulate(model, T, y0=start.y0)
+    y0 = manipulate(model, 80.0)
+    return model, simulate(model, T, y0=y0)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +53,7 @@ def equal(one: Any, other: Any) -> bool:
 
 @pytest.mark.parametrize("fidelity", ["massless", "inertial"])
 def test_a_run_is_loaded_as_it_was(tmp_path, fidelity):
-    model, run = ran(pad__fidelity=fidelity)
+    model, run = ran(pad__inertial=fidelity == "inertial")
     run.save(tmp_path / "run.nc")
     again = Trajectory.load(tmp_path / "run.nc")
     for name in (
@@ -180,9 +173,9 @@ def test_points_stick_slip_and_part_as_the_graph_says(extended):
     for name in ("pads.L.tau_ratio", "pad.slow(0.1 s)") if extended else ():
         extend(model, [name])
         torch.nn.init.constant_(model.parameter(name), 0.5)
-    start = grasp_and_roll(model, grasp_force=80.0)
+    y0 = manipulate(model, 80.0)
     t = times(3.0, 61)
-    run = simulate(model, t, y0=start.y0)
+    run = simulate(model, t, y0=y0)
     rows = torch.arange(0, len(t), 4)
     state = model.unpack(run.y[rows], model.follow(t[rows]))
     found = torch.zeros(3)
@@ -411,7 +404,7 @@ def test_a_second_backward_through_a_shared_start_is_explained():
 def test_a_star_imports_what_help_names():
     names: dict[str, Any] = {}
     exec("from torchsoft import *", names)
-    assert {"SoftGrasp", "simulate", "Rig", "Trajectory"} <= names.keys()
+    assert {"Rig", "simulate", "Rig", "Trajectory"} <= names.keys()
     assert "torch" not in names
 
 

@@ -8,13 +8,14 @@ from typing import Any
 from unittest import mock
 
 import torch
+from conftest import PAPER, excited, rest, still
 
 from hostile.processes import ROOT
-from torchsoft import Parameters, SoftGrasp, Trajectory, rest, simulate
+from torchsoft import Trajectory, simulate
 from torchsoft.datasets import generate as generation
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import Serial, generate, simulate_task
-from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 
 EXAMPLE = ROOT / "examples" / "identify"
@@ -69,14 +70,13 @@ rtol = 1e-3
 
 ROLLING = """
 import json, threading, torch
-from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.scenario import grasp_and_roll
+from torchsoft import simulate
 torch.set_num_threads(1)
 def roll(_=0):
     coarse = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
     model = still(coarse)
-    rig = grasp_and_roll(model, grasp_force=75.0)
-    run = simulate(model, torch.linspace(0, 0.3, 7, dtype=torch.float64), y0=rig.y0)
+    y0 = manipulate(model, 75.0)
+    run = simulate(model, torch.linspace(0, 0.3, 7, dtype=torch.float64), y0=y0)
     return [float(value).hex() for value in run["y_Br"]]
 """
 """A program that can roll the disc, to the bit."""
@@ -124,8 +124,8 @@ def problem() -> Problem:
     p = PAPER.override(SMALL)
     sensors = {"x_C": Sensor(noise=1e-5), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
     strokes = Strokes(travel=5e-3, stroke_time=0.15)
-    motion = Excitation(motion=strokes, duration=0.4, senses="bracket")
-    recorded = record("strokes", begin(motion, p), {"pad.E": 0.9e6}, sensors, rtol=1e-3, seed=3)
+    motion = Excitation(motion=strokes, duration=0.4)
+    recorded = record("strokes", excited(motion, p), {"pad.E": 0.9e6}, sensors, rtol=1e-3, seed=3)
     return Problem([recorded], sensors, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()})
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import RUBBER, coarse, f64, grasp, times
+from conftest import PAPER, RUBBER, coarse, f64, grasp, press, rest, still, times
 from torch import nn
 
 from torchsoft import (
@@ -25,7 +25,6 @@ from torchsoft import (
     NoEquilibrium,
     Pad,
     PadMesh,
-    Parameters,
     Profile,
     Prony,
     Reference,
@@ -35,14 +34,10 @@ from torchsoft import (
     SimulationFailed,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
     StandardLinearSolid,
     hold,
-    press,
-    rest,
     simulate,
 )
-from torchsoft.paper.rig import NAMES
 from torchsoft.quantity import quantities
 from torchsoft.solve.gradients import GradientFailed
 

@@ -11,18 +11,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from conftest import excited, rest, still
 
 from hostile.damage import TEXTS, Mutant, Victim, damage, document, leaves, mutant, put, written
 from hostile.processes import ROOT
 from hostile.specimens import Table, cells, csv_text
 from hostile.trial import LIMIT, Tally, count, random, sentence
-from torchsoft import Parameters, SoftGrasp, rest, simulate
+from torchsoft import simulate
 from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost as dataset_cost
 from torchsoft.datasets.generate import points
 from torchsoft.datasets.rig_files import embedded
-from torchsoft.excitation import Excitation, begin
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import measured
 from torchsoft.sysid.measured import cost
 from torchsoft.sysid.runs import Runner
@@ -124,7 +125,7 @@ def run_briefly(p: Parameters) -> None:
 
 def excite_briefly(e: Excitation) -> None:
     """The grasp, and its reference to the end."""
-    begun = begin(e, PAPER.override(COARSE))
+    begun = excited(e, PAPER.override(COARSE))
     follow = begun.rig.follow(torch.linspace(0, e.duration, 101, dtype=torch.float64))
     finite(begun.y0, follow, simulate(begun.rig, BRIEFLY, y0=begun.y0, step=2e-3).y)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, grasp, times
+from conftest import PAPER, coarse, grasp, still, times
 from torch import Tensor, nn
 
 from hostile.trial import Tally, count, random
@@ -19,27 +19,17 @@ from torchsoft import (
     Circle,
     Ellipse,
     KelvinVoigt,
-    Parameters,
     Profile,
     Reference,
+    Rig,
     RoundedBox,
     SimulationFailed,
-    SoftGrasp,
     StandardLinearSolid,
     Trajectory,
     simulate,
 )
-from torchsoft.excitation import (
-    Chirp,
-    Excitation,
-    MultiSine,
-    Press,
-    Roll,
-    Strokes,
-    reference,
-    start,
-)
 from torchsoft.physics.statics import NoEquilibrium
+from torchsoft.rigs.excite import Excitation
 from torchsoft.solve.diagnostics import NEGLIGIBLE, RESIDUAL
 from torchsoft.solve.gradients import GradientFailed
 
@@ -96,7 +86,7 @@ CHOICES: dict[str, Any] = {
 }
 
 
-def build(rng: np.random.Generator) -> tuple[Excitation, SoftGrasp]:
+def build(rng: np.random.Generator) -> tuple[Excitation, Rig]:
     """A motion, and a rig of random parts; of one rig in seven a number is set to what it cannot
     be."""
     near = partial(spread, rng, decades=float(rng.choice([0.3, 1.0])))
@@ -211,7 +201,7 @@ def test_threads_give_the_bits_of_runs_alone(tally):
     """Eight threads, a hundred runs with gradients in each; two threads share a model."""
     models = [
         coarse(pad__elements_x=24),
-        coarse(pad__elements_x=24, pad__fidelity="inertial"),
+        coarse(pad__elements_x=24, pad__inertial=True),
         coarse(pad__elements_x=24, contact__points=2),
         still(coarse(pad__elements_x=24).settings, friction=law(20)),
     ]

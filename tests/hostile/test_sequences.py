@@ -34,16 +34,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from hostile.trial import SEED, count, sentence
-from torchsoft import (
-    Coulomb,
-    Profile,
-    SimulationFailed,
-    SmoothSlip,
-    SoftGrasp,
-    hold,
-    simulate,
-)
-from torchsoft.paper.rig import NAMES
+from torchsoft import Coulomb, Profile, Rig, SimulationFailed, SmoothSlip, hold, simulate
 from torchsoft.solve.gradients import GradientFailed
 
 pytestmark = [
@@ -84,7 +75,7 @@ class Own(nn.Module):
         return self.dropout(SHARE * (E - self.mu_s * F_N).clamp(min=0.0) / (R + 10.0))
 
 
-def run(model: SoftGrasp, y0: Tensor, gradient: Any = "discrete") -> Any:
+def run(model: Rig, y0: Tensor, gradient: Any = "discrete") -> Any:
     return simulate(model, T, y0=y0, gradient=gradient, step=1e-3, tolerance=1e-10)
 
 
@@ -95,7 +86,7 @@ def loss(ended: Any) -> Any:
 class Simulated(nn.Module):
     """A run as a module, for functional_call."""
 
-    def __init__(self, model: SoftGrasp) -> None:
+    def __init__(self, model: Rig) -> None:
         super().__init__()
         self.model = model
 
@@ -113,7 +104,7 @@ class Ran:
     """One run: its loss, and a copy of the model for differences, with the tensors whose gradients
     are wanted beside their places in it."""
 
-    def __init__(self, model: SoftGrasp, y0: Tensor, put: dict[str, Tensor]) -> None:
+    def __init__(self, model: Rig, y0: Tensor, put: dict[str, Tensor]) -> None:
         self.share, self.copy, y0 = SHARE, copy.deepcopy(model), y0.clone().requires_grad_()
         twins = zip(model.parameters(), self.copy.parameters())
         self.places = [(y0, y0.detach()), *((p, q) for p, q in twins if p.requires_grad)]
@@ -166,7 +157,7 @@ class ModelInUse(RuleBasedStateMachine):
     tally: ClassVar = Counter[str]()
 
     @initialize(key=st.integers(0, 2**32 - 1), before=st.integers(0, 5))
-    def begin(self, key: int, before: int) -> None:
+    def excited(self, key: int, before: int) -> None:
         self.rng, self.before = np.random.default_rng([SEED, key]), before
         self.model, self.rans = coarse(**SETTINGS), list[Ran]()
         velocity = 0.05 * self.rng.uniform(-1, 1), 0.01 * self.rng.uniform(-1, 1)

@@ -10,8 +10,8 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.control import Loop
 from torchsoft.tables import line
 
-GRASP, SINCE = 0.375, 0.5
-"""End of the grasp, and begin of the motion after a pause [s]."""
+SINCE = 0.5
+"""Begin of the motion [s], after the grasp and a pause."""
 
 INTERVAL = 0.01
 """Time [s] between outputs."""
@@ -22,13 +22,16 @@ pad, is symmetric until rounding breaks it."""
 
 
 class Excitation(NamedTuple):
-    """A grasp that compresses the pads together by `depth` [m], then the tables of two motions:
-    along the pads, `roll`, and on top of the grasp, `press`; until `duration` [s]."""
+    """A grasp that compresses the pads together by `depth` [m] within a time `grasp` [s], then the
+    tables of two motions: along the pads, `roll`, and on top of the grasp, `press`, which begin at
+    `since` [s] unless they say when; until `duration` [s]."""
 
     roll: Mapping[str, Any]
     press: Mapping[str, Any] | None = None
     duration: float = 2.0
     depth: float = 1.4e-3
+    grasp: float = 0.375
+    since: float = SINCE
 
 
 def _sines(amplitude: float, band: tuple[float, float], seed: int) -> dict[str, Any]:
@@ -89,16 +92,17 @@ def excite(
     body, across, way = _presser(file, body)
     along = "y" if across == "x" else "x"
     press_loop, roll_loop = (_loops(file)[f"{body}.{axis}"] for axis in (across, along))
-    grasp = {"times": (0.0, GRASP), "values": (0.0, way * excitation.depth), "offset": "start"}
+    times, values = (0.0, excitation.grasp), (0.0, way * excitation.depth)
+    grasp = {"times": times, "values": values, "offset": "start"}
     press = {"kind": "profile"} | grasp | dict(excitation.press or {})
     roll = dict(excitation.roll)
     for motion in (press, roll):
         if motion["kind"] != "profile":
-            motion["since"] = SINCE
+            motion.setdefault("since", excitation.since)
     motions = {press_loop.setpoint: press, roll_loop.setpoint: roll}
     actuators: dict[str, Any] = {}
     if (one := file.actuators.get(press_loop.actuators[0])) and one.feed_forward is not None:
-        held = {"times": (0.0, GRASP), "values": (0.0, "held")}
+        held = {"times": times, "values": (0.0, "held")}
         motions[one.feed_forward] = {"kind": "profile"} | held
     if roll_loop.actuators[0] in file.actuators:
         actuators[roll_loop.actuators[0]] = {"measures": f"{senses or body}.{along}"}
