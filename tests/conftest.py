@@ -91,9 +91,9 @@ def manipulate(model: Rig, force: float, **motions: nn.Module) -> Tensor:
     return y0
 
 
-def press(rig: Rig, height: float = GRASPED) -> Tensor:
+def press(rig: Rig, height: float = GRASPED, x: float = 60e-3) -> Tensor:
     """The paper's disc between its pads, with the bracket at a height [m], without friction."""
-    return rig.state(disc={"x": 60e-3, "y": "rest"}, bracket={"x": 60e-3, "y": height})
+    return rig.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": height})
 
 
 @torch.no_grad()
@@ -142,10 +142,12 @@ def f64(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def grasp(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tensor, Reference]:
+def grasp(
+    model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **where: float
+) -> tuple[Tensor, Reference]:
     """The frictionless grasp (size,) with the disc moving at `velocity` [m/s], and the reference
     that holds it there."""
-    y = press(model).detach()
+    y = press(model, **where).detach()
     pose = model.unpack(y).pose
     y[model.layout.slices["velocity", "disc"]] = f64(*velocity, 0.0)
     return y, hold(
@@ -153,9 +155,9 @@ def grasp(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tenso
     )
 
 
-def grasped(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> Tensor:
+def grasped(model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **where: float) -> Tensor:
     """The grasp, after the model was given the reference that holds it."""
-    y, model.reference = grasp(model, velocity)
+    y, model.reference = grasp(model, velocity, **where)
     return y
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, still, times
+from conftest import COARSE, coarse, f64, grasped, still, times
 from torch import Tensor
 
 from torchsoft import (
@@ -109,7 +109,8 @@ def test_sensitivities_are_stacked(start):
 def test_references_times_and_rigs_of_their_own(start):
     """Shorter runs end in NaN behind the mask; frozen steps go in one by one."""
     model, y0 = start
-    other = still(model.settings, shape=Circle(20.5e-3), reference=model.reference)
+    other = still(COARSE, shape=Circle(20.5e-3))
+    other.reference = model.reference
     references = [
         model.reference,
         hold(x_d=0.06, y_d=float(y0[0, model.layout.slices["pose", "bracket"]][-1]), F_ff=-50.0),

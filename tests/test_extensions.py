@@ -53,7 +53,7 @@ def test_parts_that_are_shared_are_extended_once():
 
 
 def test_names_are_those_of_a_rig_file():
-    rig = RigFile.from_toml("rigs/two_fingers.toml").assemble()
+    rig = RigFile.ready("two_fingers").assemble()
     groups = {name.partition(".")[0] for name in extensions(rig)}
     assert groups == {"materials", "laws", "pads", "guides", "gravity_tilt"}
     names = dict.fromkeys(name for name in extensions(rig) if name.endswith(".power"))

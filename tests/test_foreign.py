@@ -15,9 +15,8 @@ from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, TAKEN_IN, node
 
-from torchsoft import PadMesh, Rig, Trajectory, simulate
+from torchsoft import BuiltRig, PadMesh, Trajectory, simulate
 from torchsoft.physics.mesh import unit_compliance
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.excite import Excitation
 
 SETTLE, STEP = 0.02, 20e-6
@@ -38,7 +37,7 @@ CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 
 @cache
-def begun() -> BuiltRig[Rig]:
+def begun() -> BuiltRig:
     return excited(SHAKEN, PAPER.override(RIG))
 
 

@@ -22,14 +22,7 @@ from skfem import (
     solve,
 )
 
-from torchsoft import (
-    CurvedPadMesh,
-    FingertipMesh,
-    KelvinVoigt,
-    Pad,
-    PadMesh,
-    QuadMesh,
-)
+from torchsoft import CurvedPadMesh, FingertipMesh, KelvinVoigt, Pad, PadMesh, QuadMesh
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 
 ROUNDING = 1e-12

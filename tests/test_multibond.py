@@ -63,8 +63,8 @@ def test_topology_names_the_rigs_elements():
         "R: R_n,L",
         "C: K_t,U",
         "R: slip_U",
-        "C: K_81^-1",
-        "R: R_99",
+        "C: Kp",
+        "R: Kd",
         "Se: m_C g",
         "Sf: 0",
     } <= labels
@@ -76,7 +76,7 @@ def test_topology_names_the_rigs_elements():
 
 
 def test_sensing_the_bracket_makes_the_horizontal_loop_collocated():
-    model = coarse(control__senses="bracket")
+    model = coarse(control__senses="bracket.x")
     graph = topology(
         model.evaluate(0.0, model.unpack(random_state(model, 0))).ports, model.junctions
     )

@@ -8,7 +8,7 @@ base there.
 import numpy as np
 import pytest
 import torch
-from fem_oracle import CM_HEIGHT, matching, world_stiffness
+from fem_oracle import CM_HEIGHT, PadNumbers, matching, world_stiffness
 from torch import Tensor
 
 from torchsoft import KelvinVoigt, Pad, PadMesh
@@ -33,8 +33,8 @@ def place(request):
 
 def pad_at(
     place: Place, *, inertial: bool, points: int = 0, **changes: float
-) -> tuple[Pad, PadParameters]:
-    p = PadParameters(**SMALL | {"enclosed": place[1]} | changes)
+) -> tuple[Pad, PadNumbers]:
+    p = PadNumbers(**SMALL | {"enclosed": place[1]} | changes)
     upper = place[0] == "U"
     mesh = PadMesh(
         p.length, p.height, p.elements_x, p.elements_y, bonded_sides=upper and p.enclosed

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from browser import MISSING, browser
-from conftest import coarse, times
+from conftest import coarse, manipulate, times
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -84,9 +84,7 @@ console.log(JSON.stringify({ scale: data.scale, curves }));"""
 def fingers():
     """Pads that stand upright, on bases with angles."""
     tips = {name: {"elements_x": 18} for name in ("left_tip", "right_tip")}
-    file = RigFile.from_toml(ROOT / "rigs" / "two_fingers.toml").override(
-        pads={"table": {"elements_x": 25}, **tips}
-    )
+    file = RigFile.ready("two_fingers").override(pads={"table": {"elements_x": 25}, **tips})
     rig, y0, _ = file.build()
     return simulate(rig, times(0.9, 10), y0=y0, rtol=1e-3)
 

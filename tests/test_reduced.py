@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, times
+from conftest import coarse, press, times
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
-from torchsoft import Profile, Reference, press, simulate
+from torchsoft import BuiltRig, Profile, Reference, simulate
 from torchsoft.cli import main
-from torchsoft.physics.statics import BuiltRig
 from torchsoft.reduced.fit import Recipe, assemble, choose, contradictions, fit, loop, score
 from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record, record, rolling_radius
@@ -356,7 +355,7 @@ def test_bodies_of_a_record_have_any_names(beside):
     with pytest.raises(ValueError, match=r"has none of x_C, .*, x_d.*; .* as in \{\"x_C\": data"):
         record({"x_disc": beside["x_disc"]}, beside.t)
     theta_d = {"kind": "profile", "times": [0.0, 0.02], "values": [0.0, 1e-2]}
-    ready, run = run_of(RigFile.from_toml(ROOT / "rigs/orientation.toml"), theta_d=theta_d)
+    ready, run = run_of(RigFile.ready("orientation"), theta_d=theta_d)
     one = record(run, bracket="upper")
     efforts = run["F_carry_upper"] + run["F_turn_upper"]
     assert np.array_equal(one.series["F_x"], efforts.numpy())

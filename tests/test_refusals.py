@@ -167,7 +167,7 @@ class Oval(Ellipse):
 
 def ran(**parts: Any) -> object:
     """A run of the rig with a part replaced, from no state in particular."""
-    model = still(coarse().settings, **parts)
+    model = still(COARSE, **parts)
     return simulate(model, T, y0=torch.zeros(model.layout.size, dtype=torch.float64))
 
 
@@ -463,7 +463,7 @@ def test_a_part_or_call_that_is_none_is_refused(row):
 
 def test_a_coupled_law_is_refused_after_its_pointwise_twin():
     """For one point both have the same expression, which is compiled already."""
-    model = still(coarse().settings, friction=rated(lambda N: N, mu=0.49))
+    model = still(COARSE, friction=rated(lambda N: N, mu=0.49))
     simulate(model, T, y0=rest(model).detach())
     with pytest.raises(ValueError, match="several points at once other rates"):
         slipping(rated(lambda N: N.sum().expand_as(N), mu=0.49))
@@ -646,7 +646,7 @@ class Dropping(nn.Module):
 def test_a_law_in_training_is_refused_after_it_ran_in_evaluation(
     start,
 ):
-    model = still(coarse().settings, friction=Dropping(), reference=start[0].reference)
+    model = still(COARSE, friction=Dropping(), reference=start[0].reference)
     simulate(model.eval(), T, y0=start[1])
     with pytest.raises(TypeError, match="the random operation"):
         simulate(model.train(), T, y0=start[1])

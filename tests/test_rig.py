@@ -2,48 +2,33 @@
 
 import pytest
 import torch
-from conftest import PAPER, coarse, f64, grasped, still, turning
+from conftest import COARSE, PAPER, coarse, f64, grasped, still, turning
 
-from torchsoft import (
-    Body,
-    Circle,
-    Ellipse,
-    Rig,
-    RoundedBox,
-    hold,
-)  # fmt: skip
+from torchsoft import Body, Circle, Ellipse, Rig, RoundedBox, hold
 
 # names
 # ----------------------------------------------------------------------
 
 
 def test_the_radius_of_a_box_is_not_the_discs():
-    """A box has a radius, too, that of its corners: it must not be read as the object's."""
+    """A box has a radius, too, that of its corners."""
     model = still(shape=RoundedBox(20e-3, 19e-3, radius=5e-3))
-    assert model.settings.compression == PAPER.compression
-    with pytest.raises(ValueError, match=r"`disc\.radius` is not a parameter"):
-        model.parameter("disc.radius")
-    said = model.description()["parameters"]
-    assert "disc.radius" not in said
-    assert said["disc.shape.radius"] == 5e-3
+    assert model.description()["parameters"]["bodies.disc.shape.radius"] == 5e-3
 
 
-def test_parameters_have_the_names_of_the_settings():
-    """Every number of `Parameters` that is a module's parameter, read back where it is."""
-    model = coarse()
-    table = model.settings.table()
-    assert {name for name in NAMES if table[name]["value"] != model.parameter(name).item()} == set()
-    own = {own for own, p in model.named_parameters() if p.ndim == 0 and p.requires_grad}
-    assert own == {NAMES[name] for name in NAMES}
-    for name, module_name in NAMES.items():
-        assert (
-            model.parameter(name)
-            is model.parameter(module_name)
-            is model.get_parameter(module_name)
-        )
-    rolling = still({"contact.friction": "coulomb"})
+def test_parameters_have_the_names_of_the_file():
+    """Every parameter stands in the file's tables; by its full name, its short one and that of the
+    module it is the same tensor."""
+    model, table = coarse(), PAPER.override(COARSE).table()
+    for name, module_name in model.aliases.items():
+        assert model.parameter(name) is model.get_parameter(module_name)
+        if name in table:
+            assert model.parameter(name).item() == table[name]["value"]
+    for short, name in model.short.items():
+        assert name not in model.aliases or model.parameter(short) is model.parameter(name)
+    sharp = still({"laws.steel_on_rubber.friction": {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}})
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
-        rolling.parameter("contact.v_s")
+        sharp.parameter("contact.v_s")
 
 
 # bodies, loops and states

@@ -93,7 +93,8 @@ def test_derivatives_are_those_of_differences():
 
     def value(by: dict[str, Tensor]) -> Tensor:
         scaled = {
-            f"model.{NAMES[n]}": model.parameter(n).detach() * (1 + h)
+            f"model.{model.names.get(model.full(n), model.full(n))}": model.parameter(n).detach()
+            * (1 + h)
             for n, h in by.items()
             if "." in n
         }

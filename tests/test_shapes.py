@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from conftest import PAPER, f64, rest, still, times
+from conftest import f64, rest, still, times
 from matplotlib.path import Path as Polygon
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline
@@ -383,7 +383,7 @@ def test_derivatives_are_those_of_differences(case):
         )  # of thirty points, some come from a side onto an arc
 
 
-COARSE = PAPER.override({"pad.elements_x": 60, "pad.elements_y": 3})
+COARSE = {"pad.elements_x": 60, "pad.elements_y": 3}
 
 
 # --- what is refused, and what is said
@@ -444,7 +444,8 @@ def test_a_centre_of_mass_off_the_origin_is_told(caplog):
 def test_an_object_that_its_pads_would_turn_is_told_of():
     wedge = RoundedPolygon([[-20e-3, -10e-3], [20e-3, -10e-3], [20e-3, 10e-3], [-20e-3, 0.0]], 2e-3)
     with pytest.warns(
-        UserWarning, match=r"held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m"
+        UserWarning,
+        match=r"`disc` is held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m",
     ):
         rest(still(COARSE, shape=wedge))
 

@@ -4,7 +4,7 @@ nothing unphysical runs."""
 import numpy as np
 import pytest
 import torch
-from conftest import Exp, coarse, excited, f64, grasped, still, times, towards
+from conftest import COARSE, PAPER, Exp, coarse, excited, f64, grasped, rest, still, times, towards
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
@@ -18,9 +18,8 @@ from torchsoft import (
     SmoothSlip,
     StandardLinearSolid,
     hold,
-    rest,
     simulate,
-)  # fmt: skip
+)
 from torchsoft.rigs.excite import Excitation
 from torchsoft.solve import stepper, system
 from torchsoft.solve.gradients import GradientFailed
@@ -39,13 +38,12 @@ def rolled(model: Rig, **options: object):
 
 
 def test_values_set_on_the_module_run_and_are_saved():
-    """A number set in place is in the settings, in what the run says of itself, and in the run."""
+    """A number set in place is in what the run says of itself, and in the run."""
     model, other = coarse(), coarse(contact__K_n=2e5)
     y0 = grasped(other, (0.05, 0.0))
     model.reference = other.reference
-    model.contact.K_n.data = f64(2e5)[0]
-    assert model.settings.contact.K_n == 2e5
-    assert model.settings.table()["contact.K_n"]["value"] == 2e5
+    model.parameter("contact.K_n").data = f64(2e5)[0]
+    assert model.description()["parameters"]["laws.steel_on_rubber.K_n"] == 2e5
     run, expected = (simulate(m, T, y0=y0) for m in (model, other))
     assert torch.equal(run.y, expected.y)
     assert run.made_by == expected.made_by
@@ -87,18 +85,18 @@ class Polygonal(Shape):
 def test_a_shape_and_a_friction_law_of_ones_own_run_with_gradients():
     """The same circle and the same law written anew: the same run, and the same gradients."""
     built_in = coarse()
-    p = built_in.settings.contact
-    mine = SmoothSlip(p.mu_s, p.mu_k, p.v_s).requires_grad_(
+    mine = SmoothSlip(0.8, 0.7, COARSE["contact.v_s"]).requires_grad_(
         False
     )  # captured, so a constant of the law
-    own = still(
-        built_in.settings, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3)
-    )
+    own = still(COARSE, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3))
     one, other = rolled(built_in, gradient="discrete"), rolled(own, gradient="discrete")
     assert float((one.y - other.y).detach().abs().max()) < 1e-9
     a, b = (
         torch.autograd.grad(run["theta"][-1], r)[0]
-        for run, r in ((one, built_in.shape.radius), (other, own.shape.r))
+        for run, r in (
+            (one, built_in.parameter("disc.radius")),
+            (other, own.bodies["disc"].shape.r),
+        )
     )
     assert float(a) == pytest.approx(float(b), rel=1e-6)
 
@@ -223,14 +221,14 @@ class Sharing(nn.Module):
 def test_a_law_is_what_its_code_is_now():
     """A global that it reads, and the number of iterations of a shape of the package, changed
     between two runs."""
-    model = still(coarse().settings, friction=Sharing())
+    model = still(COARSE, friction=Sharing())
     y0 = grasped(model, (0.08, 0.0))
     first = simulate(model, T, y0=y0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(globals(), "SHARE", 0.9)
         assert not torch.equal(simulate(model, T, y0=y0).y, first.y)
     assert torch.equal(simulate(model, T, y0=y0).y, first.y)
-    oval = still(coarse().settings, shape=Ellipse(20e-3, 18.8e-3))
+    oval = still(COARSE, shape=Ellipse(20e-3, 18.8e-3))
     with pytest.MonkeyPatch.context() as patch:
         exact = simulate(oval, T, y0=y0).y
         patch.setattr(Ellipse, "ITERATIONS", 1)
@@ -260,7 +258,7 @@ def test_what_is_saved_is_what_ran():
     assert "contact.v_s" not in made_by["parameters"]
     assert made_by["control"] == {"x": "PD", "y": "PD"}
     assert made_by["mesh"]["L"] == f"PadMesh, {len(model.pads['L'].mesh.nodes)} nodes"
-    oval = still(coarse().settings, shape=Ellipse(19.8e-3, 19.1e-3))
+    oval = still(COARSE, shape=Ellipse(19.8e-3, 19.1e-3))
     described = oval.description()
     assert "disc.radius" not in described["parameters"]
     assert described["shape"] == {"disc": "Ellipse"}
@@ -276,14 +274,15 @@ def test_what_is_saved_is_what_ran():
 
 def made_and_run() -> list[Tensor]:
     """Parts made, a motion begun and run with gradients and sensitivities."""
-    motion = MultiSine(amplitude_x=1e-3, frequency=(5.0, 20.0))
-    begun = excited(
-        Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings
-    )
+    motion = {"kind": "multi_sine", "amplitude": 1e-3, "band": (5.0, 20.0)}
+    shaken = Excitation(motion, duration=0.5, grasp=0.05, since=0.07)
+    begun = excited(shaken, PAPER.override(COARSE))
     run = simulate(begun.rig, times(0.1, 6), y0=begun.y0, gradient="discrete")
     forward = simulate(begun.rig, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
-    gradients = torch.autograd.grad(run["y_C"][-1], [begun.rig.pad.E, begun.rig.contact.K_t])
-    oval = still(begun.rig.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4))
+    gradients = torch.autograd.grad(
+        run["y_C"][-1], [begun.rig.parameter(name) for name in ("pad.E", "contact.K_t")]
+    )
+    oval = still(COARSE, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4))
     parts = [
         rest(oval),
         oval(0.0, rest(oval)),
@@ -381,15 +380,15 @@ def test_every_second_number_of_a_tensor_is_as_good_as_a_tensor():
 
 
 def test_parts_replaced_after_a_run_run():
-    """A material with more branches after the first run, in the group and in the pads."""
+    """A material with more branches after the first run."""
     model = coarse()
     simulate(model, T, y0=grasped(model))
-    p, size = model.settings.pad, model.layout.size
-    model.pad = StandardLinearSolid(p.E, 2 * p.E, p.nu, p.rho, p.tau, p.depth)
+    size, E = model.layout.size, 7.5e5
+    other = StandardLinearSolid(E, 2 * E, 0.45, 1100.0, 10e-3, 44e-3, tau_instant=1e-3)
     for pad in model.pads.values():
-        pad.material = model.pad
+        pad.material = other
     assert model.layout.size > size
-    fresh = still(coarse().settings, material=model.pad)
+    fresh = still(COARSE, material=other)
     y0 = grasped(fresh)
     model.reference = fresh.reference
     assert torch.equal(simulate(model, T, y0=y0).y, simulate(fresh, T, y0=y0).y)
@@ -404,7 +403,7 @@ def test_a_law_that_turns_nan_never_converges():
             (E > 13.0) & (E < 90.0) & (F_N > 10.0), torch.nan, (E - 0.8 * F_N).clamp(min=0.0) / R
         )
 
-    model = still(coarse().settings, friction=broken)
+    model = still(COARSE, friction=broken)
     y0 = grasped(model)
     pushed = towards(model, Profile([0.0, 0.2], [0.06, 0.09]))
     with pytest.raises(

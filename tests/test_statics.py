@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 import torch
-from conftest import PAPER, f64, holding_force, still
-from fem_oracle import dilatation, shear, world_stiffness
+from conftest import f64, holding_force, press, still
+from fem_oracle import PadNumbers, dilatation, shear, world_stiffness
 from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, condense, solve
 from test_experiments import experiment
 
@@ -26,8 +26,7 @@ from torchsoft import (
     RoundedBox,
     SmoothSlip,
     SoftContact,
-    press,
-)  # fmt: skip
+)
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import resting
@@ -90,13 +89,15 @@ DEPTH = 1e-4
 """By how much [m] it is pressed into each of two pads."""
 
 
+PAD = PadNumbers()
+
+
 def punched(K_n: float, elements_x: int) -> tuple[Rig, State, float]:
     """The box pressed between the pads without weight; the force [N] on the bracket."""
-    changes = {"scenario.gravity": 0.0, "contact.K_n": K_n}
+    changes = {"gravity": 0.0, "contact.K_n": K_n}
     mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
     model = still(changes | mesh, shape=PUNCH)
-    p = model.settings
-    y = press(model, 2 * (p.pad.height + 10e-3 - DEPTH) + p.bracket.cm_height).detach()
+    y = press(model, 2 * (PAD.height + 10e-3 - DEPTH) + 2.18e-3).detach()
     return model, model.unpack(y), holding_force(model, y)
 
 
@@ -104,7 +105,7 @@ def test_a_long_box_is_a_flat_punch_on_springs():
     """On the same mesh, assembled by scikit-fem, with a spring K_n between each node under the flat
     side and the box."""
     model, state, force = punched(1.2e5, 120)
-    pad = model.settings.pad
+    pad = PAD
     nodes, K = world_stiffness(pad, "L")
     under = np.flatnonzero((nodes[:, 1] == pad.height) & (np.abs(nodes[:, 0] - 60e-3) < FLAT))
     springs = 1.2e5 * np.bincount(2 * under + 1, minlength=len(K))
@@ -123,7 +124,7 @@ def test_a_long_box_is_a_flat_punch_on_springs():
 def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch():
     """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are
     bilinear of half a millimetre."""
-    pad = PAPER.pad
+    pad = PAD
     mesh = MeshQuad.init_tensor(np.linspace(0, pad.length, 481), np.linspace(0, pad.height, 17))
     basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=4)
     lame_lambda, lame_mu = lame_moduli(pad.E, pad.nu)

@@ -4,7 +4,7 @@ met."""
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times, towards
+from conftest import GRASPED, coarse, f64, grasped, manipulate, times, towards
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
@@ -15,17 +15,19 @@ from torchsoft.solve.steps import given_steps
 T = times(0.4, 9)
 
 
+def quick(grasp: float) -> dict[str, Profile]:
+    """The paper's grasp within another time [s]."""
+    top = 49.994e-3
+    y_d = Profile([0.0, grasp], [top, GRASPED])
+    return {"y_d": y_d, "F_ff": Profile([0.0, grasp], [0.0, -80.0])}
+
+
 @pytest.fixture(scope="module")
 def start():
     """The paper's manipulation on a coarse mesh, quickened: its touch-down and grasp within 0.3
     s."""
-    model = coarse(
-        scenario__grasp_time=0.25,
-        scenario__roll_time=0.5,
-        scenario__hold_time=0.1,
-        scenario__travel=4e-3,
-    )
-    y0 = manipulate(model, 80.0)
+    model = coarse()
+    y0 = manipulate(model, 80.0, x_d=Profile([0.0, 0.5], [60e-3, 64e-3]), **quick(0.25))
     return model, y0
 
 
@@ -205,8 +207,8 @@ def test_no_step_passes_a_knot_of_the_reference():
 
 
 def test_inertial_pads_take_steps_by_tolerance():
-    model = coarse(pad__inertial=True, scenario__grasp_time=0.1)
-    y0 = manipulate(model, 80.0)
+    model = coarse(pad__inertial=True)
+    y0 = manipulate(model, 80.0, **quick(0.1))
     t = times(0.15, 7)
     loose, tight = (simulate(model, t, y0=y0, rtol=rtol) for rtol in (1e-3, 1e-5))
     assert float((loose["y_C"] - tight["y_C"]).abs().max()) < 1e-6

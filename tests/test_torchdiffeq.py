@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import coarse, f64, grasped, manipulate, times
 from torchdiffeq import odeint, odeint_adjoint
 
 from torchsoft import METHOD, Rig, register_method, simulate

@@ -177,8 +177,9 @@ def test_taxels_are_sensors_of_a_fit():
     felt = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
     centre = {"L.centre": Sensor(noise=1e-4), "bracket_moment": Sensor(noise=1e-3)}
     planned = excited(SHAKE, BASE)
-    rig = still(planned.rig.settings, planned.rig.reference, taxels=SKIN)
-    data = record("shake", planned._replace(rig=rig), TRUTH, SENSORS | felt | centre, noise=0.0)
+    rig = planned.rig
+    rig.taxels = SKIN
+    data = record("shake", planned, TRUTH, SENSORS | felt | centre, noise=0.0)
     assert data.channels[-6:] == (*felt, *centre)
     sensors = (
         SENSORS

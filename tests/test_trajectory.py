@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
-from conftest import coarse, f64, rest, times
+from conftest import coarse, f64, manipulate, rest, times
 from torch import Tensor
 
 import torchsoft

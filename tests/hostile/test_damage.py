@@ -28,7 +28,7 @@ from hostile.damage import (
     damage,
     forged,
 )
-from hostile.processes import ROOT, ended, fork, kernel, restore
+from hostile.processes import ended, fork, kernel, restore
 from hostile.specimens import dataset, make, problem, run
 from hostile.trial import LIMIT, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
@@ -234,7 +234,7 @@ def generated(tmp_path_factory):
     return Specimen(place / "sound", wrong)
 
 
-KNOWN = vocabulary(RigFile.from_toml(ROOT / "rigs" / "paper.toml").assemble(), {})
+KNOWN = vocabulary(RigFile.ready("paper").assemble(), {})
 """Columns that a trajectory of the paper's rig may have."""
 
 

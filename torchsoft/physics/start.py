@@ -1,5 +1,6 @@
 """States from coordinates of bodies: placed, moving, at rest on pads, touching or pressing."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +10,7 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, tensor
 from torchsoft.physics.contact import turned
+from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
@@ -28,6 +30,9 @@ RATES = {"v_x": "x", "v_y": "y", "omega": "theta"}
 
 UPWARDS = 0.1
 """Least upward component of the normal of a pad that can carry a body."""
+
+MOMENT_ARM = 1e-2
+"""Largest moment on a body at rest without a warning, over its size and the load."""
 
 AWAY = 100.0
 """Height [m] of a body before its pads are lowered until they touch."""
@@ -61,7 +66,31 @@ def start(rig: Rig, bodies: Starts) -> Tensor:
     for name, body in rig.bodies.items():
         check_start(name, body.freedom, bodies.get(name, {}))
     held, _ = rig.held(rig.follow(0.0))
-    return moving(rig, standing(rig, placed(rig, bodies, held)), bodies)
+    y = moving(rig, standing(rig, placed(rig, bodies, held)), bodies)
+    warn_of_moments(rig, y, bodies)
+    return y
+
+
+@torch.no_grad()
+def warn_of_moments(rig: Rig, y: Tensor, bodies: Starts) -> None:
+    """Warns of bodies at rest whose angle was not given, where pads turn them."""
+    named = [
+        name for name, given in bodies.items()
+        if given.get("y") == REST and "theta" not in given and 2 in rig.layout.free[name]
+    ]  # fmt: skip
+    if not named or any(pad.inertial for pad in rig.pads.values()):
+        return
+    graph = rig.evaluate(0.0, rig.unpack(y), settled=True)
+    loads = rig.loads(graph, net_efforts(graph.ports, rig.junctions))
+    pressed = sum(float(interface.F_N.sum()) for interface in graph.interfaces.values())
+    for name in named:
+        shape, moment = rig.bodies[name].shape, float(loads[name][2])
+        if shape is not None and abs(moment) > MOMENT_ARM * shape.size() * pressed:
+            warnings.warn(
+                f"`{name}` is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a "
+                'run from here begins with that; say theta = "rest", or another angle',
+                stacklevel=3,
+            )
 
 
 def moving(rig: Rig, y: Tensor, bodies: Starts) -> Tensor:
