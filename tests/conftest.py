@@ -23,7 +23,6 @@ from torchsoft import (
 )
 from torchsoft.physics.state import State
 from torchsoft.rigs.excite import Excitation
-from torchsoft.rigs.excite import Excitation
 
 register_method()
 

@@ -4,12 +4,11 @@ and bad data reported."""
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, press, times
+from conftest import PAPER, coarse, press, times
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
@@ -22,8 +21,6 @@ from torchsoft.reduced.terms import friction, joined, mechanics, variable
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.written import template
 from torchsoft.solve.trajectory import Trajectory
-
-ROOT = Path(__file__).parents[1]
 
 R = 0.0183
 TRUTH = {
@@ -289,7 +286,7 @@ def test_equations_read_in_text_and_latex():
 
 def test_records_of_a_run_and_of_a_dataset_are_the_same():
     model = coarse()
-    y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
+    y0 = press(model).detach()
     x_0, y_Br = (float(model.unpack(y0).pose[name][i]) for name, i in (("disc", 0), ("bracket", 1)))
     roll = Profile([0.0, 0.2], [x_0, x_0 + 1e-3])
     reference = Reference(x_d=roll, y_d=Profile([0.0], [y_Br]), F_ff=Profile([0.0], [-60.0]))
@@ -302,10 +299,10 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same():
     assert rolling_radius([one]) == pytest.approx(0.0185, rel=0.05)
     late = record(run, begin=0.1)
     assert (late.t[0], late.series["theta"][0]) == (pytest.approx(0.1), 0.0)
-    values = series["omega"].values.copy()
+    values = series["omega_C"].values.copy()
     values[50] = np.nan
-    with pytest.raises(ValueError, match=r"'omega' \(omega\) .* first at t = 0.1 s"):
-        record({name: series[name].values for name in series} | {"omega": values}, run.t)
+    with pytest.raises(ValueError, match=r"'omega' \(omega_C\) .* first at t = 0.1 s"):
+        record({name: series[name].values for name in series} | {"omega_C": values}, run.t)
 
 
 def run_of(file: RigFile, **motion: dict[str, object]) -> tuple[BuiltRig, Trajectory]:
@@ -357,9 +354,9 @@ def test_bodies_of_a_record_have_any_names(beside):
     theta_d = {"kind": "profile", "times": [0.0, 0.02], "values": [0.0, 1e-2]}
     ready, run = run_of(RigFile.ready("orientation"), theta_d=theta_d)
     one = record(run, bracket="upper")
-    efforts = run["F_carry_upper"] + run["F_turn_upper"]
+    efforts = run["effort_carry_upper"] + run["effort_turn_upper"]
     assert np.array_equal(one.series["F_x"], efforts.numpy())
-    assert float(run["F_turn_upper"].abs().max()) > 0.1
+    assert float(run["effort_turn_upper"].abs().max()) > 0.1
     assert np.array_equal(one.series["v_Br"], run["v_x_upper"].numpy())
     assert "x_d" not in one.series
     assert ready.rig.actuators["turn_upper"].pushes == "upper.x"
@@ -443,7 +440,7 @@ def test_a_run_says_what_its_bracket_weighs(beside, tmp_path):
     assert record(Trajectory.load(tmp_path / "run.nc")).mass == 0.4
     model = coarse()
     run = simulate(model, times(0.01, 5), y0=press(model, 49.6e-3))
-    assert record(run).mass == model.settings.bracket.mass
+    assert record(run).mass == PAPER.bodies["bracket"].mass
 
 
 def test_objects_show_themselves_in_a_few_lines(motions):

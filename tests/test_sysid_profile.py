@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
-from conftest import COARSE, PAPER
+from conftest import COARSE, PAPER, excited
 
-from torchsoft.rigs.excite import Excitation, excite
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.profile import RISE, Optimum, profiles
@@ -100,11 +100,7 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in
     series."""
     roll = {"kind": "profile", "times": [0.1, 0.25], "values": [0.0, 4e-3], "offset": "start"}
-    built = (
-        excite(PAPER.override(COARSE), Excitation(roll, duration=0.25, depth=1.39e-3))
-        .override({"motion.y_d.times": [0.0, 0.1], "motion.F_ff.times": [0.0, 0.1]})
-        .build()
-    )
+    built = excited(Excitation(roll, duration=0.25, grasp=0.1), PAPER.override(COARSE))
     sensors = {
         name: sensor.model_copy(update={"noise": 4 * sensor.noise}) for name, sensor in RIG.items()
     }

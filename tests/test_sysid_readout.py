@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RUBBER, dry, f64, stroked
+from conftest import COARSE, PAPER, RUBBER, dry, excited, f64
 from scipy import stats
 from scipy.optimize import least_squares
 from test_sysid import check_derivatives
@@ -24,6 +24,7 @@ from torchsoft import (
     Rig,
     simulate,
 )
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import (
     Known,
     Prior,
@@ -52,7 +53,9 @@ FAULTY = {
 
 @pytest.fixture(scope="module")
 def strokes():
-    built = stroked(PAPER.override(COARSE), 8e-3, 0.15, 0.45, grasp=0.15, since=0.2)
+    roll = {"kind": "strokes", "travel": 8e-3, "stroke_time": 0.15}
+    motion = Excitation(roll, duration=0.45, grasp=0.15, since=0.2)
+    built = excited(motion, PAPER.override(COARSE))
     return record("strokes", built, {E: 0.9e6}, FAULTY)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RUBBER, dry, still, stroked
+from conftest import COARSE, PAPER, RUBBER, dry, excited, still, strokes
 from test_experiments import experiment
 from test_sysid import check_derivatives
 from torch import Tensor
@@ -42,7 +42,8 @@ Cut = tuple[Recording, Tensor]
 @pytest.fixture(scope="module")
 def cut():
     """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
-    built = stroked(PAPER.override(COARSE), 12e-3, 0.3, 0.86, grasp=0.2, since=0.25)
+    motion = strokes(12e-3, 0.3, duration=0.86, grasp=0.2, since=0.25)
+    built = excited(motion, PAPER.override(COARSE))
     model, y0, t = built
     at = np.arange(SINCE, float(t[-1]), 5e-3)
     run = built.run(torch.from_numpy(np.append(-SETTLE, at)), rtol=1e-6)
