@@ -103,7 +103,7 @@ class Setting:
 
 
 FRICTION, RUBBER = ("smooth", "coulomb"), ("kelvin_voigt", "solid")
-LIGHT = 0.9e-4
+LIGHT = 0.7e-4
 
 
 def roll(travel: float, since: float, until: float) -> dict[str, Any]:

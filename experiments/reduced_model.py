@@ -57,8 +57,11 @@ DEPTH = 2e-4
 """Of the light grasp [m]."""
 
 PAPER = RigFile.ready("paper")
-X_0, Y_D, F_FF = PAPER.bodies["disc"].start.x, 48.6e-3, PAPER.motion["F_ff"].values[-1]
-"""Place of the disc [m], and what holds the bracket in the grasp [m, N]."""
+X_0 = PAPER.bodies["disc"].start.x
+"""Place of the disc [m]."""
+
+COARSELY = COARSE | {"motion.F_ff.values": [0.0, -75.0]}
+"""Half of the usual mesh, with the force that holds its grasp [N]."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,8 @@ class Grasp:
 def settled(file: RigFile) -> Grasp:
     """The grasp in which the manipulation of a rig file begins."""
     grasp = file.override({"motion.x_d": {"kind": "hold"}}).build()
-    still = hold(x_d=X_0, y_d=Y_D, F_ff=F_FF)
+    y_d, F_ff = (file.motion[name].values[-1] for name in ("y_d", "F_ff"))
+    still = hold(x_d=X_0, y_d=y_d, F_ff=F_ff)
     return Grasp(grasp.rig, grasp.run([0.0, SETTLED]).y[-1], still)
 
 
@@ -202,7 +206,7 @@ def by_mechanics(e: dict[str, float]) -> dict[tuple[str, str], float]:
 
 
 def study_stick(config: Config) -> dict[str, Any]:
-    file = PAPER.override(COARSE if config.smoke else {})
+    file = PAPER.override(COARSELY if config.smoke else {})
     times = [config.scenario * time for time in file.motion["x_d"].times]
     whole = file.override({"motion.x_d.times": times}).build()
     grasp, time = settled(file), 5.0 * max(config.scenario, 0.2)
