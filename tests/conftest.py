@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchsoft import (
     Body,
     BuiltRig,
+    Profile,
     Reference,
     Rig,
     RigFile,
@@ -21,6 +22,7 @@ from torchsoft import (
     register_method,
 )
 from torchsoft.physics.state import State
+from torchsoft.rigs.excite import Excitation
 
 register_method()
 
@@ -54,9 +56,19 @@ def still(changes: Mapping[str, Any] | None = None, **parts: Any) -> Rig:
     return rig
 
 
-def excited(name: str, changes: Mapping[str, Any] | None = None, **how: Any) -> BuiltRig:
-    """The paper's rig under an excitation of the catalogue."""
-    return excite(PAPER.override(changes), name, **how).build()
+def excited(
+    excitation: str | Excitation, file: RigFile | None = None, F_ff: float | None = None, **how: Any
+) -> BuiltRig:
+    """The paper's rig, or that of a file of it, under an excitation; F_ff [N] is the force fed
+    forward to the bracket, by default that which holds it."""
+    made = excite(PAPER if file is None else file, excitation, **how)
+    return made.override({} if F_ff is None else {"motion.F_ff.values": [0.0, F_ff]}).build()
+
+
+def strokes(travel: float, stroke_time: float, **more: Any) -> Excitation:
+    """Strokes there and back [m, s]."""
+    roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
+    return Excitation(roll, **more)
 
 
 def rest(rig: Rig, x: float = 60e-3) -> Tensor:
@@ -64,9 +76,23 @@ def rest(rig: Rig, x: float = 60e-3) -> Tensor:
     return rig.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": "touch"})
 
 
-def press(rig: Rig, height: float = GRASPED) -> Tensor:
+def manipulate(model: Rig, force: float, **motions: nn.Module) -> Tensor:
+    """The paper's start at rest, after the model was given the paper's motion, with a force [N]
+    fed forward; or other motions."""
+    y0 = rest(model).detach()
+    top = float(model.unpack(y0).pose["bracket"][1])
+    own = {
+        "x_d": Profile([0.0, 10.0, 15.0, 25.0], [60e-3, 40e-3, 40e-3, 60e-3]),
+        "y_d": Profile([0.0, 0.375], [top, GRASPED]),
+        "F_ff": Profile([0.0, 0.375], [0.0, -force]),
+    }
+    model.reference = Reference(**own | motions)
+    return y0
+
+
+def press(rig: Rig, height: float = GRASPED, x: float = 60e-3) -> Tensor:
     """The paper's disc between its pads, with the bracket at a height [m], without friction."""
-    return rig.state(disc={"x": 60e-3, "y": "rest"}, bracket={"x": 60e-3, "y": height})
+    return rig.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": height})
 
 
 @torch.no_grad()
@@ -115,10 +141,12 @@ def f64(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def grasp(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tensor, Reference]:
-    """The frictionless grasp (size,) with the disc moving at `velocity` [m/s], and the reference
-    that holds it there."""
-    y = press(model).detach()
+def grasp(
+    model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **place: float
+) -> tuple[Tensor, Reference]:
+    """The frictionless grasp (size,) at a place as of `press`, with the disc moving at `velocity`
+    [m/s], and the reference that holds it there."""
+    y = press(model, **place).detach()
     pose = model.unpack(y).pose
     y[model.layout.slices["velocity", "disc"]] = f64(*velocity, 0.0)
     return y, hold(
@@ -126,9 +154,9 @@ def grasp(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tenso
     )
 
 
-def grasped(model: Rig, velocity: tuple[float, float] = (0.0, 0.0)) -> Tensor:
+def grasped(model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **place: float) -> Tensor:
     """The grasp, after the model was given the reference that holds it."""
-    y, model.reference = grasp(model, velocity)
+    y, model.reference = grasp(model, velocity, **place)
     return y
 
 
