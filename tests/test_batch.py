@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import COARSE, coarse, f64, grasped, still, times
 from torch import Tensor
 
 from torchsoft import (
     Batch,
     Circle,
     Reference,
+    Rig,
     SamplesFailed,
     SimulationFailed,
-    SoftGrasp,
     hold,
     simulate,
     simulate_batch,
@@ -35,7 +35,7 @@ def start():
     return model, torch.stack([y0, y0, y0])
 
 
-def alone(model: SoftGrasp, i: int, y0: Tensor, **options: Any) -> Any:
+def alone(model: Rig, i: int, y0: Tensor, **options: Any) -> Any:
     with torch.no_grad():
         for name, values in (("contact.K_n", K_n), ("contact.mu_s", mu_s)):
             model.parameter(name).fill_(values[i])
@@ -109,7 +109,7 @@ def test_sensitivities_are_stacked(start):
 def test_references_times_and_rigs_of_their_own(start):
     """Shorter runs end in NaN behind the mask; frozen steps go in one by one."""
     model, y0 = start
-    other = still(model.settings, shape=Circle(20.5e-3), reference=model.reference)
+    other = still(COARSE, shape=Circle(20.5e-3))
     references = [
         model.reference,
         hold(x_d=0.06, y_d=float(y0[0, model.layout.slices["pose", "bracket"]][-1]), F_ff=-50.0),

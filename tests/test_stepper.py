@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, grasped, times, towards
+from conftest import COARSE, coarse, grasped, paper, times, towards
 
-from torchsoft import (
-    Parameters,
-    Profile,
-    Reference,
-    Rig,
-    SimulationFailed,
-    SoftGrasp,
-    simulate,
-)
-from torchsoft.scenario import grasp_and_roll
+from torchsoft import Profile, Reference, Rig, SimulationFailed, simulate
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
 
@@ -22,7 +13,7 @@ from torchsoft.solve.stepper import ImplicitStepper
 def test_second_order_on_a_smooth_motion(fidelity):
     """A grasped disc set moving so gently that no node slips, touches or leaves: observed order >=
     1.8."""
-    model = coarse(pad__fidelity=fidelity)
+    model = coarse(pad__inertial=fidelity == "inertial")
     y0, t = grasped(model, (1e-4, 5e-5)), times(0.032, 2)
     place = lambda h: simulate(model, t, y0=y0, step=h).state.pose["disc"][-1, :2]
     fine = place(3.2e-2 / 2048)
@@ -33,11 +24,11 @@ def test_second_order_on_a_smooth_motion(fidelity):
 
 def test_an_unstable_loop_ends_in_an_error_that_says_so():
     """E = 60 kPa, tau = 5 ms with the paper's gains."""
-    model = still(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3})
+    built = paper(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3})
     with pytest.raises(
-        SimulationFailed, match=r"disc was lost at t = .* s: the closed loop is unstable"
+        SimulationFailed, match=r"the run was lost at t = .* s: the closed loop is unstable"
     ) as caught:
-        grasp_and_roll(model)
+        built.run(rtol=1e-4)
     assert 0 < caught.value.time < 1
     assert bool(torch.isfinite(caught.value.trajectory.y).all())
 
@@ -83,7 +74,7 @@ def test_the_adjoint_follows_halved_steps(monkeypatch):
     the same steps."""
     model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
     y0, t = grasped(model, (0.5, 0.0)), times(0.01, 6)
-    E = model.pad.E
+    E = model.parameter("pad.E")
 
     class Hasty(ImplicitStepper):
         def __init__(self, rig: Rig, reference: Reference | None = None, **options: float) -> None:
