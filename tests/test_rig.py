@@ -2,49 +2,42 @@
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, turning
+from conftest import COARSE, PAPER, coarse, f64, grasped, still, turning
 
 from torchsoft import (
     Body,
     Circle,
     Ellipse,
     Rig,
-    RoundedBox,
-    SoftGrasp,
     hold,
 )  # fmt: skip
-from torchsoft.paper.parameters import Parameters
-from torchsoft.paper.rig import NAMES
 
 # names
 # ----------------------------------------------------------------------
 
 
-def test_the_radius_of_a_box_is_not_the_discs():
-    """A box has a radius, too, that of its corners: it must not be read as the object's."""
-    model = still(shape=RoundedBox(20e-3, 19e-3, radius=5e-3))
-    assert model.settings.compression == PAPER.compression
-    with pytest.raises(ValueError, match=r"`disc\.radius` is not a parameter"):
-        model.parameter("disc.radius")
-    said = model.description()["parameters"]
-    assert "disc.radius" not in said
-    assert said["disc.shape.radius"] == 5e-3
-
-
-def test_parameters_have_the_names_of_the_settings():
-    """Every number of `Parameters` that is a module's parameter, read back where it is."""
-    model = coarse()
-    table = model.settings.table()
-    assert {name for name in NAMES if table[name]["value"] != model.parameter(name).item()} == set()
-    own = {own for own, p in model.named_parameters() if p.ndim == 0 and p.requires_grad}
-    assert own == {NAMES[name] for name in NAMES}
-    for name, module_name in NAMES.items():
-        assert (
-            model.parameter(name)
-            is model.parameter(module_name)
-            is model.get_parameter(module_name)
-        )
-    rolling = still({"contact.friction": "coulomb"})
+def test_parameters_have_the_names_of_the_file():
+    """Every number of the file that is a module's parameter, read back where it is, by its full
+    name and by its short one."""
+    model, file = coarse(), PAPER.override(COARSE)
+    own = {name: p for name, p in model.named_parameters() if p.ndim == 0 and p.requires_grad}
+    names = {full: name for full, name in model.names.items() if name in own}
+    table = file.table()
+    assert {
+        table[full]["value"] - model.parameter(full).item() for full in names.keys() & table.keys()
+    } == {0.0}
+    assert {name for name in own if name not in names.values()} <= table.keys() | {
+        "bodies.disc.inertia_ratio"
+    }
+    for full, name in names.items():
+        assert model.parameter(full) is model.parameter(name) is model.get_parameter(name)
+    shorts = {short: full for short, full in model.short.items() if "." in short}
+    assert len(shorts) == 18
+    for short, full in shorts.items():
+        assert model.parameter(short) is model.parameter(full)
+    rolling = still(
+        {"laws.steel_on_rubber.friction": {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}}
+    )
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
         rolling.parameter("contact.v_s")
 
@@ -88,7 +81,7 @@ def test_sizes_of_the_papers_rig():
     assert layout.size == 2 * (2 * 61 + 61) + 2 * 5
     assert layout.shapes["pads", "L"] == (1, 61, 2)
     assert layout.free == {"disc": [0, 1, 2], "bracket": [0, 1]}
-    inertial = coarse(pad__fidelity="inertial").layout
+    inertial = coarse(pad__inertial=True).layout
     assert (
         inertial.shapes["pads", "U"] == inertial.shapes["rates", "U"] == (122, 2)
     )  # two elements high, the base held

@@ -5,35 +5,21 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from conftest import RUBBER, coarse, dry, f64, turning
+from conftest import RUBBER, coarse, dry, f64, press, turning
 from torch import Tensor
 
-from torchsoft import (
-    Body,
-    Circle,
-    Contact,
-    NoEquilibrium,
-    Pad,
-    PadMesh,
-    Rig,
-    SoftGrasp,
-    press,
-)
-from torchsoft.paper.rig import NAMES
+from torchsoft import Body, Circle, Contact, NoEquilibrium, Pad, PadMesh, Rig
 from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import settled
 
-HEIGHT = 48.6e-3
-"""Of the bracket in the grasp [m]."""
 
-
-def shaken(model: SoftGrasp, seed: int = 0, stretch: float = 5e-5) -> State:
+def shaken(model: Rig, seed: int = 0, stretch: float = 5e-5) -> State:
     """The grasp with bodies displaced by tenths of a millimetre and stretched points, sticking and
     slipping; nothing moves."""
     generator, state = (
         torch.Generator().manual_seed(seed),
-        model.unpack(press(model, HEIGHT).detach()),
+        model.unpack(press(model).detach()),
     )
 
     def noise(like: Tensor) -> Tensor:
@@ -63,7 +49,7 @@ def rates(rig: Rig, y: Tensor) -> float:
 @pytest.mark.parametrize("points", [0, 2])
 def test_pads_settled_around_the_grasp_are_those_of_statics(points):
     model = coarse(contact__points=points)
-    y = press(model, HEIGHT).detach()
+    y = press(model).detach()
     assert float((around(model, model.unpack(y)) - y).detach().abs().max()) < 1e-10  # [N]
 
 
@@ -104,7 +90,8 @@ def test_derivatives_are_those_of_differences():
 
     def value(by: dict[str, Tensor]) -> Tensor:
         scaled = {
-            f"model.{NAMES[n]}": model.parameter(n).detach() * (1 + h)
+            f"model.{model.names.get(model.full(n), model.full(n))}": model.parameter(n).detach()
+            * (1 + h)
             for n, h in by.items()
             if "." in n
         }
@@ -157,7 +144,7 @@ def test_refusals():
     model = coarse()
     state = shaken(model)
     with pytest.raises(NotImplementedError, match="inertial"):
-        around(coarse(pad__fidelity="inertial"), state)
+        around(coarse(pad__inertial=True), state)
     unknown = state.stretch | {"L": torch.full((61,), torch.nan).double()}
     far = {name: torch.full_like(s, 1e-3) for name, s in state.stretch.items()}
     away = state.pose | {"disc": f64(0.06, 0.01, 0.0)}
