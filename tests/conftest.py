@@ -142,11 +142,11 @@ def f64(*values: float) -> Tensor:
 
 
 def grasp(
-    model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **where: float
+    model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **place: float
 ) -> tuple[Tensor, Reference]:
-    """The frictionless grasp (size,) with the disc moving at `velocity` [m/s], and the reference
-    that holds it there."""
-    y = press(model, **where).detach()
+    """The frictionless grasp (size,) at a place as of `press`, with the disc moving at `velocity`
+    [m/s], and the reference that holds it there."""
+    y = press(model, **place).detach()
     pose = model.unpack(y).pose
     y[model.layout.slices["velocity", "disc"]] = f64(*velocity, 0.0)
     return y, hold(
@@ -154,9 +154,9 @@ def grasp(
     )
 
 
-def grasped(model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **where: float) -> Tensor:
+def grasped(model: Rig, velocity: tuple[float, float] = (0.0, 0.0), **place: float) -> Tensor:
     """The grasp, after the model was given the reference that holds it."""
-    y, model.reference = grasp(model, velocity, **where)
+    y, model.reference = grasp(model, velocity, **place)
     return y
 
 

@@ -8,6 +8,7 @@ from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
 from skfem.helpers import ddot, div, dot, sym_grad
 from torch import Tensor
 
+from torchsoft import Pad
 from torchsoft.physics.mesh import Array, lame_moduli
 
 CM_HEIGHT = 2.18e-3
@@ -58,23 +59,25 @@ def oracle(x: Array, y: Array, centred: bool = True) -> tuple[Array, Array, Arra
     return K_lambda, K_mu, M
 
 
-def world_stiffness(p: PadNumbers, which: str) -> tuple[Array, Array]:
+def world_stiffness(pad: Pad) -> tuple[Array, Array]:
     """Positions [m] (n, 2) and dense stiffness [N/m] of a pad's free nodes, meshed where it stands
     in the world."""
-    if which == "L":
+    p, rubber = pad.mesh, pad.material
+    if pad.base is None:
         left, base, top = 0.0, 0.0, p.height
     else:
         left, base, top = -p.length / 2, -CM_HEIGHT, -CM_HEIGHT - p.height
     x = np.linspace(left, left + p.length, p.elements_x + 1)
     y = np.linspace(min(base, top), max(base, top), p.elements_y + 1)
     K_lambda, K_mu, _ = oracle(x, y)
-    lame_lambda, lame_mu = lame_moduli(p.E, p.nu)
+    lame_lambda, lame_mu = lame_moduli(rubber.E.item(), rubber.nu.item())
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
     held = nodes[:, 1] == base
-    if which == "U" and p.enclosed:
+    if p.bonded_sides:
         held |= (nodes[:, 0] == x[0]) | (nodes[:, 0] == x[-1])
     dofs = (2 * np.flatnonzero(~held)[:, None] + np.arange(2)).ravel()
-    return nodes[~held], p.depth * (lame_lambda * K_lambda + lame_mu * K_mu)[dofs][:, dofs]
+    K = rubber.depth.item() * (lame_lambda * K_lambda + lame_mu * K_mu)
+    return nodes[~held], K[dofs][:, dofs]
 
 
 def matching(positions: Tensor, nodes: Array) -> Array:

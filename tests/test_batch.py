@@ -110,7 +110,6 @@ def test_references_times_and_rigs_of_their_own(start):
     """Shorter runs end in NaN behind the mask; frozen steps go in one by one."""
     model, y0 = start
     other = still(COARSE, shape=Circle(20.5e-3))
-    other.reference = model.reference
     references = [
         model.reference,
         hold(x_d=0.06, y_d=float(y0[0, model.layout.slices["pose", "bracket"]][-1]), F_ff=-50.0),

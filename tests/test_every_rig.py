@@ -361,9 +361,9 @@ def test_efforts_of_a_policy_are_those_of_its_module():
     wanted = rig.actuators["x"].law.module(setpoints, poses).detach()
     wanted[:, 1] += run["F"]
     for i, name in enumerate(PUSHES):
-        assert torch.allclose(run[f"F_{name}"], wanted[:, i], rtol=1e-12, atol=1e-12)
+        assert torch.allclose(run[f"effort_{name}"], wanted[:, i], rtol=1e-12, atol=1e-12)
         assert float(wanted[:, i].abs().max()) > 0.1
-    assert (run.units["theta_d"], run.units["F_turn"], run.units["y_d"]) == ("rad", "N.m", "m")
+    assert (run.units["theta_d"], run.units["effort_turn"], run.units["y_d"]) == ("rad", "N.m", "m")
 
 
 def test_knots_with_a_graph_receive_their_gradient():

@@ -5,7 +5,7 @@ from types import MappingProxyType
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import GRASPED, coarse, f64, grasped, times
 from rig_tester import assert_gradients_exact
 from torch import Tensor
 
@@ -18,11 +18,11 @@ Window = tuple[Rig, Tensor, float]
 
 
 def window(
-    duration: float, velocity: tuple[float, float] = (0.0, 0.0),
-    where: Mapping[str, float] = MappingProxyType({}), **changes: object,
+    duration: float, velocity: tuple[float, float] = (0.0, 0.0), height: float = GRASPED,
+    x: float = 60e-3, **changes: object,
 ) -> Window:  # fmt: skip
     model = coarse(**changes)
-    return model, grasped(model, velocity, **where), duration
+    return model, grasped(model, velocity, height=height, x=x), duration
 
 
 SLIPPERY = {"contact__mu_s": 0.3, "contact__mu_k": 0.2}
@@ -31,7 +31,7 @@ SLIPPERY = {"contact__mu_s": 0.3, "contact__mu_k": 0.2}
 def jerk() -> Window:
     """A light grasp, the horizontal loop about the bracket, and the bracket far from where that
     loop wants it."""
-    made = window(6e-3, where={"height": 49.7e-3}, control__senses="bracket.x", **SLIPPERY)
+    made = window(6e-3, height=49.7e-3, control__senses="bracket.x", **SLIPPERY)
     with torch.no_grad():
         made[0].reference["x_d"].values += 2e-3
     return made
@@ -40,7 +40,7 @@ def jerk() -> Window:
 WINDOWS = {
     "stick": lambda: window(4e-3, (1e-2, 5e-3)),
     "slip": lambda: window(2e-3, (0.08, 0.0), **SLIPPERY),
-    "make-break": lambda: window(2e-3, (0.3, -0.02), {"x": 0.0609}),
+    "make-break": lambda: window(2e-3, (0.3, -0.02), x=0.0609),
     "jerk": jerk,
 }
 

@@ -4,29 +4,40 @@ import pytest
 import torch
 from conftest import COARSE, PAPER, coarse, f64, grasped, still, turning
 
-from torchsoft import Body, Circle, Ellipse, Rig, RoundedBox, hold
+from torchsoft import (
+    Body,
+    Circle,
+    Ellipse,
+    Rig,
+    hold,
+)  # fmt: skip
 
 # names
 # ----------------------------------------------------------------------
 
 
-def test_the_radius_of_a_box_is_not_the_discs():
-    """A box has a radius, too, that of its corners."""
-    model = still(shape=RoundedBox(20e-3, 19e-3, radius=5e-3))
-    assert model.description()["parameters"]["bodies.disc.shape.radius"] == 5e-3
-
-
 def test_parameters_have_the_names_of_the_file():
-    """Every parameter stands in the file's tables; by its full name, its short one and that of the
-    module it is the same tensor."""
-    model, table = coarse(), PAPER.override(COARSE).table()
-    for name, module_name in model.aliases.items():
-        assert model.parameter(name) is model.get_parameter(module_name)
-        if name in table:
-            assert model.parameter(name).item() == table[name]["value"]
-    for short, name in model.short.items():
-        assert name not in model.aliases or model.parameter(short) is model.parameter(name)
-    sharp = still({"laws.steel_on_rubber.friction": {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}})
+    """Every number of the file that is a module's parameter, read back where it is, by its full
+    name and by its short one."""
+    model, file = coarse(), PAPER.override(COARSE)
+    own = {name: p for name, p in model.named_parameters() if p.ndim == 0 and p.requires_grad}
+    names = {full: name for full, name in model.names.items() if name in own}
+    table = file.table()
+    assert {
+        table[full]["value"] - model.parameter(full).item() for full in names.keys() & table.keys()
+    } == {0.0}
+    assert {name for name in own if name not in names.values()} <= table.keys() | {
+        "bodies.disc.inertia_ratio"
+    }
+    for full, name in names.items():
+        assert model.parameter(full) is model.parameter(name) is model.get_parameter(name)
+    shorts = {short: full for short, full in model.short.items() if "." in short}
+    assert len(shorts) == 18
+    for short, full in shorts.items():
+        assert model.parameter(short) is model.parameter(full)
+    rolling = still(
+        {"laws.steel_on_rubber.friction": {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}}
+    )
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
         sharp.parameter("contact.v_s")
 

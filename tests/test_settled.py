@@ -13,16 +13,13 @@ from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import settled
 
-HEIGHT = 48.6e-3
-"""Of the bracket in the grasp [m]."""
-
 
 def shaken(model: Rig, seed: int = 0, stretch: float = 5e-5) -> State:
     """The grasp with bodies displaced by tenths of a millimetre and stretched points, sticking and
     slipping; nothing moves."""
     generator, state = (
         torch.Generator().manual_seed(seed),
-        model.unpack(press(model, HEIGHT).detach()),
+        model.unpack(press(model).detach()),
     )
 
     def noise(like: Tensor) -> Tensor:
@@ -52,7 +49,7 @@ def rates(rig: Rig, y: Tensor) -> float:
 @pytest.mark.parametrize("points", [0, 2])
 def test_pads_settled_around_the_grasp_are_those_of_statics(points):
     model = coarse(contact__points=points)
-    y = press(model, HEIGHT).detach()
+    y = press(model).detach()
     assert float((around(model, model.unpack(y)) - y).detach().abs().max()) < 1e-10  # [N]
 
 

@@ -1,34 +1,40 @@
 """Steps by tolerance: accuracy, dense output, frozen steps and their gradients, and what cannot be
 met."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from conftest import GRASPED, coarse, f64, grasped, manipulate, times, towards
+from conftest import COARSE, coarse, f64, grasped, paper, times, towards
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import SimulationFailed, Trajectory, simulate
+from torchsoft import Rig, SimulationFailed, Trajectory, simulate
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.solve.steps import given_steps
 
 T = times(0.4, 9)
 
 
-def quick(grasp: float) -> dict[str, Profile]:
-    """The paper's grasp within another time [s]."""
-    top = 49.994e-3
-    y_d = Profile([0.0, grasp], [top, GRASPED])
-    return {"y_d": y_d, "F_ff": Profile([0.0, grasp], [0.0, -80.0])}
+def quick(grasp_time: float, changes: dict[str, Any]) -> tuple[Rig, Tensor]:
+    """The paper's manipulation on a coarse mesh, that grasps within a time [s] by 80 N."""
+    grasp = {f"motion.{name}.times": [0.0, grasp_time] for name in ("y_d", "F_ff")}
+    model, y0, _ = paper(COARSE | {"motion.F_ff.values": [0.0, -80.0]} | grasp | changes)
+    return model, y0
 
 
 @pytest.fixture(scope="module")
 def start():
     """The paper's manipulation on a coarse mesh, quickened: its touch-down and grasp within 0.3
     s."""
-    model = coarse()
-    y0 = manipulate(model, 80.0, x_d=Profile([0.0, 0.5], [60e-3, 64e-3]), **quick(0.25))
-    return model, y0
+    return quick(
+        0.25,
+        {
+            "motion.x_d.times": [0.0, 0.5, 0.6, 1.1],
+            "motion.x_d.values": ["start", 56e-3, 56e-3, 60e-3],
+        },
+    )
 
 
 @pytest.fixture(scope="module")
@@ -207,8 +213,7 @@ def test_no_step_passes_a_knot_of_the_reference():
 
 
 def test_inertial_pads_take_steps_by_tolerance():
-    model = coarse(pad__inertial=True)
-    y0 = manipulate(model, 80.0, **quick(0.1))
+    model, y0 = quick(0.1, {"pad.inertial": True})
     t = times(0.15, 7)
     loose, tight = (simulate(model, t, y0=y0, rtol=rtol) for rtol in (1e-3, 1e-5))
     assert float((loose["y_C"] - tight["y_C"]).abs().max()) < 1e-6
