@@ -1,8 +1,5 @@
 """Gradients of runs: finite differences in every regime of contact; reproducible to the bit."""
 
-from collections.abc import Mapping
-from types import MappingProxyType
-
 import pytest
 import torch
 from conftest import GRASPED, coarse, f64, grasped, times

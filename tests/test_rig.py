@@ -4,13 +4,7 @@ import pytest
 import torch
 from conftest import COARSE, PAPER, coarse, f64, grasped, still, turning
 
-from torchsoft import (
-    Body,
-    Circle,
-    Ellipse,
-    Rig,
-    hold,
-)  # fmt: skip
+from torchsoft import Body, Circle, Ellipse, Rig, hold
 
 # names
 # ----------------------------------------------------------------------

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, excited, strokes
+from conftest import COARSE, PAPER, RIG, excited, stroked, waves
 
 from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.sysid import (
-    RIG,
     Problem,
     Recording,
     Sensor,
@@ -54,10 +53,10 @@ TRUSTED: dict[str, Any] = {"assumptions": "trusted"}
 """Nothing but the fit."""
 SENSORS = RIG
 RATIO = "contact.mu_k / contact.mu_s"
-GRASP: dict[str, Any] = {"grasp_time": 0.2, "settle": 0.05, "senses": "bracket"}
-STROKES = strokes(travel=8e-3, stroke_time=0.2, duration=0.65, **GRASP)
+GRASP: dict[str, Any] = {"grasp": 0.2, "since": 0.25}
+STROKES = stroked(travel=8e-3, stroke_time=0.2, duration=0.65, **GRASP)
 SHAKE = Excitation(
-    motion=MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2, 12)),
+    *waves(6e-3, 1e-4, (2, 12)),
     duration=0.65,
     depth=8e-4,
     **GRASP,
@@ -128,7 +127,7 @@ def check_derivatives(
     )
 
 
-SHORT = strokes(travel=8e-3, stroke_time=0.1, duration=0.25, grasp_time=0.1, settle=0.0)
+SHORT = stroked(travel=8e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.1)
 
 
 @pytest.mark.parametrize("fidelity", ["massless", pytest.param("inertial", marks=pytest.mark.slow)])
@@ -182,7 +181,7 @@ def rest_known() -> dict[str, Unknown]:
 
 
 def test_what_the_data_do_not_determine_is_not_a_number():
-    gentle = strokes(travel=1e-3, stroke_time=0.4, duration=0.65, **GRASP)
+    gentle = stroked(travel=1e-3, stroke_time=0.4, duration=0.65, **GRASP)
     data = record("gentle", excited(gentle, BASE), {}, SENSORS, seed=1)
     answer = identify(
         Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), rtol=RTOL,
@@ -232,7 +231,7 @@ def test_a_regular_grid_between_the_samples_changes_nothing(strokes):
 def shaking():
     """Hard, by fine steps, without noise."""
     hard = Excitation(
-        motion=MultiSine(amplitude_x=4e-3, amplitude_y=2e-4, frequency=(10, 40)),
+        *waves(4e-3, 2e-4, (10, 40)),
         duration=0.65,
         **GRASP,
     )

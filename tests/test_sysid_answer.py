@@ -14,10 +14,10 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, still, times
+from conftest import COARSE, PAPER, excited, still, stroked, times
 from test_sysid_friction import Viscous
 
-from torchsoft import Rig, simulate
+from torchsoft import Rig, RigFile, simulate
 from torchsoft.physics.motion import Reference
 from torchsoft.sysid import (
     IdentificationResult,
@@ -43,7 +43,7 @@ SENSORS = {
     "y_Br": Sensor(noise=1e-5),
     "F_y": Sensor(noise=0.1),
 }
-GRASP = strokes(, duration=0.25, depth=1.2e-3, grasp_time=0.15)
+GRASP = stroked(10e-3, 1.0, duration=0.25, depth=1.2e-3, grasp=0.15, since=0.275)
 UNKNOWNS = {
     "contact.R_n": Unknown(per="recording"), "pad.E": Unknown(), "contact.v_s": Unknown(),
     "pad.tau": Unknown(prior=Prior(median=0.01, sd=0.3, kind="log-normal")),
@@ -304,7 +304,7 @@ def slippery(problem, result):
     )  # fmt: skip
 
 
-def slide(settings: Parameters, reference: Reference) -> Rig:
+def slide(settings: RigFile, reference: Reference) -> Rig:
     return still(settings, reference, friction=Viscous(0.6, 30.0))
 
 
@@ -316,7 +316,7 @@ def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
         answer.model()
     mine, weak = (
         slide(BASE, reference),
-        r"only where the search ended: contact\.friction\.alpha = 0\.663$",
+        r"only where the search ended: laws\.steel_on_rubber\.friction\.alpha = 0\.663$",
     )
     with pytest.warns(UserWarning, match=weak) as caught:
         its = answer.applied_to(mine)
@@ -325,8 +325,14 @@ def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
         own = slippery.model()
     for name, value in own.named_parameters():
         assert torch.equal(its.parameter(name), value), name
-    assert float(its.parameter("pad.E").detach()) == slippery["pad.E"].last != BASE.pad.E
-    assert float(mine.parameter("pad.E").detach()) == BASE.pad.E  # it is a copy that was changed
+    assert (
+        float(its.parameter("pad.E").detach())
+        == slippery["pad.E"].last
+        != BASE.materials["rubber"].E
+    )
+    assert (
+        float(mine.parameter("pad.E").detach()) == BASE.materials["rubber"].E
+    )  # it is a copy that was changed
     another = slide(BASE.override({"pad.nu": 0.4}), reference)
     with (
         pytest.warns(UserWarning, match=weak),
@@ -334,7 +340,7 @@ def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
     ):
         answer.applied_to(another)
     with pytest.raises(
-        ValueError, match=r"`contact\.friction\.alpha` is not a parameter of this rig"
+        ValueError, match=r"`laws\.steel_on_rubber\.friction\.alpha` is not a parameter of this rig"
     ):
         answer.applied_to(still(BASE))
 

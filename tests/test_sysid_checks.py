@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, excited, strokes
+from conftest import COARSE, PAPER, RIG, excited, stroked
 
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import (
-    RIG,
     Problem,
     Recording,
     Sensor,
@@ -63,8 +62,8 @@ from torchsoft.sysid.suspects import assumption_notices
 
 BASE = PAPER.override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
-STROKES = strokes(travel=8e-3, stroke_time=0.2, duration=0.9)
-BRIEF = strokes(travel=8e-3, stroke_time=0.15, duration=0.3, grasp_time=0.12, settle=0.03)
+STROKES = stroked(travel=8e-3, stroke_time=0.2, duration=0.9)
+BRIEF = stroked(travel=8e-3, stroke_time=0.15, duration=0.3, grasp=0.12, since=0.15)
 SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 RTOL = 1e-4
 
@@ -194,7 +193,7 @@ def test_a_finer_mesh_is_asked_for_by_data_that_one_made():
     assert any("elements" in sentence for sentence in assumption_notices(found))
 
 
-LIGHT = strokes(travel=30e-3, stroke_time=0.15, duration=0.9, depth=3e-4)
+LIGHT = stroked(travel=30e-3, stroke_time=0.15, duration=0.9, depth=3e-4)
 QUIET = {name: Sensor(noise=0.2 * one.noise) for name, one in SENSORS.items()}
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import COARSE, PAPER, excited, strokes
+from conftest import COARSE, PAPER, excited, stroked
 from test_sysid_noise import made
 
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
@@ -17,7 +17,7 @@ from torchsoft.sysid.runs import Runner
 BASE = PAPER.override(COARSE)
 TRUTH = {"pad.E": 0.8e6, "pad.tau": 0.011}
 NOISE = {"x_C": 1e-5, "theta": 5e-4, "F_x": 0.1}
-STROKES = strokes(travel=8e-3, stroke_time=0.2, duration=0.6)
+STROKES = stroked(travel=8e-3, stroke_time=0.2, duration=0.6)
 AR = Autoregression.stated((0.8,), 5e-3)
 STAGE = Stage("all", ("strokes",), ("pad.E", "pad.tau"), 1e-4)
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE, PAPER, excited, still, strokes, towards
+from conftest import COARSE, PAPER, RIG, excited, rolled, still, stroked, towards
 from scipy import stats
 from test_sysid_friction import Viscous
 
-from torchsoft import Profile, Reference, Rig
+from torchsoft import Profile, Reference, Rig, RigFile, excite
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
+from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Density, LawFit, compare, density, judged, ratio, versus
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import Part
@@ -136,26 +136,26 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
 
 BASE = PAPER.override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
 SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
-BRIEF: dict[str, Any] = {"duration": 0.4, "grasp_time": 0.15, "settle": 0.05}
-STROKE = strokes(travel=25e-3, stroke_time=0.15, depth=2e-4, **BRIEF)
-GENTLE = Excitation(motion=Roll(travel=1e-3), depth=1e-3, **BRIEF)
+BRIEF: dict[str, Any] = {"duration": 0.4, "grasp": 0.15, "since": 0.2}
+STROKE = stroked(travel=25e-3, stroke_time=0.15, depth=2e-4, **BRIEF)
+GENTLE = Excitation(rolled(1e-3, 0.4, 0.2), depth=1e-3, **BRIEF)
 UNKNOWNS = {
     "smooth": {"contact.mu_s": Unknown(low=0.4, high=1.2),
     "contact.mu_k": Unknown(ratio_to="contact.mu_s", low=0.4, high=0.9)},
-    "viscous": {"contact.friction.alpha": Unknown(low=0.3, high=1.2)},
+    "viscous": {"laws.steel_on_rubber.friction.alpha": Unknown(low=0.3, high=1.2)},
 }  # fmt: skip
 
 
-def viscous(settings: Parameters, reference: Reference) -> Rig:
+def viscous(settings: RigFile, reference: Reference) -> Rig:
     return still(settings, reference, friction=Viscous(0.6, 5.0))
 
 
-BUILDS = {"smooth": Rig, "viscous": viscous}
+BUILDS = {"smooth": still, "viscous": viscous}
 
 
 def laws(recording: Recording, excitation: Excitation) -> dict[str, Problem]:
     """The library's law and a user's own, given the same recording."""
-    p, reference = excitation.settings(BASE), recording.rig.reference
+    p, reference = excite(BASE, excitation), recording.rig.reference
     return {
         name: Problem([replace(recording, rig=build(p, reference))], SENSORS, UNKNOWNS[name])
         for name, build in BUILDS.items()
@@ -180,14 +180,16 @@ def plans(problems: dict[str, Problem]) -> dict[str, list[Stage]]:
 
 @pytest.fixture(scope="module")
 def stroke():
-    return made(STROKE, viscous, {"contact.friction.alpha": 0.55})
+    return made(STROKE, viscous, {"laws.steel_on_rubber.friction.alpha": 0.55})
 
 
 def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
     found = compare(stroke, plans=plans(stroke))
     assert (found.outcome, found.law) == ("law", "viscous"), found.verdict
     assert found["viscous"].weight > 0.999 > found["viscous"].p > 1e-3
-    assert found["viscous"].estimates["contact.friction.alpha"] == pytest.approx(0.55, rel=0.02)
+    assert found["viscous"].estimates["laws.steel_on_rubber.friction.alpha"] == pytest.approx(
+        0.55, rel=0.02
+    )
     assert found["smooth"].bic - found["viscous"].bic > 20
     found.save(tmp_path / "comparison.json")
     assert json.loads((tmp_path / "comparison.json").read_text())["law"] == "viscous"
@@ -195,7 +197,7 @@ def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
 
 
 def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another():
-    problems = made(GENTLE, viscous, {"contact.friction.alpha": 0.6})
+    problems = made(GENTLE, viscous, {"laws.steel_on_rubber.friction.alpha": 0.6})
     found = compare(problems, plans=plans(problems))
     assert (found.outcome, found.law) == ("cannot tell", None), found.verdict
     assert found.against[0].distance < 4
@@ -217,7 +219,7 @@ def test_laws_that_were_not_given_the_same_data_are_refused(stroke):
         ({"b": other(name="two")}, {}, "`a` and `b` have other recordings: one and two"),
         ({"b": other(samples=noisier)}, {}, "`one` of the laws `a` and `b` has other samples"),
         ({"b": other({"x_C": SENSORS["x_C"]})}, {}, "have other sensors"),
-        ({"b": other(rig=still(STROKE.settings(BASE), moved))}, {},
+        ({"b": other(rig=still(excite(BASE, STROKE), moved))}, {},
          "follow another reference in recording `one`"),
         ({"b": p}, {"heldout": ["one"]}, r"`heldout` must name some of \['one'\], but not all"),
         ({"b": p}, {"plans": elsewhere}, "the last stage of the plan of `a` must fit one"),

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, excited, grasp, turning
+from conftest import COARSE, PAPER, RIG, excited, grasp, turning
 
 from torchsoft import Profile, Reference
 from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.rigs.excite import Excitation
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.design import BENT, design, rank
 from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
@@ -24,8 +24,10 @@ from torchsoft.sysid.runs import Runner
 
 P = PAPER.override(COARSE)
 PLAN = Excitation(
-    motion=Knots(x=((0.05, 1e-3), (0.1, -0.5e-3)), y=((0.06, -2e-4), (0.1, 1e-4))),
-    duration=0.25, grasp_time=0.1, settle=0.02, depth=1e-3,
+    {"kind": "profile", "times": [0.12, 0.17, 0.22], "values": [0.0, 1e-3, -0.5e-3],
+     "offset": "start"},
+    {"times": [0.0, 0.1, 0.12, 0.18, 0.22], "values": [0.0, -1e-3, -1e-3, -1.2e-3, -0.9e-3]},
+    duration=0.25, grasp=0.1, since=0.12, depth=1e-3,
 )  # fmt: skip
 BOUNDS = {
     "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13, shortest=0.02),

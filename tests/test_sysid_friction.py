@@ -8,29 +8,29 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from conftest import COARSE, PAPER, excited, still, strokes
+from conftest import COARSE, PAPER, RIG, excited, still, stroked
 from test_sysid import check_derivatives
 from torch import Tensor, nn
 
-from torchsoft import Reference, Rig
+from torchsoft import Reference, Rig, RigFile, excite
 from torchsoft.physics.contact import SlipLaw
 from torchsoft.physics.shapes import parameter
-from torchsoft.sysid import RIG, Problem, Recording, Stage, Unknown, identify, record
+from torchsoft.sysid import Problem, Recording, Stage, Unknown, identify, record
 
 BASE = PAPER.override(COARSE)
 SENSORS = {
     name: RIG[name].model_copy(update={"noise": 0.7 * RIG[name].noise})
     for name in ("x_C", "theta", "F_x")
 }
-JERKS = strokes(
+JERKS = stroked(
     travel=30e-3,
     stroke_time=0.1,
     duration=0.6,
     depth=5e-4,
-    grasp_time=0.2,
-    settle=0.05,
+    grasp=0.2,
+    since=0.25,
 )
-TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 200.0}
+TRUTH = {"laws.steel_on_rubber.friction.alpha": 0.45, "laws.steel_on_rubber.friction.beta": 200.0}
 
 
 class Viscous(nn.Module):
@@ -44,20 +44,20 @@ class Viscous(nn.Module):
         return (E - self.alpha * F_N).clamp(min=0.0) / (R + self.beta * F_N)
 
 
-def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> Rig:
+def rig(settings: RigFile, reference: Reference, alpha: float = 0.6) -> Rig:
     return still(settings, reference, friction=Viscous(alpha, 100.0))
 
 
-def built(recording: Recording, build: Callable[[Parameters, Reference], Rig]) -> Recording:
+def built(recording: Recording, build: Callable[[RigFile, Reference], Rig]) -> Recording:
     """The same samples, of another rig."""
-    return replace(recording, rig=build(recording.rig.settings, recording.rig.reference))
+    return replace(recording, rig=build(excite(BASE, JERKS), recording.rig.reference))
 
 
 @pytest.fixture(scope="module")
 def jerks():
     """Without noise, of the true law; the recording's own model has other numbers."""
     planned = excited(JERKS, BASE)
-    planned = planned._replace(rig=rig(planned.rig.settings, planned.rig.reference))
+    planned = replace(planned, rig=rig(excite(BASE, JERKS), planned.rig.reference))
     return record("jerks", planned, TRUTH | {"pad.E": 0.9e6}, SENSORS, noise=0.0)
 
 
@@ -73,13 +73,19 @@ def test_its_parameters_are_found_beside_those_of_the_pads(jerks):
         assert abs(answer[name].last / value - 1) < 0.1 * answer[name].relative_sd, (
             name
         )  # of the steps, which differ
-    assert answer["contact.friction.alpha"].unit == ""
+    assert answer["laws.steel_on_rubber.friction.alpha"].unit == ""
 
 
 def test_its_derivatives_by_both_routes_are_those_of_differences(jerks):
-    slack = {"contact.friction.beta": Unknown(scale="linear", nominal=1.0, low=0.0, high=100.0)}
+    slack = {
+        "laws.steel_on_rubber.friction.beta": Unknown(
+            scale="linear", nominal=1.0, low=0.0, high=100.0
+        )
+    }
     ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}
-    problem = Problem([jerks], SENSORS, {"contact.friction.alpha": Unknown()} | slack | ratio)
+    problem = Problem(
+        [jerks], SENSORS, {"laws.steel_on_rubber.friction.alpha": Unknown()} | slack | ratio
+    )
     check_derivatives(problem, problem.coordinates.start, 3e-5, 2e-4)
 
 
@@ -91,7 +97,7 @@ def test_it_can_be_sent_to_another_process(jerks):
 
 def test_only_what_the_model_has_can_be_identified(jerks):
     assert {*TRUTH, "pad.E", "control.R_99", "disc.radius"} <= set(jerks.parameters)
-    for name in ("contact.mu_s", "contact.friction.gamma"):
+    for name in ("contact.mu_s", "laws.steel_on_rubber.friction.gamma"):
         with pytest.raises(
             ValueError, match=f"`{name}` cannot be identified; .*contact.friction.alpha"
         ):
@@ -100,14 +106,14 @@ def test_only_what_the_model_has_can_be_identified(jerks):
     with pytest.raises(
         ValueError, match=r"contact\.friction\.alpha = -1 is not on a logarithmic scale"
     ):
-        Problem([negative], SENSORS, {"contact.friction.alpha": Unknown()})
+        Problem([negative], SENSORS, {"laws.steel_on_rubber.friction.alpha": Unknown()})
 
 
 def frictionless(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
     return E / R
 
 
-def plain(settings: Parameters, reference: Reference, law: SlipLaw = frictionless) -> Rig:
+def plain(settings: RigFile, reference: Reference, law: SlipLaw = frictionless) -> Rig:
     return still(settings, reference, friction=law)
 
 

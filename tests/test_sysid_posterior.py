@@ -9,11 +9,11 @@ import threading
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
-from conftest import COARSE, PAPER, excited
+from conftest import COARSE, PAPER, RIG, excited, rolled
 from scipy import stats
 
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, record
+from torchsoft.sysid import Prior, Problem, Sensor, Unknown, record
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.posterior import Whitened, laplace, nuts
 from torchsoft.sysid.profile import Optimum
@@ -203,7 +203,7 @@ def rolling():
     """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a
     saturated sensor."""
     base = PAPER.override(COARSE)
-    roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
+    roll = Excitation(rolled(4e-3, 0.25, 0.1), duration=0.25, grasp=0.1)
     sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
     data = record("roll", excited(roll, base), {}, sensors, noise=0.0)
     prior = Prior(median=0.75e6, sd=0.1, kind="log-normal")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, excited, paper_settings, still, strokes
+from conftest import COARSE, PAPER, RIG, excited, paper_settings, rolled, still, stroked, waves
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
@@ -18,7 +18,7 @@ from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid import Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prechecks import (
     accepted,
@@ -41,15 +41,13 @@ FAR = {
 """How far the truth is from where a fit would start."""
 
 MOTIONS = {
-    "rolling": strokes(travel=15e-3, stroke_time=0.2, duration=0.9,
-    grasp_time=0.2, settle=0.05), "shaking": Excitation(
-        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.9,
-        depth=4e-4, grasp_time=0.2
+    "rolling": stroked(travel=15e-3, stroke_time=0.2, duration=0.9,
+    grasp=0.2, since=0.25), "shaking": Excitation(
+        *waves(6e-3, 2e-4, (4.0, 17.0)), duration=0.9,
+        depth=4e-4, grasp=0.2, since=0.325
     ),
-    "pressing": Excitation(motion=Press(amplitude=5e-4, frequency=12.0, travel=10e-3), duration=0.9,
-    grasp_time=0.2), "about the disc": strokes(travel=8e-3, stroke_time=0.25, duration=0.9, grasp_time=0.2, settle=0.05,
-        senses="disc", x_C0=60e-3
-    ),
+    "pressing": Excitation(rolled(10e-3, 0.9, 0.325), {"kind": "sines", "components":
+    [{"amplitude": 5e-4, "frequency": 12.0}]}, duration=0.9, grasp=0.2, since=0.325), "about the disc": stroked(travel=8e-3, stroke_time=0.25, duration=0.9, grasp=0.2, since=0.25),
 }  # fmt: skip
 
 

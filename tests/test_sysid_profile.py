@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
-from conftest import COARSE, PAPER, excited
+from conftest import COARSE, PAPER, RIG, excited
 
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
+from torchsoft.sysid import Problem, Stage, Unknown, identify, record
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.profile import RISE, Optimum, profiles
 

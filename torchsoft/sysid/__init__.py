@@ -9,11 +9,10 @@ from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.result import IdentificationResult, load_answer
-from torchsoft.sysid.synthetic import RIG, record
+from torchsoft.sysid.synthetic import good_sensors, record
 from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
 
 __all__ = [
-    "RIG",
     "Estimate",
     "IdentificationResult",
     "Known",
@@ -30,5 +29,6 @@ __all__ = [
     "explain",
     "identify",
     "load_answer",
+    "good_sensors",
     "record",
 ]  # fmt: skip

@@ -70,7 +70,7 @@ from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
 """Relative tolerance of the last stage, at which derivatives are usually right to a tenth, and
-estimates to a fraction of a standard deviation with sensors as good as `RIG`."""
+estimates to a fraction of a standard deviation with sensors as good as `good_sensors`."""
 
 PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
 """Packages whose versions a result records."""

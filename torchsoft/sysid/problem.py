@@ -150,6 +150,8 @@ class Problem(Shown):
                     f"recording `{recording.name}` has samples of none of the sensors "
                     f"{list(sensors)}"
                 )
+        full = {short: name for one in recordings for short, name in one.rig.short.items()}
+        unknowns = {full.get(name, name): one.named(full) for name, one in unknowns.items()}
         recordings, unknowns = with_extensions(recordings, unknowns)
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
         self.coordinates = Coordinates(unknowns, sensors, recordings)

@@ -196,7 +196,11 @@ class IdentificationResult(Shown):
     )
 
     def __getitem__(self, name: str) -> Estimate:
-        """The first estimate of that name."""
+        """The first estimate of that name, full or short."""
+        for one in self.recordings:
+            rig, tables = self.rigs.get(one.name), one.tables or {}
+            short = rig.short if rig is not None else tables.get("names", {})
+            name = short.get(name, name)
         for estimate in self.estimates:
             if estimate.name == name:
                 return estimate

@@ -11,19 +11,25 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import REST
 from torchsoft.rigs.built import BuiltRig
+from torchsoft.solve.trajectory import measurable, units
 from torchsoft.sysid.initial_state import Standing, Start
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Grid, Recording
 from torchsoft.sysid.unknowns import Sensor, by_channel
 
-RIG = {
-    channel: Sensor(noise=noise)
-    for channel, noise in (
-        ("x_C", 1e-5), ("y_C", 1e-5), ("theta_C", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5),
-        ("effort_x", 0.1), ("effort_y", 0.1),
-    )
-}  # fmt: skip
-"""Sensors of rigs/paper.toml where they are good: poses to 10 um and 0.5 mrad, forces to 0.1 N."""
+NOISE = {"m": 1e-5, "rad": 5e-4, "N": 0.1, "N.m": 1e-3}
+"""Noise of good sensors by the unit of what they measure."""
+
+
+def good_sensors(rig: Rig) -> dict[str, Sensor]:
+    """Sensors of all free coordinates and efforts of a rig, to 10 um, 0.5 mrad, 0.1 N and
+    1 N.mm."""
+    known = units(rig)
+    return {
+        name: Sensor(noise=NOISE[known[name]])
+        for name in measurable(rig) if known[name] in NOISE
+    }  # fmt: skip
+
 
 RTOL = 1e-6
 """Relative tolerance of the runs behind synthetic recordings, a tenth of a fit's."""

@@ -90,6 +90,10 @@ class Unknown(Table):
             raise ValueError("a fixed unknown needs no prior")
         return self
 
+    def named(self, full: Mapping[str, str]) -> Self:
+        """With the full name of what it is a ratio to, which `full` has by short names."""
+        return self.model_copy(update={"ratio_to": full.get(self.ratio_to or "", self.ratio_to)})
+
 
 Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia", "clock"]
 NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
