@@ -52,7 +52,7 @@ RTOL = 1e-4
 TRUSTED: dict[str, Any] = {"assumptions": "trusted"}
 """Nothing but the fit."""
 SENSORS = RIG
-RATIO = "contact.mu_k / contact.mu_s"
+RATIO = "laws.steel_on_rubber.friction.mu_k / laws.steel_on_rubber.friction.mu_s"
 GRASP: dict[str, Any] = {"grasp": 0.2, "since": 0.25}
 STROKES = stroked(travel=8e-3, stroke_time=0.2, duration=0.65, **GRASP)
 SHAKE = Excitation(
@@ -62,13 +62,18 @@ SHAKE = Excitation(
     **GRASP,
 )
 TRUTH = {
-    "pad.E": 0.9e6,
-    "pad.tau": 0.012,
-    "contact.K_n": 1.6e5,
-    "contact.mu_s": 0.5,
-    "contact.mu_k": 0.4,
+    "materials.rubber.E": 0.9e6,
+    "materials.rubber.tau": 0.012,
+    "laws.steel_on_rubber.K_n": 1.6e5,
+    "laws.steel_on_rubber.friction.mu_s": 0.5,
+    "laws.steel_on_rubber.friction.mu_k": 0.4,
 }
-FOUR = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
+FOUR = (
+    "materials.rubber.E",
+    "materials.rubber.tau",
+    "laws.steel_on_rubber.K_n",
+    "laws.steel_on_rubber.friction.mu_s",
+)
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +89,10 @@ def shake():
 
 def four(**changes: Unknown) -> dict[str, Unknown]:
     """E and tau from twice and half the nominal values."""
-    start = {"pad.E": 1.5e6, "pad.tau": 5e-3}
+    start = {"materials.rubber.E": 1.5e6, "materials.rubber.tau": 5e-3}
     return (
         {name: Unknown(nominal=start.get(name)) for name in FOUR}
-        | {"contact.mu_k": known("contact.mu_k")}
+        | {"laws.steel_on_rubber.friction.mu_k": known("laws.steel_on_rubber.friction.mu_k")}
         | changes
     )
 
@@ -134,8 +139,12 @@ SHORT = stroked(travel=8e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.
 def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity):
     """The starting displacements are held, also where a pad's elasticity changes."""
     p = BASE.override({"pad.fidelity": fidelity})
-    data = record("short", excited(SHORT, p), {"pad.E": 0.9e6}, SENSORS)
-    unknowns = {"pad.E": Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), "pad.tau": Unknown()}
+    data = record("short", excited(SHORT, p), {"materials.rubber.E": 0.9e6}, SENSORS)
+    unknowns = {
+        "materials.rubber.E": Unknown(),
+        "materials.rubber.nu": Unknown(low=0.4, high=0.49),
+        "materials.rubber.tau": Unknown(),
+    }
     problem = Problem([data], SENSORS, unknowns)
     check_derivatives(problem, problem.coordinates.start, RTOL, 1e-5, h=3e-6)
 
@@ -158,7 +167,10 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes, shak
 
 def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
     problem = Problem(
-        [strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6), "pad.tau": Unknown()} | rest_known()
+        [strokes],
+        SENSORS,
+        {"materials.rubber.E": Unknown(nominal=1.0e6), "materials.rubber.tau": Unknown()}
+        | rest_known(),
     )
     runner = Runner(problem.recordings)
     _, steps = problem.freeze(runner, problem.coordinates.start, ["strokes"], RTOL)
@@ -177,43 +189,60 @@ def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
 
 
 def rest_known() -> dict[str, Unknown]:
-    return {name: known(name) for name in ("contact.K_n", "contact.mu_s", "contact.mu_k")}
+    return {
+        name: known(name)
+        for name in (
+            "laws.steel_on_rubber.K_n",
+            "laws.steel_on_rubber.friction.mu_s",
+            "laws.steel_on_rubber.friction.mu_k",
+        )
+    }
 
 
 def test_what_the_data_do_not_determine_is_not_a_number():
     gentle = stroked(travel=1e-3, stroke_time=0.4, duration=0.65, **GRASP)
     data = record("gentle", excited(gentle, BASE), {}, SENSORS, seed=1)
     answer = identify(
-        Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), rtol=RTOL,
-        plan=[Stage("all", ("gentle",), ("pad.E", "contact.mu_k"), RTOL)],
+        Problem([data], SENSORS, {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.friction.mu_k": Unknown()}), rtol=RTOL,
+        plan=[Stage("all", ("gentle",), ("materials.rubber.E", "laws.steel_on_rubber.friction.mu_k"), RTOL)],
         **TRUSTED,
     )  # fmt: skip
-    mu_k, E = answer["contact.mu_k"], answer["pad.E"]
+    mu_k, E = answer["laws.steel_on_rubber.friction.mu_k"], answer["materials.rubber.E"]
     assert not mu_k.identifiable
     assert mu_k.value is None
     assert mu_k.ci95 is None
     assert E.identifiable
     assert E.ci95[0] < BASE.pad.E < E.ci95[1]
-    assert any("contact.mu_k" in notice for notice in answer.notices)
+    assert any("laws.steel_on_rubber.friction.mu_k" in notice for notice in answer.notices)
     assert not answer.directions[-1].identifiable
-    assert "contact.mu_k" in answer.directions[-1].components
-    row = next(e for e in json.loads(answer.to_json())["estimates"] if e["name"] == "contact.mu_k")
+    assert "laws.steel_on_rubber.friction.mu_k" in answer.directions[-1].components
+    row = next(
+        e
+        for e in json.loads(answer.to_json())["estimates"]
+        if e["name"] == "laws.steel_on_rubber.friction.mu_k"
+    )
     assert row["value"] is None
     assert "not identifiable" in answer.table()
 
 
 def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes):
-    t, theta = strokes.samples["theta"]
+    t, theta = strokes.samples["theta_C"]
     late = np.interp(t - 1.5e-3, t, theta) + 2e-3
     samples = strokes.samples | {
-        "theta": (t[3::2], late[3::2]),
-        "F_x": tuple(x[:60] for x in strokes.samples["F_x"]),
+        "theta_C": (t[3::2], late[3::2]),
+        "effort_x": tuple(x[:60] for x in strokes.samples["effort_x"]),
     }
     data = replace(strokes, name="gaps", samples=samples)
-    sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
-    unknowns = {"pad.E": Unknown()} | rest_known() | {"pad.tau": known("pad.tau")}
+    sensors = SENSORS | {"theta_C": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
+    unknowns = (
+        {"materials.rubber.E": Unknown()}
+        | rest_known()
+        | {"materials.rubber.tau": known("materials.rubber.tau")}
+    )
     answer = identify(Problem([data], sensors, unknowns), rtol=RTOL, **TRUSTED)
-    assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=2e-3)
+    assert answer["materials.rubber.E"].value == pytest.approx(
+        TRUTH["materials.rubber.E"], rel=2e-3
+    )
     assert answer["bias of theta"].value == pytest.approx(2e-3, abs=1e-4)
     assert answer["delay of theta"].value == pytest.approx(1.5e-3, abs=1e-4)
 
@@ -239,8 +268,10 @@ def shaking():
 
 
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking):
-    problem = Problem([shaking], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()})
-    plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 2e-2)]
+    problem = Problem(
+        [shaking], SENSORS, {"materials.rubber.E": Unknown(), "materials.rubber.tau": Unknown()}
+    )
+    plan = [Stage("all", ("shaking",), ("materials.rubber.E", "materials.rubber.tau"), 2e-2)]
     coarse = identify(problem, plan=plan, tightenings=0, **TRUSTED)
     assert any(
         "rtol = 0.02 is too coarse" in notice and "take rtol = 0.002" in notice
@@ -281,9 +312,9 @@ def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest():
 def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes):
     """From a start so far off that the steps chosen there are the wrong ones in the end."""
     unknowns = {name: Unknown(nominal=0.4 * TRUTH[name]) for name in FOUR} | {
-        "contact.mu_k": known("contact.mu_k")
+        "laws.steel_on_rubber.friction.mu_k": known("laws.steel_on_rubber.friction.mu_k")
     }
-    unknowns |= {"contact.mu_s": Unknown(nominal=0.9)}
+    unknowns |= {"laws.steel_on_rubber.friction.mu_s": Unknown(nominal=0.9)}
     problem = Problem([strokes], SENSORS, unknowns)
     answer = identify(problem, plan=[Stage("all", ("strokes",), FOUR, 1e-3)], **TRUSTED)
     first, anew = (stage["name"] for stage in answer.stages[:2])
@@ -315,7 +346,7 @@ def test_recordings_that_begin_alike_share_their_start(strokes, monkeypatch):
     monkeypatch.setattr(runs, "initial_state", counted)
     twin = replace(strokes, name="twin")
     later = replace(strokes, name="later", start=strokes.start._replace(lead=0.3))
-    unknowns = {"pad.E": Unknown(nominal=1.1e6), "pad.tau": Unknown()}
+    unknowns = {"materials.rubber.E": Unknown(nominal=1.1e6), "materials.rubber.tau": Unknown()}
 
     def rows(*recordings):
         problem = Problem(recordings, SENSORS, unknowns)
@@ -330,7 +361,10 @@ def test_recordings_that_begin_alike_share_their_start(strokes, monkeypatch):
 
 def test_interrupted_it_continues_and_ends_the_same(strokes, tmp_path, monkeypatch):
     problem = Problem(
-        [strokes], SENSORS, {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()
+        [strokes],
+        SENSORS,
+        {"materials.rubber.E": Unknown(nominal=1.4e6), "materials.rubber.tau": Unknown()}
+        | rest_known(),
     )
     whole = identify(problem, rtol=RTOL, **TRUSTED)
     inner, left = Runner.run, [4]
@@ -368,7 +402,7 @@ def test_threads_give_the_same_residuals(strokes, shake):
 
 
 def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes):
-    one, (t, y) = {"pad.E": Unknown()}, strokes.samples["x_C"]
+    one, (t, y) = {"materials.rubber.E": Unknown()}, strokes.samples["x_C"]
 
     def problem(
         names: int = 1, sensors: dict[str, Sensor] = SENSORS, unknowns: dict[str, Unknown] = one
@@ -382,10 +416,13 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes):
         (lambda: problem(2), "names of their own"),
         (lambda: problem(sensors={"z": Sensor(noise=1.0)}), "`z` is not a channel"),
         (
-            lambda: problem(sensors={"omega": Sensor(noise=1.0)}),
-            "samples of `omega`",
+            lambda: problem(sensors={"omega_C": Sensor(noise=1.0)}),
+            "samples of `omega_C`",
         ),
-        (lambda: problem(unknowns={"pad.E": Unknown(fixed=True)}), "nothing to identify"),
+        (
+            lambda: problem(unknowns={"materials.rubber.E": Unknown(fixed=True)}),
+            "nothing to identify",
+        ),
         (lambda: problem(unknowns={"pad.length": Unknown()}), "`pad.length` cannot be identified"),
         (lambda: identify(problem(), heldout=["strokes"]), "`heldout`"),
         (lambda: sampled(""), "no samples"),
@@ -404,10 +441,10 @@ def test_data_out_of_reach_name_the_recording():
     about_disc = STROKES.model_copy(update={"senses": "disc", "x_C0": 60e-3})
     data = record("strokes", excited(about_disc, BASE), {}, SENSORS)
     problem = Problem(
-        [data], SENSORS, {"pad.E": Unknown(nominal=4e4)}
+        [data], SENSORS, {"materials.rubber.E": Unknown(nominal=4e4)}
     )  # so soft that the loop is unstable
     with pytest.raises(Unreachable, match=r"recording `strokes`: .* t = .* s"):
-        identify(problem, plan=[Stage("all", ("strokes",), ("pad.E",), 1e-3)])
+        identify(problem, plan=[Stage("all", ("strokes",), ("materials.rubber.E",), 1e-3)])
 
 
 def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
@@ -421,13 +458,23 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
 
     monkeypatch.setattr(Problem, "freeze", failing)
     few = lambda *given: [one for one in assumptions(*given) if one.name in tried]
-    tried = "mesh", "clock of the set-points", "disc.mass"
+    tried = "mesh", "clock of the set-points", "bodies.disc.mass"
     monkeypatch.setattr(sensitivity, "assumptions", few)
-    data = record("strokes", excited(SHORT, BASE), {"pad.E": TRUTH["pad.E"]}, SENSORS, noise=0.0)
-    problem = Problem([data], SENSORS, {"pad.E": Unknown(nominal=0.8e6)})
-    plan = [Stage(f"by {rtol}", ("strokes",), ("pad.E",), rtol) for rtol in (1e-3, 1e-4)]
+    data = record(
+        "strokes",
+        excited(SHORT, BASE),
+        {"materials.rubber.E": TRUTH["materials.rubber.E"]},
+        SENSORS,
+        noise=0.0,
+    )
+    problem = Problem([data], SENSORS, {"materials.rubber.E": Unknown(nominal=0.8e6)})
+    plan = [
+        Stage(f"by {rtol}", ("strokes",), ("materials.rubber.E",), rtol) for rtol in (1e-3, 1e-4)
+    ]
     answer = identify(problem, plan=plan)
-    assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.05)
+    assert answer["materials.rubber.E"].value == pytest.approx(
+        TRUTH["materials.rubber.E"], rel=0.05
+    )
     assert answer.made_by["rtol"] == 1e-3
     assert answer.made_by["rtol_asked"] == 1e-4
     assert not answer.converged
@@ -445,8 +492,12 @@ def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
 @pytest.mark.parametrize(
     ("truth", "free", "ends"),
     [
-        ((0.5, 0.55), ("contact.mu_s", RATIO), (0.5, 0.55)),  # its denominator by the factor's root
-        ((0.3708, 0.7), ("contact.mu_s", RATIO), (0.3708, 0.7)),  # it stays
+        (
+            (0.5, 0.55),
+            ("laws.steel_on_rubber.friction.mu_s", RATIO),
+            (0.5, 0.55),
+        ),  # its denominator by the factor's root
+        ((0.3708, 0.7), ("laws.steel_on_rubber.friction.mu_s", RATIO), (0.3708, 0.7)),  # it stays
         ((0.5, 0.55), (RATIO,), (0.3708, 0.55)),  # it is not free
     ],
 )
@@ -455,7 +506,12 @@ def test_a_ratio_is_scanned_with_its_denominator(strokes, monkeypatch, truth, fr
     monkeypatch.setattr(
         Problem, "gather", lambda self, x, jobs, runs: Residuals(x - at, np.zeros((2, 2)), {})
     )
-    unknowns = {"contact.mu_s": Unknown(), "contact.mu_k": Unknown(ratio_to="contact.mu_s")}
+    unknowns = {
+        "laws.steel_on_rubber.friction.mu_s": Unknown(),
+        "laws.steel_on_rubber.friction.mu_k": Unknown(
+            ratio_to="laws.steel_on_rubber.friction.mu_s"
+        ),
+    }
     problem = Problem([strokes], SENSORS, unknowns)
     c, runner = problem.coordinates, SimpleNamespace(run=lambda jobs: [None for _ in jobs])
     place = lambda values: np.array([one.to_x(v) for one, v in zip(c.all, values)])
@@ -506,28 +562,34 @@ def test_what_a_fit_cannot_honour_is_refused_before_it(strokes, how, message):
 
 def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes):
     problem = Problem(
-        [strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known()
+        [strokes],
+        SENSORS,
+        {"materials.rubber.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known(),
     )
-    stage = Stage("all", ("strokes",), ("pad.E",), 1e-3, starts=3)
-    free = np.array([c.name == "pad.E" for c in problem.coordinates.all])
+    stage = Stage("all", ("strokes",), ("materials.rubber.E",), 1e-3, starts=3)
+    free = np.array([c.name == "materials.rubber.E" for c in problem.coordinates.all])
     points = sobol(problem, problem.coordinates.start, free, stage, 0)
     low, high = problem.coordinates.bounds
     assert len({p.tobytes() for p in points}) == len(points) == 2
     assert all((low <= p).all() and (p <= high).all() for p in points)
     answer = identify(problem, plan=[stage], **TRUSTED)
-    assert answer["pad.E"].last == pytest.approx(TRUTH["pad.E"], rel=0.05)
+    assert answer["materials.rubber.E"].last == pytest.approx(TRUTH["materials.rubber.E"], rel=0.05)
 
 
 def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(strokes, shake):
     unknowns = four(
-        **{"contact.mu_k": Unknown(ratio_to="contact.mu_s", nominal=0.7, low=0.3, high=1.0)}
+        **{
+            "laws.steel_on_rubber.friction.mu_k": Unknown(
+                ratio_to="laws.steel_on_rubber.friction.mu_s", nominal=0.7, low=0.3, high=1.0
+            )
+        }
     )
     problem = Problem([shake, strokes], SENSORS, unknowns)
     runner = Runner(problem.recordings)
     plan = default_plan(problem, runner, 1e-5, problem.names)
     slow = min(problem.recordings, key=lambda recording: recording.speed)
     assert plan[0].recordings == (slow.name,)
-    ratio = "contact.mu_k / contact.mu_s"
+    ratio = "laws.steel_on_rubber.friction.mu_k / laws.steel_on_rubber.friction.mu_s"
     assert dict(plan[0].tied) == {ratio: 1.0}
     *tied, scanned, last = plan
     assert all(ratio not in stage.free for stage in tied)
@@ -535,8 +597,8 @@ def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(strokes, shake)
     assert dict(scanned.scanned)[ratio][0] == 1.0
     assert plan[0].rtol > plan[-1].rtol == 1e-5
     tied = tie_ratios(problem, problem.coordinates.start)
-    assert problem.values(tied, 0)["contact.mu_k"] == pytest.approx(
-        problem.values(tied, 0)["contact.mu_s"]
+    assert problem.values(tied, 0)["laws.steel_on_rubber.friction.mu_k"] == pytest.approx(
+        problem.values(tied, 0)["laws.steel_on_rubber.friction.mu_s"]
     )
 
 

@@ -39,14 +39,14 @@ ROOT = Path(__file__).parents[1]
 PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
 BASE = PAPER.override(COARSE)
 SENSORS = {
-    "theta": Sensor(noise=5e-4, bias=0.02),
+    "theta_C": Sensor(noise=5e-4, bias=0.02),
     "y_Br": Sensor(noise=1e-5),
-    "F_y": Sensor(noise=0.1),
+    "effort_y": Sensor(noise=0.1),
 }
 GRASP = stroked(10e-3, 1.0, duration=0.25, depth=1.2e-3, grasp=0.15, since=0.275)
 UNKNOWNS = {
-    "contact.R_n": Unknown(per="recording"), "pad.E": Unknown(), "contact.v_s": Unknown(),
-    "pad.tau": Unknown(prior=Prior(median=0.01, sd=0.3, kind="log-normal")),
+    "laws.steel_on_rubber.R_n": Unknown(per="recording"), "materials.rubber.E": Unknown(), "laws.steel_on_rubber.friction.v_s": Unknown(),
+    "materials.rubber.tau": Unknown(prior=Prior(median=0.01, sd=0.3, kind="log-normal")),
 }  # fmt: skip
 
 HOSTILE = 'a<b> & "$x_1$"'
@@ -83,7 +83,14 @@ def example(kind: Any) -> Any:
 def problem():
     """Two short grasps, one of them from a place that is not known well."""
     recordings = [
-        record(name, excited(GRASP, BASE), {"contact.K_n": 1.6e5}, SENSORS, rtol=1e-3, seed=seed)
+        record(
+            name,
+            excited(GRASP, BASE),
+            {"laws.steel_on_rubber.K_n": 1.6e5},
+            SENSORS,
+            rtol=1e-3,
+            seed=seed,
+        )
         for seed, name in enumerate(("first", "second"))
     ]
     start = recordings[1].start._replace(position_sd={"disc.x": 2e-5})
@@ -119,11 +126,11 @@ def test_draws_are_those_of_the_covariance(result):
             assert sd == pytest.approx(seen[name].relative_sd, rel=0.1)
         else:
             assert (values == values[0]).all()
-    E = next(i for i, c in enumerate(result.coordinates) if c.name == "pad.E")
-    ratio = replace(result.coordinates[E], ratio_to="contact.K_n")
+    E = next(i for i, c in enumerate(result.coordinates) if c.name == "materials.rubber.E")
+    ratio = replace(result.coordinates[E], ratio_to="laws.steel_on_rubber.K_n")
     others = [ratio if i == E else c for i, c in enumerate(result.coordinates)]
     with pytest.warns(UserWarning, match="not identifiable"):
-        ends = [one.draws(3, "second", seed=1)["pad.E"]
+        ends = [one.draws(3, "second", seed=1)["materials.rubber.E"]
                 for one in (result, replace(result, coordinates=others))]  # fmt: skip
     assert ends[0] == pytest.approx(ends[1])  # K_n is known
     with pytest.raises(ValueError, match="`count`"):
@@ -234,10 +241,11 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path)
     for name, value in mine.named_parameters():
         if not name.startswith("reference."):
             assert torch.equal(its.parameter(name), value), name
-    assert float(its.parameter("pad.E").detach()) == result["pad.E"].last
-    own = [e.last for e in result.estimates if e.name == "contact.R_n"]
+    assert float(its.parameter("materials.rubber.E").detach()) == result["materials.rubber.E"].last
+    own = [e.last for e in result.estimates if e.name == "laws.steel_on_rubber.R_n"]
     assert [
-        float(result.model(name).parameter("contact.R_n").detach()) for name in ("first", "second")
+        float(result.model(name).parameter("laws.steel_on_rubber.R_n").detach())
+        for name in ("first", "second")
     ] == own
     assert own[0] != own[1]
     t = times(0.2, 30)
@@ -253,14 +261,15 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path)
 
 
 def test_what_is_not_identifiable_is_named_when_it_is_used(result, path):
-    assert not result["contact.v_s"].identifiable
+    assert not result["laws.steel_on_rubber.friction.v_s"].identifiable
     for answer in (result, load_answer(path)):
         with pytest.warns(
-            UserWarning, match=r"only where the search ended: .*contact\.v_s = \S+$"
+            UserWarning,
+            match=r"only where the search ended: .*laws\.steel_on_rubber\.friction\.v_s = \S+$",
         ) as caught:
             answer.model("first")
         assert [Path(one.filename).name for one in caught] == [Path(__file__).name]
-        assert "pad.E" not in str(caught[0].message)
+        assert "materials.rubber.E" not in str(caught[0].message)
 
 
 def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
@@ -272,10 +281,14 @@ def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
     out = [e for e in result.estimates if e.recording != "second"]
     answer = replace(result, estimates=out, coordinates=[left_out(c) for c in result.coordinates])
     with pytest.warns(
-        UserWarning, match=r"only where the search ended: contact\.R_n = \S+, contact\.v_s = \S+$"
+        UserWarning,
+        match=r"only where the search ended: laws\.steel_on_rubber\.R_n = \S+, laws\.steel_on_rubber\.friction\.v_s = \S+$",
     ):
         answer.model("second")
-    with pytest.warns(UserWarning, match=r"only where the search ended: .*contact\.v_s = \S+$"):
+    with pytest.warns(
+        UserWarning,
+        match=r"only where the search ended: .*laws\.steel_on_rubber\.friction\.v_s = \S+$",
+    ):
         answer.model("first")
 
 
@@ -292,7 +305,11 @@ def test_a_recording_must_be_named_where_rigs_differ(result):
 def slippery(problem, result):
     """A result for rigs with a law of the user's own, whose alpha is not identifiable."""
     own = [replace(r, rig=slide(BASE, r.rig.reference)) for r in problem.recordings]
-    mine = Problem(own, SENSORS, {"contact.friction.alpha": Unknown(), "pad.E": Unknown()})
+    mine = Problem(
+        own,
+        SENSORS,
+        {"laws.steel_on_rubber.friction.alpha": Unknown(), "materials.rubber.E": Unknown()},
+    )
     c, C = mine.coordinates, np.zeros((len(mine.coordinates),) * 2)
     x, C[0, 0] = c.start + 0.1, 1.0
     found = estimates(mine, x, c.free, C, np.zeros(len(x)))
@@ -326,17 +343,20 @@ def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
     for name, value in own.named_parameters():
         assert torch.equal(its.parameter(name), value), name
     assert (
-        float(its.parameter("pad.E").detach())
-        == slippery["pad.E"].last
+        float(its.parameter("materials.rubber.E").detach())
+        == slippery["materials.rubber.E"].last
         != BASE.materials["rubber"].E
     )
     assert (
-        float(mine.parameter("pad.E").detach()) == BASE.materials["rubber"].E
+        float(mine.parameter("materials.rubber.E").detach()) == BASE.materials["rubber"].E
     )  # it is a copy that was changed
-    another = slide(BASE.override({"pad.nu": 0.4}), reference)
+    another = slide(BASE.override({"materials.rubber.nu": 0.4}), reference)
     with (
         pytest.warns(UserWarning, match=weak),
-        pytest.warns(UserWarning, match=r"its values may mislead: pad\.nu is 0\.4 and was 0\.45$"),
+        pytest.warns(
+            UserWarning,
+            match=r"its values may mislead: materials\.rubber\.nu is 0\.4 and was 0\.45$",
+        ),
     ):
         answer.applied_to(another)
     with pytest.raises(
@@ -351,8 +371,8 @@ def test_contributions_are_those_of_the_inverse_matrices(problem, result):
     J = problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3, free).J
     m, k = problem.samples(["first"]), list(problem.coordinates.labels)
     parts = {"first": J[:m], "second": J[m:-2], None: J[-2:]}
-    known = [i for i, label in enumerate(k) if label != "contact.v_s"]
-    J[:, k.index("contact.v_s")] = 0.0
+    known = [i for i, label in enumerate(k) if label != "laws.steel_on_rubber.friction.v_s"]
+    J[:, k.index("laws.steel_on_rubber.friction.v_s")] = 0.0
     seen = np.array([i in known for i in range(len(k))])
     F = {name: rows[:, known].T @ rows[:, known] for name, rows in parts.items()}
     C = np.linalg.inv(sum(F.values()))
@@ -367,8 +387,8 @@ def test_contributions_are_those_of_the_inverse_matrices(problem, result):
                     (left[i, i] / C[i, i]) ** 0.5, rel=1e-6
                 ), label
         if one.source == "second":
-            assert one.without["contact.R_n in second"] is None  # nothing else sees it
-            assert one.without["pad.E"] > 1.1
+            assert one.without["laws.steel_on_rubber.R_n in second"] is None  # nothing else sees it
+            assert one.without["materials.rubber.E"] > 1.1
     assert [one.source for one in result.contributions] == list(parts)
 
 
@@ -376,11 +396,11 @@ def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinat
     problem,
 ):
     sure, unknowns = Prior(median=0.8, sd=0.1), {
-        "contact.mu_s": Unknown(prior=Prior(median=0.8, sd=0.1)),
-        "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s", fixed=True),
-        "pad.nu": Unknown(scale="linear", low=0.3, high=0.49),
+        "laws.steel_on_rubber.friction.mu_s": Unknown(prior=Prior(median=0.8, sd=0.1)),
+        "laws.steel_on_rubber.friction.mu_k": Unknown(nominal=0.5, ratio_to="laws.steel_on_rubber.friction.mu_s", fixed=True),
+        "materials.rubber.nu": Unknown(scale="linear", low=0.3, high=0.49),
     }  # fmt: skip
-    own = Problem(problem.recordings[:1], {"theta": Sensor(noise=5e-4)}, unknowns)
+    own = Problem(problem.recordings[:1], {"theta_C": Sensor(noise=5e-4)}, unknowns)
     c = own.coordinates
     x = c.start + np.array([np.log(1.1), 0.0, -0.05 / 0.19])
     found = {
@@ -390,7 +410,10 @@ def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinat
         )
     }
     assert list(found) == list(unknowns)
-    for name, start in (("contact.mu_s", 0.8), ("contact.mu_k", 0.4)):
+    for name, start in (
+        ("laws.steel_on_rubber.friction.mu_s", 0.8),
+        ("laws.steel_on_rubber.friction.mu_k", 0.4),
+    ):
         e = found[name]
         assert (e.start, e.value) == pytest.approx((start, 1.1 * start))
         assert e.ci95 == pytest.approx(
@@ -398,7 +421,7 @@ def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinat
         )
         assert e.step_bias_sd == pytest.approx(0.5)
     assert [e.prior for e in found.values()] == [sure, None, None]
-    nu = found["pad.nu"]
+    nu = found["materials.rubber.nu"]
     assert (nu.start, nu.value, nu.unit) == (0.45, pytest.approx(0.4), "1")
     assert nu.ci95 == pytest.approx((0.4 - 0.196 * 0.38, 0.4 + 0.196 * 0.38), rel=1e-4)
     assert nu.relative_sd == pytest.approx(0.2 * 0.19 / 0.4)

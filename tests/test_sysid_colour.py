@@ -15,11 +15,11 @@ from torchsoft.sysid.residual_tests import parts
 from torchsoft.sysid.runs import Runner
 
 BASE = PAPER.override(COARSE)
-TRUTH = {"pad.E": 0.8e6, "pad.tau": 0.011}
-NOISE = {"x_C": 1e-5, "theta": 5e-4, "F_x": 0.1}
+TRUTH = {"materials.rubber.E": 0.8e6, "materials.rubber.tau": 0.011}
+NOISE = {"x_C": 1e-5, "theta_C": 5e-4, "effort_x": 0.1}
 STROKES = stroked(travel=8e-3, stroke_time=0.2, duration=0.6)
 AR = Autoregression.stated((0.8,), 5e-3)
-STAGE = Stage("all", ("strokes",), ("pad.E", "pad.tau"), 1e-4)
+STAGE = Stage("all", ("strokes",), ("materials.rubber.E", "materials.rubber.tau"), 1e-4)
 
 
 def sensors(colour: str = "white") -> dict[str, Sensor]:
@@ -92,7 +92,9 @@ def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact):
     for name, truth in TRUTH.items():
         for answer in (white, found, declared):
             assert abs(np.log(answer[name].last / truth)) < 3 * answer[name].relative_sd, name
-    assert found["pad.tau"].relative_sd > 1.3 * white["pad.tau"].relative_sd
+    assert (
+        found["materials.rubber.tau"].relative_sd > 1.3 * white["materials.rubber.tau"].relative_sd
+    )
 
 
 def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact):
@@ -102,7 +104,7 @@ def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact):
         for c, (t, y) in exact.samples.items()
     }
     plain = problem(replace(exact, samples=gaps))
-    coloured = plain.with_noise({"x_C": AR, "F_x": Autoregression((1.2, -0.5), 0.7, 5e-3)})
+    coloured = plain.with_noise({"x_C": AR, "effort_x": Autoregression((1.2, -0.5), 0.7, 5e-3)})
     runner, which, x = Runner(plain.recordings), ["strokes"], plain.coordinates.start
     free = plain.coordinates.free
     _, steps = plain.freeze(runner, x, which, 1e-4)

@@ -26,7 +26,7 @@ def law(name: str, r: np.ndarray, k: int = 3, held: np.ndarray | None = None) ->
     """A law that left these residuals, as far as the rule looks at it."""
 
     def said(residuals: np.ndarray, recording: str) -> Density:
-        part = Part(recording, "F_x", T, slice(0, len(residuals)), residuals, residuals)
+        part = Part(recording, "effort_x", T, slice(0, len(residuals)), residuals, residuals)
         return Density([part], residuals, residuals, -0.5 * float(residuals @ residuals))
 
     heldout = None if held is None else said(held, "other")
@@ -134,14 +134,16 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
     assert "take a tighter tolerance" in judged([fitted("a"), fitted("b")], [rough])[2]
 
 
-BASE = PAPER.override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
-SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
+BASE = PAPER.override(
+    COARSE | {"laws.steel_on_rubber.friction.mu_s": 0.7, "laws.steel_on_rubber.friction.mu_k": 0.6}
+)
+SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "effort_x")}
 BRIEF: dict[str, Any] = {"duration": 0.4, "grasp": 0.15, "since": 0.2}
 STROKE = stroked(travel=25e-3, stroke_time=0.15, depth=2e-4, **BRIEF)
 GENTLE = Excitation(rolled(1e-3, 0.4, 0.2), depth=1e-3, **BRIEF)
 UNKNOWNS = {
-    "smooth": {"contact.mu_s": Unknown(low=0.4, high=1.2),
-    "contact.mu_k": Unknown(ratio_to="contact.mu_s", low=0.4, high=0.9)},
+    "smooth": {"laws.steel_on_rubber.friction.mu_s": Unknown(low=0.4, high=1.2),
+    "laws.steel_on_rubber.friction.mu_k": Unknown(ratio_to="laws.steel_on_rubber.friction.mu_s", low=0.4, high=0.9)},
     "viscous": {"laws.steel_on_rubber.friction.alpha": Unknown(low=0.3, high=1.2)},
 }  # fmt: skip
 
@@ -166,7 +168,7 @@ def made(
     excitation: Excitation, build: Any, values: dict[str, float], noise: float = 1.0
 ) -> dict[str, Problem]:
     planned = excited(excitation, BASE)
-    planned = planned._replace(rig=build(planned.rig.settings, planned.rig.reference))
+    planned = replace(planned, rig=build(excite(BASE, STROKE), planned.rig.reference))
     recording = record("one", planned, values, SENSORS, rtol=1e-5, noise=noise, seed=1)
     return laws(recording, excitation)
 
@@ -234,9 +236,9 @@ def test_densities_are_those_of_the_normal_distribution():
     t: Any = np.arange(n) * 5e-3
     sigma, noise = 0.3, Autoregression.stated((0.6, 0.2), 5e-3)
     problem: Any = SimpleNamespace(
-        recordings=[SimpleNamespace(name="one", samples={"F_x": (t, t)})],
-        sensors={"F_x": Sensor(noise=sigma)},
-        noise={"F_x": noise},
+        recordings=[SimpleNamespace(name="one", samples={"effort_x": (t, t)})],
+        sensors={"effort_x": Sensor(noise=sigma)},
+        noise={"effort_x": noise},
         whitened=print,
     )
     lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))

@@ -33,7 +33,7 @@ BOUNDS = {
     "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13, shortest=0.02),
     "y_d": Bounds(low=0.048, high=0.0499, speed=0.1, after=0.13),
 }
-SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
+SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "effort_y")}
 
 
 @pytest.fixture(scope="session")
@@ -43,7 +43,9 @@ def plan():
 
 @pytest.fixture(scope="session")
 def problem(plan):
-    return Problem([plan], SENSORS, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+    return Problem(
+        [plan], SENSORS, {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()}
+    )
 
 
 def planner(problem: Problem, criterion: Optimality, **limits: tuple[float, float]) -> Planner:
@@ -71,12 +73,16 @@ def test_for_one_parameter_the_criteria_are_one():
     assert values == pytest.approx([np.log(0.2)] * 3)
 
 
-@pytest.mark.parametrize("sensors", [{}, {"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}])
+@pytest.mark.parametrize("sensors", [{}, {"effort_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}])
 def test_slopes_are_those_of_differences(plan, sensors, monkeypatch):
     """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted
     beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
-    stated = Problem([plan], SENSORS | sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+    stated = Problem(
+        [plan],
+        SENSORS | sensors,
+        {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()},
+    )
     one = planner(stated, "A", F_y=(-30.0, 30.0))
     z, x = one.moves.start, stated.coordinates.start
     at = one.evaluate(z, x)
@@ -85,7 +91,7 @@ def test_slopes_are_those_of_differences(plan, sensors, monkeypatch):
         np.random.default_rng(1).standard_normal(one.moves.n),
         3e-5,
     )
-    assert at.peaks["F_y"] > 1
+    assert at.peaks["effort_y"] > 1
     ahead, behind = (one.evaluate(z + s * h * direction, x, at.steps) for s in (1, -1))
     wanted = (ahead.value + ahead.cost - behind.value - behind.cost) / (2 * h)
     assert slopes @ direction == pytest.approx(wanted, rel=1e-3)
@@ -97,7 +103,11 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
     parts, sds = [], []
     for better in (4.0, 4e4):
         sensors = {name: Sensor(noise=one.noise / better) for name, one in SENSORS.items()}
-        stated = Problem([plan], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+        stated = Problem(
+            [plan],
+            sensors,
+            {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()},
+        )
         one = planner(stated, "A")
         at = one.evaluate(one.moves.start, stated.coordinates.start)
         sd = np.array(list(one.deviations(stated.coordinates.start, at).values()))
@@ -115,8 +125,8 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
 def test_nuisances_are_left_out_as_the_schur_complement(plan):
     stated = Problem(
         [plan],
-        {**SENSORS, "F_y": Sensor(noise=0.1, bias=1.0)},
-        {"pad.E": Unknown(), "contact.K_n": Unknown()},
+        {**SENSORS, "effort_y": Sensor(noise=0.1, bias=1.0)},
+        {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()},
     )
     x, c = stated.coordinates.start, stated.coordinates
     J = stated.residuals(Runner([plan]), x, ["plan"], 1e-3, c.free).J
@@ -129,12 +139,14 @@ def test_nuisances_are_left_out_as_the_schur_complement(plan):
 
 def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan):
     unknowns = {
-        "contact.mu_s": Unknown(),
-        "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s"),
+        "laws.steel_on_rubber.friction.mu_s": Unknown(),
+        "laws.steel_on_rubber.friction.mu_k": Unknown(
+            nominal=0.5, ratio_to="laws.steel_on_rubber.friction.mu_s"
+        ),
     }
     stated = Problem([plan], SENSORS, unknowns)
-    names, T = chosen(stated, stated.coordinates.start, ["contact.mu_k"])
-    assert names == ("contact.mu_k",)
+    names, T = chosen(stated, stated.coordinates.start, ["laws.steel_on_rubber.friction.mu_k"])
+    assert names == ("laws.steel_on_rubber.friction.mu_k",)
     assert T.tolist() == [[1.0, 1.0]]
 
 
@@ -175,9 +187,12 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan):
             {"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}},
             "no motion of these knots",
         ),
-        ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.F_x = \(1, -1\)"),
+        ({"limits": {"effort_x": (1.0, -1.0)}}, r"limits.F_x = \(1, -1\)"),
         ({"limits": {"Fx": (-1.0, 1.0)}}, "limits.Fx"),
-        ({"names": ["pad.nu"]}, "`names` must be some of the parameters pad.E, contact.K_n"),
+        (
+            {"names": ["materials.rubber.nu"]},
+            "`names` must be some of the parameters materials.rubber.E, laws.steel_on_rubber.K_n",
+        ),
         ({"criterion": "E"}, "`criterion` must be one of D, A, worst, not 'E'"),
         ({"iterations": -1}, "`iterations` must not be negative"),
     ],
@@ -191,7 +206,7 @@ def test_what_does_not_fit_is_refused(problem, changes, message):
 @pytest.fixture(scope="session")
 def found(problem):
     return design(
-        problem, "plan", BOUNDS, limits={"F_y": (-70.0, 70.0)}, iterations=20, rate=0.4,
+        problem, "plan", BOUNDS, limits={"effort_y": (-70.0, 70.0)}, iterations=20, rate=0.4,
         criterion="worst",
     )  # fmt: skip
 
@@ -221,7 +236,7 @@ def test_any_rig_with_profiles():
     )
     t, sensors = (
         np.linspace(0.0, 0.1, 21),
-        {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta"]},
+        {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta_C"]},
     )
     data = Recording(
         "turning",
@@ -240,7 +255,7 @@ def test_any_rig_with_profiles():
         names=["pads.L.material.tau"],
         iterations=4,
         rate=0.3,
-        limits={"F_x": (-20.0, 20.0)},
+        limits={"effort_x": (-20.0, 20.0)},
     )
     assert found.after["pads.L.material.tau"] < 0.9 * found.before["pads.L.material.tau"]
     assert found.made_by["gradients"] >= 4 * 4

@@ -20,7 +20,7 @@ from torchsoft.sysid import Problem, Recording, Stage, Unknown, identify, record
 BASE = PAPER.override(COARSE)
 SENSORS = {
     name: RIG[name].model_copy(update={"noise": 0.7 * RIG[name].noise})
-    for name in ("x_C", "theta", "F_x")
+    for name in ("x_C", "theta_C", "effort_x")
 }
 JERKS = stroked(
     travel=30e-3,
@@ -58,17 +58,19 @@ def jerks():
     """Without noise, of the true law; the recording's own model has other numbers."""
     planned = excited(JERKS, BASE)
     planned = replace(planned, rig=rig(excite(BASE, JERKS), planned.rig.reference))
-    return record("jerks", planned, TRUTH | {"pad.E": 0.9e6}, SENSORS, noise=0.0)
+    return record("jerks", planned, TRUTH | {"materials.rubber.E": 0.9e6}, SENSORS, noise=0.0)
 
 
 def test_its_parameters_are_found_beside_those_of_the_pads(jerks):
-    problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, "pad.E")})
+    problem = Problem(
+        [jerks], SENSORS, {name: Unknown() for name in (*TRUTH, "materials.rubber.E")}
+    )
     plan = [Stage("all", ("jerks",), problem.coordinates.labels, 1e-6)]
     answer = identify(
         problem, plan=plan, assumptions="trusted"
     )  # three sensors do not tell beta from the mesh
     assert answer.converged
-    for name, value in (*TRUTH.items(), ("pad.E", 0.9e6)):
+    for name, value in (*TRUTH.items(), ("materials.rubber.E", 0.9e6)):
         assert answer[name].identifiable, name
         assert abs(answer[name].last / value - 1) < 0.1 * answer[name].relative_sd, (
             name
@@ -82,7 +84,7 @@ def test_its_derivatives_by_both_routes_are_those_of_differences(jerks):
             scale="linear", nominal=1.0, low=0.0, high=100.0
         )
     }
-    ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}
+    ratio = {"actuators.y.Kp": Unknown(ratio_to="actuators.x.Kp")}
     problem = Problem(
         [jerks], SENSORS, {"laws.steel_on_rubber.friction.alpha": Unknown()} | slack | ratio
     )
@@ -96,10 +98,13 @@ def test_it_can_be_sent_to_another_process(jerks):
 
 
 def test_only_what_the_model_has_can_be_identified(jerks):
-    assert {*TRUTH, "pad.E", "control.R_99", "disc.radius"} <= set(jerks.parameters)
-    for name in ("contact.mu_s", "laws.steel_on_rubber.friction.gamma"):
+    assert {*TRUTH, "materials.rubber.E", "actuators.y.Kd", "bodies.disc.shape.radius"} <= set(
+        jerks.parameters
+    )
+    for name in ("laws.steel_on_rubber.friction.mu_s", "laws.steel_on_rubber.friction.gamma"):
         with pytest.raises(
-            ValueError, match=f"`{name}` cannot be identified; .*contact.friction.alpha"
+            ValueError,
+            match=f"`{name}` cannot be identified; .*laws.steel_on_rubber.friction.alpha",
         ):
             Problem([jerks], SENSORS, {name: Unknown()})
     negative = built(jerks, partial(rig, alpha=-1.0))

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RIG, excited, paper_settings, rolled, still, stroked, waves
+from conftest import COARSE, PAPER, RIG, rolled, still, stroked, waves
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from torchsoft import Reference
+from torchsoft import Reference, RigFile, excite
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
@@ -33,10 +33,10 @@ from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner
 
 NOMINAL = PAPER.override(COARSE)
-SENSORS = RIG | {"omega": Sensor(noise=0.02)}
+SENSORS = RIG | {"omega_C": Sensor(noise=0.02)}
 FAR = {
-    "contact.K_n": 3.0, "contact.R_n": 0.4, "contact.K_t": 0.4, "contact.R_t": 2.5,
-    "contact.mu_s": 0.7, "contact.mu_k": 0.6, "pad.E": 0.5, "pad.tau": 2.5,
+    "laws.steel_on_rubber.K_n": 3.0, "laws.steel_on_rubber.R_n": 0.4, "laws.steel_on_rubber.K_t": 0.4, "laws.steel_on_rubber.R_t": 2.5,
+    "laws.steel_on_rubber.friction.mu_s": 0.7, "laws.steel_on_rubber.friction.mu_k": 0.6, "materials.rubber.E": 0.5, "materials.rubber.tau": 2.5,
 }  # fmt: skip
 """How far the truth is from where a fit would start."""
 
@@ -51,21 +51,28 @@ MOTIONS = {
 }  # fmt: skip
 
 
+def planned(name: str) -> RigFile:
+    """The rig file of a motion."""
+    senses = "disc" if name == "about the disc" else None
+    return excite(NOMINAL, MOTIONS[name], senses=senses)
+
+
 @pytest.fixture(scope="module")
 def recordings():
     """What rigs with parameters far from the nominal ones give."""
     table = NOMINAL.table()
-    truth = {name: factor * table[name]["value"] for name, factor in FAR.items()}
+    full = {name: NOMINAL.full(name)[0] for name in FAR}
+    truth = {name: factor * table[full[name]]["value"] for name, factor in FAR.items()}
     return {
-        name: record(name, excited(motion, NOMINAL), truth, SENSORS, seed=k, rtol=1e-4)
-        for k, (name, motion) in enumerate(MOTIONS.items())
+        name: record(name, planned(name).build(), truth, SENSORS, seed=k, rtol=1e-4)
+        for k, name in enumerate(MOTIONS)
     }
 
 
 @pytest.fixture(scope="module")
 def runs(recordings):
     """Runs with the nominal parameters."""
-    problem = Problem(list(recordings.values()), SENSORS, {"pad.E": Unknown()})
+    problem = Problem(list(recordings.values()), SENSORS, {"materials.rubber.E": Unknown()})
     jobs = problem.jobs(problem.coordinates.start, problem.names, LOOSE, None)
     made = zip(recordings.items(), Runner(problem.recordings).run(jobs))
     return {name: Signals(run.t, one.channels, run.signals, None) for (name, one), run in made}
@@ -78,7 +85,7 @@ def looked_at(
     its own."""
     mine = {name: sensor for name, sensor in sensors.items() if name in recording.samples}
     if run is None:
-        problem = Problem([recording], mine, {"pad.E": Unknown()})
+        problem = Problem([recording], mine, {"materials.rubber.E": Unknown()})
         return precheck(problem, Runner(problem.recordings))
     span = float(recording.times[0]), float(recording.times[-1])
     readouts = {
@@ -102,7 +109,7 @@ def noted(
     recording: Recording, settings: Mapping[str, Any] | None = None, **signals: Any
 ) -> Recording:
     """With other settings, and other signals of the reference."""
-    p, old = paper_settings(recording), recording.rig.reference
+    p, old = planned(recording.name), recording.rig.reference
     reference = Reference(**{name: signals.get(name, old[name]) for name in ("x_d", "y_d", "F_ff")})
     return replace(recording, rig=still(p.override(dict(settings or {})), reference))
 
@@ -115,27 +122,27 @@ def late(by: float) -> Callable[[Any, Any], Any]:
     return lambda t, y: CubicSpline(t, y)(np.maximum(t - by, t[0]))
 
 
-NO_F = {"F_x": None, "F_y": None}
+NO_F = {"effort_x": None, "effort_y": None}
 MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]] = {
     "sign of a force": (
-        "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x",
-        "F_x looks as if its sign were opposite", True
+        "rolling", lambda r: changed(r, effort_x=scaled(-1)), "sign of effort_x",
+        "effort_x looks as if its sign were opposite", True
     ),
     "sign of a force that only a run tells": (
-        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y",
+        "rolling", lambda r: changed(r, effort_y=scaled(-1), y_Br=None), "sign of effort_y",
         "correlation with a run from the start", True
     ),
     "sign of an angle": (
-        "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta",
+        "rolling", lambda r: changed(r, theta_C=scaled(-1)), "sign of theta",
         "theta looks as if its sign were opposite",
                                                                             True
     ),
     "millinewtons": (
-        "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x",
+        "shaking", lambda r: changed(r, effort_x=scaled(1e3)), "unit of effort_x",
         "millinewtons taken for newtons", True
     ),
     "degrees": (
-        "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta",
+        "rolling", lambda r: changed(r, theta_C=scaled(57.3)), "unit of theta",
         "degrees taken for radians", True
     ),
     "the disc's set-point taken for the bracket's": (
@@ -169,7 +176,7 @@ MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]
         "was a force fed forward that F_ff does", False
     ),
     "a zero": (
-        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x",
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of effort_x",
         "zeros and set-points right?", False
     ),
 }  # fmt: skip
@@ -211,15 +218,15 @@ def test_nothing_is_said_of_what_is_right(recordings, runs, motion):
     assert looked_at(changed(one, **NO_F), run) == []
     assert looked_at(changed(one, x_Br=None, y_Br=None), run) == []
     declared = SENSORS | {
-        "x_Br": Sensor(noise=1e-5, bias=1e-4), "theta": Sensor(noise=5e-4, bias=0.1, delay=0.08),
-        "F_x": Sensor(noise=0.1, delay=6e-3), "F_y": Sensor(noise=0.1, gain=0.2),
+        "x_Br": Sensor(noise=1e-5, bias=1e-4), "theta_C": Sensor(noise=5e-4, bias=0.1, delay=0.08),
+        "effort_x": Sensor(noise=0.1, delay=6e-3), "effort_y": Sensor(noise=0.1, gain=0.2),
     }  # fmt: skip
     faulty = changed(
         one,
         x_Br=lambda t, x: x + 40e-6,
-        theta=lambda t, y: late(60e-3)(t, y) + 0.02,
-        F_x=late(5e-3),
-        F_y=scaled(1.15),
+        theta_C=lambda t, y: late(60e-3)(t, y) + 0.02,
+        effort_x=late(5e-3),
+        effort_y=scaled(1.15),
     )
     assert looked_at(faulty, run, declared) == []
 
@@ -227,12 +234,12 @@ def test_nothing_is_said_of_what_is_right(recordings, runs, motion):
 def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
     recordings,
 ):
-    flipped = changed(recordings["rolling"], F_y=scaled(-1))
+    flipped = changed(recordings["rolling"], effort_y=scaled(-1))
     assert list(controller_findings(flipped, SENSORS))
-    gains = ["control.K_98", "control.R_99", "control.K_81"]
+    gains = ["actuators.y.Kp", "actuators.y.Kd", "actuators.x.Kp"]
     assert not list(controller_findings(flipped, SENSORS, gains))
     for one, code in (
-        (flipped, "sign of F_y"),
+        (flipped, "sign of effort_y"),
         (noted(recordings["rolling"], {"control.senses": "disc.x"}), "control.senses"),
     ):
         problem = Problem([one], SENSORS, {name: Unknown() for name in gains})
@@ -254,12 +261,17 @@ def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_
     )
     same = replace(one, rig=rig)
     assert not list(controller_findings(same, SENSORS))
-    more = changed(same, F_x=lambda t, F: F + 20.0)
-    assert [f.code for f in controller_findings(more, SENSORS)] == ["loop of F_x"]
-    assert "F_x is +20 N more, on the average," in next(controller_findings(more, SENSORS)).message
-    (note,) = controller_findings(changed(same, theta=None), SENSORS)
+    more = changed(same, effort_x=lambda t, F: F + 20.0)
+    assert [f.code for f in controller_findings(more, SENSORS)] == ["loop of effort_x"]
+    assert (
+        "effort_x is +20 N more, on the average,"
+        in next(controller_findings(more, SENSORS)).message
+    )
+    (note,) = controller_findings(changed(same, theta_C=None), SENSORS)
     assert note.severity == "note"
-    assert "F_x is not compared with its controller, since theta is not recorded" in note.message
+    assert (
+        "effort_x is not compared with its controller, since theta is not recorded" in note.message
+    )
 
 
 def test_coloured_noise_is_no_mistake(recordings, runs):
@@ -281,9 +293,9 @@ def test_coloured_noise_is_no_mistake(recordings, runs):
 def test_gaps_and_other_rates_of_samples_are_no_mistake(recordings, runs):
     """A force with a hole in it, and a camera at 50 Hz."""
     one, samples = recordings["rolling"], dict(recordings["rolling"].samples)
-    t, F = samples["F_x"]
+    t, F = samples["effort_x"]
     there = (t < 0.4) | (t > 0.5)
-    samples |= {"F_x": (t[there], F[there]), "x_C": tuple(x[::4] for x in samples["x_C"])}
+    samples |= {"effort_x": (t[there], F[there]), "x_C": tuple(x[::4] for x in samples["x_C"])}
     assert looked_at(replace(one, samples=samples), runs["rolling"]) == []
 
 
@@ -310,9 +322,9 @@ def test_sparse_set_points_are_told_by_what_they_do(recordings, rates):
             actuator(torch.stack((*d.unbind(-1), zero, zero, zero), -1)).detach() for d in signals
         ]
         real = float((efforts[0] - efforts[1]).square().mean().sqrt())
-        told = {gap.channel: gap for gap in gaps(sparse, SENSORS, "x")}["F_x"]
+        told = {gap.channel: gap for gap in gaps(sparse, SENSORS, "x")}["effort_x"]
         assert 0.5 * real < told.error < 2.5 * real
-        assert told.noises == told.error / SENSORS["F_x"].noise
+        assert told.noises == told.error / SENSORS["effort_x"].noise
         assert 2.5 < told.order <= 4.0
     enough, few, hardly = (
         list(setpoint_findings(at_rows(one, rate, rates=rates), SENSORS))
@@ -351,25 +363,25 @@ def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings):
 
 def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant():
     found = together([
-        Diagnostic("error", "a", "F_x looks wrong", "sign of F_x"),
-        Diagnostic("warning", "a", "F_y is off", "loop of F_y"),
-        Diagnostic("error", "b", "F_x looks wrong too", "sign of F_x"),
+        Diagnostic("error", "a", "effort_x looks wrong", "sign of effort_x"),
+        Diagnostic("warning", "a", "effort_y is off", "loop of effort_y"),
+        Diagnostic("error", "b", "effort_x looks wrong too", "sign of effort_x"),
     ])  # fmt: skip
-    assert [f.code for f in found] == ["sign of F_x", "loop of F_y"]
-    assert found[0].message == "F_x looks wrong; so it is in `b`"
-    with pytest.raises(ValueError, match=r'if it is so, say acknowledged = \["sign of F_x"\]'):
+    assert [f.code for f in found] == ["sign of effort_x", "loop of effort_y"]
+    assert found[0].message == "effort_x looks wrong; so it is in `b`"
+    with pytest.raises(ValueError, match=r'if it is so, say acknowledged = \["sign of effort_x"\]'):
         accepted(found, [])
     with pytest.raises(
         ValueError,
-        match=r"called 'nonsense', so leave it out; what was found is sign of F_x, loop of F_y$",
+        match=r"called 'nonsense', so leave it out; what was found is sign of effort_x, loop of F_y$",
     ):
-        accepted(found, ["sign of F_x", "nonsense"])
+        accepted(found, ["sign of effort_x", "nonsense"])
     with pytest.raises(
         ValueError,
         match=r"^acknowledged: nothing was found that is called 'nonsense', .* nothing looks "
         r"wrong$",
     ):
         accepted([], ["nonsense"])
-    first, second = accepted(found, ["sign of F_x"])
-    assert first == "F_x looks wrong; so it is in `b` (acknowledged)"
-    assert second == "F_y is off"
+    first, second = accepted(found, ["sign of effort_x"])
+    assert first == "effort_x looks wrong; so it is in `b` (acknowledged)"
+    assert second == "effort_y is off"

@@ -68,7 +68,7 @@ def true_bodies(recording: Recording, y0: Tensor) -> dict[str, float]:
         f"{body}.{v}{axis}": float(part[body][i])
         for v, part in parts
         for body in part
-        for i, axis in enumerate(("x", "y", "theta"))
+        for i, axis in enumerate(("x", "y", "theta_C"))
     }
 
 
