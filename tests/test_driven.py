@@ -3,16 +3,15 @@
 import json
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
 
-from torchsoft import hold, simulate
+from torchsoft import BuiltRig, hold, simulate
 from torchsoft.cli import main
-from torchsoft.physics.statics import BuiltRig, resting, standing
+from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.check import check
 from torchsoft.solve.diagnostics import NEUTRAL, modes
@@ -89,7 +88,7 @@ def written(folder: Path, start: float = 32.5e-3) -> Path:
 
 
 @pytest.fixture
-def built(tmp_path: Path) -> BuiltRig[Any]:
+def built(tmp_path: Path) -> BuiltRig:
     """The rig, begun where the indenter touches."""
     return RigFile.from_toml(written(tmp_path)).build()
 
@@ -105,7 +104,7 @@ def test_the_check_finds_nothing(tmp_path: Path, start: float):
     assert run.energy_residual_rel < 1e-3
 
 
-def test_gradients_of_the_force(built: BuiltRig[Any]):
+def test_gradients_of_the_force(built: BuiltRig):
     """By a material's tau and by the motion: adjoint, sensitivities and differences agree."""
     rig, y0, t = built
     tau, places = rig.parameter(TAU), rig.reference["indenter.y"].values
@@ -132,7 +131,7 @@ def test_gradients_of_the_force(built: BuiltRig[Any]):
         assert difference == pytest.approx(float(slope), rel=1e-3)
 
 
-def test_modes_without_a_free_coordinate(built: BuiltRig[Any]):
+def test_modes_without_a_free_coordinate(built: BuiltRig):
     """Out of contact there is none; pressed in, pads relax and nothing grows; at rest the body is
     where it is driven."""
     rig = built.rig
