@@ -7,16 +7,15 @@ from itertools import pairwise
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import coarse, f64, grasped, manipulate, times
 from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import METHOD, SoftGrasp, register_method, simulate
-from torchsoft.scenario import grasp_and_roll
+from torchsoft import METHOD, Rig, register_method, simulate
 from torchsoft.solve.torchdiffeq import TorchdiffeqSolver
 
 OPTIONS = {"step_size": 2e-3, "tolerance": 1e-10}
 
-Rolling = tuple[SoftGrasp, torch.Tensor]
+Rolling = tuple[Rig, torch.Tensor]
 SOLVERS = importlib.import_module("torchdiffeq._impl.odeint").SOLVERS
 
 
@@ -32,9 +31,9 @@ def test_an_import_leaves_torchdiffeq_alone_and_pysindy_for_later():
 def test_torchdiffeq_runs_the_stepper():
     """`odeint(model, y0, t, method="sdirk2")` is `simulate`, sample by sample."""
     model = coarse()
-    manipulation = grasp_and_roll(model, grasp_force=75.0)
+    y0 = manipulate(model, 75.0)
     t = times(0.1, 6)
-    y0 = torch.stack((manipulation.y0, manipulation.y0.clone()))
+    y0 = torch.stack((y0, y0.clone()))
     y0[1, model.layout.slices["velocity", "disc"]] = f64(1e-3, 0.0, 0.0)
     solution = odeint(model, y0, t, method=METHOD, options={"step_size": 2e-3})
     assert solution.shape == (6, 2, model.layout.size)
@@ -122,16 +121,16 @@ def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_their
 def rolling():
     """A model and two states (2, size) in its grasp."""
     model = coarse()
-    manipulation = grasp_and_roll(model, grasp_force=75.0)
+    y0 = manipulate(model, 75.0)
     with torch.no_grad():
-        y = odeint(model, manipulation.y0, f64(0, 0.3, 0.5), method=METHOD)
+        y = odeint(model, y0, f64(0, 0.3, 0.5), method=METHOD)
     y0 = torch.stack((y[1], y[2])).detach()
     y0[:, model.layout.slices["velocity", "disc"]] += f64(0.02, 0.0, 0.0)
     return model, y0
 
 
 def gradients(
-    model: SoftGrasp, y0: torch.Tensor, verb: object
+    model: Rig, y0: torch.Tensor, verb: object
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     model.zero_grad(set_to_none=True)
     start = y0.clone().requires_grad_(True)
