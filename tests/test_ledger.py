@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times, towards
+from conftest import COARSE, PAPER, coarse, excited, f64, grasped, still, times, towards
 from torch import Tensor, nn
 
 from torchsoft import (
@@ -21,12 +21,11 @@ from torchsoft import (
     Rig,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
     hold,
     simulate,
     simulate_batch,
 )
-from torchsoft.excitation import CATALOGUE, begin
+from torchsoft.rigs.excite import CATALOGUE
 from torchsoft.solve.diagnostics import RESIDUAL, doubts
 
 
@@ -41,9 +40,8 @@ def told(model: Rig, run: Callable[..., object] = simulate, **options: object) -
 @pytest.mark.parametrize("name", ["deep jerks", "light jerks"])
 def test_hard_motions_pass_at_the_default_step_and_at_what_is_advised(name):
     """The hardest of the ready excitations, and the same as coarse as nobody should take them."""
-    excitation = CATALOGUE[name]
-    begun = begin(excitation, coarse(contact__v_s=5e-3).settings)
-    t = times(excitation.duration, 2)
+    begun = excited(name, PAPER.override(COARSE | {"contact.v_s": 5e-3}))
+    t = times(CATALOGUE[name].duration, 2)
     assert told(begun.rig, t=t, y0=begun.y0) == []
     begun.rig.reference = towards(begun.rig, Profile([0.6, 0.68, 0.76], [0.06, 0.08, 0.06]))
     (text,) = told(begun.rig, t=t, y0=begun.y0, step=0.05)
@@ -60,7 +58,7 @@ class Springy(nn.Module):
 
 
 def test_a_slip_law_that_supplies_power_is_seen_in_the_ledger():
-    model = still(coarse().settings, friction=Springy())
+    model = still(COARSE, friction=Springy())
     said = told(model, t=times(0.01, 6), y0=grasped(model, (0.05, 0.0)))
     assert any("`slip` is to dissipate energy, but gave" in text for text in said), said
     assert any("the slip law of `L` gives" in text for text in said), said
@@ -89,7 +87,7 @@ def test_a_law_that_detaches_what_it_depends_on_is_told_of(what, line):
     """With its line; not one that detaches the condition of a choice only, nor one whose parameter
     is held on purpose."""
     slip = Held(0.3 + 0.001 * len(what), what)
-    model = still(coarse().settings, friction=slip)
+    model = still(COARSE, friction=slip)
     run = {"t": times(0.01, 3), "y0": grasped(model, (0.05, 0.0)), "gradient": "discrete"}
     said = told(model, **run)
     sentence = (
@@ -104,11 +102,11 @@ def test_a_parameter_that_is_held_may_be_detached():
         def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
             return (E - self.mu.detach() * F_N).clamp(min=0.0) / R
 
-    model = still(coarse().settings, friction=Fixed(0.3, ""))
+    model = still(COARSE, friction=Fixed(0.3, ""))
     run = {"t": times(0.002, 2), "y0": grasped(model)}
     (text,) = told(model, **run)
     assert "derivatives by `mu` are wrong" in text
-    model.contact.friction.requires_grad_(False)
+    model.contacts["L"].law.friction.requires_grad_(False)
     assert told(model, **run) == []
 
 
