@@ -7,9 +7,10 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from conftest import still
 from test_datasets_config import SMOKE
 
-from torchsoft import PadMesh, Parameters, SoftGrasp
+from torchsoft import PadMesh
 from torchsoft.cli import main
 from torchsoft.cost import Cost, Costly, agree, duration, rig_row, rig_step
 from torchsoft.datasets.config import Config

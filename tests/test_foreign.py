@@ -10,19 +10,21 @@ import foreign
 import numpy as np
 import pytest
 import torch
+from conftest import PAPER, excited
 from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, TAKEN_IN, node
 
-from torchsoft import PadMesh, Parameters, SoftGrasp, Trajectory, simulate
-from torchsoft.excitation import Excitation, MultiSine, begin
+from torchsoft import BuiltRig, PadMesh, Trajectory, simulate
 from torchsoft.physics.mesh import unit_compliance
-from torchsoft.physics.statics import BuiltRig
+from torchsoft.rigs.excite import Excitation
 
 SETTLE, STEP = 0.02, 20e-6
+SINES = {"kind": "multi_sine", "band": (5.0, 20.0), "since": 0.05}
 SHAKEN = Excitation(
-    motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(5.0, 20.0)), duration=0.36,
-    depth=3e-4, grasp_time=0.04, settle=0.01,
+    SINES | {"amplitude": 10e-3, "seed": 0},
+    SINES | {"amplitude": 2e-4, "seed": 1, "times": (0.0, 0.04)},
+    duration=0.36, depth=2e-4,
 )  # fmt: skip
 RIG = {
     "pad.elements_x": 60,
@@ -31,14 +33,14 @@ RIG = {
     "contact.mu_s": 0.6,
     "contact.mu_k": 0.4,
 }
-OWN = Numbers(across=60, through=3, mu_s=0.6, mu_k=0.4, x_C0=SHAKEN.x_C0, senses_disc=False)
+OWN = Numbers(across=60, through=3, mu_s=0.6, mu_k=0.4, x_C0=60.3e-3, senses_disc=False)
 POSES = ("x_C", "y_C", "theta", "x_Br", "y_Br")
 CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 
 @cache
-def begun() -> BuiltRig[SoftGrasp]:
-    return begin(SHAKEN, PAPER.override(RIG))
+def begun() -> BuiltRig:
+    return excited(SHAKEN, PAPER.override(RIG))
 
 
 @cache
