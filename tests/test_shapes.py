@@ -441,6 +441,14 @@ def test_a_centre_of_mass_off_the_origin_is_told(caplog):
     )
 
 
+def test_an_object_that_its_pads_would_turn_is_told_of():
+    wedge = RoundedPolygon([[-20e-3, -10e-3], [20e-3, -10e-3], [20e-3, 10e-3], [-20e-3, 0.0]], 2e-3)
+    with pytest.warns(
+        UserWarning, match=r"held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m"
+    ):
+        rest(still(COARSE, shape=wedge))
+
+
 def test_a_long_box_rests_on_its_whole_side():
     model = still(COARSE, shape=RoundedBox(30e-3, 5e-3, 1e-3))
     state = model.unpack(rest(model).detach())
