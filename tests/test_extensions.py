@@ -4,7 +4,7 @@ an identification."""
 from copy import deepcopy
 
 import pytest
-from conftest import COARSE, rest, still, times
+from conftest import COARSE, paper, rest, still, times
 
 from torchsoft import simulate
 from torchsoft.physics.extensions import extend, extensions
@@ -12,26 +12,27 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
 MODEL = still(COARSE)
+POWER = "laws.steel_on_rubber.power"
 NAMES = tuple(extensions(MODEL))
 
 
 def test_what_a_rig_may_be_extended_by():
     assert NAMES == (
         "pads.L.E_ratio", "pads.L.tau_ratio", "pads.U.E_ratio", "pads.U.tau_ratio",
-        "pad.slow(0.1 s)", "pad.slow(1 s)", "contact.power", "guides.bracket.x.friction",
-        "guides.bracket.x.damping", "guides.bracket.y.friction", "guides.bracket.y.damping",
-        "gravity_tilt",
+        "materials.rubber.slow(0.1 s)", "materials.rubber.slow(1 s)", POWER,
+        "guides.bracket.x.friction", "guides.bracket.x.damping", "guides.bracket.y.friction",
+        "guides.bracket.y.damping", "gravity_tilt",
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("slow", ["pad.slow(0.1 s)", "pad.slow(1 s)"])
+@pytest.mark.parametrize("slow", ["materials.rubber.slow(0.1 s)", "materials.rubber.slow(1 s)"])
 def test_neutral_extensions_change_nothing(slow):
     """All of them at once; of slow branches a pad has one."""
-    model = grasp_and_roll(deepcopy(MODEL)).model
-    before = simulate(model, times(0.3, 31), y0=rest(model))
+    built = paper(COARSE)
+    model, before = built.rig, built.run(times(0.3, 31))
     names = [name for name in NAMES if name == slow or ".slow(" not in name]
     extend(model, names)
-    after = simulate(model, before.t, y0=rest(model), knots=before.knots)
+    after = simulate(model, before.t, y0=built.start(), knots=before.knots)
     for channel in ("x_C", "y_C", "theta", "F_x", "F_y"):
         moved = (after[channel] - before[channel]).abs().max()
         assert float(moved) <= 1e-8 * float(before[channel].abs().max() + 1e-3), channel
@@ -42,12 +43,12 @@ def test_neutral_extensions_change_nothing(slow):
 
 def test_parts_that_are_shared_are_extended_once():
     model = deepcopy(MODEL)
-    extend(model, ["contact.power", "pad.slow(1 s)", "gravity_tilt"])
+    extend(model, [POWER, "materials.rubber.slow(1 s)", "gravity_tilt"])
     assert model.contacts["L"].law.power is model.contacts["U"].law.power
     assert model.pads["L"].branches == model.pads["U"].branches == 2
     assert not any(".slow(" in name for name in extensions(model))
-    assert model.quantity("contact.power") is not None
-    extend(model, ["contact.power"])  # is there already
+    assert model.quantity(POWER) is not None
+    extend(model, [POWER])  # is there already
     with pytest.raises(ValueError, match=r"`contact.colour` is not a parameter of this rig"):
         extend(model, ["contact.colour"])
 

@@ -10,7 +10,7 @@ import foreign
 import numpy as np
 import pytest
 import torch
-from conftest import PAPER, excited, waves
+from conftest import PAPER, excited
 from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, TAKEN_IN, node
@@ -20,9 +20,11 @@ from torchsoft.physics.mesh import unit_compliance
 from torchsoft.rigs.excite import Excitation
 
 SETTLE, STEP = 0.02, 20e-6
+SINES = {"kind": "multi_sine", "band": (5.0, 20.0), "since": 0.05}
 SHAKEN = Excitation(
-    *waves(10e-3, 2e-4, (5.0, 20.0)), duration=0.36,
-    depth=3e-4, grasp=0.04, since=0.05,
+    SINES | {"amplitude": 10e-3, "seed": 0},
+    SINES | {"amplitude": 2e-4, "seed": 1, "times": (0.0, 0.04)},
+    duration=0.36, depth=2e-4,
 )  # fmt: skip
 RIG = {
     "pad.elements_x": 60,
@@ -31,7 +33,7 @@ RIG = {
     "contact.mu_s": 0.6,
     "contact.mu_k": 0.4,
 }
-OWN = Numbers(across=60, through=3, mu_s=0.6, mu_k=0.4, x_C0=SHAKEN.x_C0, senses_disc=False)
+OWN = Numbers(across=60, through=3, mu_s=0.6, mu_k=0.4, x_C0=60.3e-3, senses_disc=False)
 POSES = ("x_C", "y_C", "theta", "x_Br", "y_Br")
 CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 

@@ -4,7 +4,20 @@ nothing unphysical runs."""
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, Exp, coarse, excited, f64, grasped, rest, still, times, towards
+from conftest import (
+    COARSE,
+    PAPER,
+    RUBBER,
+    Exp,
+    coarse,
+    excited,
+    f64,
+    grasped,
+    rest,
+    still,
+    times,
+    towards,
+)
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
@@ -19,7 +32,7 @@ from torchsoft import (
     StandardLinearSolid,
     hold,
     simulate,
-)
+)  # fmt: skip
 from torchsoft.rigs.excite import Excitation
 from torchsoft.solve import stepper, system
 from torchsoft.solve.gradients import GradientFailed
@@ -42,12 +55,11 @@ def test_values_set_on_the_module_run_and_are_saved():
     model, other = coarse(), coarse(contact__K_n=2e5)
     y0 = grasped(other, (0.05, 0.0))
     model.reference = other.reference
-    model.parameter("contact.K_n").data = f64(2e5)[0]
-    assert model.description()["parameters"]["laws.steel_on_rubber.K_n"] == 2e5
+    model.contacts["L"].law.K_n.data = f64(2e5)[0]
     run, expected = (simulate(m, T, y0=y0) for m in (model, other))
     assert torch.equal(run.y, expected.y)
     assert run.made_by == expected.made_by
-    assert run.made_by["parameters"]["contact.K_n"] == 2e5
+    assert run.made_by["parameters"]["laws.steel_on_rubber.K_n"] == 2e5
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # torch's, of what it does not compile
@@ -85,16 +97,14 @@ class Polygonal(Shape):
 def test_a_shape_and_a_friction_law_of_ones_own_run_with_gradients():
     """The same circle and the same law written anew: the same run, and the same gradients."""
     built_in = coarse()
-    mine = SmoothSlip(0.8, 0.7, COARSE["contact.v_s"]).requires_grad_(
-        False
-    )  # captured, so a constant of the law
+    mine = SmoothSlip(0.8, 0.7, 0.05).requires_grad_(False)  # captured, so a constant of the law
     own = still(COARSE, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3))
     one, other = rolled(built_in, gradient="discrete"), rolled(own, gradient="discrete")
     assert float((one.y - other.y).detach().abs().max()) < 1e-9
     a, b = (
         torch.autograd.grad(run["theta"][-1], r)[0]
         for run, r in (
-            (one, built_in.parameter("disc.radius")),
+            (one, built_in.bodies["disc"].shape.radius),
             (other, own.bodies["disc"].shape.r),
         )
     )
@@ -110,13 +120,13 @@ def test_what_becomes_of_the_reference_and_the_model_does_not_change_the_gradien
     place."""
     model = coarse()
     run = rolled(model, gradient="discrete")
-    wanted = [model.pad.E, model.parameter("contact.K_t"), model.parameter("control.R_80")]
+    wanted = [model.parameter(name) for name in ("pad.E", "contact.K_t", "control.R_80")]
     before = torch.autograd.grad(run["theta"][-1], wanted, retain_graph=True)
     with torch.no_grad():
         model.reference["x_d"].values += 1e-3
     model.reference = hold(x_d=0.03, y_d=0.07, F_ff=9.0)
     after = torch.autograd.grad(run["theta"][-1], wanted, retain_graph=True)
-    model.contact.K_n.data = f64(5e5)[0]
+    model.contacts["L"].law.K_n.data = f64(5e5)[0]
     last = torch.autograd.grad(run["theta"][-1], wanted)
     assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(before, after, last))
 
@@ -137,7 +147,10 @@ class Simulated(nn.Module):
 def test_gradients_reach_the_tensors_of_a_functional_call():
     model = coarse()
     y0 = grasped(model, (0.05, 0.0))
-    names = {"pad.E": 0.8e6, "contact.K_n": 1e5, "disc.shape.radius": 19.4e-3, "control.x.Kp": 1e5}
+    names = {
+        "pads.L.material.E": 0.8e6, "contacts.L.law.K_n": 1e5, "bodies.disc.shape.radius": 19.4e-3,
+        "actuators.x.law.Kp": 1e5,
+    }  # fmt: skip
     put_in = {f"model.{name}": f64(value)[0].requires_grad_() for name, value in names.items()}
     theta = torch.func.functional_call(Simulated(model), put_in, (y0,))
     got = torch.autograd.grad(theta, list(put_in.values()))
@@ -151,7 +164,7 @@ def test_gradients_reach_the_tensors_of_a_functional_call():
     assert torch.equal(theta.detach(), other.detach())
     assert all(torch.equal(a, b) for a, b in zip(got, expected))
     assert all(float(x) != 0 for x in got)
-    assert float(model.pad.E.detach()) == 0.75e6
+    assert float(model.parameter("pad.E").detach()) == 0.75e6
 
 
 def test_parametrized_parameters_get_their_gradients():
@@ -160,9 +173,12 @@ def test_parametrized_parameters_get_their_gradients():
     y0 = grasped(plain, (0.08, 0.0))
     logarithmic.reference = plain.reference
     names = ("K_t", "mu_s", "E", "nu", "Kd", "radius", "mass")
-    owners = lambda m: zip(
-        (m.contact, m.contact.friction, m.pad, m.pad, m.control["x"], m.shape, m.disc), names
-    )
+
+    def owners(m: Rig) -> zip:
+        law, rubber, disc = m.contacts["L"].law, m.pads["L"].material, m.bodies["disc"]
+        loop = m.actuators["x"].law
+        return zip((law, law.friction, rubber, rubber, loop, disc.shape, disc), names)
+
     values = [getattr(owner, name) for owner, name in owners(plain)]
     for owner, name in owners(logarithmic):
         parametrize.register_parametrization(owner, name, Exp())
@@ -181,14 +197,15 @@ def test_tied_parameters_get_the_sum_of_their_gradients():
     plain, tied = coarse(), coarse()
     y0 = grasped(plain, (0.05, 0.01))
     tied.reference = plain.reference
-    tied.contact.R_t = tied.contact.R_n
-    tied.control["y"].Kp = tied.contact.K_n  # 1.2e5 N/m all of them
-    tied.contact.K_t = tied.contact.K_n
+    law = tied.contacts["L"].law
+    law.R_t = law.R_n
+    tied.actuators["y"].law.Kp = law.K_n  # 1.2e5 N/m all of them
+    law.K_t = law.K_n
     names = ("contact.R_n", "contact.R_t", "contact.K_n", "contact.K_t", "control.K_98")
     R_n, R_t, K_n, K_t, K_98 = torch.autograd.grad(
         Simulated(plain)(y0), [plain.parameter(n) for n in names]
     )
-    R, K = torch.autograd.grad(Simulated(tied)(y0), [tied.contact.R_n, tied.contact.K_n])
+    R, K = torch.autograd.grad(Simulated(tied)(y0), [law.R_n, law.K_n])
     assert float(R) == pytest.approx(float(R_n + R_t), rel=1e-9)
     assert float(K) == pytest.approx(float(K_n + K_t + K_98), rel=1e-9)
     assert min(abs(float(x)) for x in (R_n, R_t, K_n, K_t, K_98)) > 0
@@ -203,7 +220,7 @@ def test_what_has_no_gradient_says_so():
         (run["theta"][-1] + lost).backward(retain_graph=True)
     (run["theta"][-1] + 0.0 * lost).backward(retain_graph=True)
     with pytest.raises(GradientFailed, match="has no second derivative"):
-        torch.autograd.grad(run["theta"][-1], model.pad.E, create_graph=True)
+        torch.autograd.grad(run["theta"][-1], model.parameter("pad.E"), create_graph=True)
     assert not rolled(model).dissipated["slip"].requires_grad
 
 
@@ -241,26 +258,26 @@ def test_what_is_saved_is_what_ran():
     model, other = coarse(), coarse(contact__K_n=2e5)
     y0 = grasped(model, (0.05, 0.0))
     said = lambda: simulate(model, T, y0=y0).made_by
-    parametrize.register_parametrization(model.contact, "K_t", Exp())
+    law, E = model.contacts["L"].law, model.parameter("pad.E")
+    parametrize.register_parametrization(law, "K_t", Exp())
     with torch.no_grad():
-        model.contact.parametrizations.K_t.original.add_(0.1)
-    assert said()["parameters"]["contact.K_t"] == model.contact.K_t.item() != 1.2e5
+        law.parametrizations.K_t.original.add_(0.1)
+    assert said()["parameters"]["laws.steel_on_rubber.K_t"] == law.K_t.item() != 1.2e5
     model.load_state_dict(other.state_dict(), strict=False)
-    assert said()["parameters"]["contact.K_n"] == 2e5
-    optimiser = torch.optim.SGD([model.pad.E], lr=1e12)
+    assert said()["parameters"]["laws.steel_on_rubber.K_n"] == 2e5
+    optimiser = torch.optim.SGD([E], lr=1e12)
     rolled(model, gradient="discrete")["theta"][-1].backward()
     optimiser.step()
-    assert said()["parameters"]["pad.E"] == model.pad.E.item() != 0.75e6
-    model.contact.friction = Coulomb(0.5, 0.4)
+    assert said()["parameters"]["materials.rubber.E"] == E.item() != 0.75e6
+    law.friction = Coulomb(0.5, 0.4)
     made_by = said()
-    assert made_by["parameters"]["contact.friction"] == "coulomb"
     assert made_by["friction"]["L"] == "Coulomb"
-    assert "contact.v_s" not in made_by["parameters"]
+    assert "laws.steel_on_rubber.friction.v_s" not in made_by["parameters"]
     assert made_by["control"] == {"x": "PD", "y": "PD"}
     assert made_by["mesh"]["L"] == f"PadMesh, {len(model.pads['L'].mesh.nodes)} nodes"
     oval = still(COARSE, shape=Ellipse(19.8e-3, 19.1e-3))
     described = oval.description()
-    assert "disc.radius" not in described["parameters"]
+    assert "bodies.disc.shape.radius" not in described["parameters"]
     assert described["shape"] == {"disc": "Ellipse"}
     oval.actuators["x"] = Actuator(
         "disc.x", "bracket.x", lambda w, w_dot, f, q, q_dot: f - 1e3 * q, setpoint="x_d"
@@ -274,14 +291,13 @@ def test_what_is_saved_is_what_ran():
 
 def made_and_run() -> list[Tensor]:
     """Parts made, a motion begun and run with gradients and sensitivities."""
-    motion = {"kind": "multi_sine", "amplitude": 1e-3, "band": (5.0, 20.0)}
-    shaken = Excitation(motion, duration=0.5, grasp=0.05, since=0.07)
-    begun = excited(shaken, PAPER.override(COARSE))
-    run = simulate(begun.rig, times(0.1, 6), y0=begun.y0, gradient="discrete")
-    forward = simulate(begun.rig, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
-    gradients = torch.autograd.grad(
-        run["y_C"][-1], [begun.rig.parameter(name) for name in ("pad.E", "contact.K_t")]
-    )
+    roll = {"kind": "multi_sine", "amplitude": 1e-3, "band": (5.0, 20.0), "since": 0.07}
+    excitation = Excitation(roll, {"times": (0.0, 0.05)}, duration=0.5)
+    rig, y0, _ = excited(excitation, PAPER.override(COARSE))
+    run = simulate(rig, times(0.1, 6), y0=y0, gradient="discrete")
+    forward = simulate(rig, run.t, y0=y0, gradient="forward", wrt=["pad.E", "pad.nu"])
+    wanted = [rig.parameter(name) for name in ("pad.E", "contact.K_t")]
+    gradients = torch.autograd.grad(run["y_C"][-1], wanted)
     oval = still(COARSE, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4))
     parts = [
         rest(oval),
@@ -381,14 +397,12 @@ def test_every_second_number_of_a_tensor_is_as_good_as_a_tensor():
 
 def test_parts_replaced_after_a_run_run():
     """A material with more branches after the first run."""
-    model = coarse()
+    model, fresh = coarse(), coarse()
     simulate(model, T, y0=grasped(model))
-    size, E = model.layout.size, 7.5e5
-    other = StandardLinearSolid(E, 2 * E, 0.45, 1100.0, 10e-3, 44e-3, tau_instant=1e-3)
-    for pad in model.pads.values():
-        pad.material = other
-    assert model.layout.size > size
-    fresh = still(COARSE, material=other)
+    rubber = StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.01)
+    for pad in (*model.pads.values(), *fresh.pads.values()):
+        pad.material = rubber
+    assert model.layout.size > coarse().layout.size
     y0 = grasped(fresh)
     model.reference = fresh.reference
     assert torch.equal(simulate(model, T, y0=y0).y, simulate(fresh, T, y0=y0).y)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, excited, f64, grasped, still, times
+from conftest import coarse, excited, f64, grasped, times
 from rig_tester import assert_gradients_exact
 from scipy.integrate import quad
 from scipy.stats import norm
@@ -28,6 +28,7 @@ from torchsoft import (
     PadMesh,
     Rig,
     Taxels,
+    Trajectory,
     simulate,
     simulate_batch,
 )
@@ -43,6 +44,18 @@ def pressed(speed: float = 0.02) -> tuple[Rig, Tensor]:
     model = coarse()
     model.taxels |= SKIN
     return model, grasped(model, (speed, 0.0))
+
+
+def run(**options: Any) -> Trajectory:
+    model, y0 = pressed()
+    return simulate(model, times(0.1, 3), y0=y0, **options)
+
+
+def covered(**taxels: Taxels) -> Rig:
+    """The paper's bodies and pads without loops, with taxels."""
+    rig = coarse()
+    parts = {name: dict(getattr(rig, name)) for name in ("bodies", "pads", "contacts")}
+    return Rig(**parts, taxels=taxels)
 
 
 def falling() -> tuple[Rig, Tensor]:
@@ -104,16 +117,14 @@ def test_a_taxel_takes_what_a_gaussian_has_inside_it():
 REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "both": (lambda: Taxels("L", 1e-3, count=3, centres=[0.0]), "a `count` or their `centres`"),
     "width": (lambda: Taxels("L", 0.0, count=3), "`width` should be from 1e-06 to 10 m, not 0"),
-    "pad": (lambda: still(taxels={"skin": Taxels("K", 1e-3, count=3)}), "they lie on `K`"),
-    "name": (lambda: still(taxels={"L": Taxels("L", 1e-3, count=3)}), "is called `L` too"),
+    "pad": (lambda: covered(skin=Taxels("K", 1e-3, count=3)), "they lie on `K`"),
+    "name": (lambda: covered(L=Taxels("L", 1e-3, count=3)), "is called `L` too"),
     "channel": (
-        lambda: simulate(
-            coarse(), times(0.1, 3), gradient="forward", wrt=["pad.E"], touch=["L.norm"]
-        ),
+        lambda: run(gradient="forward", wrt=["pad.E"], touch=["L.norm"]),
         r"`touch` names 'L.norm', but channels of touch are .*L.normal.0 to 60",
     ),
     "route": (
-        lambda: simulate(coarse(), times(0.1, 3), touch=["L.normal"]),
+        lambda: run(touch=["L.normal"]),
         "`touch` belong to gradient='forward'",
     ),
     "file": (
@@ -176,11 +187,10 @@ def test_taxels_are_sensors_of_a_fit():
     delay and a gain of its own but one."""
     felt = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
     centre = {"L.centre": Sensor(noise=1e-4), "bracket_moment": Sensor(noise=1e-3)}
-    planned = excited(SHAKE, BASE)
-    rig = planned.rig
-    rig.taxels = SKIN
+    skin = {"pad": "L", "width": 3e-3, "count": 40, "spread": 1e-3}
+    planned = excited(SHAKE, BASE.override(taxels={"skin": skin}))
     data = record("shake", planned, TRUTH, SENSORS | felt | centre, noise=0.0)
-    assert data.channels[-6:] == (*felt, *centre)
+    assert data.channels[-6:] == (*felt, "L.centre", "M_U")
     sensors = (
         SENSORS
         | centre
@@ -211,7 +221,7 @@ def test_taxels_of_a_rig_file_are_columns_of_its_recordings(tmp_path):
         '\n[taxels.skin]\npad = "left_tip"\nwidth = 2e-3\ncount = 3\nspread = 5e-4\n'
     )
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
-    fit = FIT.replace("y_disc.noise = 1e-5\n", "").replace("F_left_x.noise = 0.05\n", "")
+    fit = FIT.replace("y_disc.noise = 1e-5\n", "").replace("effort_left_x.noise = 0.05\n", "")
     fit += '"skin.normal".noise = 0.01\n'
     (tmp_path / "fit.toml").write_text(fit, encoding="utf-8")
     names = ["x_disc", "x_left", *(f"skin.normal.{i}" for i in range(3))]

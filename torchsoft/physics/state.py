@@ -65,7 +65,7 @@ class Layout:
         if y.shape[-1:] != (self.size,) or y.dtype != torch.float64:
             raise ValueError(
                 f"`y` must be float64 of shape (..., {self.size}), but is {y.dtype} of shape "
-                f"{tuple(y.shape)}; build it with `rest` or `Rig.pack`"
+                f"{tuple(y.shape)}; build it with `Rig.state` or `Rig.pack`"
             )
 
     def unpack(

@@ -85,13 +85,17 @@ def summary(rig: Rig) -> tuple[str, list[tuple[str, str]]]:
 
 def description(rig: Rig) -> dict[str, Any]:
     """Implementation of `Rig.description`."""
-    names = {own: name for name, own in rig.names.items()}
+    names, values = {own: name for name, own in rig.names.items()}, dict[str, Any]()
+    for own, value in rig.named_parameters():
+        if own.startswith("reference."):
+            continue
+        owner, behind, last = own.partition(".parametrizations.")
+        if behind:  # the value, not what it is made of
+            last = last.partition(".")[0]
+            own, value = f"{owner}.{last}", getattr(rig.get_submodule(owner), last)
+        values[names.get(own, own)] = value.detach().tolist()
     return {
-        "parameters": {
-            names.get(own, own): value.detach().tolist()
-            for own, value in rig.named_parameters()
-            if not own.startswith("reference.")
-        },
+        "parameters": values,
         "friction": {
             name: law_name(contact.law.friction) for name, contact in rig.contacts.items()
         },
