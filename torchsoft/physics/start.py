@@ -109,8 +109,13 @@ def placed(rig: Rig, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
     """Poses of bodies that start as given, by what `held` has of coordinates that are not free.
 
     First bodies rest, then others come down until they touch, then these are pressed and the
-    resting ones give way. Differentiable; raises `NoPlace` and `NoEquilibrium`.
+    resting ones give way. Differentiable; raises `NoPlace` and `NoEquilibrium`, and `ValueError` in
+    inference mode, which has no graphs.
     """
+    if torch.is_inference_mode_enabled():
+        raise ValueError(
+            "statics need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()"
+        )
     pose = {name: list(at.unbind()) for name, at in held.items()}
     rests: dict[str, list[int]] = {}
     presses: dict[str, Any] = {}
