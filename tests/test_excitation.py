@@ -1,50 +1,154 @@
-"""Excitations: what cannot be carried out is refused by its field before anything is simulated."""
+"""Excitations: motions of any rig that grasps, in place of two of its own."""
+
+import math
+from typing import Any
 
 import pytest
 from conftest import PAPER, excited, f64
 
-from torchsoft.rigs.excite import CATALOGUE, Excitation
-from torchsoft.tables import InvalidTable
+from torchsoft import BuiltRig, RigFile
+from torchsoft.rigs.excite import CATALOGUE, GRASP, OFF_NODE, SINCE, Excitation, excite
 
-ROLL = {"kind": "slow_roll"}
+RIGS = "paper", "light_grasp", "ellipse", "rounded_box"
+COARSE = {"elements_x": 40, "elements_y": 1}
+ROLL = {"kind": "profile", "times": [0.5, 0.8], "values": [0.0, 4e-3], "offset": "start"}
+
+
+def coarse(name: str) -> RigFile:
+    file = RigFile.ready(name)
+    return file.override(pads=dict.fromkeys(file.pads, COARSE))
+
+
+def followed(built: BuiltRig, *times: float) -> dict[str, list[float]]:
+    """Values of the motions at these times."""
+    values = built.rig.follow(f64(*times))[..., 0].T.tolist()
+    return dict(zip(built.rig.signals, values))
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("rig", ["paper", "ellipse"])
+def test_every_entry_of_the_catalogue_builds(rig, name):
+    one = CATALOGUE[name]
+    built = excite(coarse(rig), name).build()
+    assert float(built.t[-1]) == one.duration
+    values = followed(built, *built.t.tolist())
+    heights = values["y_d"]
+    assert heights[0] - heights[40] == pytest.approx(one.depth, abs=1e-12)
+    assert all(math.isfinite(x) for row in values.values() for x in row)
+    moved = max(values["x_d"]) - min(values["x_d"])
+    assert moved > 1e-3
+    assert values["x_d"][:50] == pytest.approx([values["x_d"][0]] * 50, abs=1e-12)  # the grasp
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_rig_that_grasps_is_excited(rig):
+    """Its bracket touches, comes down by the depth and moves to the side by its own loop, and the
+    force that holds it is fed forward."""
+    file = coarse(rig)
+    before = file.bodies["bracket"].start
+    changed = excite(file, Excitation(ROLL, duration=1.0, depth=1e-3))
+    assert changed.actuators["x"].measured == "bracket.x"
+    built = changed.build()
+    state = built.rig.unpack(built.y0)
+    x, y, _ = state.pose["bracket"].tolist()
+    (upper,) = (one for one in built.rig.contacts if built.rig.pads[one].base == "bracket")
+    assert abs(built.rig.penetration(upper, state).max().item()) < 1e-15
+    assert x == pytest.approx(before.x + OFF_NODE)
+    body = built.rig.contacts[upper].body
+    assert state.pose[body][0].item() == pytest.approx(file.bodies[body].start.x + OFF_NODE)
+    values = followed(built, 0.0, GRASP, SINCE, 0.8, 1.0)
+    assert values["y_d"] == pytest.approx([y, *[y - 1e-3] * 4], abs=1e-15)
+    assert values["x_d"] == pytest.approx([x, x, x, x + 4e-3, x + 4e-3], abs=1e-15)
+    held = built.rig.unpack(built.rig.state({
+        body: {"x": state.pose[body][0].item(), "y": "rest"},
+        "bracket": {"x": x, "y": {"depth": 1e-3}},
+    }))  # fmt: skip
+    force = float(held.pads[upper][0][:, 1].detach().sum())
+    assert values["F_ff"] == pytest.approx([0.0, *[-force] * 4], rel=1e-6)
+    assert changed.names.keys() == file.names.keys()
+    assert changed.materials == file.materials
+
+
+@pytest.mark.parametrize("rig", ["paper", "light_grasp"])
+def test_an_excitation_runs(rig):
+    (law,) = (file := coarse(rig)).laws
+    file = file.override({f"laws.{law}.friction.v_s": 0.05})
+    run = excite(file, Excitation(ROLL, duration=0.8)).build().run(rtol=1e-3)
+    x = run["x_Br" if rig == "paper" else "x_bracket"]
+    assert float(x[-1]) == pytest.approx(64.3e-3, abs=4e-4)  # the loop gives way to friction
+    assert all(float(F[-1, :, 0].sum()) > 10.0 for F in run.force.values())
+
+
+def test_a_loop_may_sense_the_manipulated_body():
+    """Then nothing is moved off the nodes."""
+    file = coarse("paper")
+    changed = excite(file, "strokes", senses="disc")
+    assert changed.actuators["x"].measured == "disc.x"
+    assert changed.bodies["disc"].start.x == changed.bodies["bracket"].start.x == 60e-3
+    assert excite(file, "strokes").actuators["x"].measured == "bracket.x"
+
+
+def test_shaking_is_along_and_across():
+    """By phases of their own, from the seeds."""
+    file = coarse("paper")
+    times = [0.01 * i for i in range(50, 200)]
+    one, again = (followed(excite(file, "shaking").build(), *times) for _ in range(2))
+    assert one == again
+    x, y = ([v - row[0] for v in row] for row in (one["x_d"], one["y_d"]))
+    assert 1e-3 < max(map(abs, x)) <= 10e-3
+    assert 2e-5 < max(map(abs, y)) <= 2e-4
+    scaled = [v * max(map(abs, x)) / max(map(abs, y)) for v in y]
+    assert max(abs(a - b) for a, b in zip(x, scaled)) > 1e-3
+
+
+# refusals
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("tree", "message"),
+    ("rig", "how", "words"),
     [
-        ({"motion": ROLL, "duration": 0.4},
-         "duration = 0.4 s leaves no motion: grasp_time = 0.375 s and settle = 0.125 s"),
-        ({"motion": {"kind": "chirp"}, "duration": 0.7}, "chirp needs more than 0.3 s after them"),
-        ({"motion": {"kind": "multi_sine"}, "duration": 1e5}, "makes more than 100000 periods"),
-        ({"motion": {"kind": "strokes", "stroke_time": 1e-5}, "duration": 9.0},
-        "motion.stroke_time = 1e-05 s makes more than"),
-        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}},
-         "times of motion.x must increase, but 0.1 s"),
-        ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}},
-         "duration = 2 s ends before the last knot of the motion, at 2.5 s"),
+        ("two_fingers", {}, "left and right do; say which `body`"),
+        ("drop", {}, "across the pad and along it: none does"),
+        ("paper", {"body": "disc"}, "along it: none does"),
+    ],
+)
+def test_a_rig_without_one_body_that_grasps_is_refused(rig, how, words):
+    with pytest.raises(ValueError, match=r"needs a body with a pad that two loops move") as error:
+        excite(RigFile.ready(rig), "strokes", **how)
+    assert words in str(error.value)
+
+
+def test_one_of_two_fingers_is_excited():
+    """The left one presses to the right, and moves upwards."""
+    file = RigFile.ready("two_fingers")
+    changed = excite(file, Excitation(ROLL, depth=5e-3, duration=1.0), body="left")
+    assert changed.motion["left_close"].values == (0.0, 5e-3)
+    assert changed.motion["left_lift"].values == (0.0, 4e-3)
+    assert changed.motion["right_close"] == file.motion["right_close"]
+    assert excite(file, "slow roll", body="right").motion["right_close"].values == (0.0, -1.5e-3)
+
+
+def test_an_unknown_excitation_is_refused():
+    with pytest.raises(ValueError, match="there is no excitation `stroke`; did you mean `strokes`"):
+        excite(RigFile.ready("paper"), "stroke")
+
+
+@pytest.mark.parametrize(
+    ("roll", "duration", "message"),
+    [
+        ({"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 2.0}, 0.7,
+         "motion.x_d.since = 0.5 s leaves 0.2 s until 0.7 s"),
+        ({"kind": "multi_sine", "amplitude": 1e-3, "band": [0.5, 1e5]}, 9.0,
+         "motion.x_d has more than 100000 periods"),
+        ({"kind": "strokes", "travel": 1e-3, "stroke_time": 1e-5}, 9.0,
+         "motion.x_d.stroke_time = 1e-05 s makes 850000 strokes"),
+        ({"kind": "profile", "times": [0.1, 0.1], "values": [0.0, 1e-3]}, 2.0,
+         "times must increase, but 0.1 s"),
+        ({"kind": "waltz"}, 2.0, "motion.x_d"),
     ],
 )  # fmt: skip
-def test_an_impossible_excitation_is_refused_by_its_field(tree, message):
-    with pytest.raises(InvalidTable) as error:
-        Excitation.model_validate(tree)
+def test_an_impossible_excitation_is_refused_by_its_field(roll: Any, duration, message):
+    with pytest.raises(ValueError, match=r".") as error:
+        excite(coarse("paper"), Excitation(roll, duration=duration)).build()
     assert message in str(error.value)
-
-
-def test_lists_stand_for_bands():
-    shaking = CATALOGUE["shaking"].model_dump(mode="json")
-    assert Excitation.model_validate(shaking) == CATALOGUE["shaking"]
-
-
-def test_knots_are_reached_from_the_grasp():
-    """At rest at each, on top of where the grasp ended."""
-    knots, p = Knots(x=((0.1, 4e-3), (0.3, -2e-3)), y=((0.2, -1e-4),)), PAPER
-    excitation = Excitation(motion=knots, grasp=0.2, since=0.3, duration=0.8, depth=1e-3)
-    reference, since = excited(excitation, p).rig.reference, 0.3
-    t = f64(0.0, since, since + 0.1, since + 0.2, since + 0.3, 5.0)
-    value, rate = reference(t, ["x_d", "y_d"]).unbind(-1)
-    x, y = 60.3e-3, apart(p)
-    assert value[:, 0].tolist() == pytest.approx([x, x, x + 4e-3, x + 1e-3, x - 2e-3, x - 2e-3])
-    assert value[:, 1].tolist() == pytest.approx(
-        [y, y - 1e-3, y - 1.05e-3, y - 1.1e-3, y - 1.1e-3, y - 1.1e-3]
-    )
-    assert rate[[0, 1, 2, 4, 5], 0].abs().max() == 0
