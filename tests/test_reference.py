@@ -4,14 +4,15 @@ last changed (`made_by`), and their gradients."""
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from conftest import PAPER, excited, holding_force, manipulate, press, rest, still, times
+from conftest import PAPER, grasp, holding_force, paper, press, rest, still, times
 from torch import Tensor
 
-from torchsoft import Rig, Trajectory, simulate
-from torchsoft.rigs.excite import CATALOGUE
-from torchsoft.solve.diagnostics import NEUTRAL, loop_modes
+from torchsoft import Profile, Reference, Rig, Trajectory, simulate
+from torchsoft.physics.motion import Wave, Waves, wave
+from torchsoft.solve.diagnostics import NEUTRAL, modes
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
 
@@ -48,10 +49,10 @@ def series(run: Trajectory) -> dict[str, Tensor]:
 @pytest.fixture(scope="module")
 def manipulation():
     """The 30 s with the gradient behind them, pads' initial displacements held."""
-    y0 = manipulate(still(), REFERENCE["manipulation"]["grasp_force"])
-    t = times(30, 3001)
-    y0 = held_displacements(made.model, y0)
-    return made.model, simulate(made.model, t, y0=y0, step=2e-3, gradient="discrete")
+    force = REFERENCE["manipulation"]["grasp_force"]
+    rig, y0, _ = paper({"motion.F_ff.values": [0.0, -force]})
+    y0 = held_displacements(rig, y0)
+    return rig, simulate(rig, times(30, 3001), y0=y0, step=2e-3, gradient="discrete")
 
 
 def test_the_manipulation_is_the_reference(manipulation):
@@ -72,13 +73,11 @@ def test_the_manipulation_is_the_reference(manipulation):
         assert touching == [9, 11, 11 if k == "L" else 10, 10, 11, 11, 11]
 
 
-def test_gradients_of_the_manipulation_are_the_references(
-    manipulation,
-):
+def test_gradients_of_the_manipulation_are_the_references(manipulation):
     model, run = manipulation
-    reference = REFERENCE["gradient_of_theta_10s"]
+    reference = REFERENCE["gradient_of_theta_C_10s"]
     names = list(reference["by"])
-    found = torch.autograd.grad(run["theta"][1000], [model.parameter(name) for name in names])
+    found = torch.autograd.grad(run["theta_C"][1000], [model.parameter(name) for name in names])
     sure = [name for name in names if reference["uncertainty"][name] <= RELATIVE]
     assert len(sure) == 19
     for name, gradient in zip(names, found):
@@ -88,52 +87,53 @@ def test_gradients_of_the_manipulation_are_the_references(
         ), name
 
 
+def light_shaking(y_Br: float, force: float) -> Reference:
+    """A grasp 0.3 mm deep from the bracket's height [m], with its force [N] fed forward, and sums
+    of five sines of 6 mm and 0.2 mm along it and across, in a band of 4 to 20 Hz."""
+    rng, n, (low, high) = np.random.default_rng(0), 5, np.log((4.0, 20.0))
+
+    def sines(amplitude: float) -> Wave:
+        frequency = np.exp(low + (np.arange(n) + rng.random(n)) / n * (high - low))
+        phase = rng.uniform(0, 2 * np.pi, n)
+        return wave(np.full(n, amplitude / n), frequency, np.zeros(n), phase)
+
+    along, across = sines(6e-3), sines(2e-4)
+    times, since, until = [0.0, 0.375], 0.5, 2.0
+    return Reference(
+        x_d=Waves(([0.0], [60.3e-3]), since, until, along),
+        y_d=Waves((times, [y_Br, 49.8e-3]), since, until, across),
+        F_ff=Profile(times, [0.0, -force]),
+    )
+
+
 def test_light_shaking_is_the_reference():
     """Nodes touch, leave and slip all along; the angle's derivatives by one pass forward, with
     those of the start."""
     reference = REFERENCE["light_shaking"]
-    excitation, y_Br = (
-        CATALOGUE["light shaking"],
-        reference["y_Br_start"],
-    )  # to seven digits `apart`
-    model, y0, _ = excited(
-        excitation,
-        PAPER.override({"contact.v_s": 0.05}),
-        grasp_force=reference["grasp_force"],
-    )
-    y0[model.layout.slices["pose", "bracket"].start + 1] = y_Br
-    model.reference = excited(excitation, model, y_Br, reference["grasp_force"])
-    names = list(reference["theta_end_by"])
+    y_Br = reference["y_Br_start"]
+    changes = {"contact.v_s": 0.05, "control.senses": "bracket.x", "bodies.disc.start.x": 60.3e-3}
+    model = PAPER.override(changes).assemble()
+    model.reference = light_shaking(y_Br, reference["grasp_force"])
+    y0 = model.state(disc={"x": 60.3e-3, "y": "rest"}, bracket={"x": 60.3e-3, "y": y_Br}).detach()
+    names = list(reference["theta_C_end_by"])
     columns = []
     for name in names:
-        p = model.parameter(name)
-        keep, ones = (
-            held_displacements(model, y0),
-            torch.zeros(model.layout.size, dtype=torch.float64, requires_grad=True),
-        )
+        keep = held_displacements(model, y0)
+        ones = torch.zeros(model.layout.size, dtype=torch.float64, requires_grad=True)
         (pulled,) = torch.autograd.grad(
-            (keep * ones).sum(), p, create_graph=True, allow_unused=True
+            (keep * ones).sum(), model.parameter(name), create_graph=True, allow_unused=True
         )
         columns.append(
             torch.zeros_like(y0) if pulled is None else torch.autograd.grad(pulled, ones)[0]
         )
-    t = times(2, 401)
-    run = simulate(
-        model,
-        t,
-        y0=y0,
-        step=5e-4,
-        gradient="forward",
-        wrt=names,
-        dy0=torch.stack(columns, -1),
-        rigid=True,
-    )
+    how = {"step": 5e-4, "gradient": "forward", "wrt": names, "rigid": True}
+    run = simulate(model, times(2, 401), y0=y0, dy0=torch.stack(columns, -1), **how)
     found = series(run)
     for name, value in reference["end"].items():
         extent = float(found[name].max() - found[name].min())
         assert float(found[name][-1]) == pytest.approx(value, abs=OF_RANGE * extent), name
     for name, gradient in zip(names, run.sensitivities[-1, 2].tolist()):
-        assert gradient == pytest.approx(reference["theta_end_by"][name], rel=RELATIVE), name
+        assert gradient == pytest.approx(reference["theta_C_end_by"][name], rel=RELATIVE), name
 
 
 CASES = {"default": {}, "E = 60e3": {"pad.E": 60e3}}
@@ -149,7 +149,7 @@ def case(request):
 @torch.no_grad()
 def test_statics_are_the_references(case):
     model, expected = case
-    y = press(model, model.settings.scenario.y_Br_grasp)
+    y = press(model)
     for name, state in (("rest_y_C", rest(model)), ("press_y_C", y)):
         height = float(model.unpack(state).pose["disc"][1])
         assert height == pytest.approx(expected[name], abs=1e-12)
@@ -159,10 +159,11 @@ def test_statics_are_the_references(case):
 @pytest.mark.slow
 def test_loop_modes_are_the_references(case):
     model, expected = case
-    modes = loop_modes(model)
-    assert int((modes.abs() < NEUTRAL).sum()) == expected["neutral_modes"]
-    creep = (modes + 1 / model.settings.pad.tau).abs() < 1e-3  # of nodes clear of the disc
-    leading = modes[(modes.abs() > NEUTRAL) & ~creep & (modes.imag >= 0)][:4]
+    y, held = grasp(model)
+    found = modes(model, y, held).values
+    assert int((found.abs() < NEUTRAL).sum()) == expected["neutral_modes"]
+    creep = (found + 1 / model.parameter("pad.tau").item()).abs() < 1e-3  # clear of the disc
+    leading = found[(found.abs() > NEUTRAL) & ~creep & (found.imag >= 0)][:4]
     got = torch.stack((leading.real, leading.imag), -1)
     assert torch.allclose(
         got, torch.tensor(expected["leading_modes"], dtype=torch.float64), rtol=1e-4, atol=1e-2
