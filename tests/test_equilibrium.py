@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from conftest import PAPER, f64, holding_force, press, rest
 from conftest import coarse as build
 from conftest import f64, holding_force, press, rest
 from torch import Tensor

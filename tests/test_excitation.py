@@ -4,10 +4,10 @@ import math
 from typing import Any
 
 import pytest
-from conftest import PAPER, excited, f64
+from conftest import f64
 
 from torchsoft import BuiltRig, RigFile
-from torchsoft.rigs.excite import CATALOGUE, GRASP, OFF_NODE, SINCE, Excitation, excite
+from torchsoft.rigs.excite import CATALOGUE, OFF_NODE, SINCE, Excitation, excite
 
 RIGS = "paper", "light_grasp", "ellipse", "rounded_box"
 COARSE = {"elements_x": 40, "elements_y": 1}
@@ -56,7 +56,7 @@ def test_a_rig_that_grasps_is_excited(rig):
     assert x == pytest.approx(before.x + OFF_NODE)
     body = built.rig.contacts[upper].body
     assert state.pose[body][0].item() == pytest.approx(file.bodies[body].start.x + OFF_NODE)
-    values = followed(built, 0.0, GRASP, SINCE, 0.8, 1.0)
+    values = followed(built, 0.0, 0.375, SINCE, 0.8, 1.0)
     assert values["y_d"] == pytest.approx([y, *[y - 1e-3] * 4], abs=1e-15)
     assert values["x_d"] == pytest.approx([x, x, x, x + 4e-3, x + 4e-3], abs=1e-15)
     held = built.rig.unpack(built.rig.state({
@@ -126,7 +126,15 @@ def test_one_of_two_fingers_is_excited():
     assert changed.motion["left_close"].values == (0.0, 5e-3)
     assert changed.motion["left_lift"].values == (0.0, 4e-3)
     assert changed.motion["right_close"] == file.motion["right_close"]
-    assert excite(file, "slow roll", body="right").motion["right_close"].values == (0.0, -1.5e-3)
+    assert excite(file, "slow roll", body="right").motion["right_close"].values == (0.0, -1.4e-3)
+
+
+def test_times_of_an_excitation_may_be_chosen():
+    strokes = {"kind": "strokes", "travel": 5e-3, "stroke_time": 0.1}
+    changed = excite(coarse("paper"), Excitation(strokes, duration=0.4, grasp=0.1, since=0.2))
+    assert changed.motion["y_d"].times == changed.motion["F_ff"].times == (0.0, 0.1)
+    assert changed.motion["x_d"].since == 0.2
+    assert float(changed.build().t[-1]) == 0.4
 
 
 def test_an_unknown_excitation_is_refused():
