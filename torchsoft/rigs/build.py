@@ -224,8 +224,9 @@ class RigFile(Shown, Group):
         }  # fmt: skip
 
     def unit_of(self, name: str) -> str:
-        """Unit of an entry, "1" for one without. Raises `ValueError` for an unknown name."""
-        keys, _, field = place(self, name)
+        """Unit of an entry by its name, full or short, "1" for one without. Raises `ValueError` for
+        an unknown name."""
+        keys, _, field = place(self, self.full(name)[0])
         own, (group, *way) = unit(field) or "1", keys
         if not re.search(r",| or ", own) or len(way) < 2:
             return own
