@@ -1,8 +1,6 @@
 """The finite elements of scikit-fem, against which those of the pads are held; meshed where a pad
 stands in the world."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
 from skfem.helpers import ddot, div, dot, sym_grad
@@ -12,22 +10,6 @@ from torchsoft import Pad
 from torchsoft.physics.mesh import Array, lame_moduli
 
 CM_HEIGHT = 2.18e-3
-
-
-@dataclass(frozen=True)
-class PadNumbers:
-    """Size, mesh and material of a pad, by default of the paper's."""
-
-    length: float = 0.120
-    height: float = 4.59e-3
-    depth: float = 44e-3
-    E: float = 0.75e6
-    nu: float = 0.45
-    rho: float = 1100.0
-    tau: float = 10e-3
-    elements_x: int = 120
-    elements_y: int = 4
-    enclosed: bool = False
 
 
 @BilinearForm

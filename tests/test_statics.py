@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 import torch
-from conftest import f64, holding_force, press, still
-from fem_oracle import PadNumbers, dilatation, shear, world_stiffness
+from conftest import PAPER, f64, holding_force, press, still
+from fem_oracle import dilatation, shear, world_stiffness
 from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, condense, solve
 from test_experiments import experiment
 
@@ -89,7 +89,7 @@ DEPTH = 1e-4
 """By how much [m] it is pressed into each of two pads."""
 
 
-PAD = PadNumbers()
+PAD, RUBBER = PAPER.pads["L"], PAPER.materials["rubber"]
 
 
 def punched(K_n: float, elements_x: int) -> tuple[Rig, State, float]:
@@ -105,17 +105,16 @@ def test_a_long_box_is_a_flat_punch_on_springs():
     """On the same mesh, assembled by scikit-fem, with a spring K_n between each node under the flat
     side and the box."""
     model, state, force = punched(1.2e5, 120)
-    pad = PAD
-    nodes, K = world_stiffness(pad, "L")
-    under = np.flatnonzero((nodes[:, 1] == pad.height) & (np.abs(nodes[:, 0] - 60e-3) < FLAT))
+    nodes, K = world_stiffness(model.pads["L"])
+    under = np.flatnonzero((nodes[:, 1] == PAD.height) & (np.abs(nodes[:, 0] - 60e-3) < FLAT))
     springs = 1.2e5 * np.bincount(2 * under + 1, minlength=len(K))
-    depth = pad.height - (float(state.pose["disc"][1]) - 10e-3)
+    depth = PAD.height - (float(state.pose["disc"][1]) - 10e-3)
     u = np.linalg.solve(K + np.diag(springs), -depth * springs)
     carried = springs * (depth + u)
     assert depth == pytest.approx(DEPTH, rel=1e-9)  # both pads give way alike
     assert len(under) == 29
     assert force == pytest.approx(carried.sum(), rel=1e-9)
-    surface = nodes[:, 1] == pad.height
+    surface = nodes[:, 1] == PAD.height
     assert state.pads["L"][0, :, 1].numpy() == pytest.approx(
         -carried[1::2][surface], rel=1e-7, abs=1e-9
     )
@@ -124,17 +123,16 @@ def test_a_long_box_is_a_flat_punch_on_springs():
 def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch():
     """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are
     bilinear of half a millimetre."""
-    pad = PAD
-    mesh = MeshQuad.init_tensor(np.linspace(0, pad.length, 481), np.linspace(0, pad.height, 17))
+    mesh = MeshQuad.init_tensor(np.linspace(0, PAD.length, 481), np.linspace(0, PAD.height, 17))
     basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=4)
-    lame_lambda, lame_mu = lame_moduli(pad.E, pad.nu)
-    K = pad.depth * (lame_lambda * dilatation.assemble(basis) + lame_mu * shear.assemble(basis))
+    lame_lambda, lame_mu = lame_moduli(RUBBER.E, RUBBER.nu)
+    K = RUBBER.depth * (lame_lambda * dilatation.assemble(basis) + lame_mu * shear.assemble(basis))
     x, y = basis.doflocs
     vertical = np.isin(
         np.arange(basis.N),
         np.concatenate([dofs[1] for dofs in (basis.nodal_dofs, basis.facet_dofs)]),
     )
-    under = np.flatnonzero(vertical & (y == pad.height) & (np.abs(x - 60e-3) < FLAT + 1e-9))
+    under = np.flatnonzero(vertical & (y == PAD.height) & (np.abs(x - 60e-3) < FLAT + 1e-9))
     u = np.zeros(basis.N)
     u[under] = -DEPTH
     u = solve(*condense(K, x=u, D=np.union1d(np.flatnonzero(y == 0), under)))
