@@ -2,29 +2,27 @@
 
 import csv
 import io
-import json
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import torch
-from conftest import PAPER, excited, rest, still
+from conftest import PAPER, excited, rest, still, stroked
 
 from hostile.processes import ROOT
 from torchsoft import Trajectory, simulate
 from torchsoft.datasets import generate as generation
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import Serial, generate, simulate_task
-from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 
 EXAMPLE = ROOT / "examples" / "identify"
 
 SMALL = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
 
-DATASET = f"""
+DATASET = """
 title = "Small"
-rig = {json.dumps(str(ROOT / "rigs" / "paper.toml"))}
+rig = "paper"
 seed = 5
 trajectories = 3
 trajectories_per_shard = 2
@@ -39,18 +37,18 @@ samples_per_chunk = 16
 "pads.U.elements_y" = 1
 "laws.steel_on_rubber.friction.v_s" = 0.05
 "motion.y_d.times.1" = 0.1
-"motion.F_ff" = {{ kind = "profile", times = [0.0, 0.1], values = [0.0, "held"] }}
+"motion.F_ff" = { kind = "profile", times = [0.0, 0.1], values = [0.0, "held"] }
 [parameters]
-"materials.rubber.E" = {{ low = 7e5, high = 8e5, scale = "log" }}
-"motion.y_d.values.1" = {{ low = 48.6e-3, high = 48.8e-3 }}
+"materials.rubber.E" = { low = 7e5, high = 8e5, scale = "log" }
+"motion.y_d.values.1" = { low = 48.6e-3, high = 48.8e-3 }
 [[kinds]]
 name = "shake"
-fixed."motion.x_d" = {{ kind = "chirp", since = 0.1, amplitude = 1e-3, first = 2.0, last = 5.0 }}
-parameters."motion.x_d.amplitude" = {{ low = 2e-4, high = 4e-4 }}
+fixed."motion.x_d" = { kind = "chirp", since = 0.1, amplitude = 1e-3, first = 2.0, last = 5.0 }
+parameters."motion.x_d.amplitude" = { low = 2e-4, high = 4e-4 }
 """
 
-IDENTIFICATION = f"""
-rig = {json.dumps(str(ROOT / "rigs" / "paper.toml"))}
+IDENTIFICATION = """
+rig = "paper"
 [settings]
 laws.steel_on_rubber.friction.v_s = 0.05
 actuators.x.measures = "bracket.x"
@@ -70,13 +68,13 @@ rtol = 1e-3
 
 ROLLING = """
 import json, threading, torch
-from torchsoft import simulate
+from torchsoft import RigFile
 torch.set_num_threads(1)
 def roll(_=0):
     coarse = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
-    model = still(coarse)
-    y0 = manipulate(model, 75.0)
-    run = simulate(model, torch.linspace(0, 0.3, 7, dtype=torch.float64), y0=y0)
+    force = {"motion.F_ff.values": [0.0, -75.0]}
+    built = RigFile.ready("paper").override(coarse | force).build()
+    run = built.run(torch.linspace(0, 0.3, 7, dtype=torch.float64))
     return [float(value).hex() for value in run["y_Br"]]
 """
 """A program that can roll the disc, to the bit."""
@@ -121,11 +119,9 @@ def run() -> Trajectory:
 
 def problem() -> Problem:
     """Stiffnesses of pads and contacts, from strokes of 0.4 s."""
-    p = PAPER.override(SMALL)
     sensors = {"x_C": Sensor(noise=1e-5), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
-    strokes = Strokes(travel=5e-3, stroke_time=0.15)
-    motion = Excitation(motion=strokes, duration=0.4)
-    recorded = record("strokes", excited(motion, p), {"pad.E": 0.9e6}, sensors, rtol=1e-3, seed=3)
+    built = excited(stroked(5e-3, 0.15, duration=0.4, grasp=0.08, since=0.1), PAPER.override(SMALL))
+    recorded = record("strokes", built, {"pad.E": 0.9e6}, sensors, rtol=1e-3, seed=3)
     return Problem([recorded], sensors, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()})
 
 

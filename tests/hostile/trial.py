@@ -105,7 +105,7 @@ def tally():
     """`tally("kind")` begins a line of the table; the test fails if anything in it did not hold."""
     lines: list[Tally] = []
 
-    def excited(kind: str) -> Tally:
+    def begin(kind: str) -> Tally:
         lines.append(Tally(kind))
         return lines[-1]
 
