@@ -20,11 +20,11 @@ from torchsoft.physics.mesh import unit_compliance
 from torchsoft.rigs.excite import Excitation
 
 SETTLE, STEP = 0.02, 20e-6
-SINES = {"kind": "multi_sine", "band": (5.0, 20.0), "since": 0.05}
+SINES = {"kind": "multi_sine", "band": (5.0, 20.0)}
 SHAKEN = Excitation(
-    SINES | {"amplitude": 10e-3, "seed": 0},
-    SINES | {"amplitude": 2e-4, "seed": 1, "times": (0.0, 0.04)},
-    duration=0.36, depth=2e-4,
+    SINES | {"amplitude": 10e-3, "seed": 5},  # most others part more suddenly: smaller steps
+    SINES | {"amplitude": 2e-4, "seed": 1},
+    duration=0.36, depth=2e-4, grasp=0.04, since=0.05,
 )  # fmt: skip
 RIG = {
     "pad.elements_x": 60,

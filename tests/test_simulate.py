@@ -291,8 +291,8 @@ def test_what_is_saved_is_what_ran():
 
 def made_and_run() -> list[Tensor]:
     """Parts made, a motion begun and run with gradients and sensitivities."""
-    roll = {"kind": "multi_sine", "amplitude": 1e-3, "band": (5.0, 20.0), "since": 0.07}
-    excitation = Excitation(roll, {"times": (0.0, 0.05)}, duration=0.5)
+    roll = {"kind": "multi_sine", "amplitude": 1e-3, "band": (5.0, 20.0)}
+    excitation = Excitation(roll, duration=0.5, grasp=0.05, since=0.07)
     rig, y0, _ = excited(excitation, PAPER.override(COARSE))
     run = simulate(rig, times(0.1, 6), y0=y0, gradient="discrete")
     forward = simulate(rig, run.t, y0=y0, gradient="forward", wrt=["pad.E", "pad.nu"])
