@@ -23,6 +23,7 @@ from torchsoft import (
 )
 from torchsoft.physics.state import State
 from torchsoft.rigs.excite import Excitation
+from torchsoft.sysid import Sensor
 
 register_method()
 
@@ -34,6 +35,14 @@ COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
 
 PAPER = RigFile.ready("paper")
+RIG = {
+    name: Sensor(noise=noise)
+    for name, noise in (
+        ("x_C", 1e-5), ("y_C", 1e-5), ("theta", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5), ("F_x", 0.1),
+        ("F_y", 0.1),
+    )
+}  # fmt: skip
+"""Sensors of the paper's rig."""
 APART, GRASPED = 50.1e-3, 48.6e-3
 """Height of the paper's bracket [m] where undeformed pads just touch the disc, and in the grasp."""
 
@@ -43,16 +52,19 @@ def paper(changes: Mapping[str, Any] | None = None, **groups: Any) -> BuiltRig:
     return PAPER.override(changes, **groups).build()
 
 
-def still(changes: Mapping[str, Any] | None = None, **parts: Any) -> Rig:
-    """The paper's rig that is held where it starts, with `parts` of its own: friction, shape,
-    material."""
+def still(
+    changes: Mapping[str, Any] | RigFile | None = None, reference: Reference | None = None,
+    **parts: Any,
+) -> Rig:  # fmt: skip
+    """The paper's rig, or that of a file of it, which is held where it starts or follows a
+    reference, with `parts` of its own: friction, shape, material."""
     names = {
         "friction": "laws.steel_on_rubber.friction", "shape": "bodies.disc.shape",
         "material": "materials.rubber",
     }  # fmt: skip
-    file = PAPER.override(changes)
+    file = changes if isinstance(changes, RigFile) else PAPER.override(changes)
     rig = file.assemble({names[name]: part for name, part in parts.items()})
-    rig.reference = hold(x_d=file.bodies["disc"].start.x, y_d=APART, F_ff=0.0)
+    rig.reference = reference or hold(x_d=file.bodies["disc"].start.x, y_d=APART, F_ff=0.0)
     return rig
 
 
@@ -65,10 +77,22 @@ def excited(
     return made.override({} if F_ff is None else {"motion.F_ff.values": [0.0, F_ff]}).build()
 
 
-def strokes(travel: float, stroke_time: float, **more: Any) -> Excitation:
+def stroked(travel: float, stroke_time: float, **more: Any) -> Excitation:
     """Strokes there and back [m, s]."""
     roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
     return Excitation(roll, **more)
+
+
+def rolled(travel: float, end: float, since: float = 0.5) -> dict[str, Any]:
+    """One roll by so much [m] between two times [s]."""
+    knots = {"times": (since, end), "values": (0.0, travel)}
+    return {"kind": "profile", "offset": "start"} | knots
+
+
+def waves(x: float, y: float, band: tuple[float, float]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Sums of random sines along the pads and across them [m], in a band of frequencies [Hz]."""
+    sines = {"kind": "multi_sine", "band": band}
+    return sines | {"amplitude": x, "seed": 0}, sines | {"amplitude": y, "seed": 1}
 
 
 def rest(rig: Rig, x: float = 60e-3) -> Tensor:

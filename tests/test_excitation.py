@@ -38,7 +38,7 @@ def test_lists_stand_for_bands():
 def test_knots_are_reached_from_the_grasp():
     """At rest at each, on top of where the grasp ended."""
     knots, p = Knots(x=((0.1, 4e-3), (0.3, -2e-3)), y=((0.2, -1e-4),)), PAPER
-    excitation = Excitation(motion=knots, grasp_time=0.2, settle=0.1, duration=0.8, depth=1e-3)
+    excitation = Excitation(motion=knots, grasp=0.2, since=0.3, duration=0.8, depth=1e-3)
     reference, since = excited(excitation, p).rig.reference, 0.3
     t = f64(0.0, since, since + 0.1, since + 0.2, since + 0.3, 5.0)
     value, rate = reference(t, ["x_d", "y_d"]).unbind(-1)

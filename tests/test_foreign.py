@@ -10,7 +10,7 @@ import foreign
 import numpy as np
 import pytest
 import torch
-from conftest import PAPER, excited
+from conftest import PAPER, excited, waves
 from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, TAKEN_IN, node
@@ -21,8 +21,8 @@ from torchsoft.rigs.excite import Excitation
 
 SETTLE, STEP = 0.02, 20e-6
 SHAKEN = Excitation(
-    motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(5.0, 20.0)), duration=0.36,
-    depth=3e-4, grasp_time=0.04, settle=0.01,
+    *waves(10e-3, 2e-4, (5.0, 20.0)), duration=0.36,
+    depth=3e-4, grasp=0.04, since=0.05,
 )  # fmt: skip
 RIG = {
     "pad.elements_x": 60,

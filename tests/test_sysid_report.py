@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE, PAPER, excited, strokes
+from conftest import COARSE, PAPER, excited, stroked
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -66,7 +66,7 @@ def found():
     depths = {HOSTILE: 1.2e-3, "shallow": 0.9e-3, "held": 1e-3}
     recordings = []
     for seed, (name, depth) in enumerate(depths.items()):
-        still = strokes(0.0, 0.1, duration=0.25, grasp=0.15, since=0.15, depth=depth)
+        still = stroked(0.0, 0.1, duration=0.25, grasp=0.15, since=0.15, depth=depth)
         grasp = excited(still, PAPER.override(COARSE))
         recordings.append(record(name, grasp, truth, sensors, rtol=1e-3, seed=seed))
     start = recordings[1].start._replace(position_sd={"disc.x": 2e-5})

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RUBBER, dry, excited, still, strokes
+from conftest import COARSE, PAPER, RIG, RUBBER, dry, excited, still, stroked
 from test_experiments import experiment
 from test_sysid import check_derivatives
 from torch import Tensor
@@ -27,7 +27,7 @@ from torchsoft import (
 )
 from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.motion import Profile, Reference
-from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Stage, Unknown, identify
+from torchsoft.sysid import Known, Problem, Recording, Sensor, Stage, Unknown, identify
 from torchsoft.sysid.first_samples import WIDER, beginning, estimate_initial_state, lasting_stretch
 from torchsoft.sysid.initial_state import SETTLE, MovingStart, Standing, Stretch
 from torchsoft.sysid.runs import Runner
@@ -42,7 +42,7 @@ Cut = tuple[Recording, Tensor]
 @pytest.fixture(scope="module")
 def cut():
     """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
-    motion = strokes(12e-3, 0.3, duration=0.86, grasp=0.2, since=0.25)
+    motion = stroked(12e-3, 0.3, duration=0.86, grasp=0.2, since=0.25)
     built = excited(motion, PAPER.override(COARSE))
     model, y0, t = built
     at = np.arange(SINCE, float(t[-1]), 5e-3)

@@ -91,7 +91,7 @@ amplitude = 2e-4
 frequency = 2.0
 travel = 5e-3
 """
-GRASP = {"duration": 1.0, "depth": 1.5e-3, "senses": "bracket", "grasp_time": 0.3, "settle": 0.1}
+GRASP = {"duration": 1.0, "depth": 1.5e-3, "senses": "bracket", "grasp": 0.3, "since": 0.4}
 
 
 def parameters() -> list[dict[str, Any]]:

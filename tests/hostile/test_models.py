@@ -99,7 +99,7 @@ def build(rng: np.random.Generator) -> tuple[Excitation, Rig]:
         Press(amplitude=near(2e-4), frequency=20.0),
     )
     excitation = Excitation(
-        motion=motion, duration=0.45, depth=spread(rng, 1e-3, 0.5), grasp_time=0.06, settle=0.02,
+        motion=motion, duration=0.45, depth=spread(rng, 1e-3, 0.5), grasp=0.06, since=0.08,
         senses=some("disc", "bracket"),
     )  # fmt: skip
     p = excitation.settings(settings(rng))
