@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, excited, paper_settings, still, strokes
+from conftest import COARSE, PAPER, RIG, excited, rolled, stroked, waves
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from torchsoft import Reference
+from torchsoft import Reference, RigFile
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid import Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prechecks import (
     accepted,
@@ -33,24 +33,27 @@ from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner
 
 NOMINAL = PAPER.override(COARSE)
-SENSORS = RIG | {"omega": Sensor(noise=0.02)}
+SENSORS = {NOMINAL.full(name)[0]: sensor for name, sensor in RIG.items()} | {
+    "omega_C": Sensor(noise=0.02)
+}
+LAW, RUBBER = "laws.steel_on_rubber", "materials.rubber"
+E, GAINS = f"{RUBBER}.E", ["actuators.y.Kp", "actuators.y.Kd", "actuators.x.Kp"]
 FAR = {
-    "contact.K_n": 3.0, "contact.R_n": 0.4, "contact.K_t": 0.4, "contact.R_t": 2.5,
-    "contact.mu_s": 0.7, "contact.mu_k": 0.6, "pad.E": 0.5, "pad.tau": 2.5,
+    f"{LAW}.K_n": 3.0, f"{LAW}.R_n": 0.4, f"{LAW}.K_t": 0.4, f"{LAW}.R_t": 2.5,
+    f"{LAW}.friction.mu_s": 0.7, f"{LAW}.friction.mu_k": 0.6, E: 0.5, f"{RUBBER}.tau": 2.5,
 }  # fmt: skip
 """How far the truth is from where a fit would start."""
 
+PRESS = {"kind": "sines", "components": [{"amplitude": 5e-4, "frequency": 12.0}]}
+ABOUT = "about the disc"
+STROKE: dict[str, Any] = {"duration": 0.9, "grasp": 0.2, "since": 0.25}
+SHAKE: dict[str, Any] = {"duration": 0.9, "grasp": 0.2, "since": 0.325}
 MOTIONS = {
-    "rolling": strokes(travel=15e-3, stroke_time=0.2, duration=0.9,
-    grasp_time=0.2, settle=0.05), "shaking": Excitation(
-        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.9,
-        depth=4e-4, grasp_time=0.2
-    ),
-    "pressing": Excitation(motion=Press(amplitude=5e-4, frequency=12.0, travel=10e-3), duration=0.9,
-    grasp_time=0.2), "about the disc": strokes(travel=8e-3, stroke_time=0.25, duration=0.9, grasp_time=0.2, settle=0.05,
-        senses="disc", x_C0=60e-3
-    ),
-}  # fmt: skip
+    "rolling": stroked(15e-3, stroke_time=0.2, **STROKE),
+    "shaking": Excitation(*waves(6e-3, 2e-4, (4.0, 17.0)), depth=2.8e-4, **SHAKE),
+    "pressing": Excitation(rolled(10e-3, 0.9, since=0.325), PRESS, **SHAKE),
+    ABOUT: stroked(8e-3, stroke_time=0.25, **STROKE),
+}
 
 
 @pytest.fixture(scope="module")
@@ -58,16 +61,17 @@ def recordings():
     """What rigs with parameters far from the nominal ones give."""
     table = NOMINAL.table()
     truth = {name: factor * table[name]["value"] for name, factor in FAR.items()}
-    return {
-        name: record(name, excited(motion, NOMINAL), truth, SENSORS, seed=k, rtol=1e-4)
-        for k, (name, motion) in enumerate(MOTIONS.items())
-    }
+    found = {}
+    for k, (name, motion) in enumerate(MOTIONS.items()):
+        planned = excited(motion, NOMINAL, senses="disc" if name == ABOUT else None)
+        found[name] = record(name, planned, truth, SENSORS, seed=k, rtol=1e-4)
+    return found
 
 
 @pytest.fixture(scope="module")
 def runs(recordings):
     """Runs with the nominal parameters."""
-    problem = Problem(list(recordings.values()), SENSORS, {"pad.E": Unknown()})
+    problem = Problem(list(recordings.values()), SENSORS, {E: Unknown()})
     jobs = problem.jobs(problem.coordinates.start, problem.names, LOOSE, None)
     made = zip(recordings.items(), Runner(problem.recordings).run(jobs))
     return {name: Signals(run.t, one.channels, run.signals, None) for (name, one), run in made}
@@ -80,7 +84,7 @@ def looked_at(
     its own."""
     mine = {name: sensor for name, sensor in sensors.items() if name in recording.samples}
     if run is None:
-        problem = Problem([recording], mine, {"pad.E": Unknown()})
+        problem = Problem([recording], mine, {E: Unknown()})
         return precheck(problem, Runner(problem.recordings))
     span = float(recording.times[0]), float(recording.times[-1])
     readouts = {
@@ -104,9 +108,10 @@ def noted(
     recording: Recording, settings: Mapping[str, Any] | None = None, **signals: Any
 ) -> Recording:
     """With other settings, and other signals of the reference."""
-    p, old = paper_settings(recording), recording.rig.reference
-    reference = Reference(**{name: signals.get(name, old[name]) for name in ("x_d", "y_d", "F_ff")})
-    return replace(recording, rig=still(p.override(dict(settings or {})), reference))
+    rig, old = RigFile.from_tree(recording.rig.tables).override(settings).assemble(), recording.rig
+    own = {name: signals.get(name, old.reference[name]) for name in ("x_d", "y_d", "F_ff")}
+    rig.reference = Reference(**own)
+    return replace(recording, rig=rig)
 
 
 def scaled(factor: float) -> Callable[[Any, Any], Any]:
@@ -117,49 +122,50 @@ def late(by: float) -> Callable[[Any, Any], Any]:
     return lambda t, y: CubicSpline(t, y)(np.maximum(t - by, t[0]))
 
 
-NO_F = {"F_x": None, "F_y": None}
+SETPOINT = "what x_d is of"
+NO_F = {"effort_x": None, "effort_y": None}
 MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]] = {
     "sign of a force": (
-        "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x",
-        "F_x looks as if its sign were opposite", True
+        "rolling", lambda r: changed(r, effort_x=scaled(-1)), "sign of effort_x",
+        "effort_x looks as if its sign were opposite", True
     ),
     "sign of a force that only a run tells": (
-        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y",
+        "rolling", lambda r: changed(r, effort_y=scaled(-1), y_Br=None), "sign of effort_y",
         "correlation with a run from the start", True
     ),
     "sign of an angle": (
-        "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta",
-        "theta looks as if its sign were opposite",
+        "rolling", lambda r: changed(r, theta_C=scaled(-1)), "sign of theta_C",
+        "theta_C looks as if its sign were opposite",
                                                                             True
     ),
     "millinewtons": (
-        "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x",
+        "shaking", lambda r: changed(r, effort_x=scaled(1e3)), "unit of effort_x",
         "millinewtons taken for newtons", True
     ),
     "degrees": (
-        "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta",
+        "rolling", lambda r: changed(r, theta_C=scaled(57.3)), "unit of theta_C",
         "degrees taken for radians", True
     ),
     "the disc's set-point taken for the bracket's": (
-        "about the disc", lambda r: noted(r, {"control.senses": "bracket.x"}), "control.senses",
-        'set-point of the disc, not of the bracket (say control.senses = "disc")',
+        ABOUT, lambda r: noted(r, {"control.senses": "bracket.x"}), SETPOINT,
+        'set-point of the disc, not of the bracket (say measures = "disc.x" of the actuator x)',
         True,
     ),
     "the bracket's taken for the disc's": (
-        "rolling", lambda r: noted(r, {"control.senses": "disc.x"}), "control.senses",
+        "rolling", lambda r: noted(r, {"control.senses": "disc.x"}), SETPOINT,
         "of the bracket, not of the disc", True
     ),
     "the bracket's taken for the disc's, no forces": (
         "rolling", lambda r: changed(noted(r, {"control.senses": "disc.x"}), **NO_F),
-        "control.senses", "x_Br follows it to", True
+        SETPOINT, "x_Br follows it to", True
     ),
     "the bracket's taken for the disc's, the disc alone": (
         "rolling", lambda r: changed(noted(r, {"control.senses": "disc.x"}), **NO_F, x_Br=None),
-        "control.senses", "x_C does not follow it", True,
+        SETPOINT, "x_C does not follow it", True,
     ),
     "exchanged columns": (
         "rolling", lambda r: changed(r, x_C=lambda t, x: r.samples["x_Br"][1], x_Br=lambda t,
-        x: r.samples["x_C"][1]), "control.senses", "or are x_Br and x_C exchanged?", True,
+        x: r.samples["x_C"][1]), SETPOINT, "or are x_Br and x_C exchanged?", True,
     ),
     "no force fed forward": (
         "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff",
@@ -171,7 +177,7 @@ MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]
         "was a force fed forward that F_ff does", False
     ),
     "a zero": (
-        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x",
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of effort_x",
         "zeros and set-points right?", False
     ),
 }  # fmt: skip
@@ -213,15 +219,15 @@ def test_nothing_is_said_of_what_is_right(recordings, runs, motion):
     assert looked_at(changed(one, **NO_F), run) == []
     assert looked_at(changed(one, x_Br=None, y_Br=None), run) == []
     declared = SENSORS | {
-        "x_Br": Sensor(noise=1e-5, bias=1e-4), "theta": Sensor(noise=5e-4, bias=0.1, delay=0.08),
-        "F_x": Sensor(noise=0.1, delay=6e-3), "F_y": Sensor(noise=0.1, gain=0.2),
+        "x_Br": Sensor(noise=1e-5, bias=1e-4), "theta_C": Sensor(noise=5e-4, bias=0.1, delay=0.08),
+        "effort_x": Sensor(noise=0.1, delay=6e-3), "effort_y": Sensor(noise=0.1, gain=0.2),
     }  # fmt: skip
     faulty = changed(
         one,
         x_Br=lambda t, x: x + 40e-6,
-        theta=lambda t, y: late(60e-3)(t, y) + 0.02,
-        F_x=late(5e-3),
-        F_y=scaled(1.15),
+        theta_C=lambda t, y: late(60e-3)(t, y) + 0.02,
+        effort_x=late(5e-3),
+        effort_y=scaled(1.15),
     )
     assert looked_at(faulty, run, declared) == []
 
@@ -229,15 +235,14 @@ def test_nothing_is_said_of_what_is_right(recordings, runs, motion):
 def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
     recordings,
 ):
-    flipped = changed(recordings["rolling"], F_y=scaled(-1))
+    flipped = changed(recordings["rolling"], effort_y=scaled(-1))
     assert list(controller_findings(flipped, SENSORS))
-    gains = ["control.K_98", "control.R_99", "control.K_81"]
-    assert not list(controller_findings(flipped, SENSORS, gains))
+    assert not list(controller_findings(flipped, SENSORS, GAINS))
     for one, code in (
-        (flipped, "sign of F_y"),
-        (noted(recordings["rolling"], {"control.senses": "disc.x"}), "control.senses"),
+        (flipped, "sign of effort_y"),
+        (noted(recordings["rolling"], {"control.senses": "disc.x"}), SETPOINT),
     ):
-        problem = Problem([one], SENSORS, {name: Unknown() for name in gains})
+        problem = Problem([one], SENSORS, {name: Unknown() for name in GAINS})
         assert [f.code for f in precheck(problem, Runner(problem.recordings))] == [code]
 
 
@@ -256,12 +261,18 @@ def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_
     )
     same = replace(one, rig=rig)
     assert not list(controller_findings(same, SENSORS))
-    more = changed(same, F_x=lambda t, F: F + 20.0)
-    assert [f.code for f in controller_findings(more, SENSORS)] == ["loop of F_x"]
-    assert "F_x is +20 N more, on the average," in next(controller_findings(more, SENSORS)).message
-    (note,) = controller_findings(changed(same, theta=None), SENSORS)
+    more = changed(same, effort_x=lambda t, F: F + 20.0)
+    assert [f.code for f in controller_findings(more, SENSORS)] == ["loop of effort_x"]
+    assert (
+        "effort_x is +20 N more, on the average,"
+        in next(controller_findings(more, SENSORS)).message
+    )
+    (note,) = controller_findings(changed(same, theta_C=None), SENSORS)
     assert note.severity == "note"
-    assert "F_x is not compared with its controller, since theta is not recorded" in note.message
+    assert (
+        "effort_x is not compared with its controller, since theta_C is not recorded"
+        in note.message
+    )
 
 
 def test_coloured_noise_is_no_mistake(recordings, runs):
@@ -283,9 +294,9 @@ def test_coloured_noise_is_no_mistake(recordings, runs):
 def test_gaps_and_other_rates_of_samples_are_no_mistake(recordings, runs):
     """A force with a hole in it, and a camera at 50 Hz."""
     one, samples = recordings["rolling"], dict(recordings["rolling"].samples)
-    t, F = samples["F_x"]
+    t, F = samples["effort_x"]
     there = (t < 0.4) | (t > 0.5)
-    samples |= {"F_x": (t[there], F[there]), "x_C": tuple(x[::4] for x in samples["x_C"])}
+    samples |= {"effort_x": (t[there], F[there]), "x_C": tuple(x[::4] for x in samples["x_C"])}
     assert looked_at(replace(one, samples=samples), runs["rolling"]) == []
 
 
@@ -312,9 +323,9 @@ def test_sparse_set_points_are_told_by_what_they_do(recordings, rates):
             actuator(torch.stack((*d.unbind(-1), zero, zero, zero), -1)).detach() for d in signals
         ]
         real = float((efforts[0] - efforts[1]).square().mean().sqrt())
-        told = {gap.channel: gap for gap in gaps(sparse, SENSORS, "x")}["F_x"]
+        told = {gap.channel: gap for gap in gaps(sparse, SENSORS, "x")}["effort_x"]
         assert 0.5 * real < told.error < 2.5 * real
-        assert told.noises == told.error / SENSORS["F_x"].noise
+        assert told.noises == told.error / SENSORS["effort_x"].noise
         assert 2.5 < told.order <= 4.0
     enough, few, hardly = (
         list(setpoint_findings(at_rows(one, rate, rates=rates), SENSORS))
