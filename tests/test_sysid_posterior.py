@@ -9,11 +9,11 @@ import threading
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
-from conftest import COARSE, PAPER, excited
+from conftest import COARSE, PAPER, RIG, excited, rolled
 from scipy import stats
 
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, record
+from torchsoft.sysid import Prior, Problem, Sensor, Unknown, record
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.posterior import Whitened, laplace, nuts
 from torchsoft.sysid.profile import Optimum
@@ -202,10 +202,10 @@ def test_nuts_says_what_it_needs(monkeypatch):
 def rolling():
     """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a
     saturated sensor."""
-    base = PAPER.override(COARSE)
-    roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
+    motion = Excitation(rolled(4e-3, 0.25, since=0.1), duration=0.25, grasp=0.1)
+    roll = excited(motion, PAPER.override(COARSE))
     sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
-    data = record("roll", excited(roll, base), {}, sensors, noise=0.0)
+    data = record("roll", roll, {}, sensors, noise=0.0)
     prior = Prior(median=0.75e6, sd=0.1, kind="log-normal")
     unknowns = {"pad.E": Unknown(prior=prior), "pad.tau": Unknown(low=5e-3, high=20e-3)}
     return Problem([data], sensors, unknowns, {"F_x": Autoregression.stated((0.8,), 5e-3)})
