@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, excited, grasp, turning
+from conftest import APART, COARSE, PAPER, RIG, grasp, stroked, turning
 
-from torchsoft import Profile, Reference
+from torchsoft import BuiltRig, Profile, Reference, excite
 from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.rigs.excite import Excitation
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.design import BENT, design, rank
 from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
@@ -22,10 +22,20 @@ from torchsoft.sysid.planner import LEFT, Optimality, Planner, chosen, deviation
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 
-P = PAPER.override(COARSE)
+P, DEPTH = PAPER.override(COARSE), 1e-3
+E, K_N = "materials.rubber.E", "laws.steel_on_rubber.K_n"
+MU_S, MU_K = (f"laws.steel_on_rubber.friction.{name}" for name in ("mu_s", "mu_k"))
+
+
+def path(times: tuple[float, ...], values: tuple[float, ...]) -> dict[str, Any]:
+    """Table of a profile [s, m] from where its coordinate starts."""
+    return {"kind": "profile", "times": times, "values": values, "offset": "start"}
+
+
 PLAN = Excitation(
-    motion=Knots(x=((0.05, 1e-3), (0.1, -0.5e-3)), y=((0.06, -2e-4), (0.1, 1e-4))),
-    duration=0.25, grasp_time=0.1, settle=0.02, depth=1e-3,
+    path((0.12, 0.17, 0.22), (0.0, 1e-3, -0.5e-3)),
+    path((0.0, 0.1, 0.12, 0.18, 0.22), (0.0, -DEPTH, -DEPTH, -2e-4 - DEPTH, 1e-4 - DEPTH)),
+    duration=0.25, grasp=0.1, depth=DEPTH,
 )  # fmt: skip
 BOUNDS = {
     "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13, shortest=0.02),
@@ -34,14 +44,20 @@ BOUNDS = {
 SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 
 
+def clear(motion: Excitation) -> BuiltRig:
+    """The rig about to be excited, its upper pad clear of the disc: runs that begin at a touch have
+    no derivatives by what moves it."""
+    return excite(P, motion).override({"bodies.bracket.start.y": APART}).build()
+
+
 @pytest.fixture(scope="session")
 def plan():
-    return record("plan", excited(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    return record("plan", clear(PLAN), {}, SENSORS, rtol=1e-3, noise=0.0)
 
 
 @pytest.fixture(scope="session")
 def problem(plan):
-    return Problem([plan], SENSORS, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+    return Problem([plan], SENSORS, {E: Unknown(), K_N: Unknown()})
 
 
 def planner(problem: Problem, criterion: Optimality, **limits: tuple[float, float]) -> Planner:
@@ -69,12 +85,12 @@ def test_for_one_parameter_the_criteria_are_one():
     assert values == pytest.approx([np.log(0.2)] * 3)
 
 
-@pytest.mark.parametrize("sensors", [{}, {"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}])
+@pytest.mark.parametrize("sensors", [{}, {"effort_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}])
 def test_slopes_are_those_of_differences(plan, sensors, monkeypatch):
     """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted
     beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
-    stated = Problem([plan], SENSORS | sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+    stated = Problem([plan], SENSORS | sensors, {E: Unknown(), K_N: Unknown()})
     one = planner(stated, "A", F_y=(-30.0, 30.0))
     z, x = one.moves.start, stated.coordinates.start
     at = one.evaluate(z, x)
@@ -83,7 +99,7 @@ def test_slopes_are_those_of_differences(plan, sensors, monkeypatch):
         np.random.default_rng(1).standard_normal(one.moves.n),
         3e-5,
     )
-    assert at.peaks["F_y"] > 1
+    assert at.peaks["effort_y"] > 1
     ahead, behind = (one.evaluate(z + s * h * direction, x, at.steps) for s in (1, -1))
     wanted = (ahead.value + ahead.cost - behind.value - behind.cost) / (2 * h)
     assert slopes @ direction == pytest.approx(wanted, rel=1e-3)
@@ -95,7 +111,7 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
     parts, sds = [], []
     for better in (4.0, 4e4):
         sensors = {name: Sensor(noise=one.noise / better) for name, one in SENSORS.items()}
-        stated = Problem([plan], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+        stated = Problem([plan], sensors, {E: Unknown(), K_N: Unknown()})
         one = planner(stated, "A")
         at = one.evaluate(one.moves.start, stated.coordinates.start)
         sd = np.array(list(one.deviations(stated.coordinates.start, at).values()))
@@ -113,8 +129,8 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
 def test_nuisances_are_left_out_as_the_schur_complement(plan):
     stated = Problem(
         [plan],
-        {**SENSORS, "F_y": Sensor(noise=0.1, bias=1.0)},
-        {"pad.E": Unknown(), "contact.K_n": Unknown()},
+        {**SENSORS, "effort_y": Sensor(noise=0.1, bias=1.0)},
+        {E: Unknown(), K_N: Unknown()},
     )
     x, c = stated.coordinates.start, stated.coordinates
     J = stated.residuals(Runner([plan]), x, ["plan"], 1e-3, c.free).J
@@ -127,12 +143,12 @@ def test_nuisances_are_left_out_as_the_schur_complement(plan):
 
 def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan):
     unknowns = {
-        "contact.mu_s": Unknown(),
-        "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s"),
+        MU_S: Unknown(),
+        MU_K: Unknown(nominal=0.5, ratio_to=MU_S),
     }
     stated = Problem([plan], SENSORS, unknowns)
     names, T = chosen(stated, stated.coordinates.start, ["contact.mu_k"])
-    assert names == ("contact.mu_k",)
+    assert names == (MU_K,)
     assert T.tolist() == [[1.0, 1.0]]
 
 
@@ -173,9 +189,9 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan):
             {"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}},
             "no motion of these knots",
         ),
-        ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.F_x = \(1, -1\)"),
+        ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.effort_x = \(1, -1\)"),
         ({"limits": {"Fx": (-1.0, 1.0)}}, "limits.Fx"),
-        ({"names": ["pad.nu"]}, "`names` must be some of the parameters pad.E, contact.K_n"),
+        ({"names": ["pad.nu"]}, f"`names` must be some of the parameters {E}, {K_N}"),
         ({"criterion": "E"}, "`criterion` must be one of D, A, worst, not 'E'"),
         ({"iterations": -1}, "`iterations` must not be negative"),
     ],
@@ -211,7 +227,7 @@ def test_a_designed_motion_tells_more(found, problem):
 
 def test_any_rig_with_profiles():
     """It has no excitation, and its start is given."""
-    rig: Any = turning(control__senses="bracket")
+    rig: Any = turning(control__senses="bracket.x")
     y, still = grasp(rig.fixed())
     x = float(profile(still, "x_d").values)
     rig.reference = Reference(
@@ -238,7 +254,7 @@ def test_any_rig_with_profiles():
         names=["pads.L.material.tau"],
         iterations=4,
         rate=0.3,
-        limits={"F_x": (-20.0, 20.0)},
+        limits={"effort_x": (-20.0, 20.0)},
     )
     assert found.after["pads.L.material.tau"] < 0.9 * found.before["pads.L.material.tau"]
     assert found.made_by["gradients"] >= 4 * 4
@@ -277,8 +293,8 @@ def test_an_interruption_leaves_the_best_so_far(problem, monkeypatch):
 
 def test_the_next_recording_is_predicted(plan, problem):
     """What a recording would add is what it does add; one that cannot be made comes last."""
-    strokes = PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)})
-    roll = record("roll", excited(strokes, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    motion = stroked(2e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.12, depth=DEPTH)
+    roll = record("roll", clear(motion), {}, SENSORS, rtol=1e-3, noise=0.0)
     same = replace(plan, name="same")
     ranked = rank([plan], [same, roll], SENSORS, problem.unknowns, rtol=1e-3)
     assert ranked[0].score < ranked[1].score
