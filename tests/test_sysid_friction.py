@@ -7,21 +7,20 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from conftest import COARSE, PAPER, RIG, stroked
+from conftest import COARSE, PAPER, RIG, clear, stroked
 from test_sysid import check_derivatives
 from torch import Tensor, nn
 
-from torchsoft import excite
 from torchsoft.physics.contact import SlipLaw
 from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import Problem, Recording, Stage, Unknown, identify, record
 
 BASE = PAPER.override(COARSE)
 SENSORS = {
-    name: RIG[name].model_copy(update={"noise": 0.5 * RIG[name].noise})
+    name: RIG[name].model_copy(update={"noise": 0.7 * RIG[name].noise})
     for name in ("x_C", "theta", "F_x")
 }
-JERKS = stroked(30e-3, stroke_time=0.1, duration=0.6, depth=3.8e-4, grasp=0.2, since=0.25)
+JERKS = stroked(30e-3, stroke_time=0.1, duration=0.6, depth=5e-4, grasp=0.2, since=0.25)
 E, FRICTION = "materials.rubber.E", "laws.steel_on_rubber.friction"
 ALPHA, BETA = f"{FRICTION}.alpha", f"{FRICTION}.beta"
 TRUTH = {ALPHA: 0.45, BETA: 200.0}
@@ -48,7 +47,7 @@ def given(recording: Recording, law: SlipLaw | None = None) -> Recording:
 @pytest.fixture(scope="module")
 def jerks():
     """Without noise, of the true law; the recording's own model has other numbers."""
-    planned = excite(BASE, JERKS).build({FRICTION: Viscous(0.6, 100.0)})
+    planned = clear(JERKS, BASE, {FRICTION: Viscous(0.6, 100.0)})
     return record("jerks", planned, TRUTH | {E: 0.9e6}, SENSORS, noise=0.0)
 
 
