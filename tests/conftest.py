@@ -23,7 +23,7 @@ from torchsoft import (
 )
 from torchsoft.physics.state import State
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import good_sensors
+from torchsoft.sysid import Sensor
 
 register_method()
 
@@ -35,7 +35,13 @@ COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
 
 PAPER = RigFile.ready("paper")
-RIG = good_sensors(PAPER.assemble())
+RIG = {
+    name: Sensor(noise=noise)
+    for name, noise in (
+        ("x_C", 1e-5), ("y_C", 1e-5), ("theta", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5), ("F_x", 0.1),
+        ("F_y", 0.1),
+    )
+}  # fmt: skip
 """Sensors of the paper's rig."""
 APART, GRASPED = 50.1e-3, 48.6e-3
 """Height of the paper's bracket [m] where undeformed pads just touch the disc, and in the grasp."""
@@ -69,6 +75,15 @@ def excited(
     forward to the bracket, by default that which holds it."""
     made = excite(PAPER if file is None else file, excitation, **how)
     return made.override({} if F_ff is None else {"motion.F_ff.values": [0.0, F_ff]}).build()
+
+
+def clear(
+    excitation: Excitation, file: RigFile, parts: Mapping[str, Any] | None = None
+) -> BuiltRig:
+    """A file of the paper's rig under an excitation, its upper pad clear of the disc at the start:
+    runs that begin at a touch have no derivatives by what moves the disc."""
+    made = excite(file, excitation).override({"bodies.bracket.start.y": APART})
+    return made.build(parts or {})
 
 
 def stroked(travel: float, stroke_time: float, **more: Any) -> Excitation:

@@ -127,7 +127,7 @@ def test_samples_out_of_a_sensors_range_say_nothing():
 def test_what_no_sensor_measures_is_assumed(cut):
     recording, y0 = cut
     truth = true_bodies(recording, y0)
-    few = {channel: RIG[channel] for channel in ("x_C", "effort_x", "effort_y")}
+    few = {channel: RIG[channel] for channel in ("x_C", "F_x", "F_y")}
     start = underway(estimate_initial_state(noisy(recording), few))
     assert start.bodies["disc.theta"] == (0.0, 0.0)  # a circle has no angle
     for name in ("disc.y", "bracket.x", "bracket.y", "disc.v_theta", "disc.v_y", "bracket.v_x"):
