@@ -205,6 +205,24 @@ def test_derivatives_by_autograd_are_those_by_differences(name, start):
     assert torch.allclose(exact, differences, rtol=1e-7, atol=5e-6)
 
 
+@pytest.mark.parametrize("name", SCENES)
+def test_a_depth_and_a_force_are_differentiated_by(name):
+    """The bracket goes down by as much as a depth grows; by a force as differences say."""
+    one = scene(name)
+
+    def top(key: str, value: Any) -> Tensor:
+        return one.rig.unpack(one.start({key: value})).pose["bracket"][1]
+
+    by = {}
+    for (key, value), *_ in (way.items() for way in PRESSED):
+        x = torch.tensor(value, dtype=torch.float64, requires_grad=True)
+        (by[key],) = torch.autograd.grad(top(key, x), x)
+    assert float(by["depth"]) == pytest.approx(-1.0, abs=1e-12)
+    with torch.no_grad():
+        change = float(top("force", 20.01) - top("force", 19.99)) / 0.02
+    assert float(by["force"]) == pytest.approx(change, rel=1e-5)
+
+
 # refusals
 # ----------------------------------------------------------------------
 

@@ -175,7 +175,7 @@ def check_start(body: str, freedom: Mapping[str, str], given: Any) -> None:
             raise ValueError(f"`{key}` of `{body}` has no meaning: {axis} is {freedom[axis]}")
         pressed = isinstance(value, Mapping) and list(value) in [[one] for one in PRESSES]
         if key == "y" and pressed:
-            number(f"{body}.y.{next(iter(value))}", next(iter(value.values())))
+            scalar(f"{body}.y.{next(iter(value))}", next(iter(value.values())))
         elif isinstance(value, str | Mapping) and value not in words.get(key, ()):
             allowed = " or ".join(["a number", *map(repr, words.get(key, ()))])
             raise ValueError(f"`{key}` of `{body}` must be {allowed}, but is {value!r}")
