@@ -26,10 +26,10 @@ from identify_contact import MU_K, MU_S, TRUTH
 from tqdm import tqdm
 
 from torchsoft import RigFile, excite
-from torchsoft.experiment import markdown, options, write
+from torchsoft.experiment import RIG, markdown, options, write
 from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid import RIG, Problem, Unknown, record
+from torchsoft.sysid import Problem, Unknown, record
 from torchsoft.sysid.fit import percent, shift, standard_deviations
 from torchsoft.sysid.plan import FINER
 from torchsoft.sysid.problem import Residuals

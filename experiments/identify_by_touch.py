@@ -26,9 +26,9 @@ import numpy as np
 from identify_contact import LAW, MU_K, MU_S, RUBBER, TRUTH
 
 from torchsoft import RigFile, excite
-from torchsoft.experiment import COARSE, markdown, options, timed, write
+from torchsoft.experiment import COARSE, RIG, markdown, options, timed, write
 from torchsoft.rigs.excite import CATALOGUE, Excitation
-from torchsoft.sysid import RIG, Problem, Recording, identify, record
+from torchsoft.sysid import Problem, Recording, identify, record
 from torchsoft.sysid.fit import percent, standard_deviations
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft import RigFile, excite
-from torchsoft.experiment import COARSE, coloured, numbers, options, write
+from torchsoft.experiment import COARSE, RIG, coloured, numbers, options, write
 from torchsoft.rigs.excite import CATALOGUE, Excitation
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
+from torchsoft.sysid import IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals, StepsByName
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.report import report

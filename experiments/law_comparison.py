@@ -29,9 +29,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchsoft import BuiltRig, Coulomb, RigFile, excite
-from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
+from torchsoft.experiment import COARSE, RIG, markdown, options, repeated, timed, write
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
+from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Comparison, Evidence, compare, fitted
 from torchsoft.sysid.runs import Runner
 

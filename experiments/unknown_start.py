@@ -26,9 +26,8 @@ from identify_contact import LAW, RUBBER, TRUTH, noisy
 from scipy import stats
 
 from torchsoft import RigFile, excite
-from torchsoft.experiment import COARSE, markdown, options, repeated, timed, write
+from torchsoft.experiment import COARSE, RIG, markdown, options, repeated, timed, write
 from torchsoft.sysid import (
-    RIG,
     IdentificationResult,
     Known,
     MovingStart,

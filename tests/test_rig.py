@@ -29,9 +29,7 @@ def test_parameters_have_the_names_of_the_file():
     assert len(shorts) == 18
     for short, full in shorts.items():
         assert model.parameter(short) is model.parameter(full)
-    sharp = still(
-        {"laws.steel_on_rubber.friction": {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}}
-    )
+    sharp = still({"laws.steel_on_rubber.friction": {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}})
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
         sharp.parameter("contact.v_s")
 

@@ -139,7 +139,7 @@ def test_what_no_sensor_measures_is_assumed(cut):
         estimate_initial_state(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)})
     )
     assert given.bodies["disc.y"] == (0.0233, 1e-3)
-    none = {name: RIG[name] for name in ("effort_x", "theta_C")}
+    none = {name: RIG[name] for name in ("F_x", "theta")}
     with pytest.raises(ValueError, match=r"no sensor tells where `disc\.x` is"):
         estimate_initial_state(recording, none)
 

@@ -23,6 +23,8 @@ from torchsoft.display import markdown
 from torchsoft.files import save_text, write_json
 from torchsoft.parallel import parallel_map
 from torchsoft.plot.figures import save
+from torchsoft.rigs.build import RigFile
+from torchsoft.sysid.synthetic import good_sensors
 
 C = TypeVar("C")
 T = TypeVar("T")
@@ -32,6 +34,9 @@ STEPS = (1e-6, 0.02)
 
 SMALLEST, LARGEST = 1e-9, 1e6
 """Bounds of all other numbers; counts, seeds and entries of lists may be zero."""
+
+RIG = good_sensors(RigFile.ready("paper").assemble())
+"""Sensors of the paper's rig, by channel."""
 
 COARSE: dict[str, Any] = {
     "pad.elements_x": 60,

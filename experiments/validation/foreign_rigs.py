@@ -27,11 +27,10 @@ import numpy as np
 import torch
 
 from torchsoft import Reference, RigFile, excite
-from torchsoft.experiment import COARSE, coloured, markdown, options, repeated, write
+from torchsoft.experiment import COARSE, RIG, coloured, markdown, options, repeated, write
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import (
-    RIG,
     IdentificationResult,
     Problem,
     Recording,

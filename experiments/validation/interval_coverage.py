@@ -36,9 +36,9 @@ import numpy as np
 from scipy import stats
 
 from torchsoft import RigFile, csvfile, excite
-from torchsoft.experiment import COARSE, markdown, options, repeated, write
+from torchsoft.experiment import COARSE, RIG, markdown, options, repeated, write
 from torchsoft.rigs.excite import CATALOGUE, Excitation
-from torchsoft.sysid import RIG, Problem, Sensor, Stage, identify, record
+from torchsoft.sysid import Problem, Sensor, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
 from torchsoft.sysid.initial_state import Standing

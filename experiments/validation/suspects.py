@@ -21,9 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchsoft.experiment import markdown, options, repeated, timed, write
+from torchsoft.experiment import RIG, markdown, options, repeated, timed, write
 from torchsoft.sysid import (
-    RIG,
     Problem,
     Recording,
     explain,

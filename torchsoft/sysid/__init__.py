@@ -27,8 +27,8 @@ __all__ = [
     "Unreachable",
     "estimate_initial_state",
     "explain",
+    "good_sensors",
     "identify",
     "load_answer",
-    "good_sensors",
     "record",
 ]  # fmt: skip

@@ -129,7 +129,7 @@ class DesignTable(Table):
     of signals whose knots may move, `limits` (low, high) [SI] of channels, the `criterion` of the
     unknowns, or of the `parameters` alone."""
 
-    candidates: dict[Name, dict[str, Any]] = Field(default_factory=dict)
+    candidates: dict[Name, dict[str, Any] | Name] = Field(default_factory=dict)
     bounds: dict[Name, Bounds] = Field(default_factory=dict)
     limits: dict[Name, Annotated[tuple[float, float], LISTED]] = Field(default_factory=dict)
     criterion: Optimality = "D"

@@ -70,6 +70,7 @@ def estimate_initial_state(
     than `lead`, and pads that cannot be settled.
     """
     rig, first, owner = recording.rig, float(recording.times[0]), f"recording `{recording.name}`"
+    sensors = {rig.full(name): sensor for name, sensor in sensors.items()}
     late = {channel: t >= first + lead - SAME for channel, (t, _) in recording.samples.items()}
     if strange := [name for name in given or {} if name not in free_coordinates(rig)]:
         raise ValueError(
