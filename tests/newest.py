@@ -17,18 +17,20 @@ print(*sorted(f"{one.name} {one.version}" for one in distributions() if "nvidia"
 EXTRAS = "reduced,datasets,posterior,export,learn"
 GRADIENT = """
 import torch
-from torchsoft import Circle, simulate
-model = still()
+from torchsoft import RigFile
+file = RigFile.ready("paper")
+built = file.build()
 t = torch.linspace(0, 0.05, 6, dtype=torch.float64)
-run = simulate(model, t, y0=rest(model).detach(), gradient="discrete")
+run = built.run(t, gradient="discrete")
 run["y_C"][-1].backward()
-assert torch.isfinite(model.pad.E.grad) and model.pad.E.grad != 0
+slope = built.rig.parameter("materials.rubber.E").grad
+assert torch.isfinite(slope) and slope != 0
 class Straight(torch.autograd.Function):
     forward = staticmethod(lambda ctx, x: x.clamp(max=0.5))
     backward = staticmethod(lambda ctx, g: g)
 try:
-    hidden = still(friction=lambda E, F_N, R: Straight.apply(E) / R)
-    simulate(hidden, t, y0=rest(model).detach())
+    law = lambda E, F_N, R: Straight.apply(E) / R
+    file.build({"laws.steel_on_rubber.friction": law}).run(t)
 except TypeError as error:
     assert "the torch.autograd.Function" in str(error), error
 else:
@@ -72,7 +74,6 @@ def main(python: str) -> None:
         run(bin / "pip", "install", "--quiet", wheel, where=folder)
         run(bin / "python", "-c", VERSIONS, where=work)
         shutil.copytree(ROOT / "examples" / "identify", work / "examples" / "identify")
-        shutil.copytree(ROOT / "rigs", work / "rigs")
         run(bin / "torchsoft", "init", "mine", where=work)
         run(bin / "torchsoft", "check", "mine.toml", where=work)
         run(bin / "torchsoft", "run", "mine.toml", "--out", "out", where=work)

@@ -271,8 +271,17 @@ def test_a_start_that_cannot_be_is_refused(disc, bracket, words):
 
 
 def test_statics_in_inference_mode_are_refused():
+    model = build()
     with torch.inference_mode(), pytest.raises(ValueError, match=r"use torch\.no_grad\(\)"):
-        rest(build())
+        rest(model)
+
+
+def test_a_rig_that_is_not_physical_any_more_is_refused():
+    model = build()
+    with torch.no_grad():
+        model.parameter("pad.E").fill_(-1.0)
+    with pytest.raises(ValueError, match=r"`pads.L.material.E` must be from 1 to 1e\+13 Pa"):
+        rest(model)
 
 
 def test_no_equilibrium_is_reported_when_newton_does_not_converge(monkeypatch):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import PAPER, RUBBER, coarse, f64, grasp, press, rest, still, times
+from conftest import COARSE, PAPER, RUBBER, coarse, f64, grasp, press, rest, still, times
 from torch import nn
 
 from torchsoft import (
@@ -69,7 +69,8 @@ PUSH = {"measures": "disc.x", "pushes": "bracket.x", "law": PD(1.0, 1.0), "setpo
 
 
 def grasping(**parts: Any) -> Any:
-    return simulate(still(coarse(pad__elements_x=24).settings, **parts), T)
+    model = still(COARSE | {"pad.elements_x": 24}, **parts)
+    return simulate(model, T, y0=rest(model).detach())
 
 
 def falling(body: Any = None, law: Any = None, mesh: Any = None, points: Any = 0) -> Any:
@@ -82,9 +83,9 @@ def falling(body: Any = None, law: Any = None, mesh: Any = None, points: Any = 0
 
 def acting(**how: Any) -> Any:
     model = coarse(pad__elements_x=24)
+    y0 = rest(model).detach()
     model.actuators["x"] = Actuator(**PUSH | how)
-    del model.control["x"]
-    return simulate(model, T)
+    return simulate(model, T, y0=y0)
 
 
 DISC = Body(0.4, Circle(0.02))
@@ -130,7 +131,11 @@ def of_parts() -> Iterator[Attack]:
     for kind in (Profile, Sampled):
         yield kind, {"times": [0.0, 1.0], "values": [0.0, 1.0]}, {"times": lists, "values": lists}
     yield Reference, {}, {"x_d": [3, None, "x", [0.0, 1.0], lambda t: t]}
-    yield press, {"model": coarse(pad__elements_x=24)}, {"bracket_height": [*NO_NUMBER, 1.0]}
+    starts = [odd for odd in NO_NUMBER if not isinstance(odd, dict)]
+    for key in ("depth", "force"):
+        starts += [{key: odd} for odd in NO_NUMBER]
+    starts += [{}, {"depth": 1e-3, "force": 1.0}, "down"]
+    yield press, {"rig": coarse(pad__elements_x=24)}, {"height": starts, "x": NO_NUMBER}
 
 
 # runs
@@ -168,7 +173,17 @@ def of_runs() -> Iterator[Attack]:
             **dict.fromkeys(("step", "tolerance", "rtol", "atol"), lengths),
         },
     )
-    known = [None, 3, [3], ["pad.Q"], ["E"], [""], [model.pad.E], {"pad.E": 1}, ["pad.e"]]
+    known = [
+        None,
+        3,
+        [3],
+        ["pad.Q"],
+        ["E"],
+        [""],
+        [model.parameter("pad.E")],
+        {"pad.E": 1},
+        ["pad.e"],
+    ]
     rows = [y0, zeros / 0, 3, "x", torch.cat((zeros, zeros))]
     yield simulate, right | {"gradient": "forward", "wrt": ["pad.E"]}, {"wrt": known, "dy0": rows}
     discrete = right | {"gradient": "discrete"}
@@ -197,7 +212,8 @@ def of_values() -> Iterator[Attack]:
         other.parameter(name).data.fill_(value)
         return rest(other) if statics else simulate(other, T, y0=y0)
 
-    for name in NAMES:
+    known = [name for name in model.short.values() if "." in name]
+    for name in known:
         declared = model.quantity(name)
         assert declared is not None
         odds = [declared.low - 1.0, 1.1 * declared.high, NAN, INF, 1e308]

@@ -11,19 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from conftest import excited, rest, still
 
 from hostile.damage import TEXTS, Mutant, Victim, damage, document, leaves, mutant, put, written
 from hostile.processes import ROOT
 from hostile.specimens import Table, cells, csv_text
 from hostile.trial import LIMIT, Tally, count, random, sentence
-from torchsoft import simulate
+from torchsoft import RigFile, simulate
 from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost as dataset_cost
 from torchsoft.datasets.generate import points
 from torchsoft.datasets.rig_files import embedded
-from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import measured
 from torchsoft.sysid.measured import cost
 from torchsoft.sysid.runs import Runner
@@ -31,12 +29,10 @@ from torchsoft.tables import from_toml
 
 pytestmark = pytest.mark.slow
 
-PAPER = ROOT / "rigs" / "paper.toml"
-
 SMALL = 1e-3
 """Meshes whose stiffness takes more memory than this [GiB] are not built here."""
 
-COARSE = {"pad.elements_x": 20, "pad.elements_y": 1}
+COARSE = {"elements_x": 20, "elements_y": 1}
 BRIEFLY = torch.tensor([0.0, 2e-3, 6e-3], dtype=torch.float64)
 
 Lines = Callable[[str], Tally]
@@ -66,41 +62,62 @@ def finite(*tensors: torch.Tensor) -> None:
 
 MOTIONS = """
 [[motion]]
-kind = "slow_roll"
-travel = 5e-3
+kind = "hold"
+value = 60e-3
+[[motion]]
+kind = "profile"
+times = [0.4, 1.0]
+values = [0.0, 5e-3]
+offset = "start"
 [[motion]]
 kind = "strokes"
 travel = 5e-3
 stroke_time = 0.2
+since = 0.4
+until = 0.9
+[[motion]]
+kind = "spline"
+times = [0.0, 0.5, 1.0]
+values = [60e-3, 62e-3, 61e-3]
+[[motion]]
+kind = "sines"
+components = [{ amplitude = 1e-3, frequency = 2.0, phase = 0.3 }]
+since = 0.4
 [[motion]]
 kind = "multi_sine"
-amplitude_x = 1e-3
-amplitude_y = 1e-4
-frequency = [0.5, 8.0]
+amplitude = 1e-3
+band = [0.5, 8.0]
 components = 3
 seed = 1
+since = 0.4
 [[motion]]
 kind = "chirp"
-amplitude_x = 1e-3
-amplitude_y = 1e-4
-start = 0.3
-end = 8.0
-[[motion]]
-kind = "press"
-amplitude = 2e-4
-frequency = 2.0
-travel = 5e-3
+amplitude = 1e-3
+first = 0.3
+last = 8.0
+since = 0.4
 """
-GRASP = {"duration": 1.0, "depth": 1.5e-3, "senses": "bracket", "grasp": 0.3, "since": 0.4}
 
 
-def parameters() -> list[dict[str, Any]]:
-    return [PAPER.override(COARSE).model_dump()]
+def coarse(name: str) -> RigFile:
+    """A ready rig on coarse meshes."""
+    file = RigFile.ready(name)
+    return file.override(pads=dict.fromkeys(file.pads, COARSE))
 
 
-def excitations() -> list[dict[str, Any]]:
-    common = GRASP | {"x_C0": 60.3e-3}
-    return [common | {"motion": motion} for motion in tomllib.loads(MOTIONS)["motion"]]
+def stated(file: RigFile) -> dict[str, Any]:
+    return file.model_dump(mode="json", exclude_unset=True)
+
+
+def rigs() -> list[dict[str, Any]]:
+    return [stated(coarse(name)) for name in ("paper", "light_grasp", "two_fingers", "drop")]
+
+
+def motions() -> list[dict[str, Any]]:
+    """The paper's rig, moved along its pads in every way."""
+    short = coarse("paper").override(outputs={"duration": 1.0, "snapshots": []})
+    ways = tomllib.loads(MOTIONS)["motion"]
+    return [stated(short.override({"motion.x_d": motion})) for motion in ways]
 
 
 def datasets() -> list[dict[str, Any]]:
@@ -113,21 +130,16 @@ def datasets() -> list[dict[str, Any]]:
     return trees
 
 
-def run_briefly(p: Parameters) -> None:
-    """The rig at rest and three steps on."""
-    if p.pad.memory > SMALL or p.pad.elements_x * p.contact.points > 500:
+def run_briefly(file: RigFile) -> None:
+    """The rig, its motions to the end, and three steps."""
+    rig = file.assemble()
+    points = sum(pad.point_positions.shape[0] for pad in rig.pads.values())
+    if max(pad.mesh.memory for pad in rig.pads.values()) > SMALL or points > 1000:
         return
-    model = still(p)
-    y0 = rest(model).detach()
-    run = simulate(model, BRIEFLY, y0=y0, step=2e-3)
-    finite(y0, run.y, *run.channels.values())
-
-
-def excite_briefly(e: Excitation) -> None:
-    """The grasp, and its reference to the end."""
-    begun = excited(e, PAPER.override(COARSE))
-    follow = begun.rig.follow(torch.linspace(0, e.duration, 101, dtype=torch.float64))
-    finite(begun.y0, follow, simulate(begun.rig, BRIEFLY, y0=begun.y0, step=2e-3).y)
+    made, y0, _ = file.build()
+    until = torch.linspace(0, file.outputs.duration, 101, dtype=torch.float64)
+    run = simulate(made, BRIEFLY, y0=y0, step=2e-3)
+    finite(y0, made.follow(until), run.y, *run.channels.values())
 
 
 def design_briefly(config: Config) -> None:
@@ -159,8 +171,8 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "parameters": Kind(Parameters, parameters, 6000, run_briefly),
-    "excitations": Kind(Excitation, excitations, 3000, excite_briefly),
+    "rig files": Kind(RigFile, rigs, 6000, run_briefly),
+    "motions": Kind(RigFile, motions, 3000, run_briefly),
     "dataset configurations": Kind(Config, datasets, 4000, design_briefly),
 }
 
@@ -282,7 +294,7 @@ laws."""
 
 
 def identification(slow: bool) -> dict[str, Any]:
-    return {"rig": str(PAPER)} | tomllib.loads(STATED + SLOW if slow else STATED)
+    return {"rig": "paper"} | tomllib.loads(STATED + SLOW if slow else STATED)
 
 
 def run_once(case: measured.Case) -> None:

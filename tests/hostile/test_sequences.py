@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from conftest import Exp, coarse, f64, grasp, times, towards
+from conftest import PAPER, Exp, coarse, f64, grasp, times, towards
 from hypothesis import HealthCheck, Phase, seed, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -44,12 +44,21 @@ pytestmark = [
 ]
 
 T = times(6e-3, 4)
+RIG = PAPER.assemble()
 REFUSALS = ValueError, TypeError, SimulationFailed, GradientFailed
 SETTINGS = {"pad__elements_x": 48, "contact__mu_s": 0.4, "contact__mu_k": 0.3}
 WEIGHTS = {
     "theta": 1.0, "x_C": 1e2, "y_Br": 1e2, "v_x": 1.0, "omega": 0.1, "F_x": 1e-2, "F_y": 1e-2,
     "angular_momentum": 1e3,
 }  # fmt: skip
+LAW = "contacts.L.law"
+NAMES = sorted(
+    RIG.aliases.get(name, name) for name in {"gravity", *RIG.short.values()}
+    if name in {"gravity", *RIG.aliases} or name.startswith("bodies.")
+)  # fmt: skip
+"""Parameters of the rig by their places among its parts."""
+CHANGED = sorted(set(NAMES) - {f"{LAW}.friction.v_s"})
+"""Those that operations change."""
 STEPS = 1e-4, 3e-5, 1e-5, 1e-6
 """Of the differences, relative to the values; taken until two that follow each other agree."""
 ALIKE, CLEAR, SMALL = 1e-5, 1e-4, 1e-4
@@ -157,12 +166,12 @@ class ModelInUse(RuleBasedStateMachine):
     tally: ClassVar = Counter[str]()
 
     @initialize(key=st.integers(0, 2**32 - 1), before=st.integers(0, 5))
-    def excited(self, key: int, before: int) -> None:
+    def begin(self, key: int, before: int) -> None:
         self.rng, self.before = np.random.default_rng([SEED, key]), before
         self.model, self.rans = coarse(**SETTINGS), list[Ran]()
         velocity = 0.05 * self.rng.uniform(-1, 1), 0.01 * self.rng.uniform(-1, 1)
         self.y0, self.model.reference = grasp(self.model, velocity)
-        self.nominal = {name: self.model.get_parameter(name).item() for name in NAMES.values()}
+        self.nominal = {name: self.model.get_parameter(name).item() for name in NAMES}
 
     def some(self, *choices: Any) -> Any:
         return choices[self.rng.integers(len(choices))]
@@ -203,8 +212,9 @@ class ModelInUse(RuleBasedStateMachine):
 
     @step_by_step
     def tie(self) -> None:
-        if {"contact.R_t", "contact.R_n"} <= set(self.names(99)):
-            self.model.contact.R_t = self.model.contact.R_n
+        law = self.model.contacts["L"].law
+        if {f"{LAW}.R_t", f"{LAW}.R_n"} <= set(self.names(99)):
+            law.R_t = law.R_n
 
     @precondition(lambda self: not self.rans)  # torch drops the gradient of what ran before
     @step_by_step
@@ -242,8 +252,9 @@ class ModelInUse(RuleBasedStateMachine):
     @step_by_step
     def replace_law(self) -> None:
         frozen = SmoothSlip(0.5, 0.4, 0.05).requires_grad_(False)
-        del self.model.contact.friction
-        self.model.contact.friction = self.some(
+        law = self.model.contacts["L"].law
+        del law.friction
+        law.friction = self.some(
             SmoothSlip(0.5, 0.4, 0.08),
             Coulomb(0.4, 0.38),
             Own(self.rng.uniform(0.2, 0.5)).eval(),
@@ -351,10 +362,6 @@ class ModelInUse(RuleBasedStateMachine):
                 assert right, f"gradient {expected!r}, loss and differences {found} along {some}"
                 return True
         return False
-
-
-CHANGED = sorted(set(NAMES.values()) - {"contact.friction.v_s", "pad.rho"})
-"""Parameters that operations change."""
 
 
 def test_gradients_after_any_sequence_are_those_of_what_ran(tally):

@@ -223,7 +223,7 @@ def folder(tmp_path, monkeypatch):
     """Recordings, configurations, and some that are wrong."""
     rig = tomllib.loads(IDENTIFICATION)
     data = tomllib.loads(sorted((ROOT / "data_gen" / "configs").glob("*.toml"))[2].read_text())
-    data["rig"] = str(ROOT / "rigs" / "paper.toml")
+    data["rig"] = "paper"
     table = cells()
     trees = {
         "rig.toml": rig,

@@ -15,6 +15,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, resting, standing, unstretched
+from torchsoft.physics.validity import check_values
 
 REST = "rest"
 """The word for a coordinate in equilibrium."""
@@ -65,6 +66,7 @@ def start(rig: Rig, bodies: Starts) -> Tensor:
             )
     for name, body in rig.bodies.items():
         check_start(name, body.freedom, bodies.get(name, {}))
+    check_values(rig)
     held, _ = rig.held(rig.follow(0.0))
     y = moving(rig, standing(rig, placed(rig, bodies, held)), bodies)
     warn_of_moments(rig, y, bodies)

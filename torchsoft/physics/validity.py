@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the only way to tell
 
 from torchsoft.physics.arguments import check_transforms
@@ -88,11 +88,19 @@ def check_place() -> None:
 
 
 def check_values(rig: Any) -> None:
-    """Raises `ValueError` naming a parameter of the rig or a tensor of its parts that is not a
-    float64 number on the CPU, not finite, out of the bounds of its quantity or not physical by its
-    module's `well_posed`, or a material without a `chain`."""
+    """Raises `ValueError` as `check_part` does for all parts of the rig, and for a material without
+    a `chain`."""
     check_place()
-    for owner, module in rig.named_modules():
+    check_part(rig)
+    for name, pad in rig.pads.items():
+        check_chain(name, pad.material)
+
+
+def check_part(part: nn.Module) -> None:
+    """Raises `ValueError` naming a parameter of the part or a tensor of its own parts that is not a
+    float64 number on the CPU, not finite, out of the bounds of its quantity or not physical by its
+    module's `well_posed`."""
+    for owner, module in part.named_modules():
         path = f"{owner}." if owner else ""
         for name, value in module.named_parameters(recurse=False):
             check_array(f"{path}{name}", value)
@@ -110,7 +118,7 @@ def check_values(rig: Any) -> None:
         for name, value in module.named_buffers(recurse=False):
             if value.is_floating_point():
                 check_array(f"{path}{name}", value)
-    for owner, module in rig.named_modules():
+    for owner, module in part.named_modules():
         path = f"{owner}." if owner else ""
         for name in dict.fromkeys((*module._parameters, *quantities(type(module)))):
             declared, value = quantity_of(module, name), getattr(module, name, None)
@@ -127,12 +135,10 @@ def check_values(rig: Any) -> None:
                 raise ValueError(
                     f"parameter `{path}{name}` must be {declared.range}, but is {wrong[0]:g}"
                 )
-    for owner, module in rig.named_modules():
+    for owner, module in part.named_modules():
         well_posed = getattr(module, "well_posed", None)
         if well_posed is not None and (wrong := well_posed()):
             raise ValueError(f"the parameters of `{owner}` are not physical together: {wrong}")
-    for name, pad in rig.pads.items():
-        check_chain(name, pad.material)
 
 
 @torch.no_grad()

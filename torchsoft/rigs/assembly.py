@@ -6,10 +6,12 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from torch import nn
+
 from torchsoft.display import suggestion
 from torchsoft.physics.material import Series
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.validity import sound
+from torchsoft.physics.validity import check_part, sound
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.trajectory import units
 from torchsoft.tables import line
@@ -33,6 +35,8 @@ def assemble(file: RigFile, parts: Mapping[str, Any]) -> Rig:
         for name, table in getattr(file, group).items():
             with at_field(f"{group}.{name}"):
                 own = left.pop(f"{group}.{name}", None)
+                if isinstance(own, nn.Module):
+                    check_part(own)
                 found[name] = sound(build(name, table) if own is None else own)
         return found
 
