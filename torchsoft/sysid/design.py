@@ -232,7 +232,7 @@ def design(
         made_by={
             "torchsoft": version("torchsoft"), "criterion": criterion,
             "bounds": {name: one.model_dump() for name, one in bounds.items()},
-            "limits": dict(limits or {}), "iterations": search.iteration, "rate": rate,
+            "limits": planner.limits, "iterations": search.iteration, "rate": rate,
             "smoothing": smoothing, "rtol": rtol, "seed": seed,
             **planner.cost, "wall_s": clock.perf_counter() - began,
         },

@@ -38,6 +38,7 @@ from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choic
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording, RunContext
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.unknowns import in_full
 
 # Criteria of optimal design
 
@@ -87,7 +88,7 @@ def chosen(
         for name, row in zip(c.names, rows)
         if row.any() and name not in own and not name.startswith(PREFIX)
     ]
-    selected = tuple(known if names is None else names)
+    selected = tuple(known if names is None else map(one.rig.full, names))
     if not selected or len(set(selected)) < len(selected) or not set(selected) <= set(known):
         raise ValueError(
             f"`names` must be some of the parameters {', '.join(known)}, each once, but is "
@@ -159,16 +160,12 @@ class Planner:
         self, problem: Problem, plan: str, moves: Moves, limits: Mapping[str, Range],
         criterion: Optimality, names: Sequence[str] | None, rtol: float, workers: int,
     ) -> None:  # fmt: skip
-        self.problem, self.k, self.moves, self.limits = (
-            problem,
-            problem.names.index(plan),
-            moves,
-            dict(limits),
-        )
+        self.problem, self.k, self.moves = problem, problem.names.index(plan), moves
         self.recording, self.rtol, self.workers = problem.recordings[self.k], rtol, workers
         self.criterion: Optimality = criterion
         self.names, _ = chosen(problem, problem.coordinates.start, names)
-        for channel, (low, high) in limits.items():
+        self.limits = in_full([self.recording.rig], limits)
+        for channel, (low, high) in self.limits.items():
             if channel not in self.recording.channels or not low < high:
                 raise ValueError(
                     f"limits.{channel} = ({low:g}, {high:g}): a limit is (low, high) of a channel "

@@ -24,7 +24,16 @@ from torchsoft.sysid.prediction import (
 )
 from torchsoft.sysid.recording import Array, Recording, extended
 from torchsoft.sysid.runs import Job, Runner
-from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown, by_channel
+from torchsoft.sysid.unknowns import (
+    NUISANCES,
+    Coordinates,
+    Nuisance,
+    Sensor,
+    Unknown,
+    by_channel,
+    by_parameter,
+    in_full,
+)
 from torchsoft.tables import line
 
 StepsByName = float | Mapping[str, Frozen]
@@ -119,7 +128,8 @@ class Problem(Shown):
 
     `recordings` have distinct names; `sensors` are the channels that count, with their noise;
     `unknowns` are the parameters, `extensions` of the rigs included; `noise` is the colour of a
-    channel's noise, white by default. Raises `ValueError` where these do not fit together.
+    channel's noise, white by default. Short names are taken here, and the problem and its results
+    have the full ones. Raises `ValueError` where these do not fit together.
     """
 
     def __init__(
@@ -128,7 +138,8 @@ class Problem(Shown):
     ) -> None:  # fmt: skip
         names = [recording.name for recording in recordings]
         sampled = {channel for recording in recordings for channel in recording.samples}
-        sensors = by_channel([recording.rig for recording in recordings], sensors, sampled)
+        rigs = [recording.rig for recording in recordings]
+        sensors, unknowns = by_channel(rigs, sensors, sampled), by_parameter(rigs, unknowns)
         if not recordings or len(set(names)) < len(names):
             raise ValueError(f"recordings need names of their own, but are called {names}")
         for channel in sensors:
@@ -150,8 +161,6 @@ class Problem(Shown):
                     f"recording `{recording.name}` has samples of none of the sensors "
                     f"{list(sensors)}"
                 )
-        full = {short: name for one in recordings for short, name in one.rig.short.items()}
-        unknowns = {full.get(name, name): one.named(full) for name, one in unknowns.items()}
         recordings, unknowns = with_extensions(recordings, unknowns)
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
         self.coordinates = Coordinates(unknowns, sensors, recordings)
@@ -162,7 +171,7 @@ class Problem(Shown):
             sensor.delay > 0 or sensor.inertia > 0 or sensor.clock > 0
             for sensor in sensors.values()
         )
-        self.noise = dict(noise or {})
+        self.noise = in_full(rigs, noise or {})
         self._whiteners: dict[tuple[str, str], Any] = {}
         for k in range(len(recordings)):
             self.readouts(self.coordinates.start, k)

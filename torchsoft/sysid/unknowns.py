@@ -8,7 +8,7 @@ deviation is a relative one either way.
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Literal, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
 from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown
+
+T = TypeVar("T")
 
 SPREAD = 10.0
 """Default bounds of a logarithmic parameter: its nominal value divided and multiplied by this."""
@@ -57,8 +59,8 @@ class Prior(Table):
 
 
 class Unknown(Table):
-    """One parameter to identify, by its name in the rig, user-defined laws included, or by its
-    alias in `Parameters`.
+    """One parameter to identify, by its name in the rig or its short one, user-defined laws
+    included.
 
     `nominal` is the start of the search, by default the value of the recordings' own rigs; with
     `ratio_to`, value, nominal, bounds and prior are those of the ratio to that other parameter, and
@@ -89,10 +91,6 @@ class Unknown(Table):
         if self.fixed and self.prior is not None:
             raise ValueError("a fixed unknown needs no prior")
         return self
-
-    def named(self, full: Mapping[str, str]) -> Self:
-        """With the full name of what it is a ratio to, which `full` has by short names."""
-        return self.model_copy(update={"ratio_to": full.get(self.ratio_to or "", self.ratio_to)})
 
 
 Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia", "clock"]
@@ -160,15 +158,29 @@ class Sensor(Table):
         return out
 
 
+def in_full(rigs: Iterable[Rig], given: Mapping[str, T]) -> dict[str, T]:
+    """What is given by names of the rigs, by the full ones; the last of two for one name counts."""
+    full = {short: name for rig in rigs for short, name in rig.short.items()}
+    return {full.get(name, name): one for name, one in given.items()}
+
+
+def by_parameter(rigs: Iterable[Rig], unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
+    """Unknowns by the full names of the rigs' parameters."""
+    rigs, out = list(rigs), dict[str, Unknown]()
+    for name, one in in_full(rigs, unknowns).items():
+        (base,) = in_full(rigs, {one.ratio_to: one}) if one.ratio_to is not None else (None,)
+        out[name] = one if base == one.ratio_to else one.model_copy(update={"ratio_to": base})
+    return out
+
+
 def by_channel(
     rigs: Iterable[Rig], sensors: Mapping[str, Sensor], sampled: Collection[str] | None = None
 ) -> dict[str, Sensor]:
-    """Sensors by channel. A sensor named after an array of touch of the rigs, such as
-    "skin.normal", stands for each of its channels (of those `sampled`, if given) without a sensor
-    of its own."""
+    """Sensors by the full names of channels. A sensor named after an array of touch of the rigs,
+    such as "skin.normal", stands for each of its channels (of those `sampled`, if given) without a
+    sensor of its own."""
     rigs = list(rigs)
-    full = {short: name for rig in rigs for short, name in rig.short.items()}
-    sensors = {full.get(name, name): sensor for name, sensor in sensors.items()}
+    sensors = in_full(rigs, sensors)
     arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
     shared, own = dict[str, Sensor](), dict[str, Sensor]()
     for name, sensor in sensors.items():
@@ -202,7 +214,7 @@ class Coordinate:
 
     @property
     def label(self) -> str:
-        """Readable name, such as `contact.K_n`, `contact.mu_k / contact.mu_s`, `delay of theta`."""
+        """Readable name: `materials.rubber.E`, `bodies.a.mass / bodies.b.mass`, `delay of x_C`."""
         quantity = self.name if self.of_the_rig else f"{self.kind} of {self.name}"
         ratio = f" / {self.ratio_to}" if self.ratio_to else ""
         return f"{quantity}{ratio}" + (f" in {self.recording}" if self.recording else "")
