@@ -36,6 +36,16 @@ def test_parameters_have_the_names_of_the_file():
         sharp.parameter("contact.v_s")
 
 
+def test_a_change_keeps_short_names_of_entries_that_are_there_by_default():
+    """And drops those of entries that are gone."""
+    file = PAPER.override({"pad.elements_x": 60})
+    assert file.names == PAPER.names
+    assert file.override({"pad.inertial": True}).pads["L"].inertial
+    friction = {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}
+    other = file.override({"laws.steel_on_rubber.friction": friction})
+    assert file.names.keys() - other.names.keys() == {"contact.v_s"}
+
+
 # bodies, loops and states
 # ----------------------------------------------------------------------
 

@@ -185,23 +185,30 @@ class RigFile(Shown, Group):
         """Changed tables of this file, without sources of numbers that are others now and names of
         entries that are gone."""
 
-        def value(name: str) -> Any:
-            node: Any = tree
-            for key in place(self, name).keys:
+        def value(name: str, tree: Any = tree, above: int = 0) -> Any:
+            node, keys = tree, place(self, name).keys
+            for key in keys[: len(keys) - above]:
                 many = range(len(node)) if isinstance(node, list | tuple) else ()
                 if key not in (node if isinstance(node, Mapping) else many):
                     return None
-                node = node[key]  # pyright: ignore[reportCallIssue, reportArgumentType]
+                node = node[key]
             return listed(node)
 
+        def gone(name: str) -> bool:
+            if "." not in name or value(name) is not None:
+                return False
+            table, before = value(name, above=1), value(name, own, above=1) or {}
+            kept = isinstance(table, dict) and table.get("kind") == before.get("kind")
+            return not kept or value(name, own) is not None  # one by default is still there
+
+        own = self.model_dump(exclude_unset=True)
         old = {name: value for name, value, _ in entries(self)}
         for name in tree.get("sources", {}).keys() & self.sources.keys():
             if value(name) != listed(old[name]):
                 tree = tree | {"sources": {k: x for k, x in tree["sources"].items() if k != name}}
         kept = {
             short: full for short, full in tree.get("names", {}).items()
-            if short not in self.names
-            or all("." not in one or value(one) is not None for one in self.full(short))
+            if short not in self.names or not any(map(gone, self.full(short)))
         }  # fmt: skip
         return tree | ({"names": kept} if "names" in tree else {})
 
