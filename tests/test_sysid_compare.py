@@ -2,19 +2,20 @@
 and laws of friction."""
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE, PAPER, RIG, excited, rolled, still, stroked, towards
+from conftest import COARSE, PAPER, RIG, rolled, stroked, towards
 from scipy import stats
-from test_sysid_friction import Viscous
+from test_sysid_friction import ALPHA, FRICTION, Viscous
 
-from torchsoft import Profile, Reference, Rig, RigFile, excite
+from torchsoft import Profile, excite
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
+from torchsoft.sysid import Problem, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Density, LawFit, compare, density, judged, ratio, versus
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import Part
@@ -134,43 +135,29 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
     assert "take a tighter tolerance" in judged([fitted("a"), fitted("b")], [rough])[2]
 
 
-BASE = PAPER.override(
-    COARSE | {"laws.steel_on_rubber.friction.mu_s": 0.7, "laws.steel_on_rubber.friction.mu_k": 0.6}
-)
-SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "effort_x")}
+BASE = PAPER.override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
+SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
 BRIEF: dict[str, Any] = {"duration": 0.4, "grasp": 0.15, "since": 0.2}
-STROKE = stroked(travel=25e-3, stroke_time=0.15, depth=2e-4, **BRIEF)
-GENTLE = Excitation(rolled(1e-3, 0.4, 0.2), depth=1e-3, **BRIEF)
+STROKE = stroked(travel=25e-3, stroke_time=0.15, depth=0.8e-4, **BRIEF)
+GENTLE = Excitation(rolled(1e-3, 0.4, since=0.2), depth=0.88e-3, **BRIEF)
 UNKNOWNS = {
-    "smooth": {"laws.steel_on_rubber.friction.mu_s": Unknown(low=0.4, high=1.2),
-    "laws.steel_on_rubber.friction.mu_k": Unknown(ratio_to="laws.steel_on_rubber.friction.mu_s", low=0.4, high=0.9)},
-    "viscous": {"laws.steel_on_rubber.friction.alpha": Unknown(low=0.3, high=1.2)},
+    "smooth": {"contact.mu_s": Unknown(low=0.4, high=1.2),
+    "contact.mu_k": Unknown(ratio_to="contact.mu_s", low=0.4, high=0.9)},
+    "viscous": {ALPHA: Unknown(low=0.3, high=1.2)},
 }  # fmt: skip
 
 
-def viscous(settings: RigFile, reference: Reference) -> Rig:
-    return still(settings, reference, friction=Viscous(0.6, 5.0))
-
-
-BUILDS = {"smooth": still, "viscous": viscous}
-
-
-def laws(recording: Recording, excitation: Excitation) -> dict[str, Problem]:
-    """The library's law and a user's own, given the same recording."""
-    p, reference = excite(BASE, excitation), recording.rig.reference
+def laws(excitation: Excitation, alpha: float) -> dict[str, Problem]:
+    """The library's law and a user's own, given the same recording of the latter."""
+    file = excite(BASE, excitation)
+    planned = file.build({FRICTION: Viscous(0.6, 5.0)})
+    recording = record("one", planned, {ALPHA: alpha}, SENSORS, rtol=1e-5, seed=1)
+    smooth = file.assemble()
+    smooth.reference = planned.rig.reference
     return {
-        name: Problem([replace(recording, rig=build(p, reference))], SENSORS, UNKNOWNS[name])
-        for name, build in BUILDS.items()
+        name: Problem([one], SENSORS, UNKNOWNS[name])
+        for name, one in (("smooth", replace(recording, rig=smooth)), ("viscous", recording))
     }
-
-
-def made(
-    excitation: Excitation, build: Any, values: dict[str, float], noise: float = 1.0
-) -> dict[str, Problem]:
-    planned = excited(excitation, BASE)
-    planned = replace(planned, rig=build(excite(BASE, STROKE), planned.rig.reference))
-    recording = record("one", planned, values, SENSORS, rtol=1e-5, noise=noise, seed=1)
-    return laws(recording, excitation)
 
 
 def plans(problems: dict[str, Problem]) -> dict[str, list[Stage]]:
@@ -182,16 +169,14 @@ def plans(problems: dict[str, Problem]) -> dict[str, list[Stage]]:
 
 @pytest.fixture(scope="module")
 def stroke():
-    return made(STROKE, viscous, {"laws.steel_on_rubber.friction.alpha": 0.55})
+    return laws(STROKE, 0.55)
 
 
 def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
     found = compare(stroke, plans=plans(stroke))
     assert (found.outcome, found.law) == ("law", "viscous"), found.verdict
     assert found["viscous"].weight > 0.999 > found["viscous"].p > 1e-3
-    assert found["viscous"].estimates["laws.steel_on_rubber.friction.alpha"] == pytest.approx(
-        0.55, rel=0.02
-    )
+    assert found["viscous"].estimates[ALPHA] == pytest.approx(0.55, rel=0.02)
     assert found["smooth"].bic - found["viscous"].bic > 20
     found.save(tmp_path / "comparison.json")
     assert json.loads((tmp_path / "comparison.json").read_text())["law"] == "viscous"
@@ -199,7 +184,7 @@ def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
 
 
 def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another():
-    problems = made(GENTLE, viscous, {"laws.steel_on_rubber.friction.alpha": 0.6})
+    problems = laws(GENTLE, 0.6)
     found = compare(problems, plans=plans(problems))
     assert (found.outcome, found.law) == ("cannot tell", None), found.verdict
     assert found.against[0].distance < 4
@@ -214,14 +199,15 @@ def test_laws_that_were_not_given_the_same_data_are_refused(stroke):
         return Problem([replace(recording, **changes)], sensors, UNKNOWNS["smooth"])
 
     noisier = {channel: (t, y + 1e-9) for channel, (t, y) in recording.samples.items()}
-    moved = towards(recording.rig, Profile([0.0], [60e-3]))
+    moved = deepcopy(recording.rig)
+    moved.reference = towards(moved, Profile([0.0], [60e-3]))
     elsewhere = {"a": [Stage("all", (), (), 1e-4)]}
     for others, how, message in (
         ({}, {}, "needs two laws or more, not 1"),
         ({"b": other(name="two")}, {}, "`a` and `b` have other recordings: one and two"),
         ({"b": other(samples=noisier)}, {}, "`one` of the laws `a` and `b` has other samples"),
         ({"b": other({"x_C": SENSORS["x_C"]})}, {}, "have other sensors"),
-        ({"b": other(rig=still(excite(BASE, STROKE), moved))}, {},
+        ({"b": other(rig=moved)}, {},
          "follow another reference in recording `one`"),
         ({"b": p}, {"heldout": ["one"]}, r"`heldout` must name some of \['one'\], but not all"),
         ({"b": p}, {"plans": elsewhere}, "the last stage of the plan of `a` must fit one"),

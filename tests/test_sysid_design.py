@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RIG, excited, grasp, turning
+from conftest import COARSE, PAPER, RIG, clear, grasp, stroked, turning
 
 from torchsoft import Profile, Reference
 from torchsoft.plan.knots import Bounds, Moves, profile
@@ -22,30 +22,36 @@ from torchsoft.sysid.planner import LEFT, Optimality, Planner, chosen, deviation
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 
-P = PAPER.override(COARSE)
+P, DEPTH = PAPER.override(COARSE), 1e-3
+E, K_N = "materials.rubber.E", "laws.steel_on_rubber.K_n"
+MU_S, MU_K = (f"laws.steel_on_rubber.friction.{name}" for name in ("mu_s", "mu_k"))
+
+
+def path(times: tuple[float, ...], values: tuple[float, ...]) -> dict[str, Any]:
+    """Table of a profile [s, m] from where its coordinate starts."""
+    return {"kind": "profile", "times": times, "values": values, "offset": "start"}
+
+
 PLAN = Excitation(
-    {"kind": "profile", "times": [0.12, 0.17, 0.22], "values": [0.0, 1e-3, -0.5e-3],
-     "offset": "start"},
-    {"times": [0.0, 0.1, 0.12, 0.18, 0.22], "values": [0.0, -1e-3, -1e-3, -1.2e-3, -0.9e-3]},
-    duration=0.25, grasp=0.1, since=0.12, depth=1e-3,
+    path((0.12, 0.17, 0.22), (0.0, 1e-3, -0.5e-3)),
+    path((0.0, 0.1, 0.12, 0.18, 0.22), (0.0, -DEPTH, -DEPTH, -2e-4 - DEPTH, 1e-4 - DEPTH)),
+    duration=0.25, grasp=0.1, depth=DEPTH,
 )  # fmt: skip
 BOUNDS = {
     "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13, shortest=0.02),
     "y_d": Bounds(low=0.048, high=0.0499, speed=0.1, after=0.13),
 }
-SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "effort_y")}
+SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 
 
 @pytest.fixture(scope="session")
 def plan():
-    return record("plan", excited(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    return record("plan", clear(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
 
 
 @pytest.fixture(scope="session")
 def problem(plan):
-    return Problem(
-        [plan], SENSORS, {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()}
-    )
+    return Problem([plan], SENSORS, {E: Unknown(), K_N: Unknown()})
 
 
 def planner(problem: Problem, criterion: Optimality, **limits: tuple[float, float]) -> Planner:
@@ -78,11 +84,7 @@ def test_slopes_are_those_of_differences(plan, sensors, monkeypatch):
     """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted
     beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
-    stated = Problem(
-        [plan],
-        SENSORS | sensors,
-        {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()},
-    )
+    stated = Problem([plan], SENSORS | sensors, {E: Unknown(), K_N: Unknown()})
     one = planner(stated, "A", F_y=(-30.0, 30.0))
     z, x = one.moves.start, stated.coordinates.start
     at = one.evaluate(z, x)
@@ -103,11 +105,7 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
     parts, sds = [], []
     for better in (4.0, 4e4):
         sensors = {name: Sensor(noise=one.noise / better) for name, one in SENSORS.items()}
-        stated = Problem(
-            [plan],
-            sensors,
-            {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()},
-        )
+        stated = Problem([plan], sensors, {E: Unknown(), K_N: Unknown()})
         one = planner(stated, "A")
         at = one.evaluate(one.moves.start, stated.coordinates.start)
         sd = np.array(list(one.deviations(stated.coordinates.start, at).values()))
@@ -126,7 +124,7 @@ def test_nuisances_are_left_out_as_the_schur_complement(plan):
     stated = Problem(
         [plan],
         {**SENSORS, "effort_y": Sensor(noise=0.1, bias=1.0)},
-        {"materials.rubber.E": Unknown(), "laws.steel_on_rubber.K_n": Unknown()},
+        {E: Unknown(), K_N: Unknown()},
     )
     x, c = stated.coordinates.start, stated.coordinates
     J = stated.residuals(Runner([plan]), x, ["plan"], 1e-3, c.free).J
@@ -139,14 +137,12 @@ def test_nuisances_are_left_out_as_the_schur_complement(plan):
 
 def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan):
     unknowns = {
-        "laws.steel_on_rubber.friction.mu_s": Unknown(),
-        "laws.steel_on_rubber.friction.mu_k": Unknown(
-            nominal=0.5, ratio_to="laws.steel_on_rubber.friction.mu_s"
-        ),
+        MU_S: Unknown(),
+        MU_K: Unknown(nominal=0.5, ratio_to=MU_S),
     }
     stated = Problem([plan], SENSORS, unknowns)
-    names, T = chosen(stated, stated.coordinates.start, ["laws.steel_on_rubber.friction.mu_k"])
-    assert names == ("laws.steel_on_rubber.friction.mu_k",)
+    names, T = chosen(stated, stated.coordinates.start, ["contact.mu_k"])
+    assert names == (MU_K,)
     assert T.tolist() == [[1.0, 1.0]]
 
 
@@ -187,12 +183,9 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan):
             {"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}},
             "no motion of these knots",
         ),
-        ({"limits": {"effort_x": (1.0, -1.0)}}, r"limits.F_x = \(1, -1\)"),
+        ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.effort_x = \(1, -1\)"),
         ({"limits": {"Fx": (-1.0, 1.0)}}, "limits.Fx"),
-        (
-            {"names": ["materials.rubber.nu"]},
-            "`names` must be some of the parameters materials.rubber.E, laws.steel_on_rubber.K_n",
-        ),
+        ({"names": ["pad.nu"]}, f"`names` must be some of the parameters {E}, {K_N}"),
         ({"criterion": "E"}, "`criterion` must be one of D, A, worst, not 'E'"),
         ({"iterations": -1}, "`iterations` must not be negative"),
     ],
@@ -206,7 +199,7 @@ def test_what_does_not_fit_is_refused(problem, changes, message):
 @pytest.fixture(scope="session")
 def found(problem):
     return design(
-        problem, "plan", BOUNDS, limits={"effort_y": (-70.0, 70.0)}, iterations=20, rate=0.4,
+        problem, "plan", BOUNDS, limits={"F_y": (-70.0, 70.0)}, iterations=20, rate=0.4,
         criterion="worst",
     )  # fmt: skip
 
@@ -228,7 +221,7 @@ def test_a_designed_motion_tells_more(found, problem):
 
 def test_any_rig_with_profiles():
     """It has no excitation, and its start is given."""
-    rig: Any = turning(control__senses="bracket")
+    rig: Any = turning(control__senses="bracket.x")
     y, still = grasp(rig.fixed())
     x = float(profile(still, "x_d").values)
     rig.reference = Reference(
@@ -236,7 +229,7 @@ def test_any_rig_with_profiles():
     )
     t, sensors = (
         np.linspace(0.0, 0.1, 21),
-        {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta_C"]},
+        {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta"]},
     )
     data = Recording(
         "turning",
@@ -294,8 +287,8 @@ def test_an_interruption_leaves_the_best_so_far(problem, monkeypatch):
 
 def test_the_next_recording_is_predicted(plan, problem):
     """What a recording would add is what it does add; one that cannot be made comes last."""
-    strokes = PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)})
-    roll = record("roll", excited(strokes, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    motion = stroked(2e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.12, depth=DEPTH)
+    roll = record("roll", clear(motion, P), {}, SENSORS, rtol=1e-3, noise=0.0)
     same = replace(plan, name="same")
     ranked = rank([plan], [same, roll], SENSORS, problem.unknowns, rtol=1e-3)
     assert ranked[0].score < ranked[1].score

@@ -22,7 +22,7 @@ from torchsoft.sysid.residual_tests import (
 )
 
 H = 5e-3
-CHANNELS = ("x_C", "theta", "F_x")
+CHANNELS = ("x_C", "theta_C", "effort_x")
 
 
 @dataclass
@@ -114,10 +114,10 @@ def test_the_level_is_judged_by_how_many_samples_there_are():
 
 def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well():
     rng = np.random.default_rng(5)
-    loud = Case(1, fault={("run 1", "theta"): 0.9 * rng.standard_normal(400)}).judged()
+    loud = Case(1, fault={("run 1", "theta_C"): 0.9 * rng.standard_normal(400)}).judged()
     named = [f for f in alarms(loud, "level") if f.recording]
-    assert [(f.recording, f.channel) for f in named] == [("run 1", "theta")]
-    assert "theta of `run 1` 1.27 times" in residual_notices(loud)[0]
+    assert [(f.recording, f.channel) for f in named] == [("run 1", "theta_C")]
+    assert "theta_C of `run 1` 1.27 times" in residual_notices(loud)[0]
     quiet = residual_notices(Case(1, scale=0.4).judged())
     assert len(quiet) == 1  # its pattern is not judged
     assert quiet[0].startswith("residuals are smaller than the noise that was stated")
@@ -131,14 +131,14 @@ def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well():
         ("drift", "most like a drift"),
         ("gain", "most like the reading itself, as an error of its gain"),
         ("delay", "most like its rate, as a delay"),
-        ("other", "most like the rate of theta"),
-        ("inertia", "most like the acceleration of theta"),
+        ("other", "most like the rate of theta_C"),
+        ("inertia", "most like the acceleration of theta_C"),
     ],
 )
 def test_what_follows_the_motion_is_named(kind, words):
     """Each fault is of half a standard deviation, and shows in no other recording."""
-    case, where, t = Case(2), ("run 1", "F_x"), np.arange(400) * H
-    own, other = reading(case, where), reading(case, ("run 1", "theta"))
+    case, where, t = Case(2), ("run 1", "effort_x"), np.arange(400) * H
+    own, other = reading(case, where), reading(case, ("run 1", "theta_C"))
     fault = {
         "offset": np.ones(400), "drift": t - t.mean(), "gain": own, "delay": np.gradient(own, H),
         "other": np.gradient(other, H), "inertia": np.gradient(np.gradient(other, H), H),
@@ -168,8 +168,8 @@ def test_colour_is_noticed_found_allowed_for_and_named():
         in sentence
     )
     assert not colour_notices(found, CHANNELS)
-    assert "theta" not in colour_notices(found, ["theta"])[0]
-    assert not residual_notices(Case(3, noise=noise, assumed=found["theta"].noise).judged())
+    assert "theta_C" not in colour_notices(found, ["theta_C"])[0]
+    assert not residual_notices(Case(3, noise=noise, assumed=found["theta_C"].noise).judged())
 
 
 def test_white_noise_is_hardly_ever_called_coloured():
@@ -187,19 +187,19 @@ def test_white_noise_is_hardly_ever_called_coloured():
 
 def test_channels_that_err_together_are_named():
     common = np.random.default_rng(9).standard_normal(300)
-    fault = {("run 0", "x_C"): 0.6 * common, ("run 0", "F_x"): -0.6 * common}
+    fault = {("run 0", "x_C"): 0.6 * common, ("run 0", "effort_x"): -0.6 * common}
     (found,) = alarms(Case(4, fault=fault).judged(), "channels")
-    assert "x_C and F_x of `run 0` (correlation -0." in found.words
+    assert "x_C and effort_x of `run 0` (correlation -0." in found.words
 
 
 def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss():
     spike = np.zeros(300)
     spike[100] = 9.0
-    case = Case(4, fault={("run 0", "theta"): spike})
+    case = Case(4, fault={("run 0", "theta_C"): spike})
     (found,) = alarms(case.judged(), "outliers")
-    assert "theta of `run 0` (the largest" in found.words
+    assert "theta_C of `run 0` (the largest" in found.words
     assert f"t = {100 * H:g} s" in found.words
-    many = Case(4, fault={("run 0", "theta"): np.where(np.arange(300) % 12, 0.0, 8.0)})
+    many = Case(4, fault={("run 0", "theta_C"): np.where(np.arange(300) % 12, 0.0, 8.0)})
     assert alarms(many.judged(), "level")
     assert not alarms(many.judged(robust=True), "outliers")
     assert not alarms(many.judged(robust=True), "level")  # the median is what was stated
@@ -226,7 +226,7 @@ def test_a_prior_that_the_data_contradict_is_named():
         (parts, r, J), row = Case(6).fitted(), np.eye(4)[:1] / 0.05
         both, at = np.concatenate((J, row)), np.append(r, -far / 0.05)
         x = np.linalg.lstsq(both, -at, rcond=None)[0]
-        verdicts = judge_residuals(parts, at + both @ x, both, priors=["pad.E"])
+        verdicts = judge_residuals(parts, at + both @ x, both, priors=["materials.rubber.E"])
         z = abs(far - 0.0) / np.hypot(
             0.05, np.linalg.inv(J.T @ J)[0, 0] ** 0.5
         )  # the fit without it is at zero
@@ -234,14 +234,14 @@ def test_a_prior_that_the_data_contradict_is_named():
         assert one.size == pytest.approx(z, rel=1e-6, abs=1e-9)
         assert one.alarming == (far > 0)
         assert any(
-            "contradict what was known before, pad.E by" in notice
+            "contradict what was known before, materials.rubber.E by" in notice
             for notice in residual_notices(verdicts)
         ) == (far > 0)
     unseen = judge_residuals(
         parts,
         np.append(r, 0.0),
         np.concatenate((np.delete(J, 0, 1) @ np.eye(4)[1:], np.eye(4)[:1])),
-        priors=["pad.E"],
+        priors=["materials.rubber.E"],
     )
     assert not alarms(unseen, "priors")
 

@@ -202,19 +202,13 @@ def test_nuts_says_what_it_needs(monkeypatch):
 def rolling():
     """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a
     saturated sensor."""
-    base = PAPER.override(COARSE)
-    roll = Excitation(rolled(4e-3, 0.25, 0.1), duration=0.25, grasp=0.1)
-    sensors = RIG | {
-        "effort_x": Sensor(noise=0.1, bias=1.0),
-        "effort_y": Sensor(noise=0.1, low=-60.0),
-    }
-    data = record("roll", excited(roll, base), {}, sensors, noise=0.0)
+    motion = Excitation(rolled(4e-3, 0.25, since=0.1), duration=0.25, grasp=0.1)
+    roll = excited(motion, PAPER.override(COARSE))
+    sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
+    data = record("roll", roll, {}, sensors, noise=0.0)
     prior = Prior(median=0.75e6, sd=0.1, kind="log-normal")
-    unknowns = {
-        "materials.rubber.E": Unknown(prior=prior),
-        "materials.rubber.tau": Unknown(low=5e-3, high=20e-3),
-    }
-    return Problem([data], sensors, unknowns, {"effort_x": Autoregression.stated((0.8,), 5e-3)})
+    unknowns = {"pad.E": Unknown(prior=prior), "pad.tau": Unknown(low=5e-3, high=20e-3)}
+    return Problem([data], sensors, unknowns, {"F_x": Autoregression.stated((0.8,), 5e-3)})
 
 
 def test_the_density_on_a_rig_has_its_gradient(rolling):

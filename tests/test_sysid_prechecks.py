@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RIG, rolled, still, stroked, waves
+from conftest import COARSE, PAPER, RIG, excited, rolled, stroked, waves
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from torchsoft import Reference, RigFile, excite
+from torchsoft import Reference, RigFile
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
@@ -33,46 +33,45 @@ from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner
 
 NOMINAL = PAPER.override(COARSE)
-SENSORS = RIG | {"omega_C": Sensor(noise=0.02)}
+SENSORS = {NOMINAL.full(name)[0]: sensor for name, sensor in RIG.items()} | {
+    "omega_C": Sensor(noise=0.02)
+}
+LAW, RUBBER = "laws.steel_on_rubber", "materials.rubber"
+E, GAINS = f"{RUBBER}.E", ["actuators.y.Kp", "actuators.y.Kd", "actuators.x.Kp"]
 FAR = {
-    "laws.steel_on_rubber.K_n": 3.0, "laws.steel_on_rubber.R_n": 0.4, "laws.steel_on_rubber.K_t": 0.4, "laws.steel_on_rubber.R_t": 2.5,
-    "laws.steel_on_rubber.friction.mu_s": 0.7, "laws.steel_on_rubber.friction.mu_k": 0.6, "materials.rubber.E": 0.5, "materials.rubber.tau": 2.5,
+    f"{LAW}.K_n": 3.0, f"{LAW}.R_n": 0.4, f"{LAW}.K_t": 0.4, f"{LAW}.R_t": 2.5,
+    f"{LAW}.friction.mu_s": 0.7, f"{LAW}.friction.mu_k": 0.6, E: 0.5, f"{RUBBER}.tau": 2.5,
 }  # fmt: skip
 """How far the truth is from where a fit would start."""
 
+PRESS = {"kind": "sines", "components": [{"amplitude": 5e-4, "frequency": 12.0}]}
+ABOUT = "about the disc"
+STROKE: dict[str, Any] = {"duration": 0.9, "grasp": 0.2, "since": 0.25}
+SHAKE: dict[str, Any] = {"duration": 0.9, "grasp": 0.2, "since": 0.325}
 MOTIONS = {
-    "rolling": stroked(travel=15e-3, stroke_time=0.2, duration=0.9,
-    grasp=0.2, since=0.25), "shaking": Excitation(
-        *waves(6e-3, 2e-4, (4.0, 17.0)), duration=0.9,
-        depth=4e-4, grasp=0.2, since=0.325
-    ),
-    "pressing": Excitation(rolled(10e-3, 0.9, 0.325), {"kind": "sines", "components":
-    [{"amplitude": 5e-4, "frequency": 12.0}]}, duration=0.9, grasp=0.2, since=0.325), "about the disc": stroked(travel=8e-3, stroke_time=0.25, duration=0.9, grasp=0.2, since=0.25),
-}  # fmt: skip
-
-
-def planned(name: str) -> RigFile:
-    """The rig file of a motion."""
-    senses = "disc" if name == "about the disc" else None
-    return excite(NOMINAL, MOTIONS[name], senses=senses)
+    "rolling": stroked(15e-3, stroke_time=0.2, **STROKE),
+    "shaking": Excitation(*waves(6e-3, 2e-4, (4.0, 17.0)), depth=2.8e-4, **SHAKE),
+    "pressing": Excitation(rolled(10e-3, 0.9, since=0.325), PRESS, **SHAKE),
+    ABOUT: stroked(8e-3, stroke_time=0.25, **STROKE),
+}
 
 
 @pytest.fixture(scope="module")
 def recordings():
     """What rigs with parameters far from the nominal ones give."""
     table = NOMINAL.table()
-    full = {name: NOMINAL.full(name)[0] for name in FAR}
-    truth = {name: factor * table[full[name]]["value"] for name, factor in FAR.items()}
-    return {
-        name: record(name, planned(name).build(), truth, SENSORS, seed=k, rtol=1e-4)
-        for k, name in enumerate(MOTIONS)
-    }
+    truth = {name: factor * table[name]["value"] for name, factor in FAR.items()}
+    found = {}
+    for k, (name, motion) in enumerate(MOTIONS.items()):
+        planned = excited(motion, NOMINAL, senses="disc" if name == ABOUT else None)
+        found[name] = record(name, planned, truth, SENSORS, seed=k, rtol=1e-4)
+    return found
 
 
 @pytest.fixture(scope="module")
 def runs(recordings):
     """Runs with the nominal parameters."""
-    problem = Problem(list(recordings.values()), SENSORS, {"materials.rubber.E": Unknown()})
+    problem = Problem(list(recordings.values()), SENSORS, {E: Unknown()})
     jobs = problem.jobs(problem.coordinates.start, problem.names, LOOSE, None)
     made = zip(recordings.items(), Runner(problem.recordings).run(jobs))
     return {name: Signals(run.t, one.channels, run.signals, None) for (name, one), run in made}
@@ -85,7 +84,7 @@ def looked_at(
     its own."""
     mine = {name: sensor for name, sensor in sensors.items() if name in recording.samples}
     if run is None:
-        problem = Problem([recording], mine, {"materials.rubber.E": Unknown()})
+        problem = Problem([recording], mine, {E: Unknown()})
         return precheck(problem, Runner(problem.recordings))
     span = float(recording.times[0]), float(recording.times[-1])
     readouts = {
@@ -109,9 +108,10 @@ def noted(
     recording: Recording, settings: Mapping[str, Any] | None = None, **signals: Any
 ) -> Recording:
     """With other settings, and other signals of the reference."""
-    p, old = planned(recording.name), recording.rig.reference
-    reference = Reference(**{name: signals.get(name, old[name]) for name in ("x_d", "y_d", "F_ff")})
-    return replace(recording, rig=still(p.override(dict(settings or {})), reference))
+    rig, old = RigFile.from_tree(recording.rig.tables).override(settings).assemble(), recording.rig
+    own = {name: signals.get(name, old.reference[name]) for name in ("x_d", "y_d", "F_ff")}
+    rig.reference = Reference(**own)
+    return replace(recording, rig=rig)
 
 
 def scaled(factor: float) -> Callable[[Any, Any], Any]:
@@ -122,6 +122,7 @@ def late(by: float) -> Callable[[Any, Any], Any]:
     return lambda t, y: CubicSpline(t, y)(np.maximum(t - by, t[0]))
 
 
+SETPOINT = "what x_d is of"
 NO_F = {"effort_x": None, "effort_y": None}
 MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]] = {
     "sign of a force": (
@@ -133,8 +134,8 @@ MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]
         "correlation with a run from the start", True
     ),
     "sign of an angle": (
-        "rolling", lambda r: changed(r, theta_C=scaled(-1)), "sign of theta",
-        "theta looks as if its sign were opposite",
+        "rolling", lambda r: changed(r, theta_C=scaled(-1)), "sign of theta_C",
+        "theta_C looks as if its sign were opposite",
                                                                             True
     ),
     "millinewtons": (
@@ -142,29 +143,29 @@ MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]
         "millinewtons taken for newtons", True
     ),
     "degrees": (
-        "rolling", lambda r: changed(r, theta_C=scaled(57.3)), "unit of theta",
+        "rolling", lambda r: changed(r, theta_C=scaled(57.3)), "unit of theta_C",
         "degrees taken for radians", True
     ),
     "the disc's set-point taken for the bracket's": (
-        "about the disc", lambda r: noted(r, {"control.senses": "bracket.x"}), "control.senses",
-        'set-point of the disc, not of the bracket (say control.senses = "disc")',
+        ABOUT, lambda r: noted(r, {"control.senses": "bracket.x"}), SETPOINT,
+        'set-point of the disc, not of the bracket (say measures = "disc.x" of the actuator x)',
         True,
     ),
     "the bracket's taken for the disc's": (
-        "rolling", lambda r: noted(r, {"control.senses": "disc.x"}), "control.senses",
+        "rolling", lambda r: noted(r, {"control.senses": "disc.x"}), SETPOINT,
         "of the bracket, not of the disc", True
     ),
     "the bracket's taken for the disc's, no forces": (
         "rolling", lambda r: changed(noted(r, {"control.senses": "disc.x"}), **NO_F),
-        "control.senses", "x_Br follows it to", True
+        SETPOINT, "x_Br follows it to", True
     ),
     "the bracket's taken for the disc's, the disc alone": (
         "rolling", lambda r: changed(noted(r, {"control.senses": "disc.x"}), **NO_F, x_Br=None),
-        "control.senses", "x_C does not follow it", True,
+        SETPOINT, "x_C does not follow it", True,
     ),
     "exchanged columns": (
         "rolling", lambda r: changed(r, x_C=lambda t, x: r.samples["x_Br"][1], x_Br=lambda t,
-        x: r.samples["x_C"][1]), "control.senses", "or are x_Br and x_C exchanged?", True,
+        x: r.samples["x_C"][1]), SETPOINT, "or are x_Br and x_C exchanged?", True,
     ),
     "no force fed forward": (
         "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff",
@@ -236,13 +237,12 @@ def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
 ):
     flipped = changed(recordings["rolling"], effort_y=scaled(-1))
     assert list(controller_findings(flipped, SENSORS))
-    gains = ["actuators.y.Kp", "actuators.y.Kd", "actuators.x.Kp"]
-    assert not list(controller_findings(flipped, SENSORS, gains))
+    assert not list(controller_findings(flipped, SENSORS, GAINS))
     for one, code in (
         (flipped, "sign of effort_y"),
-        (noted(recordings["rolling"], {"control.senses": "disc.x"}), "control.senses"),
+        (noted(recordings["rolling"], {"control.senses": "disc.x"}), SETPOINT),
     ):
-        problem = Problem([one], SENSORS, {name: Unknown() for name in gains})
+        problem = Problem([one], SENSORS, {name: Unknown() for name in GAINS})
         assert [f.code for f in precheck(problem, Runner(problem.recordings))] == [code]
 
 
@@ -270,7 +270,8 @@ def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_
     (note,) = controller_findings(changed(same, theta_C=None), SENSORS)
     assert note.severity == "note"
     assert (
-        "effort_x is not compared with its controller, since theta is not recorded" in note.message
+        "effort_x is not compared with its controller, since theta_C is not recorded"
+        in note.message
     )
 
 
@@ -363,25 +364,25 @@ def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings):
 
 def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant():
     found = together([
-        Diagnostic("error", "a", "effort_x looks wrong", "sign of effort_x"),
-        Diagnostic("warning", "a", "effort_y is off", "loop of effort_y"),
-        Diagnostic("error", "b", "effort_x looks wrong too", "sign of effort_x"),
+        Diagnostic("error", "a", "F_x looks wrong", "sign of F_x"),
+        Diagnostic("warning", "a", "F_y is off", "loop of F_y"),
+        Diagnostic("error", "b", "F_x looks wrong too", "sign of F_x"),
     ])  # fmt: skip
-    assert [f.code for f in found] == ["sign of effort_x", "loop of effort_y"]
-    assert found[0].message == "effort_x looks wrong; so it is in `b`"
-    with pytest.raises(ValueError, match=r'if it is so, say acknowledged = \["sign of effort_x"\]'):
+    assert [f.code for f in found] == ["sign of F_x", "loop of F_y"]
+    assert found[0].message == "F_x looks wrong; so it is in `b`"
+    with pytest.raises(ValueError, match=r'if it is so, say acknowledged = \["sign of F_x"\]'):
         accepted(found, [])
     with pytest.raises(
         ValueError,
-        match=r"called 'nonsense', so leave it out; what was found is sign of effort_x, loop of F_y$",
+        match=r"called 'nonsense', so leave it out; what was found is sign of F_x, loop of F_y$",
     ):
-        accepted(found, ["sign of effort_x", "nonsense"])
+        accepted(found, ["sign of F_x", "nonsense"])
     with pytest.raises(
         ValueError,
         match=r"^acknowledged: nothing was found that is called 'nonsense', .* nothing looks "
         r"wrong$",
     ):
         accepted([], ["nonsense"])
-    first, second = accepted(found, ["sign of effort_x"])
-    assert first == "effort_x looks wrong; so it is in `b` (acknowledged)"
-    assert second == "effort_y is off"
+    first, second = accepted(found, ["sign of F_x"])
+    assert first == "F_x looks wrong; so it is in `b` (acknowledged)"
+    assert second == "F_y is off"

@@ -80,8 +80,7 @@ def with_extensions(
 
 
 def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
-    """Raises `ValueError` where a bound of an unknown makes the rig impossible, such as a disc that
-    does not fit between the pads."""
+    """Raises `ValueError` where a bound of an unknown makes the rig impossible."""
     for c in coordinates.all:
         if c.kind != "parameter" or c.ratio_to:
             continue

@@ -117,8 +117,8 @@ def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | 
 
 
 def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
-    """A parameter changed by a relative `part`, halved until the rig is possible: a smaller disc
-    may leave the pads apart. Raises `ValueError` where it never is."""
+    """A parameter changed by a relative `part`, halved until the rig is possible: friction in slip
+    must not exceed that at rest. Raises `ValueError` where it never is."""
     for _ in range(HALVINGS):
         with suppress(ValueError):
             for recording in recordings:
