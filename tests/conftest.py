@@ -71,6 +71,15 @@ def excited(
     return made.override({} if F_ff is None else {"motion.F_ff.values": [0.0, F_ff]}).build()
 
 
+def clear(
+    excitation: Excitation, file: RigFile, parts: Mapping[str, Any] | None = None
+) -> BuiltRig:  # fmt: skip
+    """A file of the paper's rig under an excitation, its upper pad clear of the disc at the start:
+    runs that begin at a touch have no derivatives by what moves the disc."""
+    made = excite(file, excitation).override({"bodies.bracket.start.y": APART})
+    return made.build(parts or {})
+
+
 def stroked(travel: float, stroke_time: float, **more: Any) -> Excitation:
     """Strokes there and back [m, s]."""
     roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
