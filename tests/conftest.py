@@ -79,7 +79,7 @@ def excited(
 
 def clear(
     excitation: Excitation, file: RigFile, parts: Mapping[str, Any] | None = None
-) -> BuiltRig:
+) -> BuiltRig:  # fmt: skip
     """A file of the paper's rig under an excitation, its upper pad clear of the disc at the start:
     runs that begin at a touch have no derivatives by what moves the disc."""
     made = excite(file, excitation).override({"bodies.bracket.start.y": APART})

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RIG, excited, stroked, waves
+from conftest import COARSE, PAPER, RIG, clear, excited, stroked, waves
 
 from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.sysid import (
@@ -122,7 +122,7 @@ SHORT = stroked(travel=8e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.
 def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(inertial):
     """The starting displacements are held, also where a pad's elasticity changes."""
     file = BASE.override({"pad.inertial": inertial})
-    data = record("short", excited(SHORT, file), {E: 0.9e6}, SENSORS)
+    data = record("short", clear(SHORT, file), {E: 0.9e6}, SENSORS)
     unknowns = {E: Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), TAU: Unknown()}
     problem = Problem([data], SENSORS, unknowns)
     check_derivatives(problem, problem.coordinates.start, RTOL, 1e-5, h=3e-6)
@@ -198,7 +198,7 @@ def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes):
         "effort_x": tuple(x[:60] for x in strokes.samples["effort_x"]),
     }
     data = replace(strokes, name="gaps", samples=samples)
-    sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
+    sensors = SENSORS | {"theta_C": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
     unknowns = {E: Unknown()} | rest_known() | {TAU: known(TAU)}
     answer = identify(Problem([data], sensors, unknowns), rtol=RTOL, **TRUSTED)
     assert answer[E].value == pytest.approx(TRUTH[E], rel=2e-3)
@@ -384,13 +384,13 @@ def test_short_names_are_taken_and_the_problem_has_the_full_ones(strokes):
     """Of parameters, of what they are ratios to, of sensors, and of coloured noise; the last of two
     sensors of one channel counts."""
     colour = Autoregression((0.8,), 0.7, 5e-3)
-    sensors = RIG | {"theta_C": Sensor(noise=1e-3, bias=0.1)}
+    sensors = RIG | {"theta": Sensor(noise=1e-3, bias=0.1)}
     unknowns = {"contact.mu_s": Unknown(), "contact.mu_k": Unknown(ratio_to="contact.mu_s")}
     problem = Problem([strokes], sensors, unknowns, {"F_x": colour})
     assert problem.coordinates.labels == (MU_S, RATIO, "bias of theta_C")
     assert problem.unknowns == {MU_S: Unknown(), MU_K: Unknown(ratio_to=MU_S)}
     assert problem.sensors.keys() == strokes.samples.keys()
-    assert problem.sensors["theta_C"] == sensors["theta_C"]
+    assert problem.sensors["theta_C"] == sensors["theta"]
     assert problem.noise == {"effort_x": colour}
     nu = "materials.rubber.nu"
     with pytest.raises(ValueError, match=f"unknowns.{nu}.high = 0.6 is beyond what {nu} may be"):

@@ -136,7 +136,7 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
 
 
 BASE = PAPER.override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
-SENSORS = {name: RIG[name] for name in ("x_C", "theta", "F_x")}
+SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "effort_x")}
 BRIEF: dict[str, Any] = {"duration": 0.4, "grasp": 0.15, "since": 0.2}
 STROKE = stroked(travel=25e-3, stroke_time=0.15, depth=0.8e-4, **BRIEF)
 GENTLE = Excitation(rolled(1e-3, 0.4, since=0.2), depth=0.88e-3, **BRIEF)

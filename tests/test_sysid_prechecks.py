@@ -33,9 +33,7 @@ from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner
 
 NOMINAL = PAPER.override(COARSE)
-SENSORS = {NOMINAL.full(name)[0]: sensor for name, sensor in RIG.items()} | {
-    "omega_C": Sensor(noise=0.02)
-}
+SENSORS = RIG | {"omega_C": Sensor(noise=0.02)}
 LAW, RUBBER = "laws.steel_on_rubber", "materials.rubber"
 E, GAINS = f"{RUBBER}.E", ["actuators.y.Kp", "actuators.y.Kd", "actuators.x.Kp"]
 FAR = {

@@ -191,7 +191,7 @@ class RigFile(Shown, Group):
                 many = range(len(node)) if isinstance(node, list | tuple) else ()
                 if key not in (node if isinstance(node, Mapping) else many):
                     return None
-                node = node[key]  # pyright: ignore[reportCallIssue, reportArgumentType]
+                node = node[key]
             return listed(node)
 
         def gone(name: str) -> bool:
