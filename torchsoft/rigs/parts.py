@@ -79,8 +79,9 @@ else:
 class DepthTable(Group):
     """A start below "touch"."""
 
-    depth: Annotated[float, Quantity("m", 0.0, 10.0)] = Field(
-        description="by which the pads of the body and those under it give way together"
+    depth: Annotated[float, Quantity("m", -10.0, 10.0)] = Field(
+        description="by which the pads of the body and those under it give way together; clear of "
+        "them where it is negative"
     )
 
 
