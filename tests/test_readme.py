@@ -24,7 +24,8 @@ PAGES = [
 ]
 SHORTER = {
     'RigFile.ready("paper")': 'RigFile.ready("paper").override({"outputs.duration": 0.5, '
-    '"outputs.interval": 5e-3, "outputs.snapshots": [], "pad.elements_x": 60, "pad.elements_y": 2})',
+    '"outputs.interval": 5e-3, "outputs.snapshots": [], "pad.elements_x": 60, '
+    '"pad.elements_y": 2})',
     '"light shaking").build()': '"light shaking").override({"outputs.duration": 0.9}).build()',
     'theta_C"][1000]': 'theta_C"][50]',
     "run.at(10)": "100",

@@ -4,7 +4,6 @@ import json
 import pickle
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,10 @@ from torch import nn
 
 from torchsoft import Body, Profile, Reference, Rig
 from torchsoft.rigs import RigFile
+from torchsoft.rigs.build import READY as READY_RIGS
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
-RIGS = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))
+RIGS = sorted(READY_RIGS.glob("*.toml"))
 PHYSICAL = ("gravity", "bodies", "materials", "laws", "actuators", "controllers")
 MASS = ("density", "depth", "half_width", "half_height", "radius")
 """Numbers that the mass of a uniform body is computed from."""

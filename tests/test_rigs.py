@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import f64, holding_force, manipulate, nested, press, rest, still, times
+from conftest import f64, grasp, holding_force, nested, press, rest, still
 from PIL import Image
 from test_rig_parts import STONE
 
@@ -23,14 +23,15 @@ from torchsoft.materials.presets import from_shore_a
 from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
+from torchsoft.rigs.build import READY as READY_RIGS
 from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.written import template, to_toml
-from torchsoft.solve.diagnostics import linearised, loop_modes, modes
+from torchsoft.solve.diagnostics import linearised, modes
 from torchsoft.solve.simulate import Interrupted
 from torchsoft.solve.trajectory import load
 
-READY = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))
+READY = sorted(READY_RIGS.glob("*.toml"))
 
 
 ELSEWHERE = "fingertips", "two_fingers", "ellipse", "rounded_box"
@@ -104,29 +105,11 @@ def test_a_loop_that_is_about_to_close_is_not_judged(gap):
     assert [str(one) for one in found if one.severity != "note"] == []
 
 
-def test_the_papers_rig_is_soft_grasp():
-    """The same start to rounding, and from the same start the same bits."""
-    model = still({"pad.elements_x": 60, "pad.elements_y": 2})
-    y0 = manipulate(model, 80.0)
-    file = coarse(ready_rig("paper"))
-    assert torch.allclose(file.build().y0, y0, rtol=0, atol=1e-11)
-    top = float(model.unpack(y0).pose["bracket"][1])
-    file = changed(file, bodies__bracket__start__y=top, motion__F_ff__values=(0.0, -80.0))
-    ready = file.build()
-    t = times(0.6, 61)
-    with torch.no_grad():
-        assert torch.equal(ready.rig(0.1, y0), model(0.1, y0))
-    runs = [simulate(rig, t, y0=y0) for rig in (model, ready.rig)]
-    assert torch.equal(runs[0].y, runs[1].y)
-    for name in ("x_C", "theta", "F_x", "F_y", "bracket_moment"):
-        assert torch.equal(runs[0][name], runs[1][name])
-
-
 def test_what_is_held_is_the_papers_grasping_force():
     """Fed forward, it is that of the friction-free grasp, and the bracket comes down to touch the
     disc wherever this is; both by statics."""
     model = still({
-        "pad.elements_x": 60, "pad.elements_y": 2, "scenario.x_C0": 60.3e-3, "pad.E": 0.6e6,
+        "pad.elements_x": 60, "pad.elements_y": 2, "pad.E": 0.6e6,
     })  # fmt: skip
     file = changed(
         coarse(ready_rig("paper")), motion__F_ff__values=(0.0, "held"), materials__rubber__E=0.6e6,
@@ -135,11 +118,13 @@ def test_what_is_held_is_the_papers_grasping_force():
     )  # fmt: skip
     ready = file.build()
     force, _ = ready.rig.reference["F_ff"](f64(1.0)[0])
-    assert float(force) == pytest.approx(-holding_force(model, press(model, 48.6e-3)), rel=1e-9)
+    assert float(force) == pytest.approx(
+        -holding_force(model, press(model, 48.6e-3, 60.3e-3)), rel=1e-9
+    )
     state = ready.rig.unpack(ready.y0)
     depth = float(ready.rig.penetration("U", state).max().detach())
     assert -1e-15 < depth <= 0.0
-    top = float(model.unpack(rest(model).detach()).pose["bracket"][1])
+    top = float(model.unpack(rest(model, 60.3e-3).detach()).pose["bracket"][1])
     assert float(state.pose["bracket"][1]) == pytest.approx(top, abs=50e-6)  # points 2 mm apart
     aside = changed(file, bodies__bracket__start__x=1.0)
     with pytest.raises(ValueError, match=r'bracket\.start\.y: "touch", but no pad bonded to it'):
@@ -153,16 +138,6 @@ def test_strokes_go_there_and_back_until_there_is_no_time_for_more():
     t = f64(0.0, 0.5, 0.6, 0.7, 0.9, 1.1, 1.3)
     wanted = f64(0.0, 0.0, -0.5e-3, -1e-3, 0.0, -1e-3, -1e-3)
     assert torch.allclose(follow(t)[0] - 60e-3, wanted, rtol=0, atol=1e-12)
-
-
-def test_channels_have_the_names_that_a_file_gives_them():
-    with pytest.raises(ValueError, match=r"channels.theta_X: the rig has no such channel"):
-        changed(coarse(ready_rig("paper")), channels__theta_X="angle").assemble()
-    file = changed(coarse(shorter(ready_rig("paper"), 0.02)), channels__F_x="push")
-    numbers = running.summary(file, running.carry_out(file), [])
-    assert set(numbers["actuators"]) == {"x", "y"}
-    with pytest.raises(ValueError, match=r"the channel `x_C`: disc\.x and disc\.theta"):
-        changed(coarse(ready_rig("paper")), channels__theta_C="x_C").assemble()
 
 
 def test_a_drop_is_not_missed():
@@ -188,7 +163,9 @@ def test_a_drop_is_not_missed():
 def test_a_loop_is_unstable_as_the_papers_modes_say():
     """The leading mode is that of the paper's own equilibrium: the friction-free grasp."""
     changes = {"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3}
-    leading = complex(loop_modes(still(changes))[0])
+    model = still(changes)
+    y, reference = grasp(model)
+    leading = complex(modes(model, y, reference).values[0])
     paper = coarse(ready_rig("paper"))
     (found,) = check(changed(paper, materials__rubber__tau=1e-3))
     assert found.severity == "error"
@@ -202,7 +179,7 @@ def test_a_loop_is_unstable_as_the_papers_modes_say():
 def test_modes_are_those_of_the_whole_state():
     """What is left out where nothing touches decides nothing."""
     model = still({"pad.elements_x": 60, "pad.elements_y": 2})
-    y = press(model, model.settings.scenario.y_Br_grasp)
+    y = press(model)
     whole = torch.linalg.eigvals(linearised(model, y, model.reference))
     some = modes(model, y, model.reference).values
     found = (some[:, None] - whole).abs().amin(1) / some.abs().clamp(min=1.0)

@@ -404,7 +404,7 @@ def test_a_second_backward_through_a_shared_start_is_explained():
 def test_a_star_imports_what_help_names():
     names: dict[str, Any] = {}
     exec("from torchsoft import *", names)
-    assert {"Rig", "simulate", "Rig", "Trajectory"} <= names.keys()
+    assert {"Rig", "simulate", "Trajectory"} <= names.keys()
     assert "torch" not in names
 
 
