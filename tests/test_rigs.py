@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import f64, grasp, holding_force, nested, press, rest, still
+from conftest import f64, holding_force, nested, press, still
 from PIL import Image
 from test_rig_parts import STONE
 
@@ -23,7 +23,7 @@ from torchsoft.materials.presets import from_shore_a
 from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
-from torchsoft.rigs.build import READY as READY_RIGS
+from torchsoft.rigs.build import ready
 from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.written import template, to_toml
@@ -31,8 +31,7 @@ from torchsoft.solve.diagnostics import linearised, modes
 from torchsoft.solve.simulate import Interrupted
 from torchsoft.solve.trajectory import load
 
-READY = sorted(READY_RIGS.glob("*.toml"))
-
+READY = [RigFile.path(name) for name in ready()]
 
 ELSEWHERE = "fingertips", "two_fingers", "ellipse", "rounded_box"
 """Ready rigs whose parts other tests run."""
@@ -47,11 +46,6 @@ def coarse(file: RigFile, **groups: dict[str, Any]) -> RigFile:
         for name, pad in file.pads.items()
     }
     return file.override(pads=pads).override(**groups)
-
-
-def ready_rig(name: str) -> RigFile:
-    """One of the ready rigs."""
-    return RigFile.from_toml(READY[0].with_name(f"{name}.toml"))
 
 
 def shorter(file: RigFile, duration: float) -> RigFile:
@@ -98,7 +92,7 @@ def test_a_ready_rig_runs_to_its_end(path):
 @pytest.mark.parametrize("gap", [0.0, 5e-5])
 def test_a_loop_that_is_about_to_close_is_not_judged(gap):
     """The bracket does not hold the disc yet, so that the loop over both is unstable there."""
-    file = ready_rig("paper")
+    file = RigFile.ready("paper")
     ready = file.build()
     top = float(ready.rig.unpack(ready.y0).pose["bracket"][1])
     found = check(changed(file, bodies__bracket__start__y=top + gap))
@@ -108,24 +102,19 @@ def test_a_loop_that_is_about_to_close_is_not_judged(gap):
 def test_what_is_held_is_the_papers_grasping_force():
     """Fed forward, it is that of the friction-free grasp, and the bracket comes down to touch the
     disc wherever this is; both by statics."""
-    model = still({
-        "pad.elements_x": 60, "pad.elements_y": 2, "pad.E": 0.6e6,
-    })  # fmt: skip
     file = changed(
-        coarse(ready_rig("paper")), motion__F_ff__values=(0.0, "held"), materials__rubber__E=0.6e6,
-        bodies__disc__start__x=60.3e-3, bodies__bracket__start__x=60.3e-3,
-        motion__x_d={"kind": "hold"},
+        coarse(RigFile.ready("paper")), motion__F_ff__values=(0.0, "held"),
+        materials__rubber__E=0.6e6, bodies__disc__start__x=60.3e-3,
+        bodies__bracket__start__x=60.3e-3, motion__x_d={"kind": "hold"},
     )  # fmt: skip
     ready = file.build()
     force, _ = ready.rig.reference["F_ff"](f64(1.0)[0])
-    assert float(force) == pytest.approx(
-        -holding_force(model, press(model, 48.6e-3, 60.3e-3)), rel=1e-9
-    )
+    grasp = {"disc": {"x": 60.3e-3, "y": "rest"}, "bracket": {"x": 60.3e-3, "y": 48.6e-3}}
+    held = holding_force(ready.rig, ready.rig.state(grasp))
+    assert float(force) == pytest.approx(-held, rel=1e-9)
     state = ready.rig.unpack(ready.y0)
     depth = float(ready.rig.penetration("U", state).max().detach())
     assert -1e-15 < depth <= 0.0
-    top = float(model.unpack(rest(model, 60.3e-3).detach()).pose["bracket"][1])
-    assert float(state.pose["bracket"][1]) == pytest.approx(top, abs=50e-6)  # points 2 mm apart
     aside = changed(file, bodies__bracket__start__x=1.0)
     with pytest.raises(ValueError, match=r'bracket\.start\.y: "touch", but no pad bonded to it'):
         aside.build()
@@ -133,17 +122,37 @@ def test_what_is_held_is_the_papers_grasping_force():
 
 def test_strokes_go_there_and_back_until_there_is_no_time_for_more():
     stroke = {"kind": "strokes", "since": 0.5, "stroke_time": 0.2, "travel": -1e-3, "until": 1.2}
-    file = changed(coarse(ready_rig("paper")), motion__x_d=stroke)
+    file = changed(coarse(RigFile.ready("paper")), motion__x_d=stroke)
     follow = file.build().rig.reference["x_d"]
     t = f64(0.0, 0.5, 0.6, 0.7, 0.9, 1.1, 1.3)
     wanted = f64(0.0, 0.0, -0.5e-3, -1e-3, 0.0, -1e-3, -1e-3)
     assert torch.allclose(follow(t)[0] - 60e-3, wanted, rtol=0, atol=1e-12)
 
 
+def test_short_names_are_for_typing():
+    """Results have the full ones; a short one is of what is there, and of nothing else."""
+    paper = coarse(shorter(RigFile.ready("paper"), 0.02))
+    file = changed(paper, names__push="effort_x", names__soft="materials.rubber.E")
+    file = file.override({"soft": 0.6e6})
+    done = running.carry_out(file)
+    run, numbers = done.trajectory, running.summary(file, done, [])
+    assert run["push"] is run["F_x"] is run["effort_x"]
+    assert not {"push", "F_x"} & {*run.keys(), *run.to_xarray()}
+    assert set(numbers["actuators"]) == {"x", "y"}
+    assert run.setup.pads["L"].E == 0.6e6
+    for short, full, sentence in (
+        ("turn", "theta_X", "the rig has no channel `theta_X`; .*`theta_C`"),
+        ("turn", "materials.steel.E", r"names\.turn: `materials\.steel\.E` is not in the rig file"),
+        ("x_C", "theta_C", r"names\.x_C: it is the name of something else already"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            paper.override(names={short: full}).assemble()
+
+
 def test_a_drop_is_not_missed():
     """Steps chosen by tolerance would be through the pad; the first touch is where free fall
     says."""
-    file = coarse(ready_rig("drop"))
+    file = coarse(RigFile.ready("drop"))
     file = changed(shorter(file, 0.3), outputs__interval=1e-3)
     run = running.carry_out(file).trajectory
     y, force = run["y_ellipse"], run.force["ground"][..., 0].sum(-1)
@@ -162,11 +171,9 @@ def test_a_drop_is_not_missed():
 @pytest.mark.slow
 def test_a_loop_is_unstable_as_the_papers_modes_say():
     """The leading mode is that of the paper's own equilibrium: the friction-free grasp."""
-    changes = {"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3}
-    model = still(changes)
-    y, reference = grasp(model)
-    leading = complex(modes(model, y, reference).values[0])
-    paper = coarse(ready_rig("paper"))
+    model = still({"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3})
+    leading = complex(modes(model, press(model), model.reference).values[0])
+    paper = coarse(RigFile.ready("paper"))
     (found,) = check(changed(paper, materials__rubber__tau=1e-3))
     assert found.severity == "error"
     assert found.where == "actuators.x"
@@ -189,7 +196,7 @@ def test_modes_are_those_of_the_whole_state():
 
 def test_steps_are_held_against_the_modes():
     """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
-    paper = coarse(ready_rig("paper"))
+    paper = coarse(RigFile.ready("paper"))
     paper = shorter(changed(paper, materials__rubber__tau=2e-3), 1.0)
     for h, coarse_steps in ((1e-3, False), (4e-3, True)):
         said = [one.message for one in check(paper.override(solver={"step": h}))]
@@ -198,7 +205,7 @@ def test_steps_are_held_against_the_modes():
 
 def test_a_body_that_flies_is_told_of_coarse_steps():
     file = coarse(
-        ready_rig("drop"),
+        RigFile.ready("drop"),
         solver={"step": 0.05},
     )
     assert any("a body comes flying and may be through a pad" in one.message for one in check(file))
@@ -342,7 +349,7 @@ def test_a_body_too_heavy_to_rest_is_named_with_its_weight():
 def test_what_two_pads_grip_is_taken_along():
     """The estimate before a run: fingertips go around a box that they hold, and the box with them;
     the run agrees."""
-    file = ready_rig("fingertips")
+    file = RigFile.ready("fingertips")
     estimate = Estimate(file, file.build())
     for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
         box = estimate(time)["box"]
@@ -418,7 +425,7 @@ def test_a_body_rests_where_nothing_accelerates_it(inertial):
 
 @torch.no_grad()
 def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate():
-    file = coarse(ready_rig("drop"))
+    file = coarse(RigFile.ready("drop"))
     rig = file.build().rig
     pose = {"ellipse": f64(60.2e-3, 30e-3, 0.1)}
     found = resting(rig, pose)["ellipse"]
@@ -519,7 +526,7 @@ def test_run_writes_everything(small, tmp_path, capsys):
         assert video.n_frames == 3
     data = load(tmp_path / "out" / "trajectory.nc")
     assert data["y_disc"].attrs["units"] == data["y_d"].attrs["units"] == "m"
-    assert data["F_y"].attrs["units"] == data["press"].attrs["units"] == "N"
+    assert data["effort_y"].attrs["units"] == data["press"].attrs["units"] == "N"
     assert data["x_d_dot"].attrs["units"] == "m/s"
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert summary["stopped"] is None

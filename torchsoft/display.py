@@ -17,7 +17,10 @@ def enumerated(names: Iterable[str]) -> str:
     for name in names:
         array, _, number = name.rpartition(".")
         last[array if number.isdecimal() else name] = number if number.isdecimal() else ""
-    return ", ".join(f"{name}.0 to {number}" if number else name for name, number in last.items())
+    return ", ".join(
+        f"{name}.0 to {number}".removeprefix(".") if number else name
+        for name, number in last.items()
+    )
 
 
 def ranked(name: object, known: Iterable[str]) -> list[tuple[float, float, str]]:
