@@ -41,12 +41,12 @@ from torchsoft.solve.progress import SimulationFailed
 ROOT = Path(__file__).parent.parent
 CONFIGS = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
 
-TOML = f"""
+TOML = """
 title = "Test"
-rig = {json.dumps(str(ROOT / "rigs" / "paper.toml"))}
+rig = "paper"
 seed = 3
-trajectories = {{trajectories}}
-trajectories_per_shard = {{shard}}
+trajectories = {trajectories}
+trajectories_per_shard = {shard}
 duration = 0.9
 sample_interval = 0.01
 step = 0.005
@@ -59,17 +59,17 @@ samples_per_chunk = 40
 "laws.steel_on_rubber.friction.v_s" = 0.05
 "motion.F_ff.values.1" = "held"
 [parameters]
-"materials.rubber.E" = {{{{ low = 7e5, high = 8e5, scale = "log" }}}}
-"laws.steel_on_rubber.friction.mu_s" = {{{{ low = 0.7, high = 0.9 }}}}
-"motion.y_d.values.1" = {{{{ low = 48.6e-3, high = 48.8e-3 }}}}
+"materials.rubber.E" = {{ low = 7e5, high = 8e5, scale = "log" }}
+"laws.steel_on_rubber.friction.mu_s" = {{ low = 0.7, high = 0.9 }}
+"motion.y_d.values.1" = {{ low = 48.6e-3, high = 48.8e-3 }}
 [[kinds]]
 name = "slow_roll"
-fixed."motion.x_d" = {{{{ kind = "strokes", since = 0.5, stroke_time = 0.4, travel = 1e-3 }}}}
-parameters."motion.x_d.travel" = {{{{ low = 1e-3, high = 2e-3, either_sign = true }}}}
+fixed."motion.x_d" = {{ kind = "strokes", since = 0.5, stroke_time = 0.4, travel = 1e-3 }}
+parameters."motion.x_d.travel" = {{ low = 1e-3, high = 2e-3, either_sign = true }}
 [[kinds]]
 name = "shake"
-fixed."motion.x_d" = {{{{ kind = "chirp", since = 0.5, amplitude = 1.0, first = 2.0, last = 5.0 }}}}
-parameters."motion.x_d.amplitude" = {{{{ low = 2e-4, high = 4e-4 }}}}
+fixed."motion.x_d" = {{ kind = "chirp", since = 0.5, amplitude = 1.0, first = 2.0, last = 5.0 }}
+parameters."motion.x_d.amplitude" = {{ low = 2e-4, high = 4e-4 }}
 """
 
 

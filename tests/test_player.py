@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from browser import MISSING, browser
-from conftest import coarse, manipulate, times
+from conftest import COARSE, paper, times
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -34,9 +34,7 @@ return [r.x + q[0], r.y + q[1]]"""
 
 @pytest.fixture(scope="module")
 def run():
-    model = coarse()
-    y0 = manipulate(model, 80.0)
-    return simulate(model, times(0.5, 51), y0=y0)
+    return paper(COARSE).run(times(0.5, 51))
 
 
 def test_a_title_does_not_hold_the_script_open(run, tmp_path):

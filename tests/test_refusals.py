@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, RUBBER, coarse, f64, grasped, press, random_state, rest, still, times
+from conftest import (
+    COARSE,
+    RUBBER,
+    coarse,
+    f64,
+    grasped,
+    press,
+    random_state,
+    rest,
+    still,
+    times,
+)
 from torch import Tensor, nn
 from torchdiffeq import odeint
 
@@ -209,13 +220,13 @@ MUST = r"the law of `actuators.x` must take five tensors .* and return the effor
 PARTS: list[tuple[Call, str]] = [
     # shapes
     (lambda: resting(shape=Superellipse(20e-3, 20e-3, 1.9)),
-     "`disc.shape.n` must be from 2 to 20, but is 1.9"),
-    (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)), "`disc.shape.n` must be finite"),
+     "`bodies.disc.shape.n` must be from 2 to 20, but is 1.9"),
+    (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)), "`bodies.disc.shape.n` must be finite"),
     (lambda: resting(shape=Superellipse(20e-3, 6e-3, 4.0)), "differ by more than a factor of 3"),
     (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 9.1e-3)),
      "corners' radius 0.0091 is larger than half of the box, 0.009"),
     (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 0.0)),
-     "`disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
+     "`bodies.disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
     (lambda: Contour(CIRCLE[:7]), "must be at least 8 places around a contour, but are 7"),
     (lambda: Contour([*CIRCLE, CIRCLE[-1]]), "has the same place twice: point 23"),
     (lambda: Contour([*CIRCLE[:-1], [0.1, INF]]),
@@ -244,7 +255,7 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: disc(support=lambda d: 0.021 * d.norm(dim=-1)),
      "`support` is more than how far it reaches"),
     (lambda: disc(gyration=lambda: f64(-1.0)[0]),
-     r"`disc.inertia` must be from 1e-24 to 1e\+06 kg.m2"),
+     r"`bodies.disc.inertia` must be from 1e-24 to 1e\+06 kg.m2"),
     (lambda: check_shape("disc", Oval(0.03, 0.02)), "called `round`, but is not"),
     # meshes and pads
     (lambda: quads(quads=[[0, 3, 4]]), "`quads` must be quadrilaterals of four numbers"),
@@ -280,15 +291,15 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5, 2e5], tau=[0.1, 0.1])),
      "two relaxation times are equal"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[-2e5], tau=[0.1])),
-     r"`pad.E_1` must be from 1 to 1e\+13 Pa, but"),
+     r"`materials.rubber.E_1` must be from 1 to 1e\+13 Pa, but"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5], tau=[5e-5])),
      "tau_instant = 0.0001 s must be below the shortest"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6, 0.5], tau=[0.1, 1])),
     "fractions J sum to 1.1, above one"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6], tau=[0.0])),
-     "`pad.tau_1` must be from 1e-09 to"),
+     "`materials.rubber.tau_1` must be from 1e-09 to"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[NAN], tau=[0.1])),
-     "`pad.J_1` must be finite, but is nan"),
+     "`materials.rubber.J_1` must be finite, but is nan"),
     (lambda: resting(material=StandardLinearSolid(**RUBBER, E_instant=1e5, tau=0.1)),
     "E_instant is below E"),
     (lambda: chain([0.7, 0.5], [0.01, 0.1]),
@@ -437,7 +448,7 @@ class Simulated(nn.Module):
 
 
 TRANSFORMED: dict[str, Any] = {
-    "E": lambda run, E: torch.func.functional_call(run, {"model.pad.E": E}),
+    "E": lambda run, E: torch.func.functional_call(run, {"model.pads.L.material.E": E}),
     "y0": lambda run, E: run(y0=run.y0 * E),
     "list": lambda run, E: run(y0=list(run.y0 * E)),
     "t": lambda run, E: run(y0=run.y0, t=T * E),
@@ -569,7 +580,7 @@ def filled(name: str, value: float) -> Callable[[Rig], object]:
 
 SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (filled("pad.E", 0.0), r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
-    (filled("pad.E", 1e308), r"parameter `pad.E` must be below 1e\+100"),
+    (filled("pad.E", 1e308), r"parameter `materials.rubber.E` must be below 1e\+100"),
     (
         filled("contact.K_n", -1.2e5),
         r"parameter `.*K_n` must be from 0.001 to 1e\+12 N/m, but is -120000",
@@ -577,7 +588,7 @@ SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (filled("contact.K_n", NAN), r"parameter `.*K_n` must be finite, but is nan"),
     (filled("pad.nu", 0.5), r"parameter `.*nu` must be from -0\.999 to 0\.4999"),
     (filled("control.K_81", -1.0), r"parameter `.*Kp` must be from 0 to 1e\+12"),
-    (filled("scenario.gravity", NAN), r"parameter `gravity` must be finite"),
+    (filled("gravity", NAN), r"parameter `gravity` must be finite"),
     (filled("contact.mu_k", 0.9), "mu_k = 0.9 > mu_s = 0.8"),
     (
         filled("contact.R_t", 0.0),
@@ -586,14 +597,17 @@ SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (lambda m: m.float(), "`gravity` must be float64"),
     (lambda m: m.to("meta"), "on meta"),
     (
-        lambda m: setattr(m.pad.E, "data", torch.ones(2).double()),
-        r"parameter `pad.E` must be one number",
+        lambda m: setattr(m.parameter("pad.E"), "data", torch.ones(2).double()),
+        r"parameter `materials.rubber.E` must be one number",
     ),
     (
         lambda m: setattr(m, "pad", KelvinVoigt(**RUBBER, tau=0.01)),
         "`pad.E` belongs to no body, pad",
     ),
-    (lambda m: setattr(m.contact, "friction", Coulomb(0.3, 0.4)), "mu_k = 0.4 > mu_s = 0.3"),
+    (
+        lambda m: setattr(m.contacts["L"].law, "friction", Coulomb(0.3, 0.4)),
+        "mu_k = 0.4 > mu_s = 0.3",
+    ),
     (lambda m: setattr(m.contacts["L"], "body", "dish"), "contact `L` is between `L` and `dish`"),
     (
         lambda m: m.reference["x_d"].times.fill_(NAN),
@@ -646,7 +660,8 @@ class Dropping(nn.Module):
 def test_a_law_in_training_is_refused_after_it_ran_in_evaluation(
     start,
 ):
-    model = still(COARSE, friction=Dropping(), reference=start[0].reference)
+    model = still(COARSE, friction=Dropping())
+    model.reference = start[0].reference
     simulate(model.eval(), T, y0=start[1])
     with pytest.raises(TypeError, match="the random operation"):
         simulate(model.train(), T, y0=start[1])

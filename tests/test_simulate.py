@@ -32,7 +32,7 @@ from torchsoft import (
     StandardLinearSolid,
     hold,
     simulate,
-)  # fmt: skip
+)
 from torchsoft.rigs.excite import Excitation
 from torchsoft.solve import stepper, system
 from torchsoft.solve.gradients import GradientFailed
