@@ -221,7 +221,8 @@ PARTS: list[tuple[Call, str]] = [
     # shapes
     (lambda: resting(shape=Superellipse(20e-3, 20e-3, 1.9)),
      "`bodies.disc.shape.n` must be from 2 to 20, but is 1.9"),
-    (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)), "`bodies.disc.shape.n` must be finite"),
+    (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)),
+     "`bodies.disc.shape.n` must be finite"),
     (lambda: resting(shape=Superellipse(20e-3, 6e-3, 4.0)), "differ by more than a factor of 3"),
     (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 9.1e-3)),
      "corners' radius 0.0091 is larger than half of the box, 0.009"),
