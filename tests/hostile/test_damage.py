@@ -283,7 +283,7 @@ def trajectory(tmp_path_factory):
     sound = tmp_path_factory.mktemp("runs")
     run().save(sound / "run.nc")
     truth = load(sound / "run.nc")
-    assert set(read_table(sound / "run.nc", (), KNOWN).values) >= {"t", "x_d", "x_C", "F_y"}
+    assert set(read_table(sound / "run.nc", (), KNOWN).values) >= {"t", "x_d", "x_C", "effort_y"}
     wrong = lambda path, kind: misread_table(path, None if kind in REMADE else truth)
     seal = lambda path, content: sealed(content)
     return Specimen(sound, wrong, seal, PLANTED | SPECIAL | REMADE)

@@ -101,7 +101,7 @@ def test_results(memory, tally):
     out, ran, recorded = memory / "place" / "out", run(), problem()
     result = identify(recorded, rtol=1e-3)
     text = page.page(result, *page.traces(result, recorded, None))
-    shifted = replace(ran, channels=ran.channels | {"F_x": ran.channels["F_x"] + 1.0})
+    shifted = replace(ran, channels=ran.channels | {"effort_x": ran.channels["effort_x"] + 1.0})
     shifted.save(memory / "old" / "run.nc")
     picture = ["--picture", str(out / "coverage.png")]
 
