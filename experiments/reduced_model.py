@@ -57,7 +57,7 @@ DEPTH = 2e-4
 """Of the light grasp [m]."""
 
 PAPER = RigFile.ready("paper")
-X_0 = PAPER.bodies["disc"].start.x
+X_0 = PAPER["bodies.disc.start.x"]
 """Place of the disc [m]."""
 
 COARSELY = COARSE | {"motion.F_ff.values": [0.0, -75.0]}
@@ -133,7 +133,7 @@ class Grasp:
 def settled(file: RigFile) -> Grasp:
     """The grasp in which the manipulation of a rig file begins."""
     grasp = file.override({"motion.x_d": {"kind": "hold"}}).build()
-    y_d, F_ff = (file.motion[name].values[-1] for name in ("y_d", "F_ff"))
+    y_d, F_ff = (file[f"motion.{name}.values"][-1] for name in ("y_d", "F_ff"))
     still = hold(x_d=X_0, y_d=y_d, F_ff=F_ff)
     return Grasp(grasp.rig, grasp.run([0.0, SETTLED]).y[-1], still)
 
@@ -149,7 +149,7 @@ def sines(x: float, size: float, band: tuple[float, float], seed: int, duration:
 def tapped(grasp: Grasp, config: Config) -> list[Record]:
     """Small random velocities of disc and bracket, and a broad multi-sine."""
     rng, (_, v, _), out = np.random.default_rng(0), indices(grasp.model), []
-    radius = PAPER.bodies["disc"].shape.radius
+    radius = PAPER["bodies.disc.shape.radius"]
     for i in range(config.taps):
         kick = KICK * rng.standard_normal(3) / (1.0, radius, 1.0)
         y = grasp.y.clone()
@@ -207,7 +207,7 @@ def by_mechanics(e: dict[str, float]) -> dict[tuple[str, str], float]:
 
 def study_stick(config: Config) -> dict[str, Any]:
     file = PAPER.override(COARSELY if config.smoke else {})
-    times = [config.scenario * time for time in file.motion["x_d"].times]
+    times = [config.scenario * time for time in file["motion.x_d.times"]]
     whole = file.override({"motion.x_d.times": times}).build()
     grasp, time = settled(file), 5.0 * max(config.scenario, 0.2)
     far = Profile([0.0, time], [X_0, X_0 + 20e-3])

@@ -69,7 +69,7 @@ def sines(roll: float, band: tuple[float, float], duration: float, depth: float)
         {"kind": "multi_sine", "amplitude": size, "band": band, "seed": seed}
         for seed, size in enumerate((roll, 2e-4))
     ]
-    return Excitation(*sums, duration, depth)
+    return Excitation(*sums, duration=duration, depth=depth)
 
 
 def strokes(travel: float, stroke_time: float, duration: float, depth: float) -> Excitation:

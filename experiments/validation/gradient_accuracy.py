@@ -182,7 +182,7 @@ def stroke(file: RigFile) -> Window:
         "motion.x_d": roll, "motion.y_d": {"kind": "hold"},
         "motion.F_ff": {"kind": "hold", "value": "held"},
     }  # fmt: skip
-    grasped = {"bodies.bracket.start.y": file.motion["y_d"].values[-1]}
+    grasped = {"bodies.bracket.start.y": file["motion.y_d.values"][-1]}
     model, y0, _ = file.override(slippery | motions | grasped).build()
     return Window("slip", model, y0, grid(6e-3, 2.5e-4), 2.5e-4)
 

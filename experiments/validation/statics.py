@@ -95,7 +95,7 @@ class Result:
     def families(self) -> dict[str, Family]:
         """Both families of curves: node spacing [mm], second order; default K_n over K_n, first
         order."""
-        length = MILLI * PAPER.pads["U"].length
+        length = MILLI * PAPER["pads.U.length"]
         return {
             "mesh": Family(self.meshes, [length / n for n in self.config.elements_x], 2),
             "penalty": Family(self.penalties, [1 / k for k in self.config.stiffenings], 1),
@@ -113,7 +113,7 @@ def half_width(x: Tensor, g: Tensor) -> Tensor:
 @torch.no_grad()
 def indent(elements_x: int, stiffening: float, compressions: Tensor) -> Curve:
     """Press the disc to each of the compressions (points,) [m]."""
-    K_n = stiffening * PAPER.laws["steel_on_rubber"].K_n
+    K_n = stiffening * PAPER["laws.steel_on_rubber.K_n"]
     mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
     model = PAPER.override(mesh | {"contact.K_n": K_n}).build().rig
     pad, rows = model.pads["U"], []
@@ -135,7 +135,7 @@ def run(config: Config) -> Result:
         )
     fraction = torch.arange(1, config.points + 1, dtype=torch.float64) / config.points
     compressions = fraction * (TOUCH - GRASP)
-    default = PAPER.pads["U"].elements_x
+    default = PAPER["pads.U.elements_x"]
     cases = [(n, 1.0) for n in config.elements_x] + [(default, k) for k in config.stiffenings]
     curves = {
         case: indent(*case, compressions) for case in tqdm(dict.fromkeys(cases), unit="curve")

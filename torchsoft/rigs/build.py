@@ -191,7 +191,7 @@ class RigFile(Shown, Group):
                 many = range(len(node)) if isinstance(node, list | tuple) else ()
                 if key not in (node if isinstance(node, Mapping) else many):
                     return None
-                node = node[key]
+                node = node[key]  # pyright: ignore[reportCallIssue, reportArgumentType]
             return listed(node)
 
         def gone(name: str) -> bool:
@@ -216,6 +216,10 @@ class RigFile(Shown, Group):
         """What a name stands for: entries or a channel, itself if it is not a short one."""
         found = self.names.get(name, name)
         return (found,) if isinstance(found, str) else found
+
+    def __getitem__(self, name: str) -> Any:
+        """Value of an entry, by its name, full or short. Raises `ValueError` for an unknown one."""
+        return place(self, self.full(name)[0]).value
 
     def table(self) -> dict[str, dict[str, Any]]:
         """Every number that the file states, by its name: value, unit, source ("published" or
