@@ -173,7 +173,7 @@ def test_applications_do_not_know_each_other(folder):
 )
 def test_no_rig_is_special(folder):
     """Whatever is known of the paper's rig stands in its file."""
-    words = re.compile(r"paper's rig|Rig|torchsoft\.paper|steel_on_rubber")
+    words = re.compile(r"paper's rig|SoftGrasp|torchsoft\.paper|steel_on_rubber")
     for path in (ROOT / folder).rglob("*.py"):
         assert not words.findall(path.read_text(encoding="utf-8")), path
 

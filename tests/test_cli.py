@@ -124,7 +124,7 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     ),
     "material: ratio": (
         ["material", "fit", "test.csv", "--nu", "0.6"],
-        "pad.nu should be less than or equal to 0.4999",
+        "--nu should be from -0.999 to 0.4999",
     ),
     "material: out": (
         ["material", "fit", "test.csv", "--out", "test.csv"],
@@ -272,9 +272,9 @@ def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder, capsys)
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
     message = capsys.readouterr().err
     assert message.startswith(
-        "torchsoft: error: recording `data`: F_y looks as if its sign were opposite: "
+        "torchsoft: error: recording `data`: effort_y looks as if its sign were opposite: "
     )
-    assert message.endswith('; if it is so, say acknowledged = ["sign of F_y"]\n')
+    assert message.endswith('; if it is so, say acknowledged = ["sign of effort_y"]\n')
     assert not (folder / "out" / "answer.json").exists()
 
 

@@ -264,11 +264,13 @@ def open_ledger(folder: Path) -> None:
     ("change", "message"),
     [
         (
-            consolidated("theta", lambda a: a["attributes"].update(units="deg")),
+            consolidated("theta_C", lambda a: a["attributes"].update(units="deg")),
             "theta: units are 'deg', not 'rad'",
         ),
         (
-            change_json("zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega")),
+            change_json(
+                "zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega_C")
+            ),
             "omega: missing",
         ),
         (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
@@ -353,7 +355,7 @@ def test_damage_is_found(made, tmp_path, damage, message):
     with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished") as refused:
         open_dataset(str(folder)).load()
     assert "\n" not in str(refused.value)
-    names = ["theta", "F_ff", "motion.y_d.values.1", "omega"]
+    names = ["theta_C", "F_ff", "motion.y_d.values.1", "omega_C"]
     if (
         "time" not in message and "/c/1" not in message
     ):  # what is damaged may be of an array that it does not read
@@ -407,18 +409,18 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
     config = made[1]
     store, design = open_or_create(str(tmp_path / "set"), config), points(config)
     row = simulate_task(config, config.subject.task(4, design[4]))
-    angle = row["theta"].copy()
+    angle = row["theta_C"].copy()
     angle[3] = np.nan
     with pytest.raises(
         ValueError, match="trajectory 4 is not marked as failed, but not finite: theta"
     ):
-        store.write(2, [row | {"theta": angle}])
+        store.write(2, [row | {"theta_C": angle}])
     assert store.unfinished() == [0, 1, 2]
     series = making.series
-    monkeypatch.setattr(making, "series", lambda *given: series(*given) | {"theta": angle})
+    monkeypatch.setattr(making, "series", lambda *given: series(*given) | {"theta_C": angle})
     row = simulate_task(config, config.subject.task(4, design[4]))
     assert (row["failed"], row["reason"]) == (1, "not finite: theta")
-    assert np.isnan(row["theta"]).all()
+    assert np.isnan(row["theta_C"]).all()
 
 
 def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(made, tmp_path):
@@ -691,7 +693,7 @@ def test_windows_in_memory_streamed_and_read_one_by_one_are_the_same(partial):
 
 def test_windows_come_fast_from_memory(partial):
     """Shuffled, two thousand a second and more on one core."""
-    windows = reading(partial, ["x_C", "F_y", "materials.rubber.E"], window=20, stride=1)
+    windows = reading(partial, ["x_C", "effort_y", "materials.rubber.E"], window=20, stride=1)
     began, count = time.process_time(), 0
     while time.process_time() - began < 0.5:
         for batch in DataLoader(windows, batch_size=64, shuffle=True):

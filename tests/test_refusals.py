@@ -14,7 +14,6 @@ from conftest import (
     coarse,
     f64,
     grasped,
-    press,
     random_state,
     rest,
     still,
@@ -292,15 +291,15 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5, 2e5], tau=[0.1, 0.1])),
      "two relaxation times are equal"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[-2e5], tau=[0.1])),
-     r"`materials.rubber.E_1` must be from 1 to 1e\+13 Pa, but"),
+     r"materials.rubber: parameter `E_1` must be from 1 to 1e\+13 Pa, but"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5], tau=[5e-5])),
      "tau_instant = 0.0001 s must be below the shortest"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6, 0.5], tau=[0.1, 1])),
     "fractions J sum to 1.1, above one"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6], tau=[0.0])),
-     "`materials.rubber.tau_1` must be from 1e-09 to"),
+     "materials.rubber: parameter `tau_1` must be from 1e-09 to"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[NAN], tau=[0.1])),
-     "`materials.rubber.J_1` must be finite, but is nan"),
+     "materials.rubber: parameter `J_1` must be finite, but is nan"),
     (lambda: resting(material=StandardLinearSolid(**RUBBER, E_instant=1e5, tau=0.1)),
     "E_instant is below E"),
     (lambda: chain([0.7, 0.5], [0.01, 0.1]),
@@ -322,7 +321,7 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: chain([1.0, 0.0]), "`chain` of the material of `L` must give two tensors, J and tau"),
     (lambda: still({"pad.inertial": True},
     material=Prony(**RUBBER, moduli=[1e5], tau=[0.1])),
-     r"inertial pad `L` needs a Kelvin-Voigt material \(one retardation time\), but has"),
+     r"an inertial pad has one retardation time"),
     # laws of contact
     (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None),
      "`friction` must be a function or a module"),
@@ -401,7 +400,6 @@ PARTS: list[tuple[Call, str]] = [
      r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"),
     (lambda: coarse()(0.0, torch.zeros(376)), "`y` must be float64 of shape"),
     # verbs
-    (lambda: press(coarse(), 50.1e-3), "0.0501 m is too high"),
     (lambda: odeint(nn.Identity(), f64(0.0), T, method=METHOD),
      r"integrates a torchsoft\.Rig, but got Identity"),
     (lambda: odeint(m := coarse(), grasped(m), T, method=METHOD, options={"stepsize": 1e-3}),
@@ -581,7 +579,7 @@ def filled(name: str, value: float) -> Callable[[Rig], object]:
 
 SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (filled("pad.E", 0.0), r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
-    (filled("pad.E", 1e308), r"parameter `materials.rubber.E` must be below 1e\+100"),
+    (filled("pad.E", 1e308), r"parameter `.*E` must be below 1e\+100"),
     (
         filled("contact.K_n", -1.2e5),
         r"parameter `.*K_n` must be from 0.001 to 1e\+12 N/m, but is -120000",
@@ -599,11 +597,7 @@ SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (lambda m: m.to("meta"), "on meta"),
     (
         lambda m: setattr(m.parameter("pad.E"), "data", torch.ones(2).double()),
-        r"parameter `materials.rubber.E` must be one number",
-    ),
-    (
-        lambda m: setattr(m, "pad", KelvinVoigt(**RUBBER, tau=0.01)),
-        "`pad.E` belongs to no body, pad",
+        r"parameter `.*E` must be one number",
     ),
     (
         lambda m: setattr(m.contacts["L"].law, "friction", Coulomb(0.3, 0.4)),

@@ -18,7 +18,7 @@ from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.names import check_names
 from torchsoft.physics.parts import COORDINATES, PD, Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed, warn_of_moments
+from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed
 from torchsoft.physics.statics import NoEquilibrium, massless, net_loads, resting, standing
 from torchsoft.quantity import Gravity
 from torchsoft.rigs.assembly import assemble, too_stiff
@@ -473,9 +473,7 @@ class RigFile(Shown, Group):
                 or f"bodies: the pads cannot settle where bodies start: {error}"
             ) from None
         solver = self.solver.model_dump(exclude_none=True)
-        y0 = moving(rig, y0, starts)
-        warn_of_moments(rig, y0, starts)
-        return BuiltRig(rig, y0, self.outputs.times(), starts, solver)
+        return BuiltRig(rig, moving(rig, y0, starts), self.outputs.times(), starts, solver)
 
     def reference(
         self, pose: Mapping[str, Array], held: Callable[[str, float], float]
