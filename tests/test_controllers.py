@@ -47,7 +47,7 @@ def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path):
     timing = {"outputs": {"duration": 0.6, "interval": 0.02}, "solver": {"rtol": 1e-6}}
     loops = RigFile.from_tree(coarse_tree() | timing)
     runs = [running.carry_out(one).trajectory for one in (read, loops)]
-    assert "F_jaw_bracket_x" in runs[0].units
+    assert "effort_jaw_bracket_x" in runs[0].units
     for name in ("x_disc", "theta_disc", "y_bracket"):
         assert torch.allclose(runs[0][name], runs[1][name], rtol=0, atol=1e-7)
 
