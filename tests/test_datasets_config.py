@@ -47,7 +47,7 @@ def test_numbers_that_are_whole_are_numbers():
         (
             ("kinds", 0, "fixed", "motion.x_e"),
             {"kind": "hold"},
-            "kinds.0.fixed.motion.x_e: `motion.x_e` is not in the rig file: motion has x_d",
+            "kinds.0.fixed.motion.x_e: `motion.x_e` is not in the rig file: did you mean `x_d`",
         ),
         (
             ("kinds", 0, "fixed", "motion.x_d", "times"),
@@ -152,7 +152,7 @@ def test_a_logarithmic_range_does_not_go_beyond_its_ends(high):
 )
 def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, file, out, message):
     monkeypatch.chdir(tmp_path)
-    text = PATH.read_text().replace("../../rigs", str(PATH.parents[2] / "rigs"))
+    text = PATH.read_text()
     Path("million.toml").write_text(text.replace("trajectories = 8", "trajectories = 1000000"))
     assert main(["dataset", "make", file, "--out", out, "--workers", "0"]) == 2
     said = capsys.readouterr().err
