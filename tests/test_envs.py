@@ -77,7 +77,9 @@ def test_any_channel_is_observed():
         seen.append(run)
         return float(run["theta_disc"][-1]) - float(action[0])
 
-    names = ("lower_x", "upper.force_y", "F_grip", "lower_skin.centre", "y_upper", "lower_x_dot")
+    names = (
+        "lower_x", "upper.force_y", "effort_grip", "lower_skin.centre", "y_upper", "lower_x_dot",
+    )  # fmt: skip
     ranges = dict.fromkeys(names, (-1.0, 1.0))
     env = small(observations=ranges, goal=None, reward=reward, samples=5)
     env.reset(seed=0)
