@@ -4,7 +4,6 @@ import json
 import pickle
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,10 @@ from torch import nn
 
 from torchsoft import Body, Profile, Reference, Rig
 from torchsoft.rigs import RigFile
+from torchsoft.rigs.build import ready
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
-RIGS = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))
+RIGS = ready()
 PHYSICAL = ("gravity", "bodies", "materials", "laws", "actuators", "controllers")
 MASS = ("density", "depth", "half_width", "half_height", "radius")
 """Numbers that the mass of a uniform body is computed from."""
@@ -32,7 +32,7 @@ def opened(name: str) -> RigFile:
         return controlled()
     if name == "series":
         return controlled().override(materials={"rubber": SERIES})
-    return RigFile.from_toml(RIGS[0].with_name(f"{name}.toml"))
+    return RigFile.ready(name)
 
 
 def numbers(tree: Any, name: str = "") -> Iterator[tuple[str, float]]:
@@ -52,7 +52,7 @@ def values(rig: Rig) -> dict[str, float]:
     return {own.get(name, name): value.item() for name, value in rig.named_parameters()}
 
 
-@pytest.mark.parametrize("rig", [*(path.stem for path in RIGS), "controllers", "series"])
+@pytest.mark.parametrize("rig", [*RIGS, "controllers", "series"])
 def test_every_number_that_a_rig_is_made_with_has_its_name(rig):
     """Each number of the file is changed in turn: what changes in the rig is called the same."""
     file = opened(rig)
@@ -125,7 +125,7 @@ def test_an_entry_that_is_not_there_is_refused(settings, words):
         controlled().override(controllers={"jaw": settings})
 
 
-TREE = RIGS[0].with_name("two_fingers.toml")
+TREE = RigFile.path("two_fingers")
 
 
 def renamed(old: str, new: str) -> RigFile:
@@ -154,9 +154,9 @@ def test_motions_have_names_by_the_rule_of_the_others(name):
     [
         ("x_{body}", "{body}.x"),
         ("v_x_{body}", "the rate of {body}.x"),
-        ("L_{body}", "the angular momentum of the body `{body}`"),
+        ("angular_momentum_{body}", "the angular momentum of the body `{body}`"),
         ("M_{pad}", "the moment on the pad `{pad}`"),
-        ("F_{actuator}", "the effort of the actuator `{actuator}`"),
+        ("effort_{actuator}", "the effort of the actuator `{actuator}`"),
         ("time", "an array `time` of files"),
         ("pose", "an array `pose` of files"),
         ("stretch_{contact}", "`stretch_{contact}` of the contact"),
@@ -207,7 +207,7 @@ def test_integers_of_400_digits_in_a_file_are_refused():
     assert count > 50
 
 
-@pytest.mark.parametrize("name", [path.stem for path in RIGS])
+@pytest.mark.parametrize("name", RIGS)
 def test_rig_files_are_pickled(name):
     file = opened(name)
     again = pickle.loads(pickle.dumps(file))
