@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from browser import MISSING, browser
-from conftest import coarse, times
+from conftest import COARSE, paper, times
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -19,7 +19,6 @@ from torchsoft import simulate
 from torchsoft.plot.animation import charts, frame_rows, packed, player
 from torchsoft.plot.scene import Scene, instants
 from torchsoft.rigs import RigFile
-from torchsoft.scenario import grasp_and_roll
 
 ROOT = Path(__file__).parents[1]
 
@@ -35,9 +34,7 @@ return [r.x + q[0], r.y + q[1]]"""
 
 @pytest.fixture(scope="module")
 def run():
-    model = coarse()
-    start = grasp_and_roll(model, grasp_force=80.0)
-    return simulate(model, times(0.5, 51), y0=start.y0)
+    return paper(COARSE).run(times(0.5, 51))
 
 
 def test_a_title_does_not_hold_the_script_open(run, tmp_path):
@@ -85,9 +82,7 @@ console.log(JSON.stringify({ scale: data.scale, curves }));"""
 def fingers():
     """Pads that stand upright, on bases with angles."""
     tips = {name: {"elements_x": 18} for name in ("left_tip", "right_tip")}
-    file = RigFile.from_toml(ROOT / "rigs" / "two_fingers.toml").override(
-        pads={"table": {"elements_x": 25}, **tips}
-    )
+    file = RigFile.ready("two_fingers").override(pads={"table": {"elements_x": 25}, **tips})
     rig, y0, _ = file.build()
     return simulate(rig, times(0.9, 10), y0=y0, rtol=1e-3)
 
