@@ -171,7 +171,7 @@ def test_the_card_says_what_the_set_holds(made, tmp_path):
         "| `materials.rubber.E` | 600000 to 900000, logarithmic | Pa |",
         "| `bodies.disc.mass` | one of 0.3, 0.4 | kg |",
         "| `laws.dry.friction.mu_k` | 0.8 to 1, times `laws.dry.friction.mu_s` | 1 |",
-        "| `x_disc` | trajectory, time | m | x of the centre of mass of disc |",
+        "| `x_disc` | trajectory, time | m | x of the body disc |",
     ):  # fmt: skip
         assert said in text, said
     (made[0] / "README.md").write_text("mine")
@@ -266,7 +266,7 @@ def test_a_log_is_a_recording(made, data, tmp_path):
 
     export(str(made[0]), "mcap", tmp_path / "logs")
     read = read_log(tmp_path / "logs" / "000001.mcap")
-    for name in ("x_disc", "F_x", "y_d"):
+    for name in ("x_disc", "effort_x", "y_d"):
         np.testing.assert_array_equal(read[name], data[name][1])
         assert read[name].attrs["units"] == data[name].attrs["units"]
     whole = (tmp_path / "logs" / "000001.mcap").read_bytes()
