@@ -342,7 +342,7 @@ def test_a_network_from_a_file_is_the_module_in_python(folder):
     with torch.no_grad():
         at = torch.stack((run["x_d"], run["x_d_dot"], run["x_bracket"], run["v_x_bracket"]), -1)
         loop = 1e5 * (at[:, 0] - at[:, 2]) + 400 * (at[:, 1] - at[:, 3])
-        assert torch.allclose(run["F_x"], loop + net(at)[:, 0], rtol=1e-9, atol=1e-9)
+        assert torch.allclose(run["effort_x"], loop + net(at)[:, 0], rtol=1e-9, atol=1e-9)
     assert run.energy_residual_rel < 1e-3
 
 
@@ -470,7 +470,7 @@ REFUSED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     ),
     "between points": (
         {"bodies__disc__shape__radius": 1e-5},
-        r"error: bodies\.disc\.shape: 0\.02 mm wide, it falls between points of `lower`"
+        r"error: bodies\.disc\.start\.y: 0\.02 mm wide, it falls between points of `lower`"
     ),
     "too stiff to rest": (
         {"laws__dry__K_n": 1e9}, r"error: laws\.dry\.K_n: no rest is found with 1e\+09 N/m, .* "
