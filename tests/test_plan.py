@@ -69,8 +69,8 @@ def test_slopes_are_the_differences():
     """By knots, a gain and a coefficient of friction, of every draw; along two directions."""
     free = FREE | {"actuators.left_y.Kp": (1e4, 1e5), "laws.dry.K_n": (5e4, 2e5)}
     variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
-    limits = {"grip": Limit(channel="F_left_x", low=4.0, high=50.0, since=0.1)}
-    terms = Terms(lambda run: run["F_left_y"].square().mean(), {"turn": TURN} | PLACE, limits)
+    limits = {"grip": Limit(channel="effort_left_x", low=4.0, high=50.0, since=0.1)}
+    terms = Terms(lambda run: run["effort_left_y"].square().mean(), {"turn": TURN} | PLACE, limits)
     over = {"materials.silicone.E": torch.tensor([5e5, 5.2e5]).double()}
     evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, over, 1e-9, None)
     z = variables.start.copy()
@@ -107,18 +107,18 @@ def test_the_target_is_reached_and_the_rig_carries_it_out(turned):
 
 def test_a_limit_is_kept_at_a_price(turned):
     """Without the limit the grip falls below it; with it fingers close."""
-    low = float(turned.trajectory["F_left_x"][30:].min()) + 1.0
-    limits = {"grip": Limit(channel="F_left_x", low=low, since=0.5)}
+    low = float(turned.trajectory["effort_left_x"][30:].min()) + 1.0
+    limits = {"grip": Limit(channel="effort_left_x", low=low, since=0.5)}
     free = FREE | {"left_x": Bounds(low=-25e-3, high=-15e-3, speed=0.1, after=0.2)}
     found = planned(free, targets={"turn": TURN} | PLACE, limits=limits)
     assert found.reached
-    assert float(found.trajectory["F_left_x"][50:].min()) >= low * (1 - 2e-3)
+    assert float(found.trajectory["effort_left_x"][50:].min()) >= low * (1 - 2e-3)
 
 
 @pytest.mark.slow
 def test_an_objective_is_lowered_within_targets():
     """The least work of a finger that may choose its gain, by the worst of two draws."""
-    objective = lambda run: run["F_left_y"].square().mean()
+    objective = lambda run: run["effort_left_y"].square().mean()
     over = {"laws.dry.K_n": torch.tensor([1e5, 1.1e5])}
     found = planned(
         FREE, objective=objective, targets={"turn": TURN}, over=over, robust="worst",
