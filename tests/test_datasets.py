@@ -41,12 +41,12 @@ from torchsoft.solve.progress import SimulationFailed
 ROOT = Path(__file__).parent.parent
 CONFIGS = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
 
-TOML = f"""
+TOML = """
 title = "Test"
-rig = {json.dumps(str(ROOT / "rigs" / "paper.toml"))}
+rig = "paper"
 seed = 3
-trajectories = {{trajectories}}
-trajectories_per_shard = {{shard}}
+trajectories = {trajectories}
+trajectories_per_shard = {shard}
 duration = 0.9
 sample_interval = 0.01
 step = 0.005
@@ -59,17 +59,17 @@ samples_per_chunk = 40
 "laws.steel_on_rubber.friction.v_s" = 0.05
 "motion.F_ff.values.1" = "held"
 [parameters]
-"materials.rubber.E" = {{{{ low = 7e5, high = 8e5, scale = "log" }}}}
-"laws.steel_on_rubber.friction.mu_s" = {{{{ low = 0.7, high = 0.9 }}}}
-"motion.y_d.values.1" = {{{{ low = 48.6e-3, high = 48.8e-3 }}}}
+"materials.rubber.E" = {{ low = 7e5, high = 8e5, scale = "log" }}
+"laws.steel_on_rubber.friction.mu_s" = {{ low = 0.7, high = 0.9 }}
+"motion.y_d.values.1" = {{ low = 48.6e-3, high = 48.8e-3 }}
 [[kinds]]
 name = "slow_roll"
-fixed."motion.x_d" = {{{{ kind = "strokes", since = 0.5, stroke_time = 0.4, travel = 1e-3 }}}}
-parameters."motion.x_d.travel" = {{{{ low = 1e-3, high = 2e-3, either_sign = true }}}}
+fixed."motion.x_d" = {{ kind = "strokes", since = 0.5, stroke_time = 0.4, travel = 1e-3 }}
+parameters."motion.x_d.travel" = {{ low = 1e-3, high = 2e-3, either_sign = true }}
 [[kinds]]
 name = "shake"
-fixed."motion.x_d" = {{{{ kind = "chirp", since = 0.5, amplitude = 1.0, first = 2.0, last = 5.0 }}}}
-parameters."motion.x_d.amplitude" = {{{{ low = 2e-4, high = 4e-4 }}}}
+fixed."motion.x_d" = {{ kind = "chirp", since = 0.5, amplitude = 1.0, first = 2.0, last = 5.0 }}
+parameters."motion.x_d.amplitude" = {{ low = 2e-4, high = 4e-4 }}
 """
 
 
@@ -145,7 +145,7 @@ def test_an_object_store_holds_the_same_bytes(made):
     read_everywhere(url, folder)
     fs = fsspec.filesystem("memory")
     fs.rm_file("/sets/rolling/finished/1.sha256")
-    fs.rm_file("/sets/rolling/theta/c/1/0")
+    fs.rm_file("/sets/rolling/theta_C/c/1/0")
     assert Store(url, config).unfinished() == [1]
     generate(config, url, Serial(), progress=False)
     assert objects(url) == contents(folder)
@@ -264,12 +264,14 @@ def open_ledger(folder: Path) -> None:
     ("change", "message"),
     [
         (
-            consolidated("theta", lambda a: a["attributes"].update(units="deg")),
-            "theta: units are 'deg', not 'rad'",
+            consolidated("theta_C", lambda a: a["attributes"].update(units="deg")),
+            "theta_C: units are 'deg', not 'rad'",
         ),
         (
-            change_json("zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega")),
-            "omega: missing",
+            change_json(
+                "zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega_C")
+            ),
+            "omega_C: missing",
         ),
         (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
         (
@@ -320,12 +322,12 @@ def test_wrong_content_is_found(made, tmp_path, change, message):
     ("damage", "message"),
     [
         (
-            edit("theta/c/0/0", flipped),
-            r"theta/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
+            edit("theta_C/c/0/0", flipped),
+            r"theta_C/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
         ),
         (edit("motion.y_d.values.1/c/2", flipped), "motion.y_d.values.1/c/2 is damaged"),
-        (remove("omega/c/1/0"), "omega/c/1/0 is missing"),
-        (swap("omega/c/0/0", "omega/c/1/0"), "omega/c/0/0 is damaged"),
+        (remove("omega_C/c/1/0"), "omega_C/c/1/0 is missing"),
+        (swap("omega_C/c/0/0", "omega_C/c/1/0"), "omega_C/c/0/0 is damaged"),
         (write("finished/1.sha256", b""), r"finished/1\.sha256 is damaged"),
         (edit("finished/1.sha256", flipped), r"finished/1\.sha256 is damaged|/c/1\S* is damaged"),
         (remove("finished/1.sha256"), "1 of 3 shards are not finished"),
@@ -353,7 +355,7 @@ def test_damage_is_found(made, tmp_path, damage, message):
     with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished") as refused:
         open_dataset(str(folder)).load()
     assert "\n" not in str(refused.value)
-    names = ["theta", "F_ff", "motion.y_d.values.1", "omega"]
+    names = ["theta_C", "F_ff", "motion.y_d.values.1", "omega_C"]
     if (
         "time" not in message and "/c/1" not in message
     ):  # what is damaged may be of an array that it does not read
@@ -366,7 +368,9 @@ def every_window(url: str, names: list[str]) -> list[dict[str, torch.Tensor]]:
     return [windows[i] for i in range(len(windows))]
 
 
-@pytest.mark.parametrize("damage", [edit("omega/zarr.json", flipped), write("omega/copy", b"x")])
+@pytest.mark.parametrize(
+    "damage", [edit("omega_C/zarr.json", flipped), write("omega_C/copy", b"x")]
+)
 def test_damage_to_what_readers_do_not_open_is_found_by_the_check(made, tmp_path, damage):
     damage(folder := copy(made[0], tmp_path / "set"))
     assert len([x for x in check(str(folder)) if "no commit" not in x]) == 1
@@ -376,7 +380,7 @@ def test_damage_to_what_readers_do_not_open_is_found_by_the_check(made, tmp_path
 def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made, tmp_path):
     """By the checksums of the arrays, without this package's reader."""
     folder = copy(made[0], tmp_path / "set")
-    for name in ("theta/c/0/0", "motion.y_d.values.1/c/1"):
+    for name in ("theta_C/c/0/0", "motion.y_d.values.1/c/1"):
         edit(name, flipped)(folder)
         with pytest.raises(ValueError, match="checksum"):
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
@@ -388,7 +392,7 @@ def test_standard_tools_check_the_shards(made, tmp_path):
     folder = copy(made[0], tmp_path / "set")
     command = [tool, "--check", "--quiet", *(str(path) for path in (folder / "finished").iterdir())]
     assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0
-    edit("theta/c/0/0", flipped)(folder)
+    edit("theta_C/c/0/0", flipped)(folder)
     assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode != 0
 
 
@@ -407,18 +411,18 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
     config = made[1]
     store, design = open_or_create(str(tmp_path / "set"), config), points(config)
     row = simulate_task(config, config.subject.task(4, design[4]))
-    angle = row["theta"].copy()
+    angle = row["theta_C"].copy()
     angle[3] = np.nan
     with pytest.raises(
-        ValueError, match="trajectory 4 is not marked as failed, but not finite: theta"
+        ValueError, match="trajectory 4 is not marked as failed, but not finite: theta_C"
     ):
-        store.write(2, [row | {"theta": angle}])
+        store.write(2, [row | {"theta_C": angle}])
     assert store.unfinished() == [0, 1, 2]
     series = making.series
-    monkeypatch.setattr(making, "series", lambda *given: series(*given) | {"theta": angle})
+    monkeypatch.setattr(making, "series", lambda *given: series(*given) | {"theta_C": angle})
     row = simulate_task(config, config.subject.task(4, design[4]))
-    assert (row["failed"], row["reason"]) == (1, "not finite: theta")
-    assert np.isnan(row["theta"]).all()
+    assert (row["failed"], row["reason"]) == (1, "not finite: theta_C")
+    assert np.isnan(row["theta_C"]).all()
 
 
 def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(made, tmp_path):
@@ -431,8 +435,8 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(made,
     (folder / "zarr.json.0123456789abcdef.partial").write_bytes(b"half")
     (folder / "time/c/0.0123456789abcdef.partial").parent.mkdir(parents=True)
     (folder / "time/c/0.0123456789abcdef.partial").write_bytes(b"half")
-    with replacing(folder / "theta/zarr.json") as partial:
-        partial.write_bytes(content["theta/zarr.json"])
+    with replacing(folder / "theta_C/zarr.json") as partial:
+        partial.write_bytes(content["theta_C/zarr.json"])
         open_or_create(str(folder), config)
         assert list(folder.rglob("*.partial")) == [partial]
     create(str(tmp_path / "other"), config)
@@ -501,8 +505,8 @@ def test_only_unfinished_shards_are_made_again(made, tmp_path, recorded):
     folder, config = copy(made[0], tmp_path / "set"), made[1]
     if not recorded:
         remove("finished/1.sha256")(folder)
-    (folder / "theta/c/1/0").unlink()
-    (folder / "theta/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
+    (folder / "theta_C/c/1/0").unlink()
+    (folder / "theta_C/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("c/**/*") if p.is_file()}
     generate(config, str(folder), Serial(), progress=False)
     assert contents(folder) == contents(made[0])
@@ -691,7 +695,7 @@ def test_windows_in_memory_streamed_and_read_one_by_one_are_the_same(partial):
 
 def test_windows_come_fast_from_memory(partial):
     """Shuffled, two thousand a second and more on one core."""
-    windows = reading(partial, ["x_C", "F_y", "materials.rubber.E"], window=20, stride=1)
+    windows = reading(partial, ["x_C", "effort_y", "materials.rubber.E"], window=20, stride=1)
     began, count = time.process_time(), 0
     while time.process_time() - began < 0.5:
         for batch in DataLoader(windows, batch_size=64, shuffle=True):
