@@ -13,6 +13,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, resting, standing, unstretched
+from torchsoft.physics.validity import check_values
 
 REST = "rest"
 """The word for a coordinate in equilibrium."""
@@ -53,6 +54,11 @@ class NoPlace(NoEquilibrium):
 
 def start(rig: Rig, bodies: Starts) -> Tensor:
     """Implementation of `Rig.state`."""
+    if torch.is_inference_mode_enabled():
+        raise ValueError(
+            "statics need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()"
+        )
+    check_values(rig)
     for name in bodies:
         if name not in rig.bodies:
             raise ValueError(
