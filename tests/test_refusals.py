@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, RUBBER, coarse, f64, grasped, random_state, times
+from conftest import (
+    COARSE,
+    RUBBER,
+    coarse,
+    f64,
+    grasped,
+    paper,
+    random_state,
+    rest,
+    still,
+    times,
+)
 from torch import Tensor, nn
 from torchdiffeq import odeint
 
@@ -29,7 +40,6 @@ from torchsoft import (
     NoEquilibrium,
     Pad,
     PadMesh,
-    Parameters,
     Profile,
     Prony,
     QuadMesh,
@@ -42,14 +52,11 @@ from torchsoft import (
     SimulationFailed,
     SmoothSlip,
     SoftContact,
-    SoftGrasp,
     StandardLinearSolid,
     StateFeedback,
     Superellipse,
     controller,
     hold,
-    press,
-    rest,
     simulate,
 )
 from torchsoft.physics.material import Material
@@ -171,7 +178,7 @@ class Oval(Ellipse):
 
 def ran(**parts: Any) -> object:
     """A run of the rig with a part replaced, from no state in particular."""
-    model = still(coarse().settings, **parts)
+    model = still(COARSE, **parts)
     return simulate(model, T, y0=torch.zeros(model.layout.size, dtype=torch.float64))
 
 
@@ -213,13 +220,14 @@ MUST = r"the law of `actuators.x` must take five tensors .* and return the effor
 PARTS: list[tuple[Call, str]] = [
     # shapes
     (lambda: resting(shape=Superellipse(20e-3, 20e-3, 1.9)),
-     "`disc.shape.n` must be from 2 to 20, but is 1.9"),
-    (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)), "`disc.shape.n` must be finite"),
+     r"bodies\.disc\.shape: parameter `n` must be from 2 to 20, but is 1.9"),
+    (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)),
+     r"bodies\.disc\.shape: parameter `n` must be finite"),
     (lambda: resting(shape=Superellipse(20e-3, 6e-3, 4.0)), "differ by more than a factor of 3"),
     (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 9.1e-3)),
      "corners' radius 0.0091 is larger than half of the box, 0.009"),
     (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 0.0)),
-     "`disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
+     r"bodies\.disc\.shape: parameter `radius` must be from 1e-06 to 10 m, but is 0"),
     (lambda: Contour(CIRCLE[:7]), "must be at least 8 places around a contour, but are 7"),
     (lambda: Contour([*CIRCLE, CIRCLE[-1]]), "has the same place twice: point 23"),
     (lambda: Contour([*CIRCLE[:-1], [0.1, INF]]),
@@ -248,7 +256,7 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: disc(support=lambda d: 0.021 * d.norm(dim=-1)),
      "`support` is more than how far it reaches"),
     (lambda: disc(gyration=lambda: f64(-1.0)[0]),
-     r"`disc.inertia` must be from 1e-24 to 1e\+06 kg.m2"),
+     r"`bodies.disc.inertia` must be from 1e-24 to 1e\+06 kg.m2"),
     (lambda: check_shape("disc", Oval(0.03, 0.02)), "called `round`, but is not"),
     # meshes and pads
     (lambda: quads(quads=[[0, 3, 4]]), "`quads` must be quadrilaterals of four numbers"),
@@ -284,15 +292,15 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5, 2e5], tau=[0.1, 0.1])),
      "two relaxation times are equal"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[-2e5], tau=[0.1])),
-     r"`pad.E_1` must be from 1 to 1e\+13 Pa, but"),
+     r"`E_1` must be from 1 to 1e\+13 Pa, but"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5], tau=[5e-5])),
      "tau_instant = 0.0001 s must be below the shortest"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6, 0.5], tau=[0.1, 1])),
     "fractions J sum to 1.1, above one"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6], tau=[0.0])),
-     "`pad.tau_1` must be from 1e-09 to"),
+     "`tau_1` must be from 1e-09 to"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[NAN], tau=[0.1])),
-     "`pad.J_1` must be finite, but is nan"),
+     "`J_1` must be finite, but is nan"),
     (lambda: resting(material=StandardLinearSolid(**RUBBER, E_instant=1e5, tau=0.1)),
     "E_instant is below E"),
     (lambda: chain([0.7, 0.5], [0.01, 0.1]),
@@ -312,8 +320,8 @@ PARTS: list[tuple[Call, str]] = [
      "`tau of the material of L` must be a float64 tensor, but is float"),
     (lambda: chain([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
     (lambda: chain([1.0, 0.0]), "`chain` of the material of `L` must give two tensors, J and tau"),
-    (lambda: still({"pad.inertial": True},
-    material=Prony(**RUBBER, moduli=[1e5], tau=[0.1])),
+    (lambda: small(pads=lambda *_: {"L": Pad(PadMesh(0.04, 4e-3, 8, 2), Prony(**RUBBER,
+    moduli=[1e5], tau=[0.1]), inertial=True)}),
      r"inertial pad `L` needs a Kelvin-Voigt material \(one retardation time\), but has"),
     # laws of contact
     (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None),
@@ -393,7 +401,6 @@ PARTS: list[tuple[Call, str]] = [
      r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"),
     (lambda: coarse()(0.0, torch.zeros(376)), "`y` must be float64 of shape"),
     # verbs
-    (lambda: press(coarse(), 50.1e-3), "0.0501 m is too high"),
     (lambda: odeint(nn.Identity(), f64(0.0), T, method=METHOD),
      r"integrates a torchsoft\.Rig, but got Identity"),
     (lambda: odeint(m := coarse(), grasped(m), T, method=METHOD, options={"stepsize": 1e-3}),
@@ -414,9 +421,9 @@ INTEGERS: dict[str, Callable[[], Any]] = {
     "times": lambda: Profile([0, HUGE], [0, 1]),
     "origin": lambda: Pad(PadMesh(0.1, 1e-2, 10, 2), KelvinVoigt(tau=1e-2, **RUBBER),
                           origin=(HUGE, 0)),
-    "rtol": lambda: simulate(coarse(), T, rtol=HUGE),
-    "atol": lambda: simulate(coarse(), T, atol=HUGE),
-    "t": lambda: simulate(coarse(), [0, HUGE]),
+    "rtol": lambda: paper(COARSE).run(T, rtol=HUGE),
+    "atol": lambda: paper(COARSE).run(T, atol=HUGE),
+    "t": lambda: paper(COARSE).run([0, HUGE]),
 }  # fmt: skip
 
 
@@ -441,7 +448,7 @@ class Simulated(nn.Module):
 
 
 TRANSFORMED: dict[str, Any] = {
-    "E": lambda run, E: torch.func.functional_call(run, {"model.pad.E": E}),
+    "E": lambda run, E: torch.func.functional_call(run, {"model.pads.L.material.E": E}),
     "y0": lambda run, E: run(y0=run.y0 * E),
     "list": lambda run, E: run(y0=list(run.y0 * E)),
     "t": lambda run, E: run(y0=run.y0, t=T * E),
@@ -467,7 +474,7 @@ def test_a_part_or_call_that_is_none_is_refused(row):
 
 def test_a_coupled_law_is_refused_after_its_pointwise_twin():
     """For one point both have the same expression, which is compiled already."""
-    model = still(coarse().settings, friction=rated(lambda N: N, mu=0.49))
+    model = still(COARSE, friction=rated(lambda N: N, mu=0.49))
     simulate(model, T, y0=rest(model).detach())
     with pytest.raises(ValueError, match="several points at once other rates"):
         slipping(rated(lambda N: N.sum().expand_as(N), mu=0.49))
@@ -522,7 +529,7 @@ RUNS: list[tuple[dict[str, Any], str]] = [
     ({"y0": f64(0.0, 0.0, 0.0)}, "must be float64 of shape"),
     ({"y0": torch.full((376,), NAN).double()}, "must be finite, but component 0"),
     ({"y0": np.full(376, "0")}, "`y0` must be numbers"),
-    ({"rig": SoftGrasp}, "`rig` must be a Rig"),
+    ({"rig": Rig}, "`rig` must be a Rig"),
     ({"reference": {}}, "`reference` must be a Reference, but is dict"),
     *(({name: value}, f"`{name}` must be positive") for name in ("step",
     "tolerance") for value in (0.0, -1e-3, NAN)),
@@ -567,13 +574,18 @@ def test_a_run_that_is_none_is_refused(row, start):
         simulate(**{"rig": start[0], "t": T, "y0": start[1]} | changes)
 
 
-def filled(name: str, value: float) -> Callable[[SoftGrasp], object]:
+def filled(name: str, value: float) -> Callable[[Rig], object]:
     return lambda model: model.parameter(name).detach().fill_(value)
 
 
-SPOILT: list[tuple[Callable[[SoftGrasp], object], str]] = [
+def grouped(model: Rig) -> None:
+    """A group that no part of the rig is in."""
+    model.groups, model.pad = ("pad",), KelvinVoigt(**RUBBER, tau=0.01)
+
+
+SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (filled("pad.E", 0.0), r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
-    (filled("pad.E", 1e308), r"parameter `pad.E` must be below 1e\+100"),
+    (filled("pad.E", 1e308), r"parameter `materials.rubber.E` must be below 1e\+100"),
     (
         filled("contact.K_n", -1.2e5),
         r"parameter `.*K_n` must be from 0.001 to 1e\+12 N/m, but is -120000",
@@ -581,7 +593,7 @@ SPOILT: list[tuple[Callable[[SoftGrasp], object], str]] = [
     (filled("contact.K_n", NAN), r"parameter `.*K_n` must be finite, but is nan"),
     (filled("pad.nu", 0.5), r"parameter `.*nu` must be from -0\.999 to 0\.4999"),
     (filled("control.K_81", -1.0), r"parameter `.*Kp` must be from 0 to 1e\+12"),
-    (filled("scenario.gravity", NAN), r"parameter `gravity` must be finite"),
+    (filled("gravity", NAN), r"parameter `gravity` must be finite"),
     (filled("contact.mu_k", 0.9), "mu_k = 0.9 > mu_s = 0.8"),
     (
         filled("contact.R_t", 0.0),
@@ -590,14 +602,17 @@ SPOILT: list[tuple[Callable[[SoftGrasp], object], str]] = [
     (lambda m: m.float(), "`gravity` must be float64"),
     (lambda m: m.to("meta"), "on meta"),
     (
-        lambda m: setattr(m.pad.E, "data", torch.ones(2).double()),
-        r"parameter `pad.E` must be one number",
+        lambda m: setattr(m.parameter("pad.E"), "data", torch.ones(2).double()),
+        r"parameter `materials.rubber.E` must be one number",
     ),
     (
-        lambda m: setattr(m, "pad", KelvinVoigt(**RUBBER, tau=0.01)),
+        grouped,
         "`pad.E` belongs to no body, pad",
     ),
-    (lambda m: setattr(m.contact, "friction", Coulomb(0.3, 0.4)), "mu_k = 0.4 > mu_s = 0.3"),
+    (
+        lambda m: setattr(m.contacts["L"].law, "friction", Coulomb(0.3, 0.4)),
+        "mu_k = 0.4 > mu_s = 0.3",
+    ),
     (lambda m: setattr(m.contacts["L"], "body", "dish"), "contact `L` is between `L` and `dish`"),
     (
         lambda m: m.reference["x_d"].times.fill_(NAN),
@@ -650,7 +665,8 @@ class Dropping(nn.Module):
 def test_a_law_in_training_is_refused_after_it_ran_in_evaluation(
     start,
 ):
-    model = still(coarse().settings, friction=Dropping(), reference=start[0].reference)
+    model = still(COARSE, friction=Dropping())
+    model.reference = start[0].reference
     simulate(model.eval(), T, y0=start[1])
     with pytest.raises(TypeError, match="the random operation"):
         simulate(model.train(), T, y0=start[1])
@@ -666,7 +682,7 @@ def test_a_slip_law_that_supplies_power_is_told_of():
 def test_compiled_rates_refuse_what_they_cannot_give(start):
     """Inertial pads, and states at which there are no forces; they go on after that."""
     with pytest.raises(NotImplementedError, match="inertial pads"):
-        Rates(coarse(pad__fidelity="inertial"))
+        Rates(coarse(pad__inertial=True))
     rates, y = Rates(start[0]), random_state(start[0], 0).numpy()
     fine = rates(0.0, y)
     with pytest.raises(SimulationFailed, match="no forces"):
