@@ -8,18 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import (
-    COARSE,
-    RUBBER,
-    coarse,
-    f64,
-    grasped,
-    paper,
-    random_state,
-    rest,
-    still,
-    times,
-)
+from conftest import COARSE, RUBBER, coarse, f64, grasped, paper, random_state, rest, still, times
 from torch import Tensor, nn
 from torchdiffeq import odeint
 

@@ -207,7 +207,9 @@ class Config(Table):
         name is, which `full` makes whole."""
         unknown = {full(name): name for name in self.unknowns}
         for i, entry in enumerate(self.recordings):
-            if strange := [unknown[x] for x in map(full, flattened(entry.settings)) if x in unknown]:
+            if strange := [
+                unknown[x] for x in map(full, flattened(entry.settings)) if x in unknown
+            ]:
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "
