@@ -145,7 +145,7 @@ def test_an_object_store_holds_the_same_bytes(made):
     read_everywhere(url, folder)
     fs = fsspec.filesystem("memory")
     fs.rm_file("/sets/rolling/finished/1.sha256")
-    fs.rm_file("/sets/rolling/theta/c/1/0")
+    fs.rm_file("/sets/rolling/theta_C/c/1/0")
     assert Store(url, config).unfinished() == [1]
     generate(config, url, Serial(), progress=False)
     assert objects(url) == contents(folder)
@@ -265,13 +265,13 @@ def open_ledger(folder: Path) -> None:
     [
         (
             consolidated("theta_C", lambda a: a["attributes"].update(units="deg")),
-            "theta: units are 'deg', not 'rad'",
+            "theta_C: units are 'deg', not 'rad'",
         ),
         (
             change_json(
                 "zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega_C")
             ),
-            "omega: missing",
+            "omega_C: missing",
         ),
         (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
         (
@@ -322,12 +322,12 @@ def test_wrong_content_is_found(made, tmp_path, change, message):
     ("damage", "message"),
     [
         (
-            edit("theta/c/0/0", flipped),
-            r"theta/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
+            edit("theta_C/c/0/0", flipped),
+            r"theta_C/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
         ),
         (edit("motion.y_d.values.1/c/2", flipped), "motion.y_d.values.1/c/2 is damaged"),
-        (remove("omega/c/1/0"), "omega/c/1/0 is missing"),
-        (swap("omega/c/0/0", "omega/c/1/0"), "omega/c/0/0 is damaged"),
+        (remove("omega_C/c/1/0"), "omega_C/c/1/0 is missing"),
+        (swap("omega_C/c/0/0", "omega_C/c/1/0"), "omega_C/c/0/0 is damaged"),
         (write("finished/1.sha256", b""), r"finished/1\.sha256 is damaged"),
         (edit("finished/1.sha256", flipped), r"finished/1\.sha256 is damaged|/c/1\S* is damaged"),
         (remove("finished/1.sha256"), "1 of 3 shards are not finished"),
@@ -368,7 +368,9 @@ def every_window(url: str, names: list[str]) -> list[dict[str, torch.Tensor]]:
     return [windows[i] for i in range(len(windows))]
 
 
-@pytest.mark.parametrize("damage", [edit("omega/zarr.json", flipped), write("omega/copy", b"x")])
+@pytest.mark.parametrize(
+    "damage", [edit("omega_C/zarr.json", flipped), write("omega_C/copy", b"x")]
+)
 def test_damage_to_what_readers_do_not_open_is_found_by_the_check(made, tmp_path, damage):
     damage(folder := copy(made[0], tmp_path / "set"))
     assert len([x for x in check(str(folder)) if "no commit" not in x]) == 1
@@ -378,7 +380,7 @@ def test_damage_to_what_readers_do_not_open_is_found_by_the_check(made, tmp_path
 def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made, tmp_path):
     """By the checksums of the arrays, without this package's reader."""
     folder = copy(made[0], tmp_path / "set")
-    for name in ("theta/c/0/0", "motion.y_d.values.1/c/1"):
+    for name in ("theta_C/c/0/0", "motion.y_d.values.1/c/1"):
         edit(name, flipped)(folder)
         with pytest.raises(ValueError, match="checksum"):
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
@@ -390,7 +392,7 @@ def test_standard_tools_check_the_shards(made, tmp_path):
     folder = copy(made[0], tmp_path / "set")
     command = [tool, "--check", "--quiet", *(str(path) for path in (folder / "finished").iterdir())]
     assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0
-    edit("theta/c/0/0", flipped)(folder)
+    edit("theta_C/c/0/0", flipped)(folder)
     assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode != 0
 
 
@@ -412,14 +414,14 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
     angle = row["theta_C"].copy()
     angle[3] = np.nan
     with pytest.raises(
-        ValueError, match="trajectory 4 is not marked as failed, but not finite: theta"
+        ValueError, match="trajectory 4 is not marked as failed, but not finite: theta_C"
     ):
         store.write(2, [row | {"theta_C": angle}])
     assert store.unfinished() == [0, 1, 2]
     series = making.series
     monkeypatch.setattr(making, "series", lambda *given: series(*given) | {"theta_C": angle})
     row = simulate_task(config, config.subject.task(4, design[4]))
-    assert (row["failed"], row["reason"]) == (1, "not finite: theta")
+    assert (row["failed"], row["reason"]) == (1, "not finite: theta_C")
     assert np.isnan(row["theta_C"]).all()
 
 
@@ -433,8 +435,8 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(made,
     (folder / "zarr.json.0123456789abcdef.partial").write_bytes(b"half")
     (folder / "time/c/0.0123456789abcdef.partial").parent.mkdir(parents=True)
     (folder / "time/c/0.0123456789abcdef.partial").write_bytes(b"half")
-    with replacing(folder / "theta/zarr.json") as partial:
-        partial.write_bytes(content["theta/zarr.json"])
+    with replacing(folder / "theta_C/zarr.json") as partial:
+        partial.write_bytes(content["theta_C/zarr.json"])
         open_or_create(str(folder), config)
         assert list(folder.rglob("*.partial")) == [partial]
     create(str(tmp_path / "other"), config)
@@ -503,8 +505,8 @@ def test_only_unfinished_shards_are_made_again(made, tmp_path, recorded):
     folder, config = copy(made[0], tmp_path / "set"), made[1]
     if not recorded:
         remove("finished/1.sha256")(folder)
-    (folder / "theta/c/1/0").unlink()
-    (folder / "theta/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
+    (folder / "theta_C/c/1/0").unlink()
+    (folder / "theta_C/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("c/**/*") if p.is_file()}
     generate(config, str(folder), Serial(), progress=False)
     assert contents(folder) == contents(made[0])

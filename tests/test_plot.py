@@ -300,7 +300,7 @@ def test_a_video_says_how_fast_it_is(speed, text):
 
 
 def test_save_writes_the_whole_file_or_none(done, tmp_path):
-    figures.save(dashboard(done[1], only=["F_y"]), tmp_path / "moment.png", dpi=50)
+    figures.save(dashboard(done[1], only=["effort_y"]), tmp_path / "moment.png", dpi=50)
     assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
     with Image.open(tmp_path / "moment.png") as picture:
         assert picture.format == "PNG"

@@ -8,17 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import (
-    COARSE,
-    RUBBER,
-    coarse,
-    f64,
-    grasped,
-    random_state,
-    rest,
-    still,
-    times,
-)
+from conftest import COARSE, RUBBER, coarse, f64, grasped, paper, random_state, rest, still, times
 from torch import Tensor, nn
 from torchdiffeq import odeint
 
@@ -219,14 +209,14 @@ MUST = r"the law of `actuators.x` must take five tensors .* and return the effor
 PARTS: list[tuple[Call, str]] = [
     # shapes
     (lambda: resting(shape=Superellipse(20e-3, 20e-3, 1.9)),
-     "`bodies.disc.shape.n` must be from 2 to 20, but is 1.9"),
+     r"bodies\.disc\.shape: parameter `n` must be from 2 to 20, but is 1.9"),
     (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)),
-     "`bodies.disc.shape.n` must be finite"),
+     r"bodies\.disc\.shape: parameter `n` must be finite"),
     (lambda: resting(shape=Superellipse(20e-3, 6e-3, 4.0)), "differ by more than a factor of 3"),
     (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 9.1e-3)),
      "corners' radius 0.0091 is larger than half of the box, 0.009"),
     (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 0.0)),
-     "`bodies.disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
+     r"bodies\.disc\.shape: parameter `radius` must be from 1e-06 to 10 m, but is 0"),
     (lambda: Contour(CIRCLE[:7]), "must be at least 8 places around a contour, but are 7"),
     (lambda: Contour([*CIRCLE, CIRCLE[-1]]), "has the same place twice: point 23"),
     (lambda: Contour([*CIRCLE[:-1], [0.1, INF]]),
@@ -291,15 +281,15 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5, 2e5], tau=[0.1, 0.1])),
      "two relaxation times are equal"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[-2e5], tau=[0.1])),
-     r"materials.rubber: parameter `E_1` must be from 1 to 1e\+13 Pa, but"),
+     r"`E_1` must be from 1 to 1e\+13 Pa, but"),
     (lambda: resting(material=Prony(**RUBBER, moduli=[1e5], tau=[5e-5])),
      "tau_instant = 0.0001 s must be below the shortest"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6, 0.5], tau=[0.1, 1])),
     "fractions J sum to 1.1, above one"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6], tau=[0.0])),
-     "materials.rubber: parameter `tau_1` must be from 1e-09 to"),
+     "`tau_1` must be from 1e-09 to"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[NAN], tau=[0.1])),
-     "materials.rubber: parameter `J_1` must be finite, but is nan"),
+     "`J_1` must be finite, but is nan"),
     (lambda: resting(material=StandardLinearSolid(**RUBBER, E_instant=1e5, tau=0.1)),
     "E_instant is below E"),
     (lambda: chain([0.7, 0.5], [0.01, 0.1]),
@@ -319,9 +309,9 @@ PARTS: list[tuple[Call, str]] = [
      "`tau of the material of L` must be a float64 tensor, but is float"),
     (lambda: chain([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
     (lambda: chain([1.0, 0.0]), "`chain` of the material of `L` must give two tensors, J and tau"),
-    (lambda: still({"pad.inertial": True},
-    material=Prony(**RUBBER, moduli=[1e5], tau=[0.1])),
-     r"an inertial pad has one retardation time"),
+    (lambda: small(pads=lambda *_: {"L": Pad(PadMesh(0.04, 4e-3, 8, 2), Prony(**RUBBER,
+    moduli=[1e5], tau=[0.1]), inertial=True)}),
+     r"inertial pad `L` needs a Kelvin-Voigt material \(one retardation time\), but has"),
     # laws of contact
     (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None),
      "`friction` must be a function or a module"),
@@ -420,9 +410,9 @@ INTEGERS: dict[str, Callable[[], Any]] = {
     "times": lambda: Profile([0, HUGE], [0, 1]),
     "origin": lambda: Pad(PadMesh(0.1, 1e-2, 10, 2), KelvinVoigt(tau=1e-2, **RUBBER),
                           origin=(HUGE, 0)),
-    "rtol": lambda: simulate(coarse(), T, rtol=HUGE),
-    "atol": lambda: simulate(coarse(), T, atol=HUGE),
-    "t": lambda: simulate(coarse(), [0, HUGE]),
+    "rtol": lambda: paper(COARSE).run(T, rtol=HUGE),
+    "atol": lambda: paper(COARSE).run(T, atol=HUGE),
+    "t": lambda: paper(COARSE).run([0, HUGE]),
 }  # fmt: skip
 
 
@@ -577,9 +567,14 @@ def filled(name: str, value: float) -> Callable[[Rig], object]:
     return lambda model: model.parameter(name).detach().fill_(value)
 
 
+def grouped(model: Rig) -> None:
+    """A group that no part of the rig is in."""
+    model.groups, model.pad = ("pad",), KelvinVoigt(**RUBBER, tau=0.01)
+
+
 SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (filled("pad.E", 0.0), r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
-    (filled("pad.E", 1e308), r"parameter `.*E` must be below 1e\+100"),
+    (filled("pad.E", 1e308), r"parameter `materials.rubber.E` must be below 1e\+100"),
     (
         filled("contact.K_n", -1.2e5),
         r"parameter `.*K_n` must be from 0.001 to 1e\+12 N/m, but is -120000",
@@ -597,7 +592,11 @@ SPOILT: list[tuple[Callable[[Rig], object], str]] = [
     (lambda m: m.to("meta"), "on meta"),
     (
         lambda m: setattr(m.parameter("pad.E"), "data", torch.ones(2).double()),
-        r"parameter `.*E` must be one number",
+        r"parameter `materials.rubber.E` must be one number",
+    ),
+    (
+        grouped,
+        "`pad.E` belongs to no body, pad",
     ),
     (
         lambda m: setattr(m.contacts["L"].law, "friction", Coulomb(0.3, 0.4)),

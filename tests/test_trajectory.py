@@ -16,7 +16,12 @@ from conftest import COARSE, coarse, f64, paper, rest, times
 from torch import Tensor
 
 import torchsoft
-from torchsoft import Rig, Trajectory, simulate, simulate_batch
+from torchsoft import (
+    Rig,
+    Trajectory,
+    simulate,
+    simulate_batch,
+)
 from torchsoft.display import hidden
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.setup import von_mises
@@ -334,7 +339,8 @@ def test_a_start_is_differentiable():
         ({"disc": {"x": 0.06}}, "`y` of `disc` is missing: it is free"),
         ({"disc": {"x": 0.06, "y": "low"}}, "`y` of `disc` must be a number or 'rest'"),
         ({"disc": {"x": "rest", "y": 0.0}}, "`x` of `disc` must be a number, but is 'rest'"),
-        ({"disc": {"x": 0.06, "y": float("nan")}}, "`disc.y` must be one finite number"),
+        ({"disc": {"x": 0.06, "y": float("nan")}, "bracket": {"x": 0.0, "y": 0.1}},
+         "`disc.y` must be one finite number"),
         ({"disc": {"x": 0.06, "y": 0.02, "vx": 1.0}}, "`vx` is no coordinate of `disc`.* `v_x`"),
         ({"disc": [0.06, 0.02]}, "`disc` must be given coordinates by name"),
         ({"disc": {"x": 0.06, "y": 0.03}, "bracket": {"x": 0.06, "y": 0.06, "theta": 0.1}},

@@ -210,7 +210,7 @@ class Rig(Shown, nn.Module):
         if found is None:
             mine = {own: other for other, own in self.names.items()}
             names = dict.fromkeys(mine.get(own, own) for own, _ in self.named_parameters())
-            names |= dict.fromkeys(short for short, full in self.short.items() if full in names)
+            names |= {short: full for short, full in self.short.items() if full in names}
             raise ValueError(
                 f"`{name}` is not a parameter of this rig; {suggestion(name, names, 'known:')}"
             )

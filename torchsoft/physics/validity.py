@@ -5,6 +5,8 @@ take no more than the effort. Every refusal is one sentence that names the fault
 
 import math
 import warnings
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -91,54 +93,51 @@ def check_values(rig: Any) -> None:
     """Raises `ValueError` as `check_part` does for all parts of the rig, and for a material without
     a `chain`."""
     check_place()
-    check_part(rig)
-    for name, pad in rig.pads.items():
-        check_chain(name, pad.material)
+    check_numbers(rig, {own: other for other, own in rig.names.items()})
+    for owner, module in rig.named_modules():
+        well_posed = getattr(module, "well_posed", None)
+        if well_posed is not None and (wrong := well_posed()):
+            raise ValueError(f"the parameters of `{owner}` are not physical together: {wrong}")
 
 
-def check_part(part: nn.Module) -> None:
-    """Raises `ValueError` naming a parameter of the part or a tensor of its own parts that is not a
-    float64 number on the CPU, not finite, out of the bounds of its quantity or not physical by its
-    module's `well_posed`."""
+def check_numbers(part: nn.Module, names: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Raises `ValueError` for a parameter or tensor of a part by the rules of `check_values`;
+    `names` are other names of parameters."""
     for owner, module in part.named_modules():
         path = f"{owner}." if owner else ""
         for name, value in module.named_parameters(recurse=False):
-            check_array(f"{path}{name}", value)
+            called = names.get(f"{path}{name}", f"{path}{name}")
+            check_array(called, value)
             if value.is_inference():
                 raise ValueError(
-                    f"parameter `{path}{name}` was made under torch.inference_mode(); make it "
-                    "outside"
+                    f"parameter `{called}` was made under torch.inference_mode(); make it outside"
                 )
             numbers = value.detach().numpy()
             if not (np.abs(numbers) < LARGEST).all():
                 finite = np.isfinite(numbers)
                 must = f"below {LARGEST:g}" if finite.all() else "finite"
                 bad = numbers[~(finite if must == "finite" else np.abs(numbers) < LARGEST)][0]
-                raise ValueError(f"parameter `{path}{name}` must be {must}, but is {bad:g}")
+                raise ValueError(f"parameter `{called}` must be {must}, but is {bad:g}")
         for name, value in module.named_buffers(recurse=False):
             if value.is_floating_point():
                 check_array(f"{path}{name}", value)
     for owner, module in part.named_modules():
         path = f"{owner}." if owner else ""
         for name in dict.fromkeys((*module._parameters, *quantities(type(module)))):
+            called = names.get(f"{path}{name}", f"{path}{name}")
             declared, value = quantity_of(module, name), getattr(module, name, None)
             if declared is None or not isinstance(value, Tensor | float):
                 continue
             numbers = value.detach().numpy() if isinstance(value, Tensor) else np.array(value)
             if numbers.ndim and not isinstance(module, Shape):
                 raise ValueError(
-                    f"parameter `{path}{name}` must be one number, but has shape "
-                    f"{tuple(numbers.shape)}"
+                    f"parameter `{called}` must be one number, but has shape {tuple(numbers.shape)}"
                 )
             wrong = numbers[~((declared.low <= numbers) & (numbers <= declared.high))]
             if wrong.size:
                 raise ValueError(
-                    f"parameter `{path}{name}` must be {declared.range}, but is {wrong[0]:g}"
+                    f"parameter `{called}` must be {declared.range}, but is {wrong[0]:g}"
                 )
-    for owner, module in part.named_modules():
-        well_posed = getattr(module, "well_posed", None)
-        if well_posed is not None and (wrong := well_posed()):
-            raise ValueError(f"the parameters of `{owner}` are not physical together: {wrong}")
 
 
 @torch.no_grad()

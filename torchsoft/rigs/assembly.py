@@ -11,7 +11,7 @@ from torch import nn
 from torchsoft.display import suggestion
 from torchsoft.physics.material import Series
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.validity import check_part, sound
+from torchsoft.physics.validity import check_numbers, sound
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.trajectory import units
 from torchsoft.tables import line
@@ -35,9 +35,7 @@ def assemble(file: RigFile, parts: Mapping[str, Any]) -> Rig:
         for name, table in getattr(file, group).items():
             with at_field(f"{group}.{name}"):
                 own = left.pop(f"{group}.{name}", None)
-                if isinstance(own, nn.Module):
-                    check_part(own)
-                found[name] = sound(build(name, table) if own is None else own)
+                found[name] = sound(build(name, table) if own is None else checked(own))
         return found
 
     def law(name: str, table: Any) -> Any:
@@ -45,7 +43,13 @@ def assemble(file: RigFile, parts: Mapping[str, Any]) -> Rig:
         sized, friction = table.numbers(pressed), left.pop(f"laws.{name}.friction", None)
         if friction is None:
             return sized.build(folder)
-        return table.part(**dict(sized.arguments(folder)) | {"friction": friction})
+        with at_field("friction"):
+            own = checked(friction)
+        return table.part(**dict(sized.arguments(folder)) | {"friction": own})
+
+    def shape(body: str) -> Any:
+        with at_field("shape"):
+            return checked(left.pop(f"bodies.{body}.shape", None))
 
     actuators = made("actuators", lambda _, one: one.build(folder))
     for name, one in file.controllers.items():
@@ -55,9 +59,7 @@ def assemble(file: RigFile, parts: Mapping[str, Any]) -> Rig:
     pads = made("pads", lambda _, one: one.build(materials[one.material], folder))
     laws = made("laws", law)
     rig = Rig(
-        bodies=made(
-            "bodies", lambda name, one: one.build(folder, left.pop(f"bodies.{name}.shape", None))
-        ),
+        bodies=made("bodies", lambda name, one: one.build(folder, shape(name))),
         pads=pads,
         contacts=made("contacts", lambda _, one: one.build(laws)),
         actuators=actuators,
@@ -82,6 +84,13 @@ def assemble(file: RigFile, parts: Mapping[str, Any]) -> Rig:
 
 PARTS = "bodies", "materials", "pads", "laws", "contacts", "taxels", "actuators"
 """Tables of which each is one part of a rig."""
+
+
+def checked(part: M) -> M:
+    """A part of one's own whose numbers are in bounds. Raises `ValueError` where they are not."""
+    if isinstance(part, nn.Module):
+        check_numbers(part)
+    return part
 
 
 def short_names(file: RigFile, rig: Rig, parameters: Collection[str]) -> dict[str, str]:

@@ -168,7 +168,9 @@ def prepare(
     check_times(t, step)
     stepper.check_start(start)
     felt = _channels_of_touch(rig, touch)
-    return Task(stepper, t, shared(start), gradient, tuple(wrt), dy0, rigid, felt, rig)
+    return Task(
+        stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid, felt, rig
+    )
 
 
 class RunOutcome(NamedTuple):

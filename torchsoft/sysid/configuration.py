@@ -206,8 +206,9 @@ class Config(Table):
             if strange := [name for name in one.without if full(name) not in unknown]:
                 raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         for i, entry in enumerate(self.recordings):
-            stated = map(full, flattened(entry.settings))
-            if strange := [unknown[name] for name in stated if name in unknown]:
+            if strange := [
+                unknown[x] for x in map(full, flattened(entry.settings)) if x in unknown
+            ]:
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "
