@@ -94,6 +94,8 @@ def check_values(rig: Any) -> None:
     a `chain`."""
     check_place()
     check_numbers(rig, {own: other for other, own in rig.names.items()})
+    for name, pad in rig.pads.items():
+        check_chain(name, pad.material)
     for owner, module in rig.named_modules():
         well_posed = getattr(module, "well_posed", None)
         if well_posed is not None and (wrong := well_posed()):
