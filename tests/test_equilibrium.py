@@ -280,7 +280,7 @@ def test_a_rig_that_is_not_physical_any_more_is_refused():
     model = build()
     with torch.no_grad():
         model.parameter("pad.E").fill_(-1.0)
-    with pytest.raises(ValueError, match=r"`pads.L.material.E` must be from 1 to 1e\+13 Pa"):
+    with pytest.raises(ValueError, match=r"`materials.rubber.E` must be from 1 to 1e\+13 Pa"):
         rest(model)
 
 

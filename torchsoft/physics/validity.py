@@ -90,8 +90,8 @@ def check_place() -> None:
 
 
 def check_values(rig: Any) -> None:
-    """Raises `ValueError` as `check_part` does for all parts of the rig, and for a material without
-    a `chain`."""
+    """Raises `ValueError` as `check_numbers` does for all parts of the rig, for parameters that are
+    not physical together, and for a material without a `chain`."""
     check_place()
     check_numbers(rig, {own: other for other, own in rig.names.items()})
     for name, pad in rig.pads.items():

@@ -114,7 +114,7 @@ class RigFile(Shown, Group):
         if name not in ready():
             known = suggestion(name, ready(), "there are")
             raise ValueError(f"there is no ready rig `{line(name, 80)}`; {known}")
-        return cls.from_toml(cls.path(name))
+        return cls.from_toml(READY / f"{name}.toml")
 
     @staticmethod
     def path(name: str | Path, folder: Path = Path()) -> Path:

@@ -95,7 +95,8 @@ def excite(
         excitation = CATALOGUE[excitation]
     body, across, way = _presser(file, body)
     along = "y" if across == "x" else "x"
-    press_loop, roll_loop = (_loops(file)[f"{body}.{axis}"] for axis in (across, along))
+    loops = _loops(file)
+    press_loop, roll_loop = (loops[f"{body}.{axis}"] for axis in (across, along))
     times, values = (
         (0.0, excitation.grasp),
         (0.0, way * (excitation.depth + (CLEAR if across == "y" else 0.0))),
