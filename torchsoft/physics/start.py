@@ -87,8 +87,9 @@ def warn_of_moments(rig: Rig, y: Tensor, bodies: Starts) -> None:
     pressed = sum(float(interface.F_N.sum()) for interface in graph.interfaces.values())
     for name in named:
         shape, moment = rig.bodies[name].shape, float(loads[name][2])
-        uneven = shape is not None and not shape.round
-        if uneven and abs(moment) > MOMENT_ARM * shape.size() * pressed:
+        if shape is None or shape.round:
+            continue
+        if abs(moment) > MOMENT_ARM * shape.size() * pressed:
             warnings.warn(
                 f"`{name}` is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a "
                 'run from here begins with that; say theta = "rest", or another angle',
