@@ -23,7 +23,7 @@ from torchsoft import (
 )
 from torchsoft.physics.state import State
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import Sensor
+from torchsoft.sysid import good_sensors
 
 register_method()
 
@@ -35,13 +35,7 @@ COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
 
 PAPER = RigFile.ready("paper")
-RIG = {
-    name: Sensor(noise=noise)
-    for name, noise in (
-        ("x_C", 1e-5), ("y_C", 1e-5), ("theta", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5), ("F_x", 0.1),
-        ("F_y", 0.1),
-    )
-}  # fmt: skip
+RIG = good_sensors(PAPER.assemble())
 """Sensors of the paper's rig."""
 APART, GRASPED = 50.1e-3, 48.6e-3
 """Height of the paper's bracket [m] where undeformed pads just touch the disc, and in the grasp."""

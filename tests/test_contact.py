@@ -171,7 +171,7 @@ def test_smooth_slip_satisfies_its_equation(E, F_N, dashpot, mu_k, extra, v_s):
     friction = SmoothSlip(mu_k + extra, mu_k, v_s)
     with torch.no_grad():
         x = float(friction(f64(E), f64(F_N), f64(dashpot)))
-    assert 0.0 <= dashpot * x <= E * (1 + 1e-12)
+    assert 0.0 <= dashpot * x <= E * (1 + 1e-12) + 1e-300  # a slip is exact to its last denormal
     if (mu_k + extra) * F_N >= E:
         assert x == 0.0 or (mu_k + extra) * F_N == E
     else:

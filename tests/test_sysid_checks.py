@@ -69,7 +69,7 @@ RATIO = "bodies.disc.inertia_ratio"
 TRUTH = {E: 0.85e6, K_N: 1.3e5}
 STROKES = stroked(travel=8e-3, stroke_time=0.2, duration=0.9)
 BRIEF = stroked(travel=8e-3, stroke_time=0.15, duration=0.3, grasp=0.12, since=0.15)
-SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
+SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "effort_y")}
 RTOL = 1e-4
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import COARSE, PAPER, clear, rolled
+from conftest import COARSE, PAPER, excited, rolled
 from test_sysid_noise import made
 
 from torchsoft.rigs.excite import Excitation
@@ -19,7 +19,7 @@ BASE = PAPER.override(COARSE)
 E, TAU = "materials.rubber.E", "materials.rubber.tau"
 TRUTH = {E: 0.8e6, TAU: 0.011}
 NOISE = {"x_C": 1e-5, "theta_C": 5e-4, "effort_x": 0.1}
-STROKE = Excitation(rolled(8e-3, 0.7), duration=0.6, depth=1.5e-3)
+ROLL = Excitation(rolled(8e-3, 0.55, since=0.25), duration=0.6, grasp=0.2)
 AR = Autoregression.stated((0.8,), 5e-3)
 STAGE = Stage("all", ("strokes",), (E, TAU), 1e-4)
 
@@ -30,7 +30,9 @@ def sensors(colour: str = "white") -> dict[str, Sensor]:
 
 @pytest.fixture(scope="module")
 def exact():
-    return record("strokes", clear(STROKE, BASE), TRUTH, sensors(), rtol=1e-6, noise=0.0)
+    return record(
+        "strokes", excited(ROLL, BASE, senses="bracket"), TRUTH, sensors(), rtol=1e-6, noise=0.0
+    )
 
 
 def noisy(

@@ -41,7 +41,7 @@ BOUNDS = {
     "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13, shortest=0.02),
     "y_d": Bounds(low=0.048, high=0.0499, speed=0.1, after=0.13),
 }
-SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
+SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "effort_y")}
 
 
 @pytest.fixture(scope="session")
@@ -229,7 +229,7 @@ def test_any_rig_with_profiles():
     )
     t, sensors = (
         np.linspace(0.0, 0.1, 21),
-        {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta"]},
+        {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta_C"]},
     )
     data = Recording(
         "turning",

@@ -204,7 +204,10 @@ def rolling():
     saturated sensor."""
     motion = Excitation(rolled(4e-3, 0.25, since=0.1), duration=0.25, grasp=0.1)
     roll = excited(motion, PAPER.override(COARSE))
-    sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
+    sensors = RIG | {
+        "effort_x": Sensor(noise=0.1, bias=1.0),
+        "effort_y": Sensor(noise=0.1, low=-60.0),
+    }
     data = record("roll", roll, {}, sensors, noise=0.0)
     prior = Prior(median=0.75e6, sd=0.1, kind="log-normal")
     unknowns = {"pad.E": Unknown(prior=prior), "pad.tau": Unknown(low=5e-3, high=20e-3)}

@@ -68,7 +68,7 @@ def true_bodies(recording: Recording, y0: Tensor) -> dict[str, float]:
         f"{body}.{v}{axis}": float(part[body][i])
         for v, part in parts
         for body in part
-        for i, axis in enumerate(("x", "y", "theta_C"))
+        for i, axis in enumerate(("x", "y", "theta"))
     }
 
 
@@ -127,7 +127,7 @@ def test_samples_out_of_a_sensors_range_say_nothing():
 def test_what_no_sensor_measures_is_assumed(cut):
     recording, y0 = cut
     truth = true_bodies(recording, y0)
-    few = {channel: RIG[channel] for channel in ("x_C", "F_x", "F_y")}
+    few = {channel: RIG[channel] for channel in ("x_C", "effort_x", "effort_y")}
     start = underway(estimate_initial_state(noisy(recording), few))
     assert start.bodies["disc.theta"] == (0.0, 0.0)  # a circle has no angle
     for name in ("disc.y", "bracket.x", "bracket.y", "disc.v_theta", "disc.v_y", "bracket.v_x"):
@@ -139,7 +139,7 @@ def test_what_no_sensor_measures_is_assumed(cut):
         estimate_initial_state(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)})
     )
     assert given.bodies["disc.y"] == (0.0233, 1e-3)
-    none = {name: RIG[name] for name in ("F_x", "theta")}
+    none = {name: RIG[name] for name in ("effort_x", "theta_C")}
     with pytest.raises(ValueError, match=r"no sensor tells where `disc\.x` is"):
         estimate_initial_state(recording, none)
 
@@ -188,7 +188,9 @@ def test_residuals_and_gradient_know_the_start(cut):
     assert len(r) == problem.samples() + len(out.start_coordinates)
     assert r[problem.samples() :] == pytest.approx(0.0, abs=1e-12)  # from the priors' means
     moved = [f"start.{name} in roll" for name in ("disc.y", "disc.v_x", "U.stretch.4")]
-    check_derivatives(problem, c.start + 1e-3, 1e-4, 1e-3, only=[E, *moved], adjoint=1e-5)
+    check_derivatives(
+        problem, c.start + 1e-3, 1e-4, 2e-5, h=1e-6, only=[E, *moved], adjoint=1e-5
+    )  # larger steps cross kinks of contact
 
 
 def test_the_start_does_not_depend_on_the_mesh(cut):

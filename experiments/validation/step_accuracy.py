@@ -84,7 +84,7 @@ def errors(run: Trajectory, exact: Trajectory) -> dict[str, float]:
 def run(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     if config.smoke:
         config = Config(
-            out=config.out, rtols=(1e-3, 1e-5), steps_ms=(2.0,), exact=1e-7, repeats=1, smoke=True
+            out=config.out, rtols=(1e-3, 1e-6), steps_ms=(2.0,), exact=1e-8, repeats=1, smoke=True
         )
     ways: dict[str, dict[str, Any]] = {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols}
     ways |= {f"step = {h:g} ms": {"step": 1e-3 * h} for h in config.steps_ms}

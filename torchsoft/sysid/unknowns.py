@@ -6,7 +6,7 @@ deviation is a relative one either way.
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Self, TypeVar, get_args
 
@@ -158,15 +158,28 @@ class Sensor(Table):
         return out
 
 
-def in_full(rigs: Iterable[Rig], given: Mapping[str, T]) -> dict[str, T]:
-    """What is given by names of the rigs, by the full ones; the last of two for one name counts."""
-    full = {short: name for rig in rigs for short, name in rig.short.items()}
-    return {full.get(name, name): one for name, one in given.items()}
+def in_full(rigs: Sequence[Rig], given: Mapping[str, T]) -> dict[str, T]:
+    """Entries by the full names of the rigs' parameters and channels.
+
+    Raises `ValueError` for two entries of one name, and for a short name of two meanings.
+    """
+    out, origin = dict[str, T](), dict[str, str]()
+    for name, one in given.items():
+        meanings = sorted({rig.short[name] for rig in rigs if name in rig.short})
+        if len(meanings) > 1:
+            raise ValueError(
+                f"`{name}` is short for {' and '.join(meanings)} in different rigs; say it in full"
+            )
+        (full,) = meanings or [name]
+        if full in out:
+            raise ValueError(f"`{name}` and `{origin[full]}` are one, given twice; leave out one")
+        out[full], origin[full] = one, name
+    return out
 
 
-def by_parameter(rigs: Iterable[Rig], unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
+def by_parameter(rigs: Sequence[Rig], unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
     """Unknowns by the full names of the rigs' parameters."""
-    rigs, out = list(rigs), dict[str, Unknown]()
+    out = dict[str, Unknown]()
     for name, one in in_full(rigs, unknowns).items():
         (base,) = in_full(rigs, {one.ratio_to: one}) if one.ratio_to is not None else (None,)
         out[name] = one if base == one.ratio_to else one.model_copy(update={"ratio_to": base})
@@ -174,12 +187,11 @@ def by_parameter(rigs: Iterable[Rig], unknowns: Mapping[str, Unknown]) -> dict[s
 
 
 def by_channel(
-    rigs: Iterable[Rig], sensors: Mapping[str, Sensor], sampled: Collection[str] | None = None
+    rigs: Sequence[Rig], sensors: Mapping[str, Sensor], sampled: Collection[str] | None = None
 ) -> dict[str, Sensor]:
     """Sensors by the full names of channels. A sensor named after an array of touch of the rigs,
     such as "skin.normal", stands for each of its channels (of those `sampled`, if given) without a
     sensor of its own."""
-    rigs = list(rigs)
     sensors = in_full(rigs, sensors)
     arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
     shared, own = dict[str, Sensor](), dict[str, Sensor]()
