@@ -286,7 +286,7 @@ def test_a_rig_that_is_not_physical_any_more_is_refused():
 
 def test_no_equilibrium_is_reported_when_newton_does_not_converge(monkeypatch):
     monkeypatch.setattr("torchsoft.physics.statics.ITERATIONS", 2)
-    with pytest.raises(NoEquilibrium, match=r"nothing is at rest: after 2 steps .* push disc\.y"):
+    with pytest.raises(NoEquilibrium, match=r"no equilibrium found: after 2 steps .* push disc\.y"):
         press(build())
 
 

@@ -152,8 +152,8 @@ def test_only_regular_files_of_a_stated_size_are_read(read, name, tmp_path):
     with large.open("wb") as file:
         file.truncate(2**42)  # a hole
     for path, words in (
-        (pipe, "is no regular file"),
-        (device, "is no regular file"),
+        (pipe, "is not a regular file"),
+        (device, "is not a regular file"),
         (large, "MB, but at most"),
     ):
         with pytest.raises(ValueError, match=words) as refusal:

@@ -88,7 +88,7 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters():
     (ratio,) = seen([0, 1, -1], [1, 0, 0])
     assert ratio.exponents == {"K": 1.0, "R": -1.0}
     assert ratio.sd == pytest.approx(0.01, rel=1e-2)
-    assert ratio.sentence == "the data see K / R to 1 %, not each (K 71 %, R 71 %)"
+    assert ratio.sentence == "only K / R is determined (1 %), not each (K 71 %, R 71 %)"
     (product,) = seen([1, 0.42, 0], [0, 0, 1])
     assert product.formula == "E * K^0.4"
     assert product.sds.keys() == {"E", "K"}

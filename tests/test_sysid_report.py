@@ -249,7 +249,9 @@ def test_what_recordings_told_is_in_the_table(page, full):
             )
         assert "\n".join((label, *cells)) in page.text
     assert full.contributions[1].without[f"{R_N} in shallow"] is None
-    assert f"the data see {E} / {K_N}^0.5 to 2 %, not each ({E} 30 %, {K_N} 40 %)\n" in page.text
+    assert (
+        f"only {E} / {K_N}^0.5 is determined (2 %), not each ({E} 30 %, {K_N} 40 %)\n" in page.text
+    )
     weak = [direction_name(d) for d in full.directions if not d.identifiable]
     assert V_S in weak
     for name in weak:

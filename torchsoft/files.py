@@ -166,8 +166,8 @@ def check_file(path: str | Path, most: float) -> Path:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(status.st_mode):
         raise ValueError(
-            f"{path} is no regular file but a device or a pipe; copy what it gives to a file, and "
-            "name that"
+            f"{path} is not a regular file but a device or a pipe; save its content to a file "
+            "first, and name that"
         )
     if status.st_size > most:
         raise ValueError(

@@ -72,7 +72,7 @@ _own = threading.local()
 
 
 @contextmanager
-def others_turn() -> Iterator[None]:
+def released_turn() -> Iterator[None]:
     """Let the other threads of a batch compute in Python while compiled code runs in this one."""
     turn: threading.Lock | None = getattr(_own, "turn", None)
     if turn is None:

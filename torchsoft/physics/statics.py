@@ -250,7 +250,7 @@ def resting(
     worst = int(F.abs().argmax())
     names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in sought.items() for axis in axes]
     raise NoEquilibrium(
-        f"nothing is at rest: after {len(path)} steps {float(F.abs().max()):.2g} N still push "
+        f"no equilibrium found: after {len(path)} steps {float(F.abs().max()):.2g} N still push "
         f"{names[worst]}; is there a pad to carry it?"
     )
 

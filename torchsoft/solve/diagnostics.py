@@ -67,8 +67,7 @@ def missing_energy(run: Trajectory) -> float:
 
 
 def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
-    """Sentences on the faults of a finished run that has a ledger, by their subject; none if there
-    are none."""
+    """Run warnings: sentences on the faults of a finished run with a ledger, by their subject."""
     run, found = trajectory, {}
     scale, part = energy_scale(run), missing_energy(run)
     if not part <= RESIDUAL:

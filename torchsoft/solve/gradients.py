@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.parallel import others_turn, parallel_map
+from torchsoft.parallel import parallel_map, released_turn
 from torchsoft.solve.kernel.arrays import Backward, Forward, room
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
@@ -149,7 +149,7 @@ def run_adjoint(
             plan.h, segment.signals, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
             rows[here], felt[here], outputs_bar[here], carried, p_bar, signals_bar[number], failed,
         )  # fmt: skip
-        with others_turn():
+        with released_turn():
             call("backward", sweep)
         if failed[0] >= 0:
             time = stepper.origin + plan.starts[failed[0]]
@@ -234,7 +234,7 @@ def iterate(
                 plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, rows,
                 felt[segment.rows],
             )  # fmt: skip
-            with others_turn():
+            with released_turn():
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(kept), torch.from_numpy(felt), out

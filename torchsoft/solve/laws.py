@@ -184,7 +184,7 @@ def compiled_law(
         if key not in _laws:
             if not known and expressions() != key:
                 raise UnknownOperation(
-                    "The law is another one when it is called again, so it keeps something of a "
+                    "The law changed between calls; it must be stateless. It keeps something of a "
                     "call."
                 )
             if points:

@@ -42,8 +42,8 @@ class Progress:
 
     @property
     def knots(self) -> Array:
-        """Times of the steps' begins and ends [s] (steps + 1,); empty without steps. Of steps that
-        times so long after zero do not resolve one is left."""
+        """Times of the steps' begins and ends [s] (steps + 1,); empty without steps. Of steps
+        below the float64 resolution of their times one is left."""
         since = np.concatenate([*self.starts, np.full(min(self.steps, 1), self.end)])
         return since if self.origin == 0 else np.unique(self.origin + since)
 

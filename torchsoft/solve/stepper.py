@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.parallel import others_turn
+from torchsoft.parallel import released_turn
 from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import CLOSEST, Reference
 from torchsoft.physics.rig import Rig
@@ -185,7 +185,7 @@ class ImplicitStepper:
             self._shortest, now.integrals, plan.starts, plan.h,
             signals.reshape(steps, 2, *signals.shape[1:]), counts,
         )  # fmt: skip
-        with others_turn():
+        with released_turn():
             call("run", run)
         return counts.tolist(), (tape, out_tape) if taping else None
 

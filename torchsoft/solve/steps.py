@@ -110,14 +110,14 @@ def check_times(t: Tensor, step: float | None = None) -> None:
     finest = max(SHORTEST, rounding * float(t.abs().max()))
     if float(t.diff().min()) < finest:
         raise ValueError(
-            f"`t` must be further apart than {finest:.1g} s, what times so long after zero "
-            "resolve; count them from the beginning of the run"
+            f"`t` must be further apart than {finest:.1g} s, the float64 resolution at "
+            "these times; count them from the beginning of the run"
         )
     finest = max(SHORTEST, rounding * float(t[-1] - t[0]))
     if step is not None and step < finest:
         raise ValueError(
-            f"`step` must be longer than {finest:.1g} s, what times so long after the beginning of "
-            "the run resolve; take a longer one, or a shorter run"
+            f"`step` must be longer than {finest:.1g} s, the float64 resolution at the end of "
+            "the run; take a longer one, or a shorter run"
         )
 
 

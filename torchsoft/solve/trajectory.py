@@ -346,7 +346,7 @@ LIGHT = 1e-3
 it lies without contact, and with 10 N it is off by a ten-thousandth."""
 
 
-class Felt(NamedTuple):
+class ForceSum(NamedTuple):
     """A channel: the sum of weight times recorded force, for a centre of pressure over that of
     `over` and `LIGHT`."""
 
@@ -398,13 +398,13 @@ class Touch:
         return out
 
     @cached_property
-    def single(self) -> dict[str, tuple[str, Felt]]:
+    def single(self) -> dict[str, tuple[str, ForceSum]]:
         """Unit and sum of the channels that are in no array."""
-        rig, out = self._rig, dict[str, tuple[str, Felt]]()
+        rig, out = self._rig, dict[str, tuple[str, ForceSum]]()
         for name, (weights, places) in self._arrays.items():
             over = np.ones(len(places)) @ weights
             at = np.flatnonzero(over)
-            out[f"{name}.centre"] = "m", Felt(2 * at, (places @ weights)[at], over[at])
+            out[f"{name}.centre"] = "m", ForceSum(2 * at, (places @ weights)[at], over[at])
         at = 2 * sum(len(self._arrays[name][1]) for name in rig.contacts)
         names = [
             (key, unit)
@@ -420,7 +420,7 @@ class Touch:
             for key, unit in zip(ON_BODY, ("N", "N", "N.m"))
         ]
         return out | {
-            name: (unit, Felt(np.array([at + i]), np.ones(1)))
+            name: (unit, ForceSum(np.array([at + i]), np.ones(1)))
             for i, (name, unit) in enumerate(names)
         }
 
@@ -444,7 +444,7 @@ class Touch:
         inside = number.isdecimal() and int(number) < self.arrays.get(array, 0)
         return name in self.single or (inside and str(int(number)) == number)
 
-    def __getitem__(self, name: str) -> Felt:
+    def __getitem__(self, name: str) -> ForceSum:
         """Raises `KeyError` naming the channels that there are."""
         if name not in self:
             raise KeyError(f"there is no channel of touch `{name}`, but there are {self.shown}")
@@ -452,7 +452,7 @@ class Touch:
             return self.single[name][1]
         owner, kind, number = name.rsplit(".", 2)
         row = self._arrays[owner][0][[int(number)]]
-        return Felt(2 * row.indices.astype(np.int64) + FORCES.index(kind), row.data)
+        return ForceSum(2 * row.indices.astype(np.int64) + FORCES.index(kind), row.data)
 
     def unit(self, name: str) -> str:
         """SI unit of a channel."""

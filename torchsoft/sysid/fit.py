@@ -72,7 +72,7 @@ class Combination:
     @property
     def sentence(self) -> str:
         each = ", ".join(f"{name} {percent(sd)}" for name, sd in self.sds.items())
-        return f"the data see {self.formula} to {percent(self.sd)}, not each ({each})"
+        return f"only {self.formula} is determined ({percent(self.sd)}), not each ({each})"
 
 
 def percent(sd: float) -> str:

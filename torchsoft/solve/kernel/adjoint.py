@@ -460,7 +460,7 @@ def free_stretches(
 
 
 @compiled
-def feel(r: Any, i: int) -> None:
+def output_adjoint(r: Any, i: int) -> None:
     """Add to the cotangents of output i's state, parameters and signals the share of its forces:
     the adjoint of the stage of no length that gives them."""
     bar, state = r.recorded_bar[i], r.z.state[3]
@@ -495,7 +495,7 @@ def backward(r: Any) -> None:
     row = out_step.size - 1
     held, first_bar, start_bar = z.state[0], z.state[1], z.state[2]
     for i in range(out_step.size):
-        feel(r, i)
+        output_adjoint(r, i)
     if h.size == 0:
         for i in range(y_bar.size):
             y_bar[i] += outputs_bar[0, i]
