@@ -330,17 +330,23 @@ def _warn_of_misses(
 
 def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
     """Coefficients that no rig of springs and dashpots has: that of F_x is 1 / m of the bracket, a
-    slip of a body's own acts against it, a dashpot has the sign of its spring."""
+    slip of a body's own acts against it, a dashpot has the sign of its spring. A linear term beside
+    a friction of the same slip is part of that friction's curve, and none of these."""
     out, found = list[str](), dict[tuple[str, tuple[tuple[str, float], ...]], tuple[str, float]]()
     masses = [one.mass for one in records if one.mass is not None]
     rates = {rate: name for name, rate in KINEMATICS.items()}
+    curved = {
+        (target, tuple(factor.form.items()))
+        for target, term in zip(model.targets, model.terms)
+        for factor in term.factors if not term.linear
+    }  # fmt: skip
     for target, term, value in zip(model.targets, model.terms, model.coefficients.tolist()):
         form = dict(term.factors[0].form) if term.linear else {}
         if form.keys() == {"F_x"} and target == "v_Br" and masses:
             right = 1 / float(np.mean(masses))
             if abs(value / right - 1) > MASS_OFF:
                 out.append(f"{value:.3g} F_x in v_Br', where 1 / m is {right:.3g}")
-        if len(form) < 2:
+        if len(form) < 2 or (target, tuple(form.items())) in curved:
             continue
         spring = form.keys() <= rates.keys() and {rates[name]: x for name, x in form.items()}
         place = spring or form

@@ -28,7 +28,7 @@ NEWTON = 1e-10
 
 LENGTHS = 1e-8, 3e-9, 3e-8, 1e-9, 1e-7, 1e-10, 1e-6
 """Of differences, relative to the parameter, in the order in which they are tried until two
-neighbours agree."""
+neighbours agree with each other and with the derivative."""
 
 REPEATS = 4
 """Most runs along the steps of the one before, until all of them are solved as they are given."""
@@ -323,7 +323,7 @@ def _checked(
             much = factor(name, own)
             judged = _judged(
                 lambda h, name=name, much=much: differenced(h * much, {name: ways[name]}),
-                largest, bound,
+                {kind: found[name] for kind, found in own.items()}, largest, bound,
             )  # fmt: skip
         for kind, found in own.items():
             change = abs(finer[kind][name] - found[name]) if finer else None
@@ -335,10 +335,9 @@ def _checked(
         along = {name: much * ways[name] for name, much in factors.items()}
         parts = {name: much * found[name] for name, much in factors.items()}
         scale = {kind: sum(map(abs, parts.values()))}
-        judged = _judged(lambda h, along=along: differenced(h, along), scale, bound)
-        one = Derivative(
-            kind, TOGETHER, sum(parts.values()), None, *judged[kind], None, scale[kind]
-        )
+        whole = sum(parts.values())
+        judged = _judged(lambda h, along=along: differenced(h, along), {kind: whole}, scale, bound)
+        one = Derivative(kind, TOGETHER, whole, None, *judged[kind], None, scale[kind])
         derivatives.append(one)
     check = GradientCheck(tuple(derivatives), made, rtol)
     conclude(_faults(check, bound))
@@ -353,22 +352,33 @@ def _checked(
 
 
 def _judged(
-    differenced: Callable[[float], Mapping[str, float]], largest: Mapping[str, float], bound: float
+    differenced: Callable[[float], Mapping[str, float]],
+    expected: Mapping[str, float],
+    largest: Mapping[str, float],
+    bound: float,
 ) -> dict[str, tuple[float, float]]:
     """Of every value the difference and its uncertainty, from the two neighbouring lengths that
-    agree best."""
+    agree best: their distance, or the noise of shorter lengths, which falls with the length, since
+    noise may agree by chance. No further length is tried once the `expected` values are met."""
     found: dict[float, Mapping[str, float]] = {}
     best: dict[str, tuple[float, float]] = {}
     for length in LENGTHS:
         found[length] = differenced(length)
-        ordered = sorted(found)
-        for a, b in pairwise(ordered):
-            for kind in largest:
+        ordered, best = sorted(found), {}
+        for kind in largest:
+            noise = 0.0  # of the value itself, from lengths up to b
+            for a, b in pairwise(ordered):
                 spread = abs(found[a][kind] - found[b][kind])
                 spread = spread if np.isfinite(spread) else np.inf
-                if kind not in best or spread < best[kind][1]:
-                    best[kind] = found[b][kind], spread
-        if best and all(best[kind][1] <= 0.1 * bound * largest[kind] for kind in best):
+                noise = max(noise, a * spread if np.isfinite(spread) else 0.0)
+                uncertainty = max(spread, noise / b)
+                if kind not in best or uncertainty < best[kind][1]:
+                    best[kind] = found[b][kind], uncertainty
+        if best and all(
+            uncertainty <= 0.1 * bound * largest[kind]
+            and abs(value - expected[kind]) <= bound * largest[kind]
+            for kind, (value, uncertainty) in best.items()
+        ):
             break
     return best
 
