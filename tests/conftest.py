@@ -63,21 +63,14 @@ def still(
 
 
 def excited(
-    excitation: str | Excitation, file: RigFile | None = None, F_ff: float | None = None, **how: Any
-) -> BuiltRig:
-    """The paper's rig, or that of a file of it, under an excitation; F_ff [N] is the force fed
-    forward to the bracket, by default that which holds it."""
-    made = excite(PAPER if file is None else file, excitation, **how)
-    return made.override({} if F_ff is None else {"motion.F_ff.values": [0.0, F_ff]}).build()
-
-
-def clear(
-    excitation: Excitation, file: RigFile, parts: Mapping[str, Any] | None = None
+    excitation: str | Excitation, file: RigFile | None = None, F_ff: float | None = None,
+    parts: Mapping[str, Any] | None = None, **how: Any,
 ) -> BuiltRig:  # fmt: skip
-    """A file of the paper's rig under an excitation, its upper pad clear of the disc at the start:
-    runs that begin at a touch have no derivatives by what moves the disc."""
-    made = excite(file, excitation).override({"bodies.bracket.start.y": APART})
-    return made.build(parts or {})
+    """The paper's rig, or that of a file of it, with `parts` of its own, under an excitation; F_ff
+    [N] is the force fed forward to the bracket, by default that which holds it."""
+    made = excite(PAPER if file is None else file, excitation, **how)
+    fed = {} if F_ff is None else {"motion.F_ff.values": [0.0, F_ff]}
+    return made.override(fed).build(parts or {})
 
 
 def stroked(travel: float, stroke_time: float, **more: Any) -> Excitation:

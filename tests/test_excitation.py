@@ -7,7 +7,7 @@ import pytest
 from conftest import f64
 
 from torchsoft import BuiltRig, RigFile
-from torchsoft.rigs.excite import CATALOGUE, CLEAR, OFF_NODE, SINCE, Excitation, excite
+from torchsoft.rigs.excite import CATALOGUE, GRIP, OFF_NODE, SINCE, Excitation, excite
 
 RIGS = "paper", "light_grasp", "ellipse", "rounded_box"
 COARSE = {"elements_x": 40, "elements_y": 1}
@@ -33,7 +33,7 @@ def test_every_entry_of_the_catalogue_builds(rig, name):
     assert float(built.t[-1]) == one.duration
     values = followed(built, *built.t.tolist())
     heights = values["y_d"]
-    assert heights[0] - heights[40] == pytest.approx(CLEAR + one.depth, abs=1e-12)
+    assert heights[0] - heights[40] == pytest.approx(one.depth - GRIP, abs=1e-12)
     assert all(math.isfinite(x) for row in values.values() for x in row)
     moved = max(values["x_d"]) - min(values["x_d"])
     assert moved > 1e-3
@@ -42,8 +42,8 @@ def test_every_entry_of_the_catalogue_builds(rig, name):
 
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_rig_that_grasps_is_excited(rig):
-    """Its bracket begins just clear, comes down by the depth from the touch and moves to the side
-    by its own loop, and the force that holds it is fed forward."""
+    """Its bracket begins in a light grip, comes down to the depth from the touch and moves to the
+    side by its own loop, and the force that holds it is fed forward."""
     file = coarse(rig)
     before = file.bodies["bracket"].start
     changed = excite(file, Excitation(ROLL, duration=1.0, depth=1e-3))
@@ -52,20 +52,20 @@ def test_a_rig_that_grasps_is_excited(rig):
     state = built.rig.unpack(built.y0)
     x, y, _ = state.pose["bracket"].tolist()
     (upper,) = (one for one in built.rig.contacts if built.rig.pads[one].base == "bracket")
-    assert built.rig.penetration(upper, state).max().item() == pytest.approx(-CLEAR, rel=1e-3)
+    assert 0.0 < built.rig.penetration(upper, state).max().item() < GRIP
     assert x == pytest.approx(before.x + OFF_NODE)
     body = built.rig.contacts[upper].body
     assert state.pose[body][0].item() == pytest.approx(file.bodies[body].start.x + OFF_NODE)
     values = followed(built, 0.0, 0.375, SINCE, 0.8, 1.0)
-    assert values["y_d"] == pytest.approx([y, *[y - CLEAR - 1e-3] * 4], abs=1e-15)
+    assert values["y_d"] == pytest.approx([y, *[y + GRIP - 1e-3] * 4], abs=1e-15)
     assert values["x_d"] == pytest.approx([x, x, x, x + 4e-3, x + 4e-3], abs=1e-15)
     held = built.rig.unpack(built.rig.state({
         body: {"x": state.pose[body][0].item(), "y": "rest"},
         "bracket": {"x": x, "y": {"depth": 1e-3}},
     }))  # fmt: skip
-    assert y - held.pose["bracket"][1].item() == pytest.approx(CLEAR + 1e-3, abs=1e-15)
-    force = float(held.pads[upper][0][:, 1].detach().sum())
-    assert values["F_ff"] == pytest.approx([0.0, *[-force] * 4], rel=1e-6)
+    assert y - held.pose["bracket"][1].item() == pytest.approx(1e-3 - GRIP, abs=1e-15)
+    light, force = (float(one.pads[upper][0][:, 1].detach().sum()) for one in (state, held))
+    assert values["F_ff"] == pytest.approx([-light, *[-force] * 4], rel=1e-6)
     assert changed.names.keys() == file.names.keys()
     assert changed.materials == file.materials
 

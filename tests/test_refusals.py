@@ -348,7 +348,7 @@ PARTS: list[tuple[Call, str]] = [
                                                 "were given"),
     (lambda: looped(lambda w, w_dot, f, q, q_dot: (w - q)[3]), MUST + "IndexError"),
     (lambda: looped(lambda w, w_dot, f, q, q_dot: next(NUMBERS) * q),
-     "`actuators.x`: The law is another one when it is"),
+     "`actuators.x`: The law changed between calls"),
     # signals
     (lambda: Profile([0.0, 0.0], [1.0, 2.0]), "increase strictly"),
     (lambda: Sampled([0.0, NAN], [1.0, 2.0]), "increase strictly"),

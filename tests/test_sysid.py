@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RIG, clear, excited, stroked, waves
+from conftest import COARSE, PAPER, RIG, excited, stroked, waves
 
-from torchsoft.rigs.excite import CATALOGUE, CLEAR, Excitation
+from torchsoft.rigs.excite import CATALOGUE, GRIP, Excitation
 from torchsoft.sysid import (
     Problem,
     Recording,
@@ -122,7 +122,7 @@ SHORT = stroked(travel=8e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.
 def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(inertial):
     """The starting displacements are held, also where a pad's elasticity changes."""
     file = BASE.override({"pad.inertial": inertial})
-    data = record("short", clear(SHORT, file), {E: 0.9e6}, SENSORS)
+    data = record("short", excited(SHORT, file), {E: 0.9e6}, SENSORS)
     unknowns = {E: Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), TAU: Unknown()}
     problem = Problem([data], SENSORS, unknowns)
     check_derivatives(problem, problem.coordinates.start, RTOL, 1e-5, h=3e-6)
@@ -541,10 +541,10 @@ def test_visible_drops_what_cannot_be_separated_from_the_others():
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_excitations_begin_at_rest_with_the_upper_pad_clear(name):
+def test_excitations_begin_at_rest_in_a_light_grip(name):
     model, y0, _ = excited(name, BASE, F_ff=-10.0)
     state = model.unpack(y0)
     with torch.no_grad():
-        assert float(model.penetration("U", state).max()) == pytest.approx(-CLEAR, abs=1e-9)
+        assert 0.0 < float(model.penetration("U", state).max()) < GRIP
         assert model.penetration("L", state).gt(0).any()
         assert model(0.0, y0)[model.layout.slices["velocity", "disc"]][1].abs() < 1e-6

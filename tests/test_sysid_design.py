@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RIG, clear, grasp, stroked, turning
+from conftest import COARSE, PAPER, RIG, excited, grasp, stroked, turning
 
 from torchsoft import Profile, Reference
 from torchsoft.plan.knots import Bounds, Moves, profile
@@ -46,7 +46,7 @@ SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "e
 
 @pytest.fixture(scope="session")
 def plan():
-    return record("plan", clear(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    return record("plan", excited(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
 
 
 @pytest.fixture(scope="session")
@@ -288,7 +288,7 @@ def test_an_interruption_leaves_the_best_so_far(problem, monkeypatch):
 def test_the_next_recording_is_predicted(plan, problem):
     """What a recording would add is what it does add; one that cannot be made comes last."""
     motion = stroked(2e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.12, depth=DEPTH)
-    roll = record("roll", clear(motion, P), {}, SENSORS, rtol=1e-3, noise=0.0)
+    roll = record("roll", excited(motion, P), {}, SENSORS, rtol=1e-3, noise=0.0)
     same = replace(plan, name="same")
     ranked = rank([plan], [same, roll], SENSORS, problem.unknowns, rtol=1e-3)
     assert ranked[0].score < ranked[1].score

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from conftest import COARSE, PAPER, RIG, clear, stroked
+from conftest import COARSE, PAPER, RIG, excited, stroked
 from test_sysid import check_derivatives
 from torch import Tensor, nn
 
@@ -47,7 +47,7 @@ def given(recording: Recording, law: SlipLaw | None = None) -> Recording:
 @pytest.fixture(scope="module")
 def jerks():
     """Without noise, of the true law; the recording's own model has other numbers."""
-    planned = clear(JERKS, BASE, {FRICTION: Viscous(0.6, 100.0)})
+    planned = excited(JERKS, BASE, parts={FRICTION: Viscous(0.6, 100.0)})
     return record("jerks", planned, TRUTH | {E: 0.9e6}, SENSORS, noise=0.0)
 
 

@@ -16,9 +16,9 @@ SINCE = 0.5
 INTERVAL = 0.01
 """Time [s] between outputs."""
 
-CLEAR = 1e-4
-"""Gap [m] between the pads at the start: a run that begins at a touch has no derivative by what
-moves the bodies."""
+GRIP = 5e-5
+"""Depth [m] of the grasp at the start. A run that begins at a touch has no derivative by what moves
+the bodies; a body that is not gripped yet rolls on its pad to the middle of an element."""
 
 OFF_NODE = 0.3e-3
 """Distance [m] along the pads by which a grasp is moved: a start on a node, or in the middle of a
@@ -81,8 +81,8 @@ def excite(
     """The rig file with an excitation, one of `CATALOGUE` by name or another, in place of two of
     its motions: those that move a `body` with a pad across the pad and along it.
 
-    A vertical press starts just above where the body's pads touch, from where its depth counts, and
-    the effort that holds it is fed forward. The loop along the pad measures the body itself, or the
+    A vertical press starts in a light grip, its depth counts from the touch, and the effort that
+    holds it is fed forward. The loop along the pad measures the body itself, or the
     body that it `senses`; with its own the manipulated one may slip freely. All other motions stay.
     Raises `ValueError` where no body, or more than one, has both motions.
     """
@@ -99,7 +99,7 @@ def excite(
     press_loop, roll_loop = (loops[f"{body}.{axis}"] for axis in (across, along))
     times, values = (
         (0.0, excitation.grasp),
-        (0.0, way * (excitation.depth + (CLEAR if across == "y" else 0.0))),
+        (0.0, way * (excitation.depth - (GRIP if across == "y" else 0.0))),
     )
     grasp = {"times": times, "values": values, "offset": "start"}
     press = {"kind": "profile"} | grasp | dict(excitation.press or {})
@@ -110,11 +110,11 @@ def excite(
     motions = {press_loop.setpoint: press, roll_loop.setpoint: roll}
     actuators: dict[str, Any] = {}
     if (one := file.actuators.get(press_loop.actuators[0])) and one.feed_forward is not None:
-        held = {"times": times, "values": (0.0, "held")}
+        held = {"times": times, "values": ("held", "held")}
         motions[one.feed_forward] = {"kind": "profile"} | held
     if roll_loop.actuators[0] in file.actuators:
         actuators[roll_loop.actuators[0]] = {"measures": f"{senses or body}.{along}"}
-    starts: dict[str, dict[str, Any]] = {body: {"y": {"depth": -CLEAR}} if across == "y" else {}}
+    starts: dict[str, dict[str, Any]] = {body: {"y": {"depth": GRIP}} if across == "y" else {}}
     touched = (one.body for one in file.contacts.values() if file.pads[one.pad].base == body)
     for name in {body, *touched} if senses is None else ():
         given = getattr(file.bodies[name].start, along)
