@@ -29,7 +29,7 @@ import torch
 from torchsoft import Reference, RigFile, excite
 from torchsoft.experiment import COARSE, RIG, coloured, markdown, options, repeated, write
 from torchsoft.physics.motion import Profile, Sampled
-from torchsoft.rigs.excite import Excitation
+from torchsoft.rigs.excite import GRIP, Excitation
 from torchsoft.sysid import (
     IdentificationResult,
     Problem,
@@ -55,6 +55,9 @@ CALLED = {"theta_C": "theta", "effort_x": "F_x", "effort_y": "F_y"}
 
 SETTLE = 0.2
 """Time [s] that the rig is simulated before the first sample: the disc has been put down then."""
+
+CLEAR = 1e-4
+"""Gap [m] between disc and upper pad at the start, as the stranger's runs have it."""
 
 KEPT = 1e-3
 """Spacing [s] of the rows that are kept."""
@@ -127,7 +130,9 @@ def planned(excitation: str, smoke: bool) -> RigFile:
     known = {name: value for name, value in TRUTH.items() if name not in SMOKE_UNKNOWNS}
     less = COARSE | known if smoke else {}
     file = RigFile.ready("paper").override({"contact.v_s": 0.05} | less)
-    return excite(file, EXCITATIONS[excitation])
+    motion = EXCITATIONS[excitation]
+    motion = motion._replace(depth=motion.depth + GRIP + CLEAR)
+    return excite(file, motion).override({"bodies.bracket.start.y": {"depth": -CLEAR}})
 
 
 def numbers(file: RigFile, differs: Mapping[str, Any]) -> Numbers:
