@@ -250,7 +250,7 @@ def strokes(config: Config, travel: float, stroke_time: float, depth: float = DE
     """Strokes there and back from a light grasp with the horizontal loop on the bracket."""
     roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
     e = Excitation(roll, duration=0.5 + 4 * stroke_time + 0.01, depth=depth)
-    file = PAPER.override({"contact.v_s": 0.05} | (COARSE if config.smoke else {}))
+    file = PAPER.override({"contact.v_s": 0.05})
     built, t, start = excite(file, e).build(), grid(e.duration, 5e-4), 1000
     run = built.run(t[: start + 1], step=5e-4)
     rest = built.run(t[start:], y0=run.y[-1], step=5e-4)
