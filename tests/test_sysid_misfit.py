@@ -104,10 +104,10 @@ def test_the_level_is_judged_by_how_many_samples_there_are():
     (overall,) = [f for f in alarms(many, "level") if f.recording is None]
     assert overall.p < 1e-9
     assert overall.size == pytest.approx(1.058, abs=0.02)
-    assert residual_notices(many)[0].startswith(
+    assert residual_notices(many)["larger"].startswith(
         "residuals are larger than the noise that was stated"
     )
-    assert "all of them together 1.0" in residual_notices(many)[0]
+    assert "all of them together 1.0" in residual_notices(many)["larger"]
     few = Case(0, lengths=(13, 13), scale=1.12**0.5).judged()
     assert not alarms(few, "level")
 
@@ -117,11 +117,11 @@ def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well():
     loud = Case(1, fault={("run 1", "theta_C"): 0.9 * rng.standard_normal(400)}).judged()
     named = [f for f in alarms(loud, "level") if f.recording]
     assert [(f.recording, f.channel) for f in named] == [("run 1", "theta_C")]
-    assert "theta_C of `run 1` 1.27 times" in residual_notices(loud)[0]
+    assert "theta_C of `run 1` 1.27 times" in residual_notices(loud)["larger"]
     quiet = residual_notices(Case(1, scale=0.4).judged())
     assert len(quiet) == 1  # its pattern is not judged
-    assert quiet[0].startswith("residuals are smaller than the noise that was stated")
-    assert "and 4 more" in quiet[0]
+    assert quiet["smaller"].startswith("residuals are smaller than the noise that was stated")
+    assert "and 4 more" in quiet["smaller"]
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_what_follows_the_motion_is_named(kind, words):
     named = alarms(found, "motion")
     assert {(f.recording, f.channel) for f in named} == {where}
     assert any(words in f.words for f in named), [f.words for f in named]
-    assert any(words in notice for notice in residual_notices(found))
+    assert any(words in notice for notice in residual_notices(found).values())
 
 
 def test_colour_is_noticed_found_allowed_for_and_named():
@@ -235,7 +235,7 @@ def test_a_prior_that_the_data_contradict_is_named():
         assert one.alarming == (far > 0)
         assert any(
             "contradict what was known before, materials.rubber.E by" in notice
-            for notice in residual_notices(verdicts)
+            for notice in residual_notices(verdicts).values()
         ) == (far > 0)
     unseen = judge_residuals(
         parts,

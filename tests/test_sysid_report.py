@@ -98,6 +98,13 @@ def test_the_first_line_says_when_the_model_does_not_explain_the_data(found):
     assert "(χ² = 200), and intervals may miss the truth" in bad.headline
     assert "identifiable" not in bad.headline
     assert first in page_of(bad, *traces(bad, problem, None))
+    assert (answer.verdict, bad.verdict) == ("holds", "does not explain")
+    doubtful = replace(answer, doubts=["residuals are not white in x_C"])
+    assert doubtful.verdict == "doubtful"
+    assert doubtful.headline.startswith(
+        "The model is doubtful, a note below speaks against it; if it holds, 4 of 6 parameters"
+    )
+    assert json.loads(doubtful.to_json())["verdict"] == "doubtful"
 
 
 def test_a_prediction_with_values_that_nothing_tells_says_so(found):

@@ -591,7 +591,7 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
                 square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]),
                 float(aicc[i]), float(bic[i]), float(weight[i] / weight.sum()),
                 None if held is None else held.log / len(held.r), None if held is None else held.p,
-                one.numerical, one.law.converged, residual_notices(one.verdicts),
+                one.numerical, one.law.converged, [*residual_notices(one.verdicts).values()],
                 any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
             )
         )  # fmt: skip

@@ -64,7 +64,7 @@ from torchsoft.sysid.result import (
 )
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
-from torchsoft.sysid.suspects import assumption_notices
+from torchsoft.sysid.suspects import assumption_doubts, assumption_notices
 from torchsoft.sysid.unknowns import Coordinates
 from torchsoft.tables import SEED, Table, plain
 
@@ -217,10 +217,12 @@ def conclude(
             f"{end.jacobian_error:.2g} of the noise, and estimates scatter more than their "
             f"intervals say; take rtol = {FINER * rtol:g}"
         )
-    notices += assumption_notices(checked) if checked is not None else []
-    notices += residual_notices(
-        verdicts, max(1.0, chi2) ** 0.5 if context.loss == "linear" else 1.0
-    )
+    alarms = residual_notices(verdicts, max(1.0, chi2) ** 0.5 if context.loss == "linear" else 1.0)
+    doubts = [sentence for kind, sentence in alarms.items() if kind != "smaller"]
+    if checked is not None:
+        notices += assumption_notices(checked)
+        doubts = assumption_doubts(checked) + doubts
+    notices += alarms.values()
     notices += refusal(coloured) + colour_notices(coloured.found, declared)
     return IdentificationResult(
         estimates=found,
@@ -235,6 +237,7 @@ def conclude(
         residuals=residual_channels(problem, at, context.fitted),
         heldout=predicted,
         notices=notices,
+        doubts=doubts,
         stages=stages,
         cost={
             "simulations": runner.simulations, "jacobians": runner.jacobians,

@@ -394,9 +394,9 @@ SENTENCES: dict[str, str] = {
 }
 
 
-def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:
-    """A sentence for each kind of alarm, naming recordings and channels, the clearest first;
-    `widened` [1] is the factor on intervals for residuals that are too large."""
+def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> dict[str, str]:
+    """By kind of alarm a sentence that names recordings and channels, the clearest first; `widened`
+    [1] is the factor on intervals for residuals that are too large."""
     kinds: dict[str, list[Verdict]] = {kind: [] for kind in SENTENCES}
     for verdict in sorted(
         (f for f in verdicts if f.alarming), key=lambda f: (f.recording is None, f.p)
@@ -411,7 +411,7 @@ def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[
     }
     if "larger" in out and widened >= 1.005:
         out["larger"] += f"; intervals are widened by {widened:.3g}"
-    return list(out.values())
+    return out
 
 
 def named(words: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -136,6 +136,8 @@ SCHEMA = "torchsoft-answer-6"
 LARGEST = 1e9
 """Largest size [B] of an answer's file."""
 
+Verdict = Literal["holds", "doubtful", "does not explain"]
+
 UNEXPLAINED = 1.25
 """RMS residual of a channel, over its stated noise, above which the headline says that the model
 does not explain the data."""
@@ -177,6 +179,7 @@ class IdentificationResult(Shown):
         str, dict[str, Number]
     ]  # NRMSE of recordings that were not fitted, by recording and channel
     notices: list[str]
+    doubts: list[str]  # the notices that speak against the model
     stages: list[dict[str, Any]]
     cost: dict[str, Number]
     made_by: dict[str, Any]
@@ -224,19 +227,30 @@ class IdentificationResult(Shown):
         return self.headline, rows
 
     @property
+    def verdict(self) -> Verdict:
+        """Whether the model holds, is in doubt, or does not explain the data."""
+        if any(one.stated >= UNEXPLAINED for one in self.residuals):
+            return "does not explain"
+        return "doubtful" if self.doubts else "holds"
+
+    @property
     def headline(self) -> str:
-        """First line of a report: the model does not explain the data, or the number of
-        identifiable parameters."""
+        """First line of a report: the verdict on the model, where it is not that it holds, and the
+        number of identifiable parameters."""
         mine = [e for e in self.estimates if e.kind == "parameter"]
-        worst = max(self.residuals, key=lambda one: one.stated, default=None)
         text = (
             f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = "
             f"{self.chi2:.3g}"
         )
         if not abs(self.chi2_stated - self.chi2) < 0.1 * self.chi2:
             text += f", {self.chi2_stated:.3g} against the stated noise"
-        if worst is None or worst.stated < UNEXPLAINED:
+        if self.verdict == "doubtful":
+            several = len(self.doubts) > 1
+            held = f"{len(self.doubts)} notes below speak" if several else "a note below speaks"
+            return f"The model is doubtful, {held} against it; if it holds, {text}"
+        if self.verdict == "holds":
             return text
+        worst = max(self.residuals, key=lambda one: one.stated)
         size = f"residuals of {worst.channel} are {worst.stated:.2g} times the stated noise"
         return (
             f"The model does not explain the data: {size} (χ² = {self.chi2_stated:.3g}), and "
@@ -349,7 +363,8 @@ class IdentificationResult(Shown):
 
     def to_json(self) -> str:
         """Content of the file."""
-        content = finite(adapter().dump_python(self, mode="json", by_alias=True))
+        content = {"verdict": self.verdict}
+        content |= finite(adapter().dump_python(self, mode="json", by_alias=True))
         return json.dumps(
             {"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False
         )
@@ -406,6 +421,7 @@ def schema() -> dict[str, Any]:
             "pattern": "^[0-9a-f]{64}$",
             "description": "SHA-256 of the rest, names sorted.",
         },
+        "verdict": {"enum": list(get_args(Verdict)), "description": "What is said of the model."},
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -443,6 +459,7 @@ def load_answer(path: str | Path) -> IdentificationResult:
             f"{path} is damaged: its content is not what was saved; restore it from a copy, or "
             "identify again"
         )
+    content.pop("verdict", None)  # it follows from the rest
     # of a steep friction law, which was fitted nevertheless
     with refusing(content, str(path)), warnings.catch_warnings(action="ignore"):
         return adapter().validate_json(json.dumps(content))

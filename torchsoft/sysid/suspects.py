@@ -24,8 +24,19 @@ no notice."""
 
 
 def assumption_notices(checked: Checked) -> list[str]:
-    """Sentences on suspected assumptions, the strongest first, and on constants of the computation
-    that affect the estimates."""
+    """Sentences on suspected assumptions, the strongest first, on those that were not tried, and on
+    constants of the computation that affect the estimates."""
+    out = assumption_doubts(checked)
+    if checked.untried:
+        out.append(
+            f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
+            "tries them"
+        )
+    return out + constant_notices(checked.checks)
+
+
+def assumption_doubts(checked: Checked) -> list[str]:
+    """Sentences on what the data hold against the assumptions, the strongest first."""
     out, checks = [], checked.checks
     favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
     if checked.candidates and not favoured:
@@ -38,11 +49,6 @@ def assumption_notices(checked: Checked) -> list[str]:
         out.append(
             f"no suspect explains to first order all that the fit left; {nearest}: `explain` fits "
             f"again with each of {len(checked.candidates)} and compares them"
-        )
-    if checked.untried:
-        out.append(
-            f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
-            "tries them"
         )
     if favoured and favoured[0].refitted and max(checked.left.values(), default=0.0) > NO_CAUSE:
         best = favoured[0]
@@ -64,6 +70,12 @@ def assumption_notices(checked: Checked) -> list[str]:
             for channel, size in sorted(left.items(), key=lambda item: -item[1])
         )
         out.append(f"none of {len(checks)} suspects explains {sizes}")
+    return out
+
+
+def constant_notices(checks: Sequence[AssumptionTest]) -> list[str]:
+    """Sentences on constants of the computation that affect the estimates."""
+    out = list[str]()
     moved_on = any(c.refitted and c.suspected for c in checks)  # to another end than the fit's
     for c in checks:
         if c.kind == "numerical" and c.unchecked:
