@@ -282,10 +282,14 @@ def main(config: Config) -> None:
     judged = repeated(lambda k: judge(cases[k]), len(cases), config.workers, "cases")
     groups = summed(judged, motions)
     rows = [
-        (row["group"], row["cases"], " / ".join(f"{v:.2g}" for v in row["D"]),
-         *(row[answer] for answer in ANSWERS))
+        (
+            row["group"],
+            row["cases"],
+            " / ".join(f"{v:.2g}" for v in row["D"]),
+            *(row[answer] for answer in ANSWERS),
+        )
         for row in groups
-    ]  # fmt: skip
+    ]
     table = markdown(("data", "cases", "D least / median / most", *ANSWERS), rows)
     every = [
         {

@@ -165,8 +165,10 @@ def runs(config: Config, url: str, split: str, count: int) -> Runs:
         }  # fmt: skip
         grip = Profile([0.0, 0.2], [-5.0, float(one["motion.grip.values.1"])])
         references.append(Reference(**held, grip=grip, upper_rate=Profile([0.0], [0.0])))
-        columns = [one[name].values + sd * draws.standard_normal(one.sizes["time"])
-                   for name, sd in NOISE.items()]  # fmt: skip
+        columns = [
+            one[name].values + sd * draws.standard_normal(one.sizes["time"])
+            for name, sd in NOISE.items()
+        ]
         measured.append(torch.from_numpy(np.stack(columns, -1)))
     return Runs(torch.tensor(data["time"].values), references, measured)
 
@@ -187,8 +189,14 @@ class Residual:
 
     def misfit(self, given: Runs, i: int, gradient: Literal["none", "discrete"] = "none") -> Tensor:
         """Run i less its measurement (T, 2), over `SCALE`. Raises `SimulationFailed`."""
-        run = simulate(self.rig, given.t, y0=self.y0, reference=given.references[i],
-                       rtol=1e-4, gradient=gradient)  # fmt: skip
+        run = simulate(
+            self.rig,
+            given.t,
+            y0=self.y0,
+            reference=given.references[i],
+            rtol=1e-4,
+            gradient=gradient,
+        )
         scale = torch.tensor(list(SCALE.values()), dtype=torch.float64)
         return (run.together(*SCALE) - given.measured[i]) / scale
 
@@ -218,8 +226,7 @@ class Residual:
     def errors(self, given: Runs) -> dict[str, float]:
         """Root mean square misfits on runs, by channel [m, rad]."""
         with torch.no_grad():
-            squares = [self.misfit(given, i).square().mean(0)
-                       for i in range(len(given.references))]  # fmt: skip
+            squares = [self.misfit(given, i).square().mean(0) for i in range(len(given.references))]
         rms = torch.stack(squares).mean(0).sqrt().tolist()
         return {name: x * scale for (name, scale), x in zip(SCALE.items(), rms)}
 
@@ -352,8 +359,11 @@ def run(config: Config) -> tuple[dict[str, Any], Figure]:
     with torch.no_grad():
         v = torch.linspace(low, high, 100, dtype=torch.float64)
         off = (network.law.mu(v) - true_mu(network.truth, v)).abs()
-    found |= {"mu_error_mean": float(off.mean()), "mu_error_max": float(off.max()),
-              "slip_mm_s": [1e3 * low, 1e3 * high]}  # fmt: skip
+    found |= {
+        "mu_error_mean": float(off.mean()),
+        "mu_error_max": float(off.max()),
+        "slip_mm_s": [1e3 * low, 1e3 * high],
+    }
     found["surrogate"], found["windows_per_second"] = surrogates(config, url)
     return found, figure(network, fitted, (low, high), found)
 

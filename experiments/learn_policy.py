@@ -132,8 +132,9 @@ class Training:
         self._bar.update(min(round(now), self._bar.total) - self._bar.n)
         over = now >= self.config.seconds
         if over or now >= self._next * self.config.seconds / self.config.evaluations:
-            mean = float(np.mean([episode(self.env, act, 1000 + i)
-                                  for i in range(self.config.episodes)]))  # fmt: skip
+            mean = float(
+                np.mean([episode(self.env, act, 1000 + i) for i in range(self.config.episodes)])
+            )
             self.history.samples.append(samples)
             self.history.seconds.append(now)
             self.history.returns.append(mean)
@@ -217,8 +218,9 @@ class Walk:
 
 def walk(env: RigEnv, policy: nn.Module, critic: nn.Module, moment: Any, horizon: int) -> Walk:
     dynamics, rewards, seen = env.dynamics, list[Tensor](), list[Tensor]()
-    now = moment._replace(y=moment.y.detach(), action=moment.action.detach(),
-                          recorded=moment.recorded.detach())  # fmt: skip
+    now = moment._replace(
+        y=moment.y.detach(), action=moment.action.detach(), recorded=moment.recorded.detach()
+    )
     observed, failed, values = dynamics.observe(now)[:SEEN], False, list[Tensor]()
     for _ in range(horizon):
         seen.append(observed.detach())
@@ -408,8 +410,9 @@ def reached(every: Sequence[History]) -> dict[str, Any]:
     out: dict[str, Any] = {"level": level}
     for name in dict.fromkeys(one.method for one in every):
         mine = [one for one in every if one.method == name]
-        first = [next((i for i, x in enumerate(one.returns) if x >= LEVEL * level), None)
-                 for one in mine]  # fmt: skip
+        first = [
+            next((i for i, x in enumerate(one.returns) if x >= LEVEL * level), None) for one in mine
+        ]
         there = [(one, i) for one, i in zip(mine, first) if i is not None]
         out[name] = {
             "returns": [one.returns[-1] for one in mine], "reached": len(there),
@@ -428,9 +431,16 @@ def table(every: Sequence[History], content: dict[str, Any]) -> str:
     for name in dict.fromkeys(one.method for one in every):
         one, mine = found[name], [h for h in every if h.method == name]
         returns = " ".join(f"{x:.1f}" for x in sorted(one["returns"]))
-        rows.append((name, returns, middle([h.samples[-1] for h in mine]),
-                     f"{one['reached']} of {len(mine)}", middle(one["samples"]),
-                     middle(one["seconds"])))  # fmt: skip
+        rows.append(
+            (
+                name,
+                returns,
+                middle([h.samples[-1] for h in mine]),
+                f"{one['reached']} of {len(mine)}",
+                middle(one["samples"]),
+                middle(one["seconds"]),
+            )
+        )
     head = ("method", "returns at the end", "samples", f"reach {LEVEL:.0%} of PPO's",
             "after samples", "after seconds")  # fmt: skip
     parts = [markdown(head, rows)]

@@ -326,11 +326,19 @@ def table(result: Result) -> str:
         "effort [N]", "verdict",
     )  # fmt: skip
     rows = [
-        (GROUPS[group].format(key), f"{x.position_mm:.4f}", f"{x.angle_deg:.3f}",
-         f"{x.rest_mm:.4f}", f"{x.rest_deg:.4f}", f"{x.friction:.3g}", f"{x.effort:.3g}",
-         x.verdict)
-        for group, some in result.outcomes.items() for key, x in some.items()
-    ]  # fmt: skip
+        (
+            GROUPS[group].format(key),
+            f"{x.position_mm:.4f}",
+            f"{x.angle_deg:.3f}",
+            f"{x.rest_mm:.4f}",
+            f"{x.rest_deg:.4f}",
+            f"{x.friction:.3g}",
+            f"{x.effort:.3g}",
+            x.verdict,
+        )
+        for group, some in result.outcomes.items()
+        for key, x in some.items()
+    ]
     demand = markdown(
         ("rigid", "asks for a friction of"),
         [(name, f"{one.friction:.3g}") for name, one in result.rigid.items()],
@@ -363,8 +371,9 @@ def inertia_alone(case: Case, bandwidth: float) -> tuple[float, float]:
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = replace(config, speeds=(6.0,), aspects=(1.3,), frictions=(0.2,),
-                         passes=1, rtol=1e-3)  # fmt: skip
+        config = replace(
+            config, speeds=(6.0,), aspects=(1.3,), frictions=(0.2,), passes=1, rtol=1e-3
+        )
     mesh = {"elements_x": 35, "elements_y": 2}
     gains = design(READY, config.bandwidth)
     file = file_of(gains, pads={"lower": mesh, "upper": mesh}) if config.smoke else file_of(gains)

@@ -76,8 +76,11 @@ def case(body: str, grip: str, mu: float | None = None) -> RigFile:
     """The rig with a body between its fingers."""
     shape, reach = BODIES[body]
     x = reach + HEIGHT - GRIPS[grip]
-    friction = {} if mu is None else {"friction": {"kind": "smooth", "mu_s": mu, "mu_k": 0.9 * mu,
-                                                   "v_s": 50e-3}}  # fmt: skip
+    friction = (
+        {}
+        if mu is None
+        else {"friction": {"kind": "smooth", "mu_s": mu, "mu_k": 0.9 * mu, "v_s": 50e-3}}
+    )
     return RigFile.from_toml(RIG).override(
         bodies={"object": {"shape": shape}, "left": {"start": {"x": -x}},
                 "right": {"start": {"x": x}}},
@@ -278,20 +281,29 @@ def table(result: dict[str, Any]) -> str:
     head = ("turn", "reached", "angle off [deg]", "place off [mm]", "within all after [s]",
             "in all [s]", "evaluations")  # fmt: skip
     rows = [
-        (name, "yes" if one["reached"] else "no", f"{one['angle_deg']:.3f}",
-         f"{one['place_mm']:.4f}",
-         "-" if one["seconds_to_reach"] is None else f"{one['seconds_to_reach']:.1f}",
-         f"{one['seconds']:.1f}", str(one["evaluations"]))
+        (
+            name,
+            "yes" if one["reached"] else "no",
+            f"{one['angle_deg']:.3f}",
+            f"{one['place_mm']:.4f}",
+            "-" if one["seconds_to_reach"] is None else f"{one['seconds_to_reach']:.1f}",
+            f"{one['seconds']:.1f}",
+            str(one["evaluations"]),
+        )
         for name, one in result["turns"].items()
-    ]  # fmt: skip
+    ]
     out = [markdown(head, rows)]
     if "rivals" in result:
         out.append(numbers("60 degrees otherwise", result["rivals"]))
-        out.append(markdown(
-            ("little friction", "reached", "why not"),
-            [(name, "yes" if one["reached"] else "no", "; ".join(one["reasons"]) or "-")
-             for name, one in result["little friction"].items()],
-        ))  # fmt: skip
+        out.append(
+            markdown(
+                ("little friction", "reached", "why not"),
+                [
+                    (name, "yes" if one["reached"] else "no", "; ".join(one["reasons"]) or "-")
+                    for name, one in result["little friction"].items()
+                ],
+            )
+        )
         out.append(numbers("on uncertain rigs, rms", result["uncertain"]))
     return "\n\n".join(out)
 

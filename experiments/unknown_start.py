@@ -215,9 +215,15 @@ def main(config: Config) -> None:
                 ],
             }  # fmt: skip
             cells.append(
-                (case, name, f"{sd:.1%}", f"{at.known[name]:.1%}", f"{sd / at.known[name]:.2f}",
-                 f"{inside} of {len(found)}" if sd < SHOWN else "not shown")
-            )  # fmt: skip
+                (
+                    case,
+                    name,
+                    f"{sd:.1%}",
+                    f"{at.known[name]:.1%}",
+                    f"{sd / at.known[name]:.2f}",
+                    f"{inside} of {len(found)}" if sd < SHOWN else "not shown",
+                )
+            )
         cases[case] = {
             "parameters": rows, "coordinates": at.coordinates, "jacobian_s": at.exact_s,
             "jacobian_by_differences_s": at.differences_s, "assuming_rest": result.rest[case],

@@ -151,8 +151,11 @@ def test_the_kernels_know_no_law():
 
 def test_rigs_are_drawn_in_one_room():
     """Whatever else they do needs no matplotlib."""
-    drawing = {name for name, path in MODULES.items() if layer(name, "") == "rigs" and "plot" in
-               {layer(other, "") for other in imports(path)}}  # fmt: skip
+    drawing = {
+        name
+        for name, path in MODULES.items()
+        if layer(name, "") == "rigs" and "plot" in {layer(other, "") for other in imports(path)}
+    }
     assert drawing == {"rigs.run"}
 
 

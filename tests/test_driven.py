@@ -112,8 +112,16 @@ def test_gradients_of_the_force(built: BuiltRig):
     places.requires_grad_(True)
     run = simulate(rig, t, y0=y0, gradient="discrete", rtol=1e-5)
     by_tau, by_place = torch.autograd.grad(run["indenter.load_y"][60], [tau, places])
-    along = simulate(rig, t, y0=y0, gradient="forward", wrt=[TAU], touch=["indenter.load_y"],
-                     rigid=True, knots=run.knots)  # fmt: skip
+    along = simulate(
+        rig,
+        t,
+        y0=y0,
+        gradient="forward",
+        wrt=[TAU],
+        touch=["indenter.load_y"],
+        rigid=True,
+        knots=run.knots,
+    )
     assert along.sensitivities is not None
     assert along.sensitivities.shape == (len(t), 0, 1)
     felt = float(along.touch_sensitivities["indenter.load_y"][60])

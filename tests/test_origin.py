@@ -102,8 +102,9 @@ def test_gradients_from_any_clock(t0: float):
         options: dict[str, Any] = {"y0": one.state().detach(), "rtol": 1e-4}
         run = simulate(one, begin + times(), gradient="discrete", **options)
         adjoint = torch.autograd.grad(run["disc.load_y"].sum(), [E, values])
-        along = simulate(one, begin + times(), gradient="forward", wrt=[name],
-                         touch=["disc.load_y"], **options)  # fmt: skip
+        along = simulate(
+            one, begin + times(), gradient="forward", wrt=[name], touch=["disc.load_y"], **options
+        )
         slope = along.touch_sensitivities["disc.load_y"].sum()
         assert float(slope) == pytest.approx(float(adjoint[0]), rel=1e-6)
         again = simulate(one, begin + times(), y0=options["y0"], knots=run.knots)

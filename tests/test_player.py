@@ -215,8 +215,10 @@ def test_it_plays_zooms_and_switches(page, tmp_path):
     pictures = []
     for quantity in ("von Mises stress", "displacement", "plain"):
         page.run(SLIDE, 29)
-        page.run("const q = document.getElementById('quantity'); q.value = arguments[0]; "
-                 "q.onchange()", quantity)  # fmt: skip
+        page.run(
+            "const q = document.getElementById('quantity'); q.value = arguments[0]; q.onchange()",
+            quantity,
+        )
         (tmp_path / "page.png").write_bytes(page.picture())
         with Image.open(tmp_path / "page.png") as picture:
             pictures.append(np.asarray(picture.convert("RGB"), dtype=float))

@@ -108,10 +108,14 @@ def test_saturating_friction_is_recovered():
 def test_ensembles_give_intervals_and_leave_the_global_generator(motions):
     rng = np.random.default_rng(0)
     rough = [
-        replace(one, series={k: x + 0.005 * x.std() * rng.standard_normal(len(x))
-                             for k, x in one.series.items()})
+        replace(
+            one,
+            series={
+                k: x + 0.005 * x.std() * rng.standard_normal(len(x)) for k, x in one.series.items()
+            },
+        )
         for one in motions
-    ]  # fmt: skip
+    ]
     recipe, before = replace(RECIPE, models=20, threshold=0.05), np.random.get_state()[1].copy()  # noqa: NPY002
     model = fit(assemble(rough, mechanics(R), recipe), recipe)
     again = fit(assemble(rough, mechanics(R), recipe), recipe)
@@ -374,8 +378,10 @@ def test_saved_runs_are_reduced_by_a_command(tmp_path, capsys):
     files = []
     for seed in range(2):
         phases = np.random.default_rng(seed).uniform(0, 6, 10).tolist()
-        waves = [{"amplitude": 3e-6, "frequency": float(f), "phase": phase}
-                 for f, phase in zip(np.geomspace(3, 120, 10), phases)]  # fmt: skip
+        waves = [
+            {"amplitude": 3e-6, "frequency": float(f), "phase": phase}
+            for f, phase in zip(np.geomspace(3, 120, 10), phases)
+        ]
         x_d = {"kind": "sines", "since": 0.6, "until": 1.2, "components": waves}
         outputs = {"duration": 1.1, "interval": 2.5e-4, "snapshots": []}
         ready = template("t").override(motion={"x_d": x_d}, outputs=outputs).build()
@@ -388,8 +394,11 @@ def test_saved_runs_are_reduced_by_a_command(tmp_path, capsys):
     assert summary["feedback"]["F_x"]["x_Br"] == pytest.approx(-1e5, rel=1e-3)
     assert summary["held_out"] == files[1]
     assert "Score: error at most" in capsys.readouterr().out
-    refused = {"--held-out": ["reduce", files[0]], "--threshold": [*command, "--threshold", "2"],
-               "--radius": [*command, "--radius", "-1"]}  # fmt: skip
+    refused = {
+        "--held-out": ["reduce", files[0]],
+        "--threshold": [*command, "--threshold", "2"],
+        "--radius": [*command, "--radius", "-1"],
+    }
     for said, wrong in refused.items():
         assert main([*wrong, "--out", str(tmp_path / "other")]) == 2
         assert said in capsys.readouterr().err
@@ -397,8 +406,10 @@ def test_saved_runs_are_reduced_by_a_command(tmp_path, capsys):
 
 def test_a_fit_that_misses_its_record_says_why(motions):
     """Coarse samples of a large motion; a law on the wrong coordinate; no law at all."""
-    coarse_ones = [Record(one.t[::100], {k: x[::100] for k, x in one.series.items()})
-                   for one in (motion(truth(), seed, 3.0) for seed in range(4))]  # fmt: skip
+    coarse_ones = [
+        Record(one.t[::100], {k: x[::100] for k, x in one.series.items()})
+        for one in (motion(truth(), seed, 3.0) for seed in range(4))
+    ]
     slow = Recipe(width=0.05, window=3.0)
     with pytest.warns(UserWarning, match=r"record \d, it .*; take small taps .* a sample is 10 ms"):
         fit(assemble(coarse_ones, mechanics(R), slow), slow, LAW)
@@ -425,8 +436,10 @@ def test_coefficients_that_no_rig_has_are_named(motions):
             assemble([replace(one, mass=0.6) for one in motions], mechanics(R), RECIPE), RECIPE, LAW
         )
     library = mechanics(R)
-    wrong = {"v_C": list(zip(library["v_C"][:2], (1e5, -9e2))),
-             "omega": list(zip(library["omega"][2:4], (2e6, -5e3)))}  # fmt: skip
+    wrong = {
+        "v_C": list(zip(library["v_C"][:2], (1e5, -9e2))),
+        "omega": list(zip(library["omega"][2:4], (2e6, -5e3))),
+    }
     model = ReducedModel(STATES, ("F_x",), KINEMATICS, wrong | {"v_Br": []}, feedback=LAW)
     drives, opposite, others = contradictions(model, motions)
     assert drives == "-900 (v_Br - 2 v_C) in v_C' drives the motion"

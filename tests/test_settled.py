@@ -149,12 +149,15 @@ def test_refusals():
     far = {name: torch.full_like(s, 1e-3) for name, s in state.stretch.items()}
     away = state.pose | {"disc": f64(0.06, 0.01, 0.0)}
     for changed, kind, message in (
-        ({"pose": {"disc": state.pose["disc"]}}, ValueError,
-         r"`pose` must be given by the names \['disc', 'bracket'\]"),
+        (
+            {"pose": {"disc": state.pose["disc"]}},
+            ValueError,
+            r"`pose` must be given by the names \['disc', 'bracket'\]",
+        ),
         ({"stretch": unknown}, ValueError, "61 finite numbers"),
         ({"pose": state.pose | {"disc": f64(0.0, 0.0)}}, ValueError, "3 finite numbers"),
         ({"pose": away, "stretch": far}, NoEquilibrium, "`L` does not settle"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(kind, match=message):
             around(model, state._replace(**changed))
     with torch.inference_mode(), pytest.raises(ValueError, match="inference_mode"):

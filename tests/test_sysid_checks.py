@@ -508,8 +508,15 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
 
 def test_no_bound_is_to_be_widened_for_what_is_not_identifiable():
     for seen in (False, True):
-        one: Any = SimpleNamespace(identifiable=seen, at_bound=True, relative_sd=2.0, label="a",
-                                   name="a", last=1.0, step_bias_sd=0.0)  # fmt: skip
+        one: Any = SimpleNamespace(
+            identifiable=seen,
+            at_bound=True,
+            relative_sd=2.0,
+            label="a",
+            name="a",
+            last=1.0,
+            step_bias_sd=0.0,
+        )
         said = notices_on([one], {}, True, 1e-5, False)
         assert any("widen" in text for text in said) == seen
 
@@ -518,8 +525,15 @@ def test_a_shift_is_said_of_what_moves_in_numbers_that_mean_something():
     """No estimate at a bound, and no part of a sensor's fault that is next to nothing."""
 
     def one(label: str, **others: Any) -> Any:
-        usual = {"identifiable": True, "at_bound": False, "relative_sd": 0.01, "last": 2.0,
-                 "step_bias_sd": 2.0, "unit": "m", "name": label}  # fmt: skip
+        usual = {
+            "identifiable": True,
+            "at_bound": False,
+            "relative_sd": 0.01,
+            "last": 2.0,
+            "step_bias_sd": 2.0,
+            "unit": "m",
+            "name": label,
+        }
         return SimpleNamespace(label=label, **usual | others)
 
     bound = one("at its bound", at_bound=True, step_bias_sd=-1e7, relative_sd=2.0)
@@ -547,7 +561,8 @@ def test_a_known_number_that_holds_an_unknown_one_is_named():
     problem = Problem([recorded()], SENSORS, {"contact.mu_s": Unknown()})
     held = held_by(problem)
     assert held == {MU_S: (MU_K, 0.7)}
-    one: Any = SimpleNamespace(identifiable=True, at_bound=True, label="mu_s", name=MU_S,
-                               last=0.70007, step_bias_sd=0.0)  # fmt: skip
+    one: Any = SimpleNamespace(
+        identifiable=True, at_bound=True, label="mu_s", name=MU_S, last=0.70007, step_bias_sd=0.0
+    )
     (said,) = notices_on([one], held, True, 1e-5, False)
     assert f"{MU_K} = 0.7, which is known, holds it there; is that right?" in said

@@ -62,10 +62,15 @@ class Case:
         y = np.concatenate([x if w is None else w @ x for w, x in zip(W, rows)])
         x = np.linalg.lstsq(J, y, rcond=None)[0]
         parts = [
-            Part(*one[:4], raw=raw - j @ x, reading=one[4], noise=self.assumed,
-                 whitened=(lambda rows: rows) if w is None else w.__matmul__)
+            Part(
+                *one[:4],
+                raw=raw - j @ x,
+                reading=one[4],
+                noise=self.assumed,
+                whitened=(lambda rows: rows) if w is None else w.__matmul__,
+            )
             for one, raw, j, w in zip(known, rows, columns, W)
-        ]  # fmt: skip
+        ]
         return parts, y - J @ x, J
 
 
@@ -215,8 +220,10 @@ def test_saturated_samples_and_ends_that_cannot_be_tested():
     judged = judge_residuals(some, quiet, np.where((quiet == 0)[:, None], 0.0, J))
     assert not any(f.alarming for f in judged)
     assert not colours(some, J)
-    short = [p._replace(**cut(p, slice(3)) | {"rows": np.arange(3 * i, 3 * i + 3)})
-             for i, p in enumerate(parts)]  # fmt: skip
+    short = [
+        p._replace(**cut(p, slice(3)) | {"rows": np.arange(3 * i, 3 * i + 3)})
+        for i, p in enumerate(parts)
+    ]
     assert not any(f.alarming for f in judge_residuals(short, r[:18], np.zeros((18, 4))))
 
 

@@ -285,10 +285,12 @@ def test_refusals(cut):
     for how, message in (
         ({"lead": 0.01}, "`x_C` of recording `roll` has 2 samples in .*take a longer `lead`"),
         ({"lead": 5.0}, "no two samples of `x_C` left"),
-        ({"sensors": RIG | {"x_C": Sensor(noise=1e-5, delay=0.08)}},
-         "`x_C` may come late by 0.08 s, but runs are known only from 0.05 s"),
+        (
+            {"sensors": RIG | {"x_C": Sensor(noise=1e-5, delay=0.08)}},
+            "`x_C` may come late by 0.08 s, but runs are known only from 0.05 s",
+        ),
         ({"given": {"disc.z": (0.0, 1.0)}}, r"`given` speaks of `disc\.z`"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=message):
             estimate_initial_state(recording, **{"sensors": RIG} | how)
     deep = deepcopy(dict(start.bodies)) | {"disc.y": (-1.0, 1.0)}

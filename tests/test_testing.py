@@ -88,8 +88,9 @@ def test_a_sign_that_depends_on_the_steps_is_told_of():
     for rtol in (1e-4, 1e-7):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            checked = check_gradients(rig, times(END, 4), y0, wrt=["gravity", "rubber.E"],
-                                      rtol=rtol)  # fmt: skip
+            checked = check_gradients(
+                rig, times(END, 4), y0, wrt=["gravity", "rubber.E"], rtol=rtol
+            )
         found[rtol] = checked.derivatives[0], [str(w.message) for w in caught]
     (rough, said), (fine, nothing) = found.values()
     assert rough.adjoint * fine.adjoint < 0

@@ -77,8 +77,9 @@ def static(config: Config, rig: Rig) -> dict[str, float]:
 def run(config: Config) -> dict[str, dict[str, float]]:
     """Numbers of every case by its label."""
     if config.smoke:
-        config = replace(config, elements_x=(120,), points=(0, 2), places=5, duration=0.8,
-                         window=(0.5, 0.8))  # fmt: skip
+        config = replace(
+            config, elements_x=(120,), points=(0, 2), places=5, duration=0.8, window=(0.5, 0.8)
+        )
     out = {}
     for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
         built = build(*case)

@@ -8,9 +8,9 @@ theta(end) / d parameter for eight parameters, by the discrete adjoint.
 
 Command: .venv/bin/python experiments/validation/step_accuracy.py [--smoke]
 Expected: rtol = 1e-3 is about as near as a step of 2 ms, for a third of its cost in the
-manipulation; gradients are right later: the worst of eight parameters' is off by 2 and 3 % at rtol =
-1e-6 in the roll and in the stroke (22 and 235 % at 2 ms), in shaking, where some are a thousand
-times smaller than others, by 17 % at 1e-7. About a minute on one core.
+manipulation; gradients are right later: the worst of eight parameters' is off by 2 and 3 % at
+rtol = 1e-6 in the roll and in the stroke (22 and 235 % at 2 ms), in shaking, where some are a
+thousand times smaller than others, by 17 % at 1e-7. About a minute on one core.
 """
 
 from dataclasses import dataclass

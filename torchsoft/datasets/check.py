@@ -249,8 +249,9 @@ def moving(data: xr.Dataset, config: Config) -> list[str]:
     own largest value."""
     names = list(config.subject.signals)
     values = data[names].isel(trajectory=np.flatnonzero(data.failed == 0)[:MOST])
-    spread = {name: float(one.std() / max(float(abs(one).max()), 1e-300))
-              for name, one in values.items()}  # fmt: skip
+    spread = {
+        name: float(one.std() / max(float(abs(one).max()), 1e-300)) for name, one in values.items()
+    }
     return sorted(names, key=lambda name: -spread[name])[:3]
 
 

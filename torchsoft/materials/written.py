@@ -109,12 +109,15 @@ def method(found: Found) -> dict[str, object]:
     m = found.measured
     return {
         "method": "nonnegative least squares on a logarithmic grid of times, then least squares in "
-                  "strengths and times together; the number of terms by Schwarz's criterion (BIC)",
-        "rows": len(m.t), "resolved_s": list(m.window), "largest_strain": m.largest_strain,
+        "strengths and times together; the number of terms by Schwarz's criterion (BIC)",
+        "rows": len(m.t),
+        "resolved_s": list(m.window),
+        "largest_strain": m.largest_strain,
         "criterion": {str(count): score for count, score in found.scores.items()},
-        "residual_rms": found.rms, "residual_of": found.residual_of,
+        "residual_rms": found.rms,
+        "residual_of": found.residual_of,
         "residual_correlation": found.correlation,
-    }  # fmt: skip
+    }
 
 
 def printed(found: Found) -> str:

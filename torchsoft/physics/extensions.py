@@ -153,8 +153,17 @@ def _power(rig: Rig, stem: str) -> nn.Parameter:
 def _guide(rig: Rig, coordinate: str, kind: str) -> nn.Parameter:
     name = f"guide_{coordinate.replace('.', '_')}"
     if name not in rig.actuators:
-        _added(rig, name, Actuator(coordinate, coordinate, Guide(), setpoint=(),
-                                   elements=(f"R: guide of {coordinate}",)))  # fmt: skip
+        _added(
+            rig,
+            name,
+            Actuator(
+                coordinate,
+                coordinate,
+                Guide(),
+                setpoint=(),
+                elements=(f"R: guide of {coordinate}",),
+            ),
+        )
     return getattr(rig.actuators[name].law, kind)
 
 

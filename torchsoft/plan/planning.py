@@ -120,8 +120,10 @@ def plan(
     Raises `ValueError` for arguments that do not fit together, and where no start can be run.
     """
     t, y0 = tensor("t", t), tensor("y0", y0)
-    for name, given, known in (("method", method, ("slsqp", "adam")),
-                               ("robust", robust, ("mean", "worst"))):  # fmt: skip
+    for name, given, known in (
+        ("method", method, ("slsqp", "adam")),
+        ("robust", robust, ("mean", "worst")),
+    ):
         if given not in known:
             raise ValueError(f"`{name}` must be one of {', '.join(known)}, not {given!r}")
     whole("iterations", iterations, 1)

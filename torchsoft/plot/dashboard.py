@@ -120,8 +120,13 @@ def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
     laws = {name: contact.friction for name, contact in run.setup.contacts.items()}
     known = all("mu_s" in law for law in laws.values())
     share_of = "friction in its cone" if known else "friction over normal force"
-    units = {"normal force": "N", "friction": "N", share_of: "%",
-             "points in contact": "1", "slipping": "1"}  # fmt: skip
+    units = {
+        "normal force": "N",
+        "friction": "N",
+        share_of: "%",
+        "points in contact": "1",
+        "slipping": "1",
+    }
     out: dict[str, tuple[str, dict[str, Array]]] = {
         kind: (unit, {}) for kind, unit in units.items()
     }

@@ -204,8 +204,9 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
     if isinstance(first.start, Standing):
         lead, other = first.start.lead, 0.0 if first.start.lead else SETTLE
         stated = f"bodies were put where they stand {lead:g} s before the first sample (lead)"
-        out.append(Variation("lead", "law", stated, f"it were {other:g} s",
-                             vary=partial(led, lead=other)))  # fmt: skip
+        out.append(
+            Variation("lead", "law", stated, f"it were {other:g} s", vary=partial(led, lead=other))
+        )
     if any(isinstance(law.friction, SmoothSlip) for law in laws(rig)):
         out.append(
             Variation(
@@ -222,9 +223,17 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
             stated = f"{name} begins where the start says"
             otherwise, by = f"it began {1e6 * PLACE:g} um further right", partial(moved, body=name)
             out.append(
-                Variation(f"start of {name}.x", "known", stated, otherwise, 1e6 * PLACE, "um",
-                          vary=by, by=lambda r, amount, name=name: moved(r, name, 1e-6 * amount))
-            )  # fmt: skip
+                Variation(
+                    f"start of {name}.x",
+                    "known",
+                    stated,
+                    otherwise,
+                    1e6 * PLACE,
+                    "um",
+                    vary=by,
+                    by=lambda r, amount, name=name: moved(r, name, 1e-6 * amount),
+                )
+            )
     for name, value in first.parameters.items():
         if name in unknown or value == 0.0 or name.startswith("start.") or "fixed" in name:
             continue

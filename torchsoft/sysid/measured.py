@@ -246,15 +246,21 @@ def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[f
     rig, lead = made.rig, made.start.lead
     around = torch.linspace(-lead, BEGINNING, 51, dtype=torch.float64)
     with torch.no_grad():
-        rates = [own(around, (name,))[..., 1].abs().max().item() for name in rig.signals
-                 if made.units[name] in ("m", "rad")]  # fmt: skip
+        rates = [
+            own(around, (name,))[..., 1].abs().max().item()
+            for name in rig.signals
+            if made.units[name] in ("m", "rad")
+        ]
         loads = net_loads(rig, state, rig.follow(first))
         held = {contact.body for name, contact in rig.contacts.items()
                 if rig.penetration(name, state).max() > 0}  # fmt: skip
     held |= {one.pushes.split(".")[0] for one in rig.actuators.values()}
     speeds = [rate.abs().max().item() for rate in state.velocity.values()]
-    rushes = [(loads[name][:2].norm() / body.mass).item() for name, body in rig.bodies.items()
-              if lead == 0 or name not in held]  # fmt: skip
+    rushes = [
+        (loads[name][:2].norm() / body.mass).item()
+        for name, body in rig.bodies.items()
+        if lead == 0 or name not in held
+    ]
     return CREEP + 2 * max(rates, default=0.0) + max(speeds, default=0.0), max(rushes, default=0.0)
 
 

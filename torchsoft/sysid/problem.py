@@ -211,8 +211,10 @@ class Problem(Shown):
         free = [one for one in self.coordinates.all if one.kind == "parameter" and not one.fixed]
         rows = [(one.label, f"{one.low:.4g} to {one.high:.4g}, from {one.nominal:.4g}")
                 for one in free]  # fmt: skip
-        rows += [(name, f"measured to {amount(one.noise, self.unit(name))}")
-                 for name, one in self.sensors.items()]  # fmt: skip
+        rows += [
+            (name, f"measured to {amount(one.noise, self.unit(name))}")
+            for name, one in self.sensors.items()
+        ]
         return f"Problem: {len(free)} unknowns, recordings {', '.join(self.names)}", rows
 
     @property

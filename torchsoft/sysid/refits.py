@@ -136,8 +136,11 @@ def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None
     if isinstance(other, str):
         return None, other
     runner = end.runner.of(other.recordings)
-    steps = {r.name: since(end.steps[r.name], float(r.times[0] - r.start.lead))
-             for r in other.recordings if r.name in end.steps}  # fmt: skip
+    steps = {
+        r.name: since(end.steps[r.name], float(r.times[0] - r.start.lead))
+        for r in other.recordings
+        if r.name in end.steps
+    }
     got = other.residuals(runner, end.x, end.which, steps)
     if got.failed:
         return None, f"a run failed: {got.reason}"

@@ -148,8 +148,10 @@ def together(episodes: list[dict[str, Any]], features: dict[str, Any]) -> dict[s
     """LeRobot's statistics over all episodes, which are of equal length."""
     out = dict[str, Any]()
     for key in features:
-        of = {statistic: np.array([one[f"stats/{key}/{statistic}"] for one in episodes])
-              for statistic in ("min", "max", "mean", "std", "count")}  # fmt: skip
+        of = {
+            statistic: np.array([one[f"stats/{key}/{statistic}"] for one in episodes])
+            for statistic in ("min", "max", "mean", "std", "count")
+        }
         mean = of["mean"].mean(0)
         spread = np.sqrt((of["std"] ** 2 + (of["mean"] - mean) ** 2).mean(0))
         found = {"min": of["min"].min(0), "max": of["max"].max(0), "mean": mean, "std": spread}

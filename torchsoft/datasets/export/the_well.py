@@ -66,9 +66,15 @@ def lay_out(file: h5py.File, source: Source, surface: str, count: int) -> list[s
     )  # fmt: skip
     groups = {
         name: file.create_group(name)
-        for name in ("boundary_conditions", "dimensions", "scalars", "t0_fields", "t1_fields",
-                     "t2_fields")
-    }  # fmt: skip
+        for name in (
+            "boundary_conditions",
+            "dimensions",
+            "scalars",
+            "t0_fields",
+            "t1_fields",
+            "t2_fields",
+        )
+    }
     grid, steady = data[point].values, {"sample_varying": False, "time_varying": False}
     groups["dimensions"].attrs["spatial_dims"] = ["s"]
     for name, values in (("time", data.time.values), ("s", grid)):
@@ -118,6 +124,8 @@ class Statistics:
                 found = {"mean": mean, "std": max(square - mean**2, 0.0) ** 0.5, "rms": square**0.5}
                 for key, value in found.items():
                     out.setdefault(key + suffix, {})[name] = value
-        lines = ([f"{key}:", *(f"  {name}: {x:.9e}" for name, x in some.items())]
-                 for key, some in out.items())  # fmt: skip
+        lines = (
+            [f"{key}:", *(f"  {name}: {x:.9e}" for name, x in some.items())]
+            for key, some in out.items()
+        )
         return "\n".join(line for some in lines for line in some) + "\n"
