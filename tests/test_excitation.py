@@ -75,7 +75,10 @@ def test_an_excitation_runs(rig):
     (law,) = (file := coarse(rig)).laws
     file = file.override({f"laws.{law}.friction.v_s": 0.05})
     run = excite(file, Excitation(ROLL, duration=0.8)).build().run(rtol=1e-3)
-    x = run["x_Br" if rig == "paper" else "x_bracket"]
+    x, body = (
+        run[name] for name in (("x_Br", "x_C") if rig == "paper" else ("x_bracket", "x_disc"))
+    )
+    assert (body[run.t <= SINCE] - body[0]).abs().max() < 1e-4  # gripped, it does not roll off
     assert float(x[-1]) == pytest.approx(64.3e-3, abs=4e-4)  # the loop gives way to friction
     assert all(float(F[-1, :, 0].sum()) > 10.0 for F in run.force.values())
 

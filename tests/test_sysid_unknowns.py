@@ -7,7 +7,14 @@ import pytest
 from conftest import still
 
 from torchsoft.sysid.estimate import nuisance_unit
-from torchsoft.sysid.unknowns import NUISANCES, Coordinate, Coordinates, Prior, Unknown
+from torchsoft.sysid.unknowns import (
+    NUISANCES,
+    Coordinate,
+    Coordinates,
+    Prior,
+    Unknown,
+    in_full,
+)
 
 RIG = still()
 FRICTION, ALPHA = "laws.steel_on_rubber.friction", "contacts.L.law.friction.alpha"
@@ -138,6 +145,17 @@ def test_a_search_starts_where_all_rigs_are():
 def test_friction_coefficients_may_both_be_free_where_they_cannot_cross():
     found = coordinates(contact__mu_k={"high": 0.75}, contact__mu_s={"low": 0.75})
     assert (ends(found, "contact.mu_k")[1], ends(found, "contact.mu_s")[0]) == (0.75, 0.75)
+
+
+def test_a_name_means_one_thing_and_is_given_once():
+    other: Any = SimpleNamespace(short={"theta": "theta_ball"})
+    assert in_full([RIG, other], {"F_x": 1, "theta_C": 2}) == {"effort_x": 1, "theta_C": 2}
+    with pytest.raises(ValueError, match="`theta_C` and `theta` are one, given twice"):
+        in_full([RIG], {"theta": 1, "theta_C": 2})
+    with pytest.raises(
+        ValueError, match="`theta` is short for theta_C and theta_ball in different"
+    ):
+        in_full([RIG, other], {"theta": 1})
 
 
 def test_a_tied_ratio_leaves_its_base_free():

@@ -129,6 +129,15 @@ def test_a_wrong_gradient_is_named():
     assert whole == pytest.approx(2 * half, rel=1e-3)
 
 
+def test_noise_that_agrees_by_chance_does_not_make_a_derivative_wrong():
+    """Of a value with noise of 1e-11 the two shortest differences agree, and are off by 5e-3."""
+    slope, noise = 0.1, {1e-10: 3e-2, 1e-9: -5e-3, 3e-9: -5.01e-3, 1e-8: 1e-3, 3e-8: -3e-4}
+    differenced = lambda h: {"value": slope + noise.get(h, 1e-12 / h)}
+    ((found, by),) = gradients._judged(differenced, {"value": slope}, {"value": 1.0}, 1e-5).values()
+    assert abs(found - slope) <= 2 * by
+    assert by < 1e-4
+
+
 @pytest.mark.parametrize("of", ["x_disc", 3.0])
 def test_what_is_differentiated_is_a_list_or_a_function(of):
     with pytest.raises(ValueError, match="`of` must be a list of channels or a function"):
