@@ -19,6 +19,7 @@ from torchsoft import (
     Circle,
     Contour,
     Ellipse,
+    RigFile,
     RoundedBox,
     RoundedPolygon,
     Shape,
@@ -448,6 +449,12 @@ def test_an_object_that_its_pads_would_turn_is_told_of():
         match=r"`disc` is held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m",
     ):
         rest(still(COARSE, shape=wedge))
+
+
+def test_a_body_of_a_file_that_its_pad_would_turn_is_told_of():
+    tilted = {"pads.ground.angle": 0.2, "bodies.ellipse.start": {"x": 0.06, "y": "rest"}}
+    with pytest.warns(UserWarning, match="`ellipse` is held at theta = 0, where the pads turn it"):
+        RigFile.ready("drop").override(tilted).build()
 
 
 def test_a_long_box_rests_on_its_whole_side():

@@ -18,7 +18,7 @@ from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.names import check_names
 from torchsoft.physics.parts import COORDINATES, PD, Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed
+from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed, warn_of_moments
 from torchsoft.physics.statics import NoEquilibrium, massless, net_loads, resting, standing
 from torchsoft.quantity import Gravity
 from torchsoft.rigs.assembly import assemble, too_stiff
@@ -472,6 +472,7 @@ class RigFile(Shown, Group):
                 too_stiff(self, rig)
                 or f"bodies: the pads cannot settle where bodies start: {error}"
             ) from None
+        warn_of_moments(rig, y0, starts)
         solver = self.solver.model_dump(exclude_none=True)
         return BuiltRig(rig, moving(rig, y0, starts), self.outputs.times(), starts, solver)
 
