@@ -103,6 +103,8 @@ def test_python_runs(page, folder):
 def test_commands_run(page, folder):
     rows = "".join(f"{t / 10},2,{10 + 5 * 0.8**t + 0.1 * (t % 3)}\n" for t in range(60))
     (folder / "relaxation.csv").write_text(f"t [s],strain [%],stress [kPa]\n{rows}")
+    pull = "".join(f"{x / 10};{x / 8};23\n" for x in range(120)).replace(".", ",")
+    (folder / "pull.csv").write_text(f"Weg;Standardkraft;Temperatur\nmm;N;C\n{pull}")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     for line in commands(page):
         program, *rest = shlex.split(line, comments=True)
