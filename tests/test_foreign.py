@@ -10,21 +10,21 @@ import foreign
 import numpy as np
 import pytest
 import torch
-from conftest import PAPER
+from conftest import PAPER, excited
 from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, TAKEN_IN, node
 
 from torchsoft import BuiltRig, PadMesh, Trajectory, simulate
 from torchsoft.physics.mesh import unit_compliance
-from torchsoft.rigs.excite import GRIP, Excitation, excite
+from torchsoft.rigs.excite import Excitation
 
-SETTLE, STEP, CLEAR = 0.02, 12.5e-6, 1e-4
+SETTLE, STEP = 0.02, 12.5e-6
 SINES = {"kind": "multi_sine", "band": (5.0, 20.0)}
 SHAKEN = Excitation(
     SINES | {"amplitude": 10e-3, "seed": 5},  # most others part more suddenly: smaller steps
     SINES | {"amplitude": 2e-4, "seed": 1},
-    duration=0.36, depth=2e-4 + GRIP + CLEAR, grasp=0.04, since=0.05,
+    duration=0.36, depth=2e-4, grasp=0.04, since=0.05, grip=-1e-4,  # clear, as the stranger's is
 )  # fmt: skip
 RIG = {
     "pad.elements_x": 60,
@@ -40,9 +40,7 @@ CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 @cache
 def begun() -> BuiltRig:
-    """The upper pad is clear of the disc at first, as the stranger's is."""
-    clear = {"bodies.bracket.start.y": {"depth": -CLEAR}}
-    return excite(PAPER.override(RIG), SHAKEN).override(clear).build()
+    return excited(SHAKEN, PAPER.override(RIG))
 
 
 @cache

@@ -626,16 +626,17 @@ def test_a_part_that_is_called_alike_is_asked_about():
         template("t").override(bodies={"disk": {"mass": 1.0}})
 
 
-BOX = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 20e-3, "radius": 3e-3}
+SQUARE = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 20e-3, "radius": 3e-3}
+BOX = {"shape": SQUARE, "start": {"theta": "rest"}}
 
 
 @pytest.mark.parametrize(
     ("disc", "far", "press", "mu", "where"),
     [
-        ({"shape": BOX}, 20e-3, -30.0, 0.7, {"bodies.disc"}),  # the run: 95 % of a pad's height
-        ({"shape": BOX}, 10e-3, -30.0, 0.7, {"bodies.disc"}),  # 56 %
-        ({"shape": BOX}, 2e-3, -30.0, 0.7, set()),  # 13 %
-        ({"shape": BOX}, 20e-3, -30.0, 0.2, set()),  # it slides: 11 %
+        (BOX, 20e-3, -30.0, 0.7, {"bodies.disc"}),  # the run: 95 % of a pad's height
+        (BOX, 10e-3, -30.0, 0.7, {"bodies.disc"}),  # 56 %
+        (BOX, 2e-3, -30.0, 0.7, set()),  # 13 %
+        (BOX, 20e-3, -30.0, 0.2, set()),  # it slides: 11 %
         ({"theta": 0.0}, 20e-3, -200.0, 0.7, {"pads.lower", "pads.upper"}),  # 53 %
         ({"theta": 0.0}, 20e-3, -30.0, 0.7, set()),  # 20 %
         ({}, 20e-3, -300.0, 0.7, set()),  # it rolls: 22 %

@@ -20,7 +20,7 @@ SENSORS = {
     name: RIG[name].model_copy(update={"noise": 0.7 * RIG[name].noise})
     for name in ("x_C", "theta_C", "effort_x")
 }
-JERKS = stroked(30e-3, stroke_time=0.1, duration=0.6, depth=8e-4, grasp=0.2, since=0.25)
+JERKS = stroked(30e-3, stroke_time=0.1, duration=0.6, depth=5e-4, grasp=0.2, since=0.25)
 E, FRICTION = "materials.rubber.E", "laws.steel_on_rubber.friction"
 ALPHA, BETA = f"{FRICTION}.alpha", f"{FRICTION}.beta"
 TRUTH = {ALPHA: 0.45, BETA: 200.0}

@@ -29,7 +29,7 @@ import torch
 from torchsoft import Reference, RigFile, excite
 from torchsoft.experiment import COARSE, RIG, coloured, markdown, options, repeated, write
 from torchsoft.physics.motion import Profile, Sampled
-from torchsoft.rigs.excite import GRIP, Excitation
+from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import (
     IdentificationResult,
     Problem,
@@ -130,9 +130,7 @@ def planned(excitation: str, smoke: bool) -> RigFile:
     known = {name: value for name, value in TRUTH.items() if name not in SMOKE_UNKNOWNS}
     less = COARSE | known if smoke else {}
     file = RigFile.ready("paper").override({"contact.v_s": 0.05} | less)
-    motion = EXCITATIONS[excitation]
-    motion = motion._replace(depth=motion.depth + GRIP + CLEAR)
-    return excite(file, motion).override({"bodies.bracket.start.y": {"depth": -CLEAR}})
+    return excite(file, EXCITATIONS[excitation]._replace(grip=-CLEAR))
 
 
 def numbers(file: RigFile, differs: Mapping[str, Any]) -> Numbers:

@@ -32,7 +32,7 @@ RATES = {"v_x": "x", "v_y": "y", "omega": "theta"}
 UPWARDS = 0.1
 """Least upward component of the normal of a pad that can carry a body."""
 
-MOMENT_ARM = 5e-2
+MOMENT_ARM = 1e-2
 """Largest moment on a body at rest without a warning, over its size and the load."""
 
 AWAY = 100.0

@@ -28,7 +28,8 @@ pad, is symmetric until rounding breaks it."""
 class Excitation(NamedTuple):
     """A grasp that compresses the pads together by `depth` [m] within a time `grasp` [s], then the
     tables of two motions: along the pads, `roll`, and on top of the grasp, `press`, which begin at
-    `since` [s] unless they say when; until `duration` [s]."""
+    `since` [s] unless they say when; until `duration` [s]. A vertical press starts at the depth
+    `grip` [m]; a negative one is a gap."""
 
     roll: Mapping[str, Any]
     press: Mapping[str, Any] | None = None
@@ -36,6 +37,7 @@ class Excitation(NamedTuple):
     depth: float = 1.4e-3
     grasp: float = 0.375
     since: float = SINCE
+    grip: float = GRIP
 
 
 def _sines(amplitude: float, band: tuple[float, float], seed: int) -> dict[str, Any]:
@@ -97,10 +99,9 @@ def excite(
     along = "y" if across == "x" else "x"
     loops = _loops(file)
     press_loop, roll_loop = (loops[f"{body}.{axis}"] for axis in (across, along))
-    times, values = (
-        (0.0, excitation.grasp),
-        (0.0, way * (excitation.depth - (GRIP if across == "y" else 0.0))),
-    )
+    grip = {"depth": excitation.grip} if across == "y" else None
+    closed = excitation.depth - (excitation.grip if grip else 0.0)
+    times, values = (0.0, excitation.grasp), (0.0, way * closed)
     grasp = {"times": times, "values": values, "offset": "start"}
     press = {"kind": "profile"} | grasp | dict(excitation.press or {})
     roll = dict(excitation.roll)
@@ -114,7 +115,7 @@ def excite(
         motions[one.feed_forward] = {"kind": "profile"} | held
     if roll_loop.actuators[0] in file.actuators:
         actuators[roll_loop.actuators[0]] = {"measures": f"{senses or body}.{along}"}
-    starts: dict[str, dict[str, Any]] = {body: {"y": {"depth": GRIP}} if across == "y" else {}}
+    starts: dict[str, dict[str, Any]] = {body: {"y": grip} if grip else {}}
     touched = (one.body for one in file.contacts.values() if file.pads[one.pad].base == body)
     for name in {body, *touched} if senses is None else ():
         given = getattr(file.bodies[name].start, along)

@@ -229,7 +229,7 @@ class IdentificationResult(Shown):
     @property
     def verdict(self) -> Verdict:
         """Whether the model holds, is in doubt, or does not explain the data."""
-        if any(one.stated >= UNEXPLAINED for one in self.residuals):
+        if not all(one.stated < UNEXPLAINED for one in self.residuals):
             return "does not explain"
         return "doubtful" if self.doubts else "holds"
 

@@ -368,10 +368,10 @@ def _judged(
         for kind in largest:
             noise = 0.0  # of the value itself, from lengths up to b
             for a, b in pairwise(ordered):
-                spread = abs(found[a][kind] - found[b][kind])
-                spread = spread if np.isfinite(spread) else np.inf
-                noise = max(noise, a * spread if np.isfinite(spread) else 0.0)
-                uncertainty = max(spread, noise / b)
+                spread, uncertainty = abs(found[a][kind] - found[b][kind]), np.inf
+                if np.isfinite(spread):
+                    noise = max(noise, a * spread)
+                    uncertainty = max(spread, noise / b)
                 if kind not in best or uncertainty < best[kind][1]:
                     best[kind] = found[b][kind], uncertainty
         if best and all(
