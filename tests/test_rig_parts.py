@@ -169,6 +169,7 @@ def in_a_rig(kind: str, table: dict[str, Any]) -> dict[str, Any]:
                     "mass": None,
                     "density": 7800.0,
                     "depth": 20e-3,
+                    "start": {"theta": 0.0 if kind == "circle" else "rest"},
                 }
             }
         }
@@ -450,7 +451,8 @@ REFUSED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "set-point elsewhere, corners between the points": (
         {"motion__x_d__values": (10e-3, 20e-3),
          "bodies": {"disc": {"shape": {"kind": "rounded_box", "half_width": 2e-2,
-         "half_height": 2e-2, "radius": 5e-4}}}},
+         "half_height": 2e-2, "radius": 5e-4},
+         "start": {"theta": "rest"}}}},
         r"warning: motion\.x_d: it begins at 0\.01 m, but bracket\.x at 0 m: `actuators\.x` pushes "
         r"with 1e\+03 at once",
         r"warning: bodies\.disc\.shape: its sharpest corner has a radius of 0\.5 mm",
