@@ -46,7 +46,7 @@ def telling(start: Start) -> int:
         for one in rig.evaluate(0.01, rig.unpack(at_random(start, seed))).interfaces.values():
             on = one.frame.g > 0
             touching.append(on)
-            slipping.append(one.out[..., 6][on] != 0)
+            slipping.append(one.law.slip[on] != 0)
         some = torch.cat(slipping)
         if all(on.any() and not on.all() for on in touching) and some.any() and not some.all():
             return seed

@@ -10,7 +10,7 @@ same at every load and size.
 """
 
 from collections.abc import Callable
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -19,11 +19,29 @@ from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Stiffness
 
-SlipLaw = Callable[[Tensor, Tensor, Tensor], Tensor]
+SlipLaw = Callable[..., Any]
 """Slip rate |gamma'| >= 0 [m/s] under a trial effort E >= 0 [N], a normal force F_N [N] and the
 dashpot R [N.s/m] that the slip relieves, each per reference spacing: a function or an `nn.Module`,
 in torch operations. The slip must not take more than the effort, R |gamma'| <= E, and all of it
-where nothing presses, R |gamma'| = E at F_N = 0: friction is continuous at touch-down then."""
+where nothing presses, R |gamma'| = E at F_N = 0: friction is continuous at touch-down then.
+
+A module with a mapping `states`, of names to `FrictionState`, has states of its own at every point:
+it is called with two more arguments, the states z* (..., n) at the stage's start and the stage's
+length a h [s], and gives the slip rate and the rates z' (..., n) of the states, with the values
+z* + a h z' that act at the end of the stage."""
+
+
+class FrictionState(NamedTuple):
+    """State of a friction law at a point: its unit, and the name of the parameter of the law that
+    it begins with."""
+
+    unit: str
+    start: str
+
+
+def friction_states(friction: object) -> dict[str, FrictionState]:
+    """States of a friction law, by name; most have none."""
+    return dict(getattr(friction, "states", {}))
 
 
 class Frame(NamedTuple):
@@ -38,13 +56,15 @@ class Frame(NamedTuple):
 
 class ContactState(NamedTuple):
     """Per point, shape (...): forces [N], stretch rate s' and slip rate gamma' [m/s], effort e of
-    the tangential elements [N], which is F_T where the point touches."""
+    the tangential elements [N], which is F_T where the point touches, rates z' (..., n) of the
+    friction law's own states."""
 
     F_N: Tensor
     F_T: Tensor
     s_dot: Tensor
     gamma_dot: Tensor
     e: Tensor
+    z_dot: Tensor | None = None
 
 
 def cross(d: Tensor) -> Tensor:
@@ -241,9 +261,10 @@ class SoftContact(nn.Module):
         s: Tensor,
         weight: Tensor | float = 1.0,
         stage: Tensor | float = 0.0,
+        z: Tensor | None = None,
     ) -> ContactState:
         """Forces and rates from penetration g [m], its rate, sliding speed v_T [m/s] and stretch s
-        [m], all (...).
+        [m], all (...), and the states z (..., n) of a friction law that has some.
 
         With `stage` = a h [s] the law at the end of an implicit stage: s is then its s*, and the
         stretch that acts is s* + a h s', which turns the dashpot R_t into R_t + a h K_t and changes
@@ -256,11 +277,15 @@ class SoftContact(nn.Module):
         trial = self.K_t * s + R * slides  # (10), (11): the effort if nothing slipped
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
-        gamma_dot = sign * self.friction(sign * trial, F_N, R)  # (12), (13)
+        if friction_states(self.friction):
+            slip, z_dot = self.friction(sign * trial, F_N, R, z, stage)
+        else:
+            slip, z_dot = self.friction(sign * trial, F_N, R), None
+        gamma_dot = sign * slip  # (12), (13)
         s_dot = slides - gamma_dot
         e = self.K_t * s + R * s_dot
         F_T = torch.where(spring > 0, e, 0.0)
-        return ContactState(weight * F_N, weight * F_T, s_dot, gamma_dot, weight * e)
+        return ContactState(weight * F_N, weight * F_T, s_dot, gamma_dot, weight * e, z_dot)
 
     def dissipated(
         self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float
@@ -276,46 +301,86 @@ class SoftContact(nn.Module):
         return weight * self.spring(g) * g.clamp(min=0.0) / (m + 1), 0.5 * weight * self.K_t * s**2
 
 
-def interface_law(contact: SoftContact, shape: Shape, x: Tensor) -> Tensor:
-    """One point's law at a stage: (f, s', F_N, F_T, power of dashpots, of slip) (..., 7) of x (...,
-    9).
+# Laws as the kernels call them. A point's motion is (p, r, theta, u', r', theta'): its place in the
+# frame of the pad's base, the body's centre and angle there, and their rates.
 
-    x = (w, omega, d, theta, s*, weight, a h): the body's velocity at its centre less the point's,
-    its spin, the point's moment arm from the centre and the body's angle, all in the frame of the
-    pad's base. f is the force on the pad [N].
+
+class PointLaw(NamedTuple):
+    """One point's law: force on the pad f (..., 2) [N] with its moment about the body's centre
+    [N.m], in the frame of the pad's base, rates (..., states) of stretch and friction's states,
+    F_N and F_T (..., 2) [N], powers of dashpots and of slip [W]."""
+
+    f: Tensor
+    moment: Tensor
+    rates: Tensor
+    force: Tensor
+    dashpots: Tensor
+    slip: Tensor
+
+    @classmethod
+    def of(cls, out: Tensor) -> Self:
+        """Parts of the outputs (..., 7 + states) of `interface_law`."""
+        return cls(
+            out[..., :2], out[..., 2], out[..., 3:-4], out[..., -4:-2], out[..., -2], out[..., -1]
+        )
+
+
+def relative_motion(x: Tensor) -> Tensor:
+    """A contact's transformer (..., 12): pose (r, theta) of a body in the frame of a pad's base,
+    its rates, and the loads on body and base (3 each) of a wrench (Eq. 16, 18, 19, 35).
+
+    x = (q, q_base, V, V_base, W) (..., 15), W being a force [N] on the pad in the frame of its
+    base and its moment about the body's centre [N.m]. Power is conserved: the loads are -T^T W
+    with T the derivative of the rates by the velocities.
     """
-    w, omega, d, theta, s, weight, stage = (
-        x[..., :2],
-        x[..., 2],
-        x[..., 3:5],
-        *x[..., 5:].unbind(-1),
-    )
-    frame = moving_frame(shape, d, theta)
-    v = w + omega[..., None] * cross(d)  # (4)-(7)
-    g_dot, v_T = (frame.n * v).sum(-1), (frame.t * v).sum(-1)
-    at = contact(frame.g, g_dot, v_T, s, weight, stage)
-    f = at.F_N[..., None] * frame.n + at.F_T[..., None] * frame.t
-    return torch.stack(
-        (
-            f[..., 0],
-            f[..., 1],
-            at.s_dot,
-            at.F_N,
-            at.F_T,
-            *contact.dissipated(at, frame.g, g_dot, weight),
-        ),
+    q, q_base, V, V_base, W = (x[..., 3 * i : 3 * i + 3] for i in range(5))
+    angle = q_base[..., 2]
+    r = turned(q[..., :2] - q_base[..., :2], -angle)
+    r_dot = turned(V[..., :2] - V_base[..., :2], -angle) - V_base[..., 2:] * cross(r)
+    f, push = W[..., :2], turned(W[..., :2], angle)
+    moment = W[..., 2:] + r[..., :1] * f[..., 1:] - r[..., 1:2] * f[..., :1]
+    return torch.cat(
+        (r, (q - q_base)[..., 2:], r_dot, (V - V_base)[..., 2:], -push, -W[..., 2:], push, moment),
         -1,
     )
 
 
+def point_place(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Moment arm d (..., 2) [m] of a point from the body's centre, and the body's angle (...)."""
+    return x[..., :2] - x[..., 2:4], x[..., 4]
+
+
+def interface_law(contact: SoftContact, shape: Shape, x: Tensor) -> Tensor:
+    """One point's law at a stage (..., 7 + states), as `PointLaw` has it, of x (..., 12 + states):
+    the point's motion (10), its states at the stage's start, its weight and the stage's length."""
+    d, theta = point_place(x)
+    s, z, weight, stage = x[..., 10], x[..., 11:-2], x[..., -2], x[..., -1]
+    frame = moving_frame(shape, d, theta)
+    v = x[..., 7:9] + x[..., 9, None] * cross(d) - x[..., 5:7]  # (4)-(7)
+    g_dot, v_T = (frame.n * v).sum(-1), (frame.t * v).sum(-1)
+    at = contact(frame.g, g_dot, v_T, s, weight, stage, z)
+    f = at.F_N[..., None] * frame.n + at.F_T[..., None] * frame.t
+    moment = d[..., 0] * f[..., 1] - d[..., 1] * f[..., 0]
+    powers = contact.dissipated(at, frame.g, g_dot, weight)
+    after = torch.stack((at.F_N, at.F_T, *powers), -1)
+    return torch.cat((f, torch.stack((moment, at.s_dot), -1), *state_rates(at), after), -1)
+
+
+def state_rates(at: ContactState) -> tuple[Tensor, ...]:
+    """Rates of the friction law's states, if it has any."""
+    return () if at.z_dot is None else (at.z_dot,)
+
+
 def distance_law(shape: Shape, x: Tensor) -> Tensor:
     """Signed distance (1,) [m] of the point of `interface_law`'s x."""
-    return -moving_frame(shape, x[3:5], x[5]).g[None]
+    return -moving_frame(shape, *point_place(x)).g[None]
 
 
 def free_law(contact: SoftContact, x: Tensor) -> Tensor:
-    """(s', power of dashpots, of slip) (3,) of x = (s*, weight, a h) away from contact."""
-    s, weight, stage = x.unbind(-1)
+    """Rates of the states, powers of dashpots and of slip (..., states + 2) away from contact, of x
+    = (states at the stage's start, weight, a h)."""
+    s, z, weight, stage = x[..., 0], x[..., 1:-2], x[..., -2], x[..., -1]
     apart, still = torch.full_like(s, -1.0), torch.zeros_like(s)
-    at = contact(apart, still, still, s, weight, stage)
-    return torch.stack((at.s_dot, *contact.dissipated(at, apart, still, weight)))
+    at = contact(apart, still, still, s, weight, stage, z)
+    powers = torch.stack(contact.dissipated(at, apart, still, weight), -1)
+    return torch.cat((at.s_dot[..., None], *state_rates(at), powers), -1)

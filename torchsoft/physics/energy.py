@@ -10,7 +10,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torchsoft.physics.contact import cross, interface_law, moving_frame, turned
+from torchsoft.physics.contact import (
+    PointLaw,
+    cross,
+    interface_law,
+    moving_frame,
+    point_place,
+    turned,
+)
 from torchsoft.physics.pads import free_rates, nodal
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Evaluation, Rig
@@ -98,8 +105,8 @@ def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
             ).sum(-1)
     for interface in graph.interfaces.values():
         dashpots, slip = (
-            dashpots + interface.out[..., 5].sum(-1),
-            slip + interface.out[..., 6].sum(-1),
+            dashpots + interface.law.dashpots.sum(-1),
+            slip + interface.law.slip.sum(-1),
         )
     return powers | {"contact_dashpots": torch.as_tensor(dashpots), "slip": torch.as_tensor(slip)}
 
@@ -135,7 +142,7 @@ def contact_states(rig: Rig, state: State, force: Mapping[str, Tensor]) -> dict[
             spread = pad.spread[which]
             x = rig.point_inputs(key, state, spread @ u, spread @ rate, which)
             slips = torch.zeros(force[key].shape[:-1], dtype=torch.int8)
-            slips[..., which] = (interface_law(law, shape, x)[..., 6] > 0).to(torch.int8)
+            slips[..., which] = (PointLaw.of(interface_law(law, shape, x)).slip > 0).to(torch.int8)
             out[key] = (force[key][..., 0] > 0).to(torch.int8) * (STICKING + slips)
     return out
 
@@ -157,7 +164,7 @@ def _rates(
         spread = pad.spread[which]
         at = spread @ u
         x = rig.point_inputs(key, state, at, torch.zeros_like(at), which)
-        frame = moving_frame(rig.shape_of(key), x[..., 3:5], x[..., 5])
+        frame = moving_frame(rig.shape_of(key), *point_place(x))
         F_N, F_T = force[key][..., which, :].split(1, -1)
         f = f + spread.mT @ (F_N * frame.n + F_T * frame.t)
     free, P = free_rates(pad, state.pads[name], 0.0)

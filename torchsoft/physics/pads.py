@@ -19,9 +19,11 @@ from torch import Tensor, nn
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import tensor, whole
+from torchsoft.physics.elements import element_constants, linear_forces
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import (
     Array,
+    Index,
     Mesh,
     dofs_of,
     lame_moduli,
@@ -232,20 +234,35 @@ class Pad(nn.Module):
     def elastic_force(self, u: Tensor) -> Tensor:
         """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape
         [N]."""
-        mesh, material = self.mesh, self.material
-        lame_lambda, lame_mu = self.lame()
-        K_lambda, K_mu = (torch.from_numpy(K) for K in mesh.matrices[:2])
-        K_e = material.depth * (lame_lambda * K_lambda + lame_mu * K_mu)
-        # bonded nodes do not move: they read, and write to, one spare slot behind the free ones
-        slot = np.full(len(mesh.nodes), len(mesh.free))
-        slot[mesh.free] = np.arange(len(mesh.free))
-        connectivity = torch.from_numpy(slot[mesh.elements])
-        padded = nn.functional.pad(u @ self.axes, (0, 0, 0, 1))
-        f_e = (padded[..., connectivity, :].flatten(-2)[..., None, :] @ K_e)[..., 0, :].unflatten(
-            -1, (4, 2)
-        )
-        f = torch.zeros_like(padded).index_add(-2, connectivity.flatten(), f_e.flatten(-3, -2))
-        return f[..., :-1, :] @ self.axes.mT
+        depth = self.material.depth
+        lame_lambda, lame_mu = (depth * modulus for modulus in self.lame())
+        held = torch.from_numpy(self.corners < 0)
+        dofs = torch.from_numpy(self.corners.clip(0))
+        own = torch.where(held, 0.0, u.flatten(-2)[..., dofs])
+        f_e = linear_forces(own, torch.from_numpy(self.constants), lame_lambda, lame_mu)
+        f = torch.zeros_like(u.flatten(-2))
+        f = f.index_add(-1, dofs.flatten(), torch.where(held, 0.0, f_e).flatten(-2))
+        return f.unflatten(-1, (-1, 2))
+
+    @property
+    def nodal(self) -> bool:
+        """Whether the state holds the displacements of all nodes, and not those of the surface
+        alone."""
+        return self.inertial
+
+    @cached_property
+    def corners(self) -> Index:
+        """Dofs of the corners of every element (elements, 8), -1 where they are bonded."""
+        number = np.full(len(self.mesh.nodes), -1)
+        number[self.mesh.free] = np.arange(len(self.mesh.free))
+        node = number[self.mesh.elements]
+        dofs = np.stack((2 * node, 2 * node + 1), -1).reshape(len(node), 8)
+        return np.where(dofs < 0, -1, dofs)
+
+    @cached_property
+    def constants(self) -> Array:
+        """Constants of every element (elements, 45) in the base's frame."""
+        return element_constants(self.placed(self.mesh.nodes)[self.mesh.elements])
 
 
 def shape_functions(nodes: Any, shares: Array, count: int) -> Array:

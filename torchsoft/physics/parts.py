@@ -162,6 +162,11 @@ class Guide(nn.Module):
         return -(self.friction / torch.sqrt(q_dot**2 + self.v_0**2) + self.damping) * q_dot
 
 
+def weight(mass: Tensor, gravity: Tensor) -> Tensor:
+    """A body's weight [N] along y."""
+    return -mass * gravity
+
+
 class Tilt(nn.Module):
     """Change of a body's weight [N] along one `axis` where gravity is turned anticlockwise by a
     `tilt` [rad] from -y; `mass` and `gravity` are the body's and the rig's own parameters."""
@@ -250,15 +255,16 @@ class Actuator(nn.Module):
     @property
     def inputs(self) -> int:
         """Number of inputs of the law."""
-        return 2 * len(self.setpoints) + 1 + 2 * len(self.measures)
+        return 2 * (len(self.reads) + len(self.measures))
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The signals that the law reads: set-points, then the feed-forward if there is one."""
+        return self.setpoints if self.feed_forward is None else (*self.setpoints, self.feed_forward)
 
     def seen(self, signals: Mapping[str, Tensor], state: State, batch: Sequence[int]) -> Tensor:
         """The law's inputs x (*batch, inputs), of signals by name (*batch, 2) and a state."""
-        x = [part for name in self.setpoints for part in signals[name].unbind(-1)]
-        fed = self.feed_forward
-        x.append(
-            torch.zeros(tuple(batch), dtype=torch.float64) if fed is None else signals[fed][..., 0]
-        )
+        x = [part.expand(tuple(batch)) for name in self.reads for part in signals[name].unbind(-1)]
         for coordinate in self.measures:
             body, _, axis = coordinate.partition(".")
             i = COORDINATES.index(axis)
@@ -266,20 +272,20 @@ class Actuator(nn.Module):
         return torch.stack(x, -1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Effort (...) of x (..., inputs): every set-point and its rate, feed-forward, every
-        coordinate and its rate."""
-        feed = 2 * len(self.setpoints)
+        """Effort (...) of x (..., inputs): every set-point, the feed-forward if there is one and
+        every coordinate, each with its rate."""
+        values, rates = x[..., 0::2], x[..., 1::2]
+        goals, read = len(self.setpoints), len(self.reads)
         w, w_dot, q, q_dot = (
-            x[..., 0:feed:2],
-            x[..., 1:feed:2],
-            x[..., feed + 1 :: 2],
-            x[..., feed + 2 :: 2],
+            part for both in (slice(goals), slice(read, None))
+            for part in (values[..., both], rates[..., both])
         )
         if not self.several[0]:
             q, q_dot = q[..., 0], q_dot[..., 0]
         if not self.several[1]:
             w, w_dot = w[..., 0], w_dot[..., 0]
-        return self.law(w, w_dot, x[..., feed], q, q_dot)
+        fed = torch.zeros_like(values[..., -1]) if read == goals else values[..., goals]
+        return self.law(w, w_dot, fed, q, q_dot)
 
 
 def names_of(field: str, given: str | Sequence[str]) -> tuple[str, ...]:

@@ -13,12 +13,22 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft.display import Shown, suggestion
-from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
+from torchsoft.physics.contact import (
+    Frame,
+    PointLaw,
+    cross,
+    friction_states,
+    interface_law,
+    moving_frame,
+    point_place,
+    relative_motion,
+    turned,
+)
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import GROUND, check_names, check_pairs, check_unique
 from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
-from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
+from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit, weight
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import Layout, State
 from torchsoft.physics.validity import Backwards
@@ -30,19 +40,18 @@ it at the most."""
 
 
 class Interface(NamedTuple):
-    """One contact at one state: moving frame (world axes), law outputs `out` (..., points, 7) as
-    `contact.interface_law` has them, stretches, the port's transformer, and g', v_T (..., points,
-    2)."""
+    """One contact at one state: moving frame (world axes), the law at its points, the port's
+    transformer, and g', v_T (..., points, 2)."""
 
     frame: Frame
-    out: Tensor
+    law: PointLaw
     transformer: Transformer
     flow: Tensor
 
     @property
     def F_N(self) -> Tensor:
         """Normal forces [N] (..., points)."""
-        return self.out[..., 3]
+        return self.law.force[..., 0]
 
 
 class Evaluation(NamedTuple):
@@ -253,6 +262,9 @@ class Rig(Shown, nn.Module):
                 for name, body in self.bodies.items()
             },
             inertial={name: (p.nodes, 2) for name, p in self.pads.items() if p.inertial},
+            friction={
+                name: len(friction_states(one.law.friction)) for name, one in self.contacts.items()
+            },
         )
 
     @property
@@ -301,8 +313,11 @@ class Rig(Shown, nn.Module):
         return self.layout.unpack(y, *self.held(self.follow(t) if signals is None else signals))
 
     def pack(self, state: State) -> Tensor:
-        """The flat vector (..., size) of a state."""
-        return self.layout.pack(state)
+        """The flat vector (..., size) of a state; states of friction that it lacks are those that
+        they begin with."""
+        friction = {name: self.friction_of(name, state) for name in self.contacts}
+        own = {name: both[0] for name, both in friction.items() if both}
+        return self.layout.pack(state._replace(friction=own))
 
     def base_motion(self, name: str, state: State) -> tuple[Tensor, Tensor]:
         """Pose and velocity (..., 3) of a pad's base."""
@@ -326,15 +341,17 @@ class Rig(Shown, nn.Module):
         pad = self.contacts[name].pad
         u = self.displacement(pad, state) if u is None else u
         p = self.pads[pad].point_positions + self.pads[pad].at_points(u)
-        return moving_frame(self.shape_of(name), *self._arms(name, state, p)).g
+        motion = self.relative(name, state)[..., None, :]
+        x = torch.cat((p, motion[..., :3].expand(*p.shape[:-1], 3)), -1)
+        return moving_frame(self.shape_of(name), *point_place(x)).g
 
-    def _arms(self, name: str, state: State, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Moment arms (..., points, 2) [m] of points p from the centre of a contact's body, and the
-        body's angle (..., 1), in the frame of the pad's base."""
+    def relative(self, name: str, state: State) -> Tensor:
+        """Pose and rates (..., 6) of a contact's body in the frame of the pad's base."""
         contact = self.contacts[name]
-        (r_B, _), r_C = self.base_motion(contact.pad, state), state.pose[contact.body]
-        centre = turned(r_C[..., :2] - r_B[..., :2], -r_B[..., 2])
-        return p - centre[..., None, :], r_C[..., 2:] - r_B[..., 2:]
+        (r_B, v_B), r_C = self.base_motion(contact.pad, state), state.pose[contact.body]
+        none = torch.zeros_like(r_C)
+        both = torch.cat((r_C, r_B, state.velocity[contact.body], v_B, none), -1)
+        return relative_motion(both)[..., :6]
 
     def shape_of(self, name: str) -> Shape:
         """Shape of a contact's body."""
@@ -345,6 +362,12 @@ class Rig(Shown, nn.Module):
     def contacts_of(self, pad: str) -> list[str]:
         """Names of the contacts of a pad."""
         return [name for name, contact in self.contacts.items() if contact.pad == pad]
+
+    @property
+    def weighted(self) -> dict[str, Body]:
+        """Bodies that gravity pulls along a free coordinate."""
+        free = {name: one for name, one in self.bodies.items() if one.freedom["y"] == "free"}
+        return {name: one for name, one in free.items() if one.weighted}
 
     @property
     def point_counts(self) -> dict[str, int]:
@@ -377,8 +400,10 @@ class Rig(Shown, nn.Module):
         velocity = {
             name: loads[name] / torch.stack(body.masses) for name, body in self.bodies.items()
         }  # (17), (18)
-        stretch = {name: interface.out[..., 2] for name, interface in graph.interfaces.items()}
-        return self.pack(State(pads, stretch, state.velocity, rates, velocity))
+        points = {name: one.law.rates.mT for name, one in graph.interfaces.items()}
+        stretch = {name: own[..., 0, :] for name, own in points.items()}
+        friction = {name: own[..., 1:, :] for name, own in points.items()}
+        return self.pack(State(pads, stretch, state.velocity, rates, velocity, friction))
 
     def loads(self, graph: Evaluation, effort: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Net forces and moments on the bodies (..., 3) [N, N, N.m], of the net efforts at the
@@ -447,7 +472,7 @@ class Rig(Shown, nn.Module):
                     f"R: slip_{key}",
                 )
                 ports[f"contact_{key}"] = Port(
-                    interfaces[key].transformer, interfaces[key].out[..., 3:5], element
+                    interfaces[key].transformer, interfaces[key].law.force, element
                 )
             ports[f"pad_{name}"] = self._pad_port(name, own, ports, u, u_dot, moment_arm, angle)
         return Evaluation(ports | self._sources(state, signals), flows, interfaces)
@@ -460,30 +485,32 @@ class Rig(Shown, nn.Module):
         u_dot: Tensor,
         which: Tensor | None = None,
     ) -> Tensor:
-        """Inputs x (..., points, 9) of a contact's law: u and u_dot (..., points, 2) are the
-        points' own, in the base's frame. `which` takes some of the points."""
+        """Inputs x (..., points, 12 + states) of a contact's law: u and u_dot (..., points, 2) are
+        the points' own, in the base's frame. `which` takes some of the points."""
         contact = self.contacts[key]
         u, u_dot = torch.broadcast_tensors(u, u_dot)
-        X, weight, s = self.pads[contact.pad].point_positions, self.weight(key), state.stretch[key]
+        X, weight = self.pads[contact.pad].point_positions, self.weight(key)
+        states = [state.stretch[key][..., None, :], *self.friction_of(key, state)]
+        states = torch.cat(states, -2).mT
         if which is not None:
-            X, weight, s = X[which], weight[which], s[..., which]
-        r_B, v_B = self.base_motion(contact.pad, state)
-        v_C, p = state.velocity[contact.body], X + u
-        d, theta = self._arms(key, state, p)
-        glide = turned(v_C[..., :2] - v_B[..., :2], -r_B[..., 2])
-        w = glide[..., None, :] - v_B[..., None, 2:] * cross(p) - u_dot
-        one = torch.ones_like(d[..., 0])
-        parts = (
-            v_C[..., 2:] * one,
-            d,
-            theta * one,
-            s * one,
-            weight * one,
-            0.0 * one,
-        )
-        return torch.cat(
-            [part if part.ndim == d.ndim else part[..., None] for part in (w, *parts)], -1
-        )
+            X, weight, states = X[which], weight[which], states[..., which, :]
+        motion = self.relative(key, state)[..., None, :]
+        parts = (X + u, motion[..., :3], u_dot, motion[..., 3:], states, weight[..., None])
+        size = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        none = torch.zeros(1, dtype=torch.float64)
+        return torch.cat([part.expand(*size, part.shape[-1]) for part in (*parts, none)], -1)
+
+    def friction_of(self, key: str, state: State) -> list[Tensor]:
+        """States (..., states, points) of a contact's law of friction, as they begin where `state`
+        has none; an empty list for a law without."""
+        friction = self.contacts[key].law.friction
+        begin = [getattr(friction, one.start) for one in friction_states(friction).values()]
+        if not begin:
+            return []
+        if key in state.friction:
+            return [state.friction[key]]
+        s = state.stretch[key]
+        return [torch.stack(begin)[:, None].expand(*s.shape[:-1], len(begin), s.shape[-1])]
 
     def point_forces(self, own: Sequence[str], state: State, u: Tensor, u_dot: Tensor) -> Tensor:
         """Sum of the forces of some contacts on the points of their pad (..., points, 2) [N], in
@@ -518,8 +545,8 @@ class Rig(Shown, nn.Module):
         pad, shape = self.pads[contact.pad], self.shape_of(key)
         r_B, _ = self.base_motion(contact.pad, state)
         x = self.point_inputs(key, state, pad.spread @ u, pad.spread @ u_dot)
-        d, angle = x[..., 3:5], r_B[..., 2, None]
-        local = moving_frame(shape, d, x[..., 5])
+        (d, theta), angle = point_place(x), r_B[..., 2, None]
+        local = moving_frame(shape, d, theta)
         n, moment_arm = turned(local.n, angle), turned(d, angle)
         R = torch.stack((n, cross(n)), -2)  # world -> (normal, tangential), the rows of [iR0]
         arm = torch.einsum("...ij,...j->...i", R, cross(moment_arm))[..., None]
@@ -531,9 +558,8 @@ class Rig(Shown, nn.Module):
             }
         )
         frame = Frame(moment_arm, n, cross(n), local.g)
-        return Interface(
-            frame, interface_law(contact.law, shape, x), transformer, transformer.flow(flows)
-        )
+        law = PointLaw.of(interface_law(contact.law, shape, x))
+        return Interface(frame, law, transformer, transformer.flow(flows))
 
     def _pad_port(
         self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor,
@@ -562,13 +588,12 @@ class Rig(Shown, nn.Module):
     def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:
         """Weights and actuators."""
         out = {}
-        for name, body in self.bodies.items():
-            if body.weighted and body.freedom["y"] == "free":
-                force = -(body.mass * self.gravity).expand(signals.shape[:-2])
-                down = Transformer({name: Block(torch.eye(2, dtype=torch.float64)[None, 1:])})
-                out[f"weight_{name}"] = Port(
-                    down, force[..., None, None], (f"Se: m_{self.symbols[name]} g",), True
-                )
+        for name, body in self.weighted.items():
+            force = weight(body.mass, self.gravity).expand(signals.shape[:-2])
+            down = Transformer({name: Block(torch.eye(2, dtype=torch.float64)[None, 1:])})
+            out[f"weight_{name}"] = Port(
+                down, force[..., None, None], (f"Se: m_{self.symbols[name]} g",), True
+            )
         for name, actuator in self.actuators.items():
             body, _, axis = actuator.pushes.partition(".")
             measured = (coordinate.partition(".") for coordinate in actuator.measures)

@@ -15,7 +15,8 @@ class State(NamedTuple):
     pads: of massless pads the nodal forces that have set in (..., branches, nodes, 2) [N], of
     inertial pads the displacements (..., nodes, 2) [m]; stretch: of contacts (..., points); pose,
     velocity: of bodies (..., 3), x, y and theta, those that are fixed or driven included; rates:
-    velocities of inertial pads' nodes (..., nodes, 2), absolute.
+    velocities of inertial pads' nodes (..., nodes, 2), absolute; friction: of contacts whose law of
+    friction has states of its own (..., states, points).
     """
 
     pads: dict[str, Tensor]
@@ -23,11 +24,12 @@ class State(NamedTuple):
     pose: dict[str, Tensor]
     rates: dict[str, Tensor]
     velocity: dict[str, Tensor]
+    friction: dict[str, Tensor] = {}
 
 
 class Layout:
-    """Layout of the flat state vector: pads, stretches, free coordinates, pads' velocities, free
-    velocities.
+    """Layout of the flat state vector: pads, contacts' stretches and states of friction, free
+    coordinates, pads' velocities, free velocities.
 
     `size` is the vector's length; `slices` and `shapes` are by (part, name), with part one of
     State's fields; the free coordinates are ("pose", body) and ("velocity", body), `free` their
@@ -37,11 +39,15 @@ class Layout:
     def __init__(
         self, pads: Mapping[str, tuple[int, ...]], stretch: Mapping[str, int],
         free: Mapping[str, list[int]], inertial: Mapping[str, tuple[int, ...]],
+        friction: Mapping[str, int],
     ) -> None:  # fmt: skip
         self.free = {name: list(axes) for name, axes in free.items()}
         self.shapes: dict[tuple[str, str], tuple[int, ...]] = {}
         self.shapes |= {("pads", name): shape for name, shape in pads.items()}
-        self.shapes |= {("stretch", name): (count,) for name, count in stretch.items()}
+        for name, count in stretch.items():
+            self.shapes["stretch", name] = (count,)
+            if friction.get(name):
+                self.shapes["friction", name] = friction[name], count
         self.shapes |= {("pose", name): (len(axes),) for name, axes in free.items()}
         self.shapes |= {("rates", name): shape for name, shape in inertial.items()}
         self.shapes |= {("velocity", name): (len(axes),) for name, axes in free.items()}

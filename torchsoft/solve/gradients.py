@@ -142,10 +142,10 @@ def run_adjoint(
     outputs_bar = np.zeros((len(run.t), *signals_bar[0].shape[1:]))
     for number in range(len(signals_bar) - 1, -1, -1):
         segment = (run.segments or [])[number]
-        plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system(segment)
+        plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system
         failed, here = np.zeros(1, np.int64), segment.rows
         sweep = Backward(
-            s, stepper.still, room("Work", s, size, columns=1), room("Cotangents", s, size), tape,
+            s, room("Work", s, size, columns=1), room("Cotangents", s, size), tape,
             plan.h, segment.signals, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
             rows[here], felt[here], outputs_bar[here], carried, p_bar, signals_bar[number], failed,
         )  # fmt: skip
@@ -222,15 +222,11 @@ def iterate(
     for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop(0)
-            plan, (tape, out_tape), s = (
-                segment.plan,
-                stepper.tapes(segment),
-                stepper.system(segment),
-            )
+            plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system
             rows = np.empty((len(plan.out_step), size, n))
             work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
             sweep = Forward(
-                s, stepper.still, work, tangents, tape, plan.h, segment.signals, plan.out_step,
+                s, work, tangents, tape, plan.h, segment.signals, plan.out_step,
                 plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, rows,
                 felt[segment.rows],
             )  # fmt: skip

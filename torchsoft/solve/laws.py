@@ -8,6 +8,7 @@ since nothing else shows whether a number that it reads has changed.
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -19,23 +20,26 @@ from torchsoft.codegen.emit import check_pointwise
 from torchsoft.codegen.graph import Graph
 from torchsoft.codegen.stops import left_out
 from torchsoft.codegen.trace import check_backward, traced
-from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.physics.contact import distance_law, free_law, friction_states, interface_law, relative_motion
+from torchsoft.physics.elements import CONSTANTS, linear_element
 from torchsoft.physics.material import Material
 from torchsoft.physics.motion import Reference, polynomial
-from torchsoft.physics.parts import Actuator
+from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
 from torchsoft.physics.validity import tried
-from torchsoft.solve.kernel.arrays import FELT, INPUTS
+from torchsoft.solve.kernel.arrays import CORNERS, MOTION, WRENCH
 
 
 class LawSet(NamedTuple):
-    """The compiled laws of one contact, and its parameters' names and tensors in their order."""
+    """The compiled laws of one contact, its parameters' names and tensors in their order, and the
+    number of states of a point."""
 
     distance: Law
     interface: Law
     free: Law
     parameters: dict[str, Tensor]
+    states: int
 
 
 def copied(
@@ -302,9 +306,41 @@ def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]
 def contact_laws(law: Any, shape: Any) -> LawSet:
     """The laws of a contact of `law` on a body of `shape`."""
     _, parameters = as_law(interface_law, {"law": law, "shape": shape})
+    states = 1 + len(friction_states(law.friction))
+    inputs, rows = MOTION + states + 2, WRENCH + states + 2
     return LawSet(
-        compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
-        compiled_law(parameters, interface_law, INPUTS, FELT, 7, points=True, law=law, shape=shape),
-        compiled_law(parameters, free_law, 3, 1, 1, law=law),
+        compiled_law(parameters, distance_law, inputs, 0, 0, shape=shape),
+        compiled_law(
+            parameters, interface_law, inputs, rows, MOTION + states, points=True, law=law,
+            shape=shape,
+        ),
+        compiled_law(parameters, free_law, states + 2, states, states, law=law),
         parameters,
-    )
+        states,
+    )  # fmt: skip
+
+
+@cache
+def motion_law() -> Law:
+    """The law of relative motion, of every contact."""
+    x = torch.linspace(0.1, 1.5, 15, dtype=torch.float64)
+    return compile_law(lambda x, _: relative_motion(x), x, {})
+
+
+@cache
+def weight_law() -> Law:
+    """The law of a weight; its parameters are mass and gravity."""
+    numbers = torch.tensor([0.5, 9.81], dtype=torch.float64)
+    law = lambda _, own: weight(*own["numbers"].unbind())[None]
+    return compile_law(law, torch.zeros(0, dtype=torch.float64), {"numbers": numbers})
+
+
+@cache
+def element_law() -> Law:
+    """The law of a linear element; its parameters are depth lambda, depth mu and tau."""
+    x = torch.linspace(0.1, 1.0, 2 * CORNERS + CONSTANTS, dtype=torch.float64)
+    moduli = torch.linspace(0.3, 0.5, 3, dtype=torch.float64)
+    return compile_law(
+        lambda x, own: linear_element(x, own["moduli"]), x, {"moduli": moduli},
+        linear=CORNERS, differentiated=2 * CORNERS,
+    )  # fmt: skip

@@ -60,6 +60,7 @@ class Segment:
     y: Array
     V: Array
     u_dot: Array
+    rate: Array
     rows: slice
     tapes: tuple[Any, Any] | None
 
@@ -100,15 +101,21 @@ class RunState:
     def taping(self) -> bool:
         return self.segments is not None and self.taped < self.tape_bytes
 
-    def copy(self) -> tuple[Array, Array, Array, Array]:
-        return self.y.copy(), self.work.V.copy(), self.work.u_dot.copy(), self.integrals.copy()
+    @property
+    def _kept(self) -> tuple[Array, ...]:
+        """Where the run stands: state, Newton's guesses, integrals."""
+        return self.y, self.work.V, self.work.u_dot, self.work.rate, self.integrals
 
-    def back(self, before: tuple[Array, Array, Array, Array]) -> None:
-        self.y[:], self.work.V[:], self.work.u_dot[:], self.integrals[:] = before
+    def copy(self) -> tuple[Array, ...]:
+        return tuple(part.copy() for part in self._kept)
+
+    def back(self, before: tuple[Array, ...]) -> None:
+        for part, value in zip(self._kept, before):
+            part[:] = value
 
     def keep(
         self, plan: Plan, signals: Array, at_outputs: Array,
-        before: tuple[Array, Array, Array, Array], rows: slice, tapes: tuple[Any, Any] | None,
+        before: tuple[Array, ...], rows: slice, tapes: tuple[Any, Any] | None,
     ) -> None:  # fmt: skip
         """Note the steps that were taken, and the tape of their derivatives."""
         if len(plan.h) > 0:
@@ -122,4 +129,4 @@ class RunState:
                 counts = 2 * len(plan.h), len(plan.out_step) if self.outputs_too else 0
                 kept = first_rows(tapes[0], counts[0]), first_rows(tapes[1], counts[1])
                 self.taped += sum(x.nbytes for tape in kept for x in tape)
-            self.segments.append(Segment(plan, signals, at_outputs, *before[:3], rows, kept))
+            self.segments.append(Segment(plan, signals, at_outputs, *before[:4], rows, kept))

@@ -24,7 +24,6 @@ from torchsoft.solve.kernel.arrays import (
     NO_SIGNALS,
     NOT_FINITE,
     OFF_THE_PAD,
-    OFF_THE_RUNG,
     REFUSED,
     TAPE_FULL,
     Limits,
@@ -126,12 +125,9 @@ class ImplicitStepper:
                 f"`tolerance` must be at least {least:.3g} N, but is {tolerance:g} N, "
                 "which rounding hides"
             )
-        if landing and step is None and self.compiled.inertial:
-            raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
         self.layout, self.integrals = self.compiled.layout, Integrals(rig)
         self._since(0.0)
         self._cap, self._shortest = 64, SHORTEST
-        self.still: Any = None
 
     def along(self, knots: Array) -> "ImplicitStepper":
         """The same with the steps between `knots` [s]."""
@@ -155,10 +151,10 @@ class ImplicitStepper:
         return self.compiled.signals(times, self._followed)
 
     def _call(
-        self, s: Any, now: "RunState", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
+        self, now: "RunState", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
         *, taping: bool, given: bool = True, follow: Any = NO_SIGNALS, errors: Any = NO_ERRORS,
         k: Array = NONE, clock: Array = START, stops: Array = NONE, times: Array = NONE,
-        row: int = 0, rung: float = 0.0,
+        row: int = 0,
     ) -> tuple[list[int], tuple[Any, Any] | None]:  # fmt: skip
         """One call of the compiled run, whose outputs go to `rows`: its counts, and the tapes of
         its stages and outputs with `taping`."""
@@ -168,7 +164,7 @@ class ImplicitStepper:
         now.work.low[:] = now.work.high[:] = 0
         y = out.y[rows]
         tape, out_tape = (
-            room("Tape", self.still, self.layout.size, stages=n, cap=self._cap)
+            room("Tape", self.system, self.layout.size, stages=n, cap=self._cap)
             for n in ((2 * steps, len(y) if now.outputs_too else 0) if taping else (0, 0))
         )
         if taping and now.outputs_too:
@@ -180,8 +176,8 @@ class ImplicitStepper:
         most = self.max_iterations if steps else START_ITERATIONS
         limits = Limits(self.tolerance, most, self.window)
         run = Run(
-            s, self.still, now.work, now.step, follow, errors, limits, outputs, tape, given,
-            now.y, k, clock, stops, times, row, rung, self.rtol, self.longest,
+            self.system, now.work, now.step, follow, errors, limits, outputs, tape, given,
+            now.y, k, clock, stops, times, row, self.rtol, self.longest,
             self._shortest, now.integrals, plan.starts, plan.h,
             signals.reshape(steps, 2, *signals.shape[1:]), counts,
         )  # fmt: skip
@@ -226,8 +222,7 @@ class ImplicitStepper:
         check_times(t, self.step)
         self._since(float(t[0]))
         self._shortest = min(SHORTEST, PART * float(t[-1] - t[0]))
-        self.still = self.compiled.system(INSTANT / GAMMA)
-        s, names = self.still, self.integrals.names
+        s, names = self.system, self.integrals.names
         out = self._room(len(t))
         work = room("Work", s, self.layout.size, columns=1)
         step = room("Step", s, self.layout.size, integrals=len(names))
@@ -249,10 +244,6 @@ class ImplicitStepper:
             if self.knots is not None
             else equal_steps(t, self.step or 0.0)
         )
-        if (
-            self.compiled.inertial and self.knots is not None
-        ):  # their arrays belong to one step length
-            todo = [plan.part(i, i + 1) for plan in todo for i in range(len(plan.h))]
         signals, at_outputs = self.signals(todo).numpy(), self.signals_at_outputs(todo).numpy()
         ends, rows = (
             np.cumsum([0, *sizes])
@@ -282,7 +273,7 @@ class ImplicitStepper:
             yield out
             if status == NEWTON_FAILED and halvings < HALVINGS:
                 out.failed += 1
-                now.work.u_dot[:] = 0.0
+                now.work.u_dot[:], now.work.rate[:] = 0.0, 0.0
                 if steps + 1 < len(plan.h):
                     rest = plan.part(steps + 1, len(plan.h))
                     pending.append(
@@ -307,18 +298,16 @@ class ImplicitStepper:
         stops = stops[(stops > times[0]) & (stops <= times[-1])]
         errors = error_parts(self.rig, now.y, self.atol)
         clock, k = np.array([times[0], min(FIRST, times[-1] - times[0]), 1.0]), now.step.K[0].copy()
-        rung, count = 0.0, self.compiled.signal_count
+        count = self.compiled.signal_count
         row_step, row_part = np.zeros(len(t), np.int64), np.zeros(len(t))
         while out.rows < len(t):
-            if self.compiled.inertial:
-                rung = 2.0 ** math.floor(math.log2(min(clock[1], self.longest)))
             plan = Plan(np.zeros(CHUNK), np.zeros(CHUNK), row_step, row_part)
             flat, at_rows = np.zeros((2 * CHUNK, count, 2)), np.zeros((len(t), count, 2))
             before = now.copy()
             (steps, done, status, solves, refused, failed, which), tapes = self._call(
-                self.compiled.system(rung or 1.0), now, plan, flat, at_rows, slice(None),
+                now, plan, flat, at_rows, slice(None),
                 taping=now.taping, given=False, follow=followed.arrays, errors=errors, k=k,
-                clock=clock, stops=stops, times=times, row=out.rows, rung=rung,
+                clock=clock, stops=stops, times=times, row=out.rows,
             )  # fmt: skip
             if followed.error is not None:
                 raise followed.error
@@ -334,7 +323,7 @@ class ImplicitStepper:
             yield out
             if status == TAPE_FULL:
                 self._cap *= 2
-            elif status not in (CONVERGED, OFF_THE_RUNG):
+            elif status != CONVERGED:
                 worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
                 raise self._failure(status, float(clock[0]), float(clock[1]), worst)
 
@@ -361,26 +350,25 @@ class ImplicitStepper:
 
     def _room(self, rows: int) -> Progress:
         """Room for so many outputs."""
-        s = self.still
         y, integrals, recorded = (
             np.zeros((rows, width))
-            for width in (self.layout.size, len(self.integrals.names), recorded_size(s))
+            for width in (self.layout.size, len(self.integrals.names), recorded_size(self.system))
         )
         return Progress(y, integrals, recorded, origin=self.origin)
 
-    def system(self, segment: Segment) -> Any:
-        """The arrays for the steps of a segment."""
-        h = segment.plan.h
-        return self.compiled.system(float(h[0])) if len(h) else self.still
+    @property
+    def system(self) -> Any:
+        """The rig's arrays."""
+        return self.compiled.system
 
     def tapes(self, segment: Segment) -> tuple[Any, Any]:
         """The tapes of a segment's stages and outputs, made again from where it began if they were
         not kept."""
         if segment.tapes is not None:
             return segment.tapes
-        s, n = self.system(segment), len(segment.plan.out_step)
+        s, n = self.system, len(segment.plan.out_step)
         work, names = room("Work", s, self.layout.size, columns=1), len(self.integrals.names)
-        work.V[:], work.u_dot[:] = segment.V, segment.u_dot
+        work.V[:], work.u_dot[:], work.rate[:] = segment.V, segment.u_dot, segment.rate
         again = RunState(
             segment.y.copy(),
             work,
@@ -403,10 +391,9 @@ class ImplicitStepper:
         """One compiled call of given steps; with `taping` once more with longer tapes if more
         points touch than they have room for."""
         before = now.copy()
-        s = self.compiled.system(float(plan.h[0])) if len(plan.h) else self.still
         while True:
             (done, rows_done, status, solves, *_), tapes = self._call(
-                s, now, plan, signals, at_outputs, rows, taping=taping
+                now, plan, signals, at_outputs, rows, taping=taping
             )
             if status != TAPE_FULL:
                 return done, rows_done, status, solves, tapes

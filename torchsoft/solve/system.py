@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import linalg, sparse
 from torch import Tensor
 
 from torchsoft.codegen import Law
 from torchsoft.physics.contact import Friction, SoftContact
-from torchsoft.physics.mesh import banded, dofs_of, unit_loads
+from torchsoft.physics.elements import CONSTANTS
+from torchsoft.physics.mesh import dofs_of
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
@@ -34,14 +34,16 @@ from torchsoft.physics.validity import (
 )
 from torchsoft.solve.kernel import arrays
 from torchsoft.solve.kernel.arrays import (
-    GAMMA,
-    Actuators,
+    CONDENSED,
+    NODAL,
     Bodies,
+    Condensed,
     Contacts,
-    Inertia,
     Limits,
+    Nodal,
     Pads,
     Points,
+    Sources,
     room,
     system,
 )
@@ -52,10 +54,13 @@ from torchsoft.solve.laws import (
     actuator_fault,
     actuator_law,
     contact_laws,
+    element_law,
     friction_fault,
     material_fault,
+    motion_law,
     shape_fault,
     structure,
+    weight_law,
 )
 from torchsoft.solve.progress import Integrals, SimulationFailed
 from torchsoft.solve.steps import Followed
@@ -73,8 +78,7 @@ def independent() -> Iterator[None]:
 
 
 class Compiled:
-    """A rig at one moment: `p` (parameters,) with its graph, `names` of its entries, and
-    `system(h)` for a step h [s]."""
+    """A rig at one moment: `p` (parameters,) with its graph, and the arrays of its `system`."""
 
     def __init__(self, rig: Rig) -> None:
         rig.check_names()
@@ -88,11 +92,10 @@ class Compiled:
         self._entries: list[Tensor] = []
         self._known: dict[tuple[int, int], LawSet] = {}
         self._count = 0
-        self._systems: dict[float, Any] = {}
         self._bodies = self._make_bodies()
-        self._pads, self._inertia = self._make_pads()
-        self._actuators = self._make_actuators()
-        self._contacts, self._points = self._make_contacts()
+        self._pads = self._make_pads()
+        parts = self._bodies, self._make_sources(), self._pads, self._make_condensed()
+        parts = *parts, self._make_nodal(), *self._make_contacts()
         self.p = torch.cat([x.reshape(-1) for x in self._entries])
         check_array("p", self.p)
         if not bool(torch.isfinite(self.p).all()):
@@ -100,6 +103,7 @@ class Compiled:
                 "the parameters of the rig give numbers that are not finite; some are too large or "
                 "too small"
             )
+        self.system = system(*parts, p=self.p.detach().numpy().copy())
 
     def _add(self, value: Tensor) -> int:
         """Append a tensor to the vector of parameters; where it begins."""
@@ -127,19 +131,12 @@ class Compiled:
         for c in np.flatnonzero(driven):
             signal[c] = rig.signals.index(".".join(places[c]))
         masses = [self._add(mass) for body in rig.bodies.values() for mass in body.masses]
-        weighted = [rig.bodies[name].weighted and axis == "y" for name, axis in places]
         coordinate = np.flatnonzero(free)
         return filled(
             Bodies, free=np.where(free, free.cumsum() - 1, -1), signal=signal,
             coordinate=coordinate, mass_at=np.array(masses)[coordinate],
-            weight=np.array(weighted)[coordinate], gravity_at=self._add(rig.gravity),
             q_start=self._start("pose"), V_start=self._start("velocity"),
         )  # fmt: skip
-
-    @property
-    def inertial(self) -> bool:
-        """Whether any pad has inertia; the arrays then belong to one step."""
-        return len(self._inertia.X) > 0
 
     @property
     def signal_count(self) -> int:
@@ -170,16 +167,13 @@ class Compiled:
         held = torch.stack([torch.stack(fixed), torch.zeros(len(fixed), dtype=torch.float64)], -1)
         return torch.cat((followed, held.expand(*t.shape, -1, -1)), -2)
 
-    def _make_pads(self) -> tuple[Pads, Inertia]:
+    def _make_pads(self) -> Pads:
         rig, slices, bodies = self.rig, self.layout.slices, list(self.rig.bodies)
         pads, sizes = rig.pads.values(), [len(pad.mesh.surface) for pad in rig.pads.values()]
         base = [3 * (len(bodies) if pad.base is None else bodies.index(pad.base)) for pad in pads]
         for name, pad in rig.pads.items():
             if structure(pad.material) is None and (wrong := material_fault(name, pad.material)):
                 warnings.warn(wrong, stacklevel=2)
-        chains = [pad.chain() for pad in pads]
-        branches = np.array([len(fractions) for fractions, _ in chains], np.int64)
-        chain_at = [self._add(torch.cat((*chain, moduli(pad)))) for chain, pad in zip(chains, pads)]
         columns = np.full((len(pads), len(self._bodies.coordinate)), -1, np.int64)
         for number, name in enumerate(rig.pads):
             touched = (3 * bodies.index(rig.contacts[key].body) for key in rig.contacts_of(name))
@@ -187,87 +181,91 @@ class Compiled:
             columns[number, mine] = np.arange(mine.sum())
         ends = np.cumsum([0, *rig.point_counts.values()])
         owners = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
-        none = torch.zeros(0, dtype=torch.float64)
-        units = [
-            (none.new_zeros(4 * n * n),) * 2 if pad.inertial else pad.unit_compliance()
-            for n, pad in zip(sizes, pads)
-        ]
-        C, dC = (torch.cat([none, *(unit[k].flatten() for unit in units)]) for k in (0, 1))
-        made = filled(
-            Pads, base=base, node_start=np.cumsum([0, *sizes]),
+        return filled(
+            Pads, kind=[NODAL if pad.nodal else CONDENSED for pad in pads], base=base,
+            node_start=np.cumsum([0, *sizes]),
             point_start=ends[np.searchsorted(owners, np.arange(len(pads) + 1))],
-            y_start=[slices["pads", name].start for name in rig.pads],
-            v_start=[
-                slices["rates", name].start if pad.inertial else -1
-                for name, pad in rig.pads.items()
-            ],
-            chain_at=chain_at, branches=branches,
-            C_start=np.cumsum([0, *(4 * n * n for n in sizes)]), C=C, dC=dC,
-            reach=[1.5 * unit.abs().max() for unit, _ in units], column=columns,
+            y_start=[slices["pads", name].start for name in rig.pads], column=columns,
             columns=(columns >= 0).sum(1),
         )  # fmt: skip
-        return made, self._make_inertia(made.node_start, made.chain_at + 2 * branches)
 
-    def _make_inertia(self, node_start: Index, material_at: Index) -> Inertia:
-        moving = {i: pad for i, pad in enumerate(self.rig.pads.values()) if pad.inertial}
-        dofs = np.zeros(len(material_at) + 1, np.int64)
-        for i, pad in moving.items():
-            dofs[i + 1] = 2 * pad.nodes
-        dofs = dofs.cumsum()
-        total = dofs[-1]
-        X, area = np.zeros(total), np.zeros(total)
-        both = {i: [pad.stiffness(1, 0), pad.stiffness(0, 1)] for i, pad in moving.items()}
-        patterns = {
-            i: sparse.csr_array(abs(K_lambda) + abs(K_mu)) for i, (K_lambda, K_mu) in both.items()
-        }
-        for pattern in patterns.values():
-            pattern.eliminate_zeros()
-        widest = max(
-            (pattern.count_nonzero(axis=1).max() for pattern in patterns.values()), default=0
-        )
-        surface = np.zeros(2 * node_start[-1], np.int64)
-        column, *K = (np.zeros((total, widest)) for _ in range(3))
-        for i, pad in moving.items():
-            here = slice(dofs[i], dofs[i + 1])
-            X[here], area[here] = pad.positions.numpy().ravel(), np.repeat(pad.mesh.nodal_areas, 2)
-            surface[2 * node_start[i] : 2 * node_start[i + 1]] = dofs_of(pad.surface.numpy())
-            stiffness, pattern = both[i], patterns[i]
-            row = np.repeat(np.arange(here.stop - here.start), np.diff(pattern.indptr))
-            at = dofs[i] + row, np.arange(len(row)) - pattern.indptr[row]
-            column[at] = pattern.indices
-            for k in range(2):
-                K[k][at] = stiffness[k][row, pattern.indices]
+    def _make_condensed(self) -> Condensed:
+        """Chains and compliances of the pads that are condensed; a nodal pad has none."""
+        pads, none = list(self.rig.pads.values()), torch.zeros(0, dtype=torch.float64)
+        units = [(none, none) if pad.nodal else pad.unit_compliance() for pad in pads]
+        C, dC = (torch.cat([none, *(unit[k].flatten() for unit in units)]) for k in (0, 1))
+        own = lambda pad: (1 / (pad.E * pad.material.depth), pad.material.nu)
+        numbers = [
+            none if pad.nodal else torch.cat((*pad.chain(), torch.stack(own(pad)))) for pad in pads
+        ]
         return filled(
-            Inertia, dof_start=dofs, surface=surface, factor=np.zeros((1, total)),
-            band=np.ones(len(material_at)), X=X, area=area, K_column=column, K_lambda=K[0],
-            K_mu=K[1], D=np.zeros((total, 2)), B=np.zeros((len(material_at), 2, 2)),
-            material_at=material_at,
+            Condensed, chain_at=[self._add(values) for values in numbers],
+            branches=[0 if pad.nodal else pad.branches for pad in pads],
+            C_start=np.cumsum([0, *(len(unit.flatten()) for unit, _ in units)]), C=C, dC=dC,
+            reach=[0.0 if pad.nodal else 1.5 * unit.abs().max()
+                   for pad, (unit, _) in zip(pads, units)],
         )  # fmt: skip
 
-    def _make_actuators(self) -> Actuators:
+    def _make_nodal(self) -> Nodal:
+        """Elements of the pads that are not condensed."""
+        rig, slices = self.rig, self.layout.slices
+        pads = [pad if pad.nodal else None for pad in rig.pads.values()]
+        dofs = [0 if pad is None else 2 * pad.nodes for pad in pads]
+        band = [0 if pad is None else 2 * spread(pad.corners // 2) + 1 for pad in pads]
+        law = element_law() if any(pads) else None
+        none = torch.zeros(0, dtype=torch.float64)
+        starts = [self._add(none if pad is None else element_moduli(pad)) for pad in pads]
+        joined = lambda kind, *shape: np.concatenate(
+            [np.zeros((0, *shape)), *(kind(pad) for pad in pads if pad is not None)]
+        )
+        surface = [
+            np.full(2 * len(pad.mesh.surface), -1) if not pad.nodal
+            else dofs_of(pad.surface.numpy()) for pad in rig.pads.values()
+        ]
+        address = lambda name: [0 if law is None else getattr(law, name)] * len(pads)
+        return filled(
+            Nodal, dof_start=np.cumsum([0, *dofs]),
+            element_start=np.cumsum([0, *(0 if pad is None else len(pad.corners) for pad in pads)]),
+            v_start=[slices["rates", name].start if pad.inertial else -1
+                     for name, pad in rig.pads.items()],
+            density_at=[at + 3 for at in starts], band=band,
+            band_start=np.cumsum([0, *(n * (2 * b + 1) for n, b in zip(dofs, band))])[:-1],
+            value=address("value"), linearise=address("linearise"), pullback=address("pullback"),
+            p_first=starts, p_last=[at + (3 if pad else 0) for at, pad in zip(starts, pads)],
+            X=joined(lambda pad: pad.positions.numpy().ravel()),
+            area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2)),
+            dof=joined(lambda pad: pad.corners, 8), constants=joined(
+                lambda pad: pad.constants, CONSTANTS),
+            surface=np.concatenate([np.zeros(0), *surface]),
+        )  # fmt: skip
+
+    def _make_sources(self) -> Sources:
+        """Actuators, and weights of the bodies that move along y."""
         rig, laws, starts = self.rig, list[Law](), list[int]()
-        numbers = lambda names: [rig.signals.index(name) for name in names]
         for name, actuator in rig.actuators.items():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
             laws.append(actuator_law(name, actuator, parameters))
             if structure(actuator) is None and (wrong := actuator_fault(name, actuator)):
                 warnings.warn(wrong, stacklevel=2)
             starts.append(self._add_all(parameters))
-        every = rig.actuators.values()
-        setpoint_start, setpoint = _ragged([numbers(one.setpoints) for one in every])
-        measured_start, measured = _ragged(
-            [[rig.coordinate(name) for name in one.measures] for one in every]
+        for body in rig.weighted.values():
+            laws.append(weight_law())
+            starts.append(self._add(torch.stack((body.mass, rig.gravity))))
+        every, others = rig.actuators.values(), [[]] * len(rig.weighted)
+        signal_start, signal = _ragged(
+            [[rig.signals.index(name) for name in one.reads] for one in every] + others
+        )
+        coordinate_start, coordinate = _ragged(
+            [[rig.coordinate(name) for name in one.measures] for one in every] + others
         )
         return filled(
-            Actuators, linearise=[law.linearise for law in laws],
+            Sources, linearise=[law.linearise for law in laws],
             pullback=[law.pullback for law in laws], p_start=[*starts, self._count],
-            pushed=[rig.coordinate(one.pushes) for one in every],
-            feed_forward=[
-                -1 if one.feed_forward is None else rig.signals.index(one.feed_forward)
-                for one in every
-            ],
-            setpoint_start=setpoint_start, setpoint=setpoint,
-            measured_start=measured_start, measured=measured,
+            pushed=[rig.coordinate(one.pushes) for one in every]
+            + [rig.coordinate(f"{name}.y") for name in rig.weighted],
+            power=[*range(len(every)), *[len(every)] * len(rig.weighted)],
+            signal_start=signal_start, signal=signal, coordinate_start=coordinate_start,
+            coordinate=coordinate,
         )  # fmt: skip
 
     def _laws(self, name: str, law: SoftContact, shape: Shape) -> LawSet:
@@ -310,15 +308,15 @@ class Compiled:
         coordinate = both.reshape(-1, 6)
         counts = list(rig.point_counts.values())
         made = filled(
-            Contacts, pad=owners, body=body, number=self._bodies.free[coordinate],
-            coordinate=coordinate, distance=[one.distance.value for one in laws],
+            Contacts, pad=owners, number=self._bodies.free[coordinate], coordinate=coordinate,
+            states=[one.states for one in laws], distance=[one.distance.value for one in laws],
             linearise=[one.interface.linearise for one in laws],
             pullback=[one.interface.pullback for one in laws],
             free=[one.free.value for one in laws],
             free_linearise=[one.free.linearise for one in laws],
             free_pullback=[one.free.pullback for one in laws], p_start=[*starts, self._count],
             point_start=np.cumsum([0, *counts]), size=[shape.size() for shape in shapes],
-            limits=limits,
+            limits=limits, relative=motion_law().linearise,
         )  # fmt: skip
         pads = [rig.pads[contact.pad] for contact in contacts]
         joined = lambda parts, *shape: np.concatenate([np.zeros((0, *shape)), *parts])
@@ -329,76 +327,34 @@ class Compiled:
             node=joined(
                 (self._pads.node_start[k] + pad.point_nodes for k, pad in zip(owners, pads)), 2
             ),
-            N=joined((pad.point_shares for pad in pads), 2), y_start=self._start("stretch"),
+            N=joined((pad.point_shares for pad in pads), 2), y_start=joined(
+                np.arange(*self.layout.slices["stretch", name].indices(self.layout.size))
+                for name in rig.contacts
+            ),
         )  # fmt: skip
 
-    def system(self, h: float) -> Any:
-        """The arrays for steps of h [s]; only inertial pads depend on it."""
-        key = float(f"{h:.12g}") if self.inertial else 0.0
-        if key not in self._systems:
-            if (
-                len(self._systems) > 32
-            ):  # an irregular output grid has many step sizes; each holds some megabytes
-                self._systems.clear()
-            pads, inertia = self._mobilities(GAMMA * key) if key else (self._pads, self._inertia)
-            p = self.p.detach().numpy().copy()
-            self._systems[key] = system(
-                self._bodies, self._actuators, pads, inertia, self._contacts, self._points, p=p
-            )
-        return self._systems[key]
 
-    def _mobilities(self, a: float) -> tuple[Pads, Inertia]:
-        """Inertial pads' mobilities at the stage length a h [s]: surface rates per surface force,
-        and per velocity of the base."""
-        pads, inertia = self._pads._replace(C=self._pads.C.copy()), self._inertia
-        parts, p = [], self.p.detach().numpy()
-        D, B = inertia.D.copy(), inertia.B.copy()
-        for i, pad in enumerate(self.rig.pads.values()):
-            here = slice(inertia.dof_start[i], inertia.dof_start[i + 1])
-            if not pad.inertial:
-                continue
-            lame_lambda, lame_mu, tau, density = p[
-                inertia.material_at[i] : inertia.material_at[i] + 4
-            ]
-            K = pad.stiffness(lame_lambda, lame_mu)
-            M = density * inertia.area[here]
-            A = banded((K * (tau + a)).tocsr())
-            A[0] += M / a
-            factor = linalg.cholesky_banded(A, lower=True)
-            surface = inertia.surface[2 * pads.node_start[i] : 2 * pads.node_start[i + 1]]
-            loads = unit_loads(len(M), surface)
-            P = linalg.cho_solve_banded((factor, True), loads)[surface]
-            pads.C[pads.C_start[i] : pads.C_start[i + 1]] = P.ravel()
-            uniform = M[:, None] * np.tile(np.eye(2), (len(M) // 2, 1)) / a
-            D[here] = linalg.cho_solve_banded((factor, True), uniform)
-            B[i] = np.diag(uniform.sum(0)) - uniform.T @ D[here]
-            parts.append((i, here, factor))
-        band = np.ones(len(self.rig.pads), np.int64)
-        width = max(len(factor) for *_, factor in parts)
-        factors = np.zeros((width, len(inertia.X)))
-        for i, here, factor in parts:
-            band[i] = len(factor)
-            factors[: len(factor), here] = factor
-        return pads, inertia._replace(factor=factors, band=band, D=D, B=B)
-
-
-def moduli(pad: Pad) -> Tensor:
-    """Numbers of a pad's material as the kernels take them: depth lambda, depth mu, tau, rho depth
-    of an inertial pad, else 1 / (E depth), nu."""
+def element_moduli(pad: Pad) -> Tensor:
+    """Parameters of a nodal pad's elements, depth lambda, depth mu and tau, and then rho depth."""
     material = pad.material
-    if not pad.inertial:
-        return torch.stack((1 / (pad.E * material.depth), material.nu))
     lame = (material.depth * modulus for modulus in pad.lame())
     return torch.stack((*lame, pad.chain()[1][0], material.rho * material.depth))
 
 
-def filled(kind: Any, **fields: Any) -> Any:
+def spread(corners: Index) -> int:
+    """Largest difference between the nodes of one element, bonded ones (below zero) apart."""
+    free = corners >= 0
+    most = np.where(free, corners, -1).max(1) - np.where(free, corners, corners.max()).min(1)
+    return int(most.max())
+
+
+def filled(part: Any, /, **fields: Any) -> Any:
     """One of `PARTS` from its fields, as arrays of their declared types."""
     parts = []
-    for name, dtype, ndim, _ in layout(kind):
+    for name, dtype, ndim, _ in layout(part):
         value = np.ascontiguousarray(fields[name], dtype) if ndim else fields[name]
         parts.append(value if np.ndim(value) == ndim else value.reshape((0,) * ndim))
-    return kind(*parts)
+    return part(*parts)
 
 
 def _ragged(lists: list[list[int]]) -> tuple[Index, list[int]]:
@@ -427,11 +383,11 @@ class Rates:
 
     def __init__(self, rig: Rig, reference: Reference | None = None) -> None:
         compiled = Compiled(rig)
-        if compiled.inertial:
+        if any(pad.inertial for pad in rig.pads.values()):
             raise NotImplementedError(
                 "the rates of inertial pads are not compiled for single states; use `rig.forward`"
             )
-        self._system, self._limits = compiled.system(1.0), LIMITS
+        self._system, self._limits = compiled.system, LIMITS
         self._work = room("Work", self._system, compiled.layout.size, columns=1)
         followed = rig.reference if reference is None else reference
         self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)

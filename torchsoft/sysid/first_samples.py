@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.physics.contact import cross
+from torchsoft.physics.contact import cross, point_place
 from torchsoft.physics.parts import COORDINATES, PD, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import above
@@ -251,7 +251,8 @@ def rolling(
             pad = rig.contacts[name].pad
             u = rig.pads[pad].at_points(rig.displacement(pad, state))
             x = rig.point_inputs(name, moving, u, torch.zeros_like(u))
-            rows.append(F_N.sqrt()[:, None] * (x[:, :2] + x[:, 2:3] * cross(x[:, 3:5])))
+            v = x[:, 7:9] + x[:, 9:10] * cross(point_place(x)[0]) - x[:, 5:7]
+            rows.append(F_N.sqrt()[:, None] * v)
         return torch.cat(rows).detach().numpy().ravel()
 
     none = glide(np.zeros(len(missing)))

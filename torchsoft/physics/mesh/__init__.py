@@ -9,6 +9,7 @@ dilatational part is integrated at the element's centre and the shear part at 2 
 from torchsoft.physics.mesh.block import CurvedPadMesh, FingertipMesh, PadMesh
 from torchsoft.physics.mesh.mesh import (
     Array,
+    Index,
     Mesh,
     StoredMesh,
     banded,
@@ -21,7 +22,7 @@ from torchsoft.physics.mesh.mesh import (
 from torchsoft.physics.mesh.quads import QuadMesh
 
 __all__ = [
-    "Array", "CurvedPadMesh", "FingertipMesh", "Mesh", "PadMesh", "QuadMesh",
+    "Array", "CurvedPadMesh", "FingertipMesh", "Index", "Mesh", "PadMesh", "QuadMesh",
     "StoredMesh", "banded", "dofs_of", "lame_moduli", "lame_slopes", "unit_compliance",
     "unit_loads",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 A rig has coordinates (x, y, theta) of its bodies, three each, and last those of the ground, which
 are zero. A coordinate is free (a component of the state) or follows a signal. "At" in a name is a
 position in the vector p of all law parameters, "start" one in another array. Nodes are the surface
-nodes of all pads, points the contact points of all contacts.
+nodes of all pads, points the contact points of all contacts, dofs those of all nodal pads.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -23,109 +23,124 @@ from torchsoft.solve.kernel.table import (
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 MIX = (1.0 - GAMMA) / GAMMA
 
-CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE, REFUSED, OFF_THE_RUNG = range(8)
+CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE, REFUSED = range(7)
 """Why a run ended."""
 
 INSTANT = 1e-13
 """Length a h [s] of the stage that gives the forces at one moment: nothing moves in it."""
 
+TINY = 1e-60
+"""Components of the state below this are set to zero, so that decaying ones do not become denormal
+numbers."""
+
 PASSED = 0.25
 """A step that tolerances choose moves no body by more than this part of its size over a pad that it
 may touch: one that flies would else be through the pad between two steps."""
 
-INPUTS, OUTPUTS, STEPPED, FELT = 9, 7, 3, 5
-"""A contact law's inputs (w, omega, d, theta, s*, weight, a h) and outputs (f, s', F_N, F_T, power
-of dashpots, of slip); how many of the outputs a stage needs, and how many are differentiated."""
+MOTION, WRENCH = 10, 3
+"""A contact point's law has as inputs its place in the base's frame and the relative pose of the
+body (5), their rates (5), its states s*, its weight and a h; as outputs its force on the pad with
+the moment about the body's centre (3), s', F_N, F_T, and the powers of dashpots and of slip. All
+but the powers are differentiated, by the motion and by s*."""
+
+CONDENSED, NODAL = range(2)
+"""Kinds of pads: condensed onto its surface, or with the displacements of all of its nodes."""
+
+CORNERS = 8
+"""Displacements of the four corners of an element: its law has them, their rates and the element's
+constants as inputs, and as outputs the forces on them and the power that it dissipates."""
 
 
 class Bodies(NamedTuple):
     """free (coordinates,): number among the free ones, or -1; signal (coordinates,): the one
-    followed, or -1; coordinate, mass_at, weight (free,): coordinate, position of its mass in p, 1
-    where gravity pulls; gravity_at; y_start of q and V."""
+    followed, or -1; coordinate, mass_at (free,): coordinate, position of its mass in p; y_start of
+    q and V."""
 
     free: Index
     signal: Index
     coordinate: Index
     mass_at: Index
-    weight: Array
-    gravity_at: int
     q_start: int
     V_start: int
 
 
-class Actuators(NamedTuple):
-    """Per actuator: law addresses, its parameters' ends in p, coordinate pushed, signal fed forward
-    (-1: none), the ends of its signals in setpoint and of its coordinates in measured."""
+class Sources(NamedTuple):
+    """Actuators and weights, each an effort on one coordinate: law addresses, its parameters' ends
+    in p, coordinate pushed, power: its number among those that are integrated; the ends of what it
+    reads in signal and in coordinate, each with its rate."""
 
     linearise: Index
     pullback: Index
     p_start: Index
     pushed: Index
-    feed_forward: Index
-    setpoint_start: Index
-    setpoint: Index
-    measured_start: Index
-    measured: Index
+    power: Index
+    signal_start: Index
+    signal: Index
+    coordinate_start: Index
+    coordinate: Index
 
 
 class Pads(NamedTuple):
-    """Per pad: base (its first coordinate), node_start, point_start, y_start of its displacements'
-    states, v_start of its velocities (-1: massless), chain_at of its branches' fractions and then
-    times in p, branches, C_start in C, reach: the largest entry of C; column, columns:
-    free coordinates that its contacts involve, and their number.
+    """Per pad: kind, base (its first coordinate), node_start, point_start, y_start of its state;
+    column, columns: free coordinates that its contacts involve, and their number."""
 
-    C holds the surface mobilities (2 nodes, 2 nodes) one after the other: massless pads'
-    compliance for E depth = 1, inertial pads' mobility.
-    """
-
+    kind: Index
     base: Index
     node_start: Index
     point_start: Index
     y_start: Index
-    v_start: Index
+    column: IndexMatrix
+    columns: Index
+
+
+class Condensed(NamedTuple):
+    """Per pad: chain_at of its branches' fractions and then times in p, branches, C_start in C,
+    reach: the largest entry of C. C holds the compliances (2 nodes, 2 nodes) for E depth = 1 one
+    after the other, dC their derivatives by nu; a nodal pad has none."""
+
     chain_at: Index
     branches: Index
     C_start: Index
     C: Array
     dC: Array
     reach: Array
-    column: IndexMatrix
-    columns: Index
 
 
-class Inertia(NamedTuple):
-    """Inertial pads, dof by dof from dof_start [pad] on: X (dofs, 2) arms, M, the sparse rows of
-    K_lambda and K_mu per depth and modulus (dofs, 18), with their columns, and D, the rates per
-    velocity of the base. surface: dof of every surface dof; factor (., band): the banded Cholesky
-    factor of M/(a h) + (tau + a h) K; B (pads, 2, 2): the base's reaction per velocity.
-
-    material_at (pads,): position of depth lambda, depth mu, tau, rho depth in p.
-    """
+class Nodal(NamedTuple):
+    """Per pad: ends in the dofs and the elements, v_start of its velocities (-1: without inertia),
+    density_at of rho depth in p, band: the largest difference between dofs of one element, its
+    place in the banded matrices; law addresses of its elements, ends of their parameters in p. Per
+    dof: X, place of its node (its own coordinate), and area. Per element: its dofs, -1 where it is
+    bonded, and constants. surface: dof of every surface dof."""
 
     dof_start: Index
-    surface: Index
-    factor: Matrix
+    element_start: Index
+    v_start: Index
+    density_at: Index
     band: Index
+    band_start: Index
+    value: Index
+    linearise: Index
+    pullback: Index
+    p_first: Index
+    p_last: Index
     X: Array
     area: Array
-    K_column: IndexMatrix
-    K_lambda: Matrix
-    K_mu: Matrix
-    D: Matrix
-    B: Cube
-    material_at: Index
+    dof: IndexMatrix
+    constants: Matrix
+    surface: Index
 
 
 class Contacts(NamedTuple):
-    """Per contact: pad, body (first coordinate), free numbers of the coordinates of the body and of
-    the pad's base (., 6) or -1, and those coordinates; law addresses, p_start of its parameters,
-    point_start, size of the body, limits (x from, x to, y from, y to) of the body's centre in the
-    base's frame."""
+    """Per contact: pad, free numbers of the coordinates of the body and of the pad's base (., 6) or
+    -1, and those coordinates; states of each of its points, law addresses, p_start of its
+    parameters, point_start, size of the body, limits (x from, x to, y from, y to) of the body's
+    centre in the base's frame. relative: address of the law of relative motion."""
 
     pad: Index
-    body: Index
     number: IndexMatrix
     coordinate: IndexMatrix
+    states: Index
     distance: Index
     linearise: Index
     pullback: Index
@@ -136,25 +151,27 @@ class Contacts(NamedTuple):
     point_start: Index
     size: Array
     limits: Matrix
+    relative: int
 
 
 class Points(NamedTuple):
     """Per contact point: its contact, undeformed place in the base's frame, weight, two surface
-    nodes and their shape functions there; y_start of the stretches."""
+    nodes and their shape functions there; y_start of its states."""
 
     contact: Index
     X: Matrix
     weight: Array
     node: IndexMatrix
     N: Matrix
-    y_start: int
+    y_start: Index
 
 
 PARTS = {
     "body": Bodies,
-    "act": Actuators,
+    "source": Sources,
     "pad": Pads,
-    "inertia": Inertia,
+    "condensed": Condensed,
+    "nodal": Nodal,
     "contact": Contacts,
     "point": Points,
 }
@@ -233,21 +250,26 @@ NO_ERRORS = Errors(
 SCRATCH: dict[str, dict[str, str]] = {
     "Work": {  # of a stage
         "coordinates": "q V V_old load",
-        "contacts 7": "frame",
-        "dofs": "zeta zeta_rate u_dot_new",  # zeta: of a massless pad's chain
+        # of every contact its bodies' motion and the wrench on its pad, their relative motion and
+        # loads with derivatives, and those of the motion by velocities of the stage
+        "contacts 15": "pair",
+        "contacts 12": "relative",
+        "contacts 12 15": "by_pair",
+        "contacts 6 6": "by_stage",
+        "condensed": "zeta zeta_rate",  # of a chain
         # displacement u*, rates (without contact, now, before and after a Newton step), forces by
         # the law and by the linear relations (now, before, after)
-        "nodes 2": "u free u_dot u_dot_old F F_linear F_old F_new",
-        "points 9": "x",  # the law's inputs, outputs and Jacobian
-        "points 7": "out",
-        "points 5 7": "J",
-        "points 5 8": "H S",  # of the touching points in the order of `active`, see `interface`
-        "points 6 2": "G",
-        "points 6 8": "L",
+        "nodes 2": "u free u_dot u_dot_old u_dot_new F F_linear F_old F_new",
+        "points inputs": "x",  # the law's inputs, outputs and Jacobian by rows
+        "points outputs": "out",
+        "points jacobian": "J",
+        # derivatives by (displacement (2), coordinates (6)): by rates of the stage and by positions
+        "points rows 8": "H S",
         # numbers of points near and touching, from every pad's first point on
         "int points": "window active",
         # numbers of those, nodes of the window, numbers of touched nodes
         "int pads": "windows actives low high counts",
+        "pads": "power",  # of nodal pads [W]
         "int nodes": "slot touched",
         "widest widest": "A P",  # one pad's share of Newton's system
         "2 widest": "PB",
@@ -257,15 +279,27 @@ SCRATCH: dict[str, dict[str, str]] = {
         "free 1": "r b",
         "free free": "Rv",
         "free": "dV",
-        "dofs columns+free": "X",  # left by Newton's elimination
+        "nodes2 columns+free": "X",  # left by Newton's elimination
         "1": "phi effort",
-        "inputs": "effort_x",
-        "1 inputs": "effort_J",
-        "9": "probe",
+        "reads": "effort_x",
+        "1 reads": "effort_J",
+        "free_inputs": "decay_x",
+        "free_outputs": "decay",
+        "square": "decay_J",
+        "inputs": "probe",
         # way [m] since the last scan for near points, that scan's margin [m], number of scans
-        "3": "decay travelled",
-        "4 inertial": "inertial",
-        "inertial": "full",  # u' of inertial pads
+        "3": "travelled",
+        # of nodal pads: rates (now, before, without contact, after a Newton step), internal forces
+        # with their sizes, loads of a solve
+        "dofs": "rate rate_old rate_free rate_new internal noise load_dof",
+        # rates per velocity of the base, and its reaction per force
+        "dofs 2": "D D_left",
+        "pads 2 2": "B",  # the base's reaction per velocity
+        "banded": "band",
+        "solves": "solves",
+        "element_inputs": "element_x",
+        "9": "element",
+        "8 16": "element_J",
         "state": "k",
     },
     # what one step leaves: its start with Newton's guesses; rates, powers, bounds of the speeds of
@@ -275,6 +309,7 @@ SCRATCH: dict[str, dict[str, str]] = {
         "integrals": "integrals at_row scrap",
         "coordinates": "V guess_V",
         "nodes 2": "u_dot guess",
+        "dofs": "rate guess_rate",
         "3": "travelled",
         "2 state": "K",
         "2 integrals": "powers",
@@ -283,49 +318,46 @@ SCRATCH: dict[str, dict[str, str]] = {
     },
     "Cotangents": {  # of u', rate and u, q and V, of a law's outputs and a point's bodies (by)
         "4 widest": "surface",
-        "4 inertial": "dofs",
+        "dofs": "rate_of own multiplier",
         "2 2": "pair",
         "free free": "matrix",
         "free 1": "nu",
         "free": "V_bar",
-        "inertial": "full",
         "nodes 2": "rate u",
         "coordinates": "q V load",  # of an output's loads, and of the pads' forces and moments
         "pads 3": "wrenches",
-        "points 5": "out",
-        "5": "weights",
-        "3": "decay_x",
+        "points rows": "out",
+        "rows": "weights",
         "6": "by",
-        "1 1": "decay_J",
+        "8": "element",
         "4 state": "state",
     },
     "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
-        "5": "weights",
-        "3": "decay_x",
+        "most": "weights",
         "parameters": "gradient",
-        "3 columns": "change",
+        "most columns": "change",
         "free columns": "r V",
         "nodes 2 columns": "u v own_rate",
-        "inertial columns": "free",
+        "dofs columns": "free rate_of",
         "int pads 2": "span",
         "widest": "zeta rate",
         "widest columns": "dzeta drate",
         "2 columns": "base_rate at_point",
-        "points 5 columns": "e",
+        "points rows columns": "e",
         "recorded columns": "recorded",  # as `recorded_size` orders it
         "8 columns": "moved",
-        "1 1": "decay_J",
+        "states columns": "decay",
         "state columns": "before first",
     },
     # of every stage y*, q, V, the touching points of every pad, their numbers with u and u',
-    # inertial pads' u'
+    # nodal pads' u'
     "Tape": {
         "stages state": "y",
         "stages coordinates": "q V",
         "int stages pads": "count",
         "int stages cap": "point",
         "stages cap 4": "state",
-        "stages inertial": "rate",
+        "stages dofs": "rate",
     },
 }
 """Arrays that the kernels write to, by name and shape: they allocate nothing."""
@@ -381,7 +413,6 @@ class Run(NamedTuple):
     """Arguments of `run`, explained in its docstring."""
 
     s: Annotated[Any, System]
-    s0: Annotated[Any, System]
     w: Annotated[Any, Work]
     d: Annotated[Any, Step]
     f: Signals
@@ -396,7 +427,6 @@ class Run(NamedTuple):
     stops: Array
     t_out: Array
     row: int
-    rung: float
     rtol: float
     longest: float
     shortest: float
@@ -429,7 +459,6 @@ class Backward(NamedTuple):
     """Arguments of `backward`."""
 
     s: Annotated[Any, System]
-    s0: Annotated[Any, System]
     w: Annotated[Any, Work]
     z: Annotated[Any, Cotangents]
     tape: Annotated[Any, Tape]
@@ -453,7 +482,6 @@ class Forward(NamedTuple):
     """Arguments of `forward`."""
 
     s: Annotated[Any, System]
-    s0: Annotated[Any, System]
     w: Annotated[Any, Work]
     z: Annotated[Any, Tangents]
     tape: Annotated[Any, Tape]
@@ -481,17 +509,24 @@ def recorded_size(s: Any) -> int:
 def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
     """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those
     that it does not decide."""
-    inputs = 1 + 2 * int(
-        (np.diff(s.act_setpoint_start) + np.diff(s.act_measured_start)).max(initial=0)
-    )
+    states, nodes = int(s.contact_states.max(initial=1)), int(s.pad_node_start[-1])
+    dofs, band = np.diff(s.nodal_dof_start), 2 * s.nodal_band + 1
+    widest = 2 * int(np.diff(s.pad_node_start).max(initial=0))
     sizes |= {
         "state": state, "coordinates": len(s.body_free), "free": len(s.body_coordinate),
         "contacts": len(s.contact_pad), "points": len(s.point_X), "pads": len(s.pad_base),
-        "nodes": int(s.pad_node_start[-1]), "inputs": inputs, "dofs": 2 * int(s.pad_node_start[-1]),
-        "widest": 2 * int(np.diff(s.pad_node_start).max(initial=0)),
-        "inertial": int(s.inertia_dof_start[-1]), "parameters": len(s.p),
+        "nodes": nodes, "nodes2": 2 * nodes, "condensed": 2 * nodes, "widest": widest,
+        "reads": 2 * int((np.diff(s.source_signal_start)
+                          + np.diff(s.source_coordinate_start)).max(initial=1)),
+        "states": states, "rows": WRENCH + states + 2, "outputs": WRENCH + states + 4,
+        "inputs": MOTION + states + 2, "jacobian": (WRENCH + states + 2) * (MOTION + states),
+        "most": max(WRENCH + states + 2, CORNERS),
+        "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
+        "dofs": int(s.nodal_dof_start[-1]), "banded": int((dofs * band).sum()),
+        "element_inputs": 2 * CORNERS + s.nodal_constants.shape[1], "parameters": len(s.p),
         "recorded": recorded_size(s),
     }  # fmt: skip
+    sizes["solves"] = int(dofs.max(initial=0)) * max(widest + 3, sizes.get("columns", 1))
     made = {}
     for shape, names in SCRATCH[kind].items():
         whole = shape.startswith("int ")

@@ -120,14 +120,15 @@ def entry_module(name: str) -> llvm.ModuleRef:
         if (library := todo.pop()) not in linked:
             linked[library] = None
             todo += library._linking_libraries
-    whole = llvm.parse_assembly("")
+    # llvmlite's memory manager has room for the table of outside functions only beside other data
+    whole = llvm.parse_assembly(f"@{name}.data = global i64 1")
     whole.data_layout, whole.name = str(result.library._final_module.data_layout), name
     for library in linked:
         whole.link_in(library._final_module, preserve=True)
     for number, inside in enumerate([*whole.functions, *whole.global_variables]):
         if inside.name == result.fndesc.llvm_func_name:
             inside.name = name
-        elif not inside.is_declaration:  # numba's names count what was compiled before
+        elif not inside.is_declaration and inside.name != f"{name}.data":  # numba's names count what was compiled before
             inside.name, inside.linkage = f"{name}.{number}", "internal"
     whole.verify()
     return whole

@@ -1,4 +1,4 @@
-"""Small linear solves of a stage and other operations on arrays, in place and without allocation.
+"""Linear solves of a stage and other operations on arrays, in place and without allocation.
 
 Inner loops run over views from 0 on: an index that might be negative, as Python allows, keeps a
 loop from being vectorised.
@@ -62,7 +62,7 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
 
 @inlined
 def row_of(matrices: Array, start: int, i: int, size: int) -> Array:
-    """Row i of the (size, size) matrix that begins at `start`, a view."""
+    """Row i of the matrix with rows of `size` that begins at `start`, a view."""
     return matrices[start + i * size : start + (i + 1) * size]
 
 
@@ -72,16 +72,54 @@ def bounds(start: Array, i: int) -> slice:
     return slice(start[i], start[i + 1])
 
 
+# Banded matrices: entry (i, j) of row i stands at i (2 band + 1) + j - i + band.
+
+
 @compiled
-def solve_banded(factor: Array, b: Array) -> None:
-    """Solve L L^T x = b in place, L in scipy's lower banded storage."""
-    band, n = factor.shape
+def factor_banded(A: Array, n: int, band: int) -> None:
+    """L U of a banded matrix in place, L with ones on its diagonal. Rows are not exchanged: the
+    matrices of pads are positive definite up to small parts."""
+    width = 2 * band + 1
+    for k in range(n):
+        last = min(n, k + band + 1)
+        inverse = 1.0 / A[k * width + band]
+        right = A[k * width + band + 1 : k * width + band + last - k]
+        for i in range(k + 1, last):
+            at = i * width + band + k - i
+            factor = A[at] * inverse
+            A[at] = factor
+            if factor != 0.0:
+                add(-factor, right, A[at + 1 : at + last - k])
+
+
+@compiled
+def solve_banded(A: Array, n: int, band: int, b: Array, m: int) -> None:
+    """Solution of A x = b for the m right-hand sides b (n m,), row by row, in place; A is
+    factorised."""
+    width = 2 * band + 1
     for i in range(n):
-        b[i] /= factor[0, i]
-        for k in range(1, min(band, n - i)):
-            b[i + k] -= factor[k, i] * b[i]
+        row = b[i * m : (i + 1) * m]
+        for k in range(max(0, i - band), i):
+            factor = A[i * width + band + k - i]
+            if factor != 0.0:
+                add(-factor, b[k * m : (k + 1) * m], row)
     for i in range(n - 1, -1, -1):
-        total = b[i]
-        for k in range(1, min(band, n - i)):
-            total -= factor[k, i] * b[i + k]
-        b[i] = total / factor[0, i]
+        row = b[i * m : (i + 1) * m]
+        for k in range(i + 1, min(n, i + band + 1)):
+            add(-A[i * width + band + k - i], b[k * m : (k + 1) * m], row)
+        inverse = 1.0 / A[i * width + band]
+        for j in range(m):
+            row[j] *= inverse
+
+
+@compiled
+def solve_transposed(A: Array, n: int, band: int, b: Array) -> None:
+    """Solution of A^T x = b (n,) in place; A is factorised."""
+    width = 2 * band + 1
+    for i in range(n):
+        last = min(n, i + band + 1)
+        b[i] /= A[i * width + band]
+        add(-b[i], A[i * width + band + 1 : i * width + band + last - i], b[i + 1 : last])
+    for i in range(n - 1, -1, -1):
+        first = max(0, i - band)
+        add(-b[i], A[i * width + band + first - i : i * width + band], b[first:i])

@@ -17,13 +17,12 @@ from torchsoft.solve.kernel.arrays import (
     GAMMA,
     NEWTON_FAILED,
     NOT_FINITE,
-    OFF_THE_RUNG,
     PASSED,
     REFUSED,
 )
 from torchsoft.solve.kernel.invoke import call_value
 from torchsoft.solve.kernel.linear import put
-from torchsoft.solve.kernel.stage import actuate
+from torchsoft.solve.kernel.sources import effort
 from torchsoft.solve.kernel.step import departed, solve_near, take_back, take_step, write_rows
 from torchsoft.solve.kernel.table import Array
 
@@ -96,17 +95,14 @@ def passing(s: Any, w: Any) -> float:
     """The largest speed of a body over a pad that it may touch, over its size [1/s]."""
     most = 0.0
     for c in range(s.contact_pad.size):
-        f = w.frame[c]
-        speed = np.hypot(f[4] + f[6] * f[3], f[5] - f[6] * f[2])
+        speed = np.hypot(w.relative[c, 3], w.relative[c, 4])
         most = max(most, speed / s.contact_size[c])
     return most
 
 
 @compiled
-def next_end(t: float, length: float, stops: Array, shift: bool) -> float:
+def next_end(t: float, length: float, stops: Array) -> float:
     """End of the next step: at the next stop, half way to it, or after the wanted length."""
-    if not shift:
-        return t + length
     stop = np.searchsorted(stops, t, side="right")
     left = stops[min(stop, stops.size - 1)] - t
     if length >= left * (1.0 - 1e-9):
@@ -116,15 +112,13 @@ def next_end(t: float, length: float, stops: Array, shift: bool) -> float:
 
 @compiled
 def run(r: Any) -> None:
-    """Take up to h.size steps. `s` are the rig's arrays, `s0` those for a stage of no length.
+    """Take up to h.size steps of the rig's arrays `s`.
 
     starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages, and the
     steps and parts of the outputs. With `given` these prescribe the steps. Otherwise they receive
     the steps taken, from the output `row` on, until the last of t_out; the tolerances choose: clock
     holds the time, the next step's length and the last step's error, k the rates at y. No step
-    passes a time of `stops`, whose last is t_out's. A positive `rung` [s] is the only length
-    allowed, for arrays `s` that belong to it: the call ends when the controller wants half of it or
-    twice.
+    passes a time of `stops`, whose last is t_out's.
 
     `tape` has two rows a step, or none. y, `integrals` and the guesses in w are advanced in place;
     after a failure they hold the last good step. With no steps the one output is that of y itself.
@@ -134,7 +128,7 @@ def run(r: Any) -> None:
     last one.
     """
     s, w, d, y, out, given = r.s, r.w, r.d, r.y, r.out, r.given != 0
-    clock, counts, h, t_out, rung = r.clock, r.counts, r.h, r.t_out, r.rung
+    clock, counts, h, t_out = r.clock, r.counts, r.h, r.t_out
     steps, row, solves, refused, failed, which = 0, r.row, 0, 0, 0, -1
     status, begin = CONVERGED, h.size == 0
     while (steps < h.size and (given or row < t_out.size)) or begin:
@@ -147,11 +141,8 @@ def run(r: Any) -> None:
         else:
             now = h[steps]
             if not given:
-                if rung > 0.0 and not rung * (1.0 - 1e-9) <= length < 2.0 * rung:
-                    status = OFF_THE_RUNG
-                    break
-                end = next_end(t, rung if rung > 0.0 else length, r.stops, rung == 0.0)
-                now = rung if rung > 0.0 else end - t
+                end = next_end(t, length, r.stops)
+                now = end - t
                 follow(r.f, t + GAMMA * now, end, r.signals[steps])
             status, count = take_step(r, now, r.signals[steps], 2 * steps)
             solves += count
@@ -235,11 +226,10 @@ def rates(r: Any) -> None:
     converged, _, _ = solve_near(s, w, r.limits, y, r.signals[0], AT_ONCE, r.powers, r.wrenches)
     put(w.k, out)
     for i in range(s.body_coordinate.size):
-        c, mass = s.body_coordinate[i], s.p[s.body_mass_at[i]]
-        load = w.load[c] - s.body_weight[i] * mass * s.p[s.body_gravity_at]
-        for a in range(s.act_pushed.size):
-            if s.act_pushed[a] == c:
-                load += actuate(s, a, w.q, w.V, r.signals[0], w.effort_x, w.effort, w.effort_J)
-        out[s.body_V_start + i] = load / mass  # (17), (18)
+        load = w.load[s.body_coordinate[i]]
+        for source in range(s.source_pushed.size):
+            if s.source_pushed[source] == s.body_coordinate[i]:
+                load += effort(s, w, source, r.signals[0])
+        out[s.body_V_start + i] = load / s.p[s.body_mass_at[i]]  # (17), (18)
         out[s.body_q_start + i] = y[s.body_V_start + i]
     r.converged[0] = 1 if converged else 0

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel import compiled, sources
 from torchsoft.solve.kernel.arrays import (
     CONVERGED,
     GAMMA,
@@ -21,16 +21,13 @@ from torchsoft.solve.kernel.arrays import (
     NOT_FINITE,
     OFF_THE_PAD,
     TAPE_FULL,
+    TINY,
+    WRENCH,
 )
-from torchsoft.solve.kernel.inertia import elastic_wrench, to_world
-from torchsoft.solve.kernel.interface import at_point
+from torchsoft.solve.kernel.contacts import at_point
 from torchsoft.solve.kernel.linear import put
-from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
+from torchsoft.solve.kernel.stage import finish, solve_stage
 from torchsoft.solve.kernel.table import Array
-
-TINY = 1e-60
-"""Components of the state below this are set to zero, so that decaying ones do not become denormal
-numbers."""
 
 
 @compiled
@@ -40,7 +37,7 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array, way: float) -> boo
     put(y, tape.y[row])
     put(w.q, tape.q[row])
     put(w.V, tape.V[row])
-    put(w.full, tape.rate[row])
+    put(w.rate, tape.rate[row])
     slot = 0
     for pad in range(s.pad_base.size):
         at = s.pad_point_start[pad]
@@ -69,68 +66,25 @@ def departed(s: Any, w: Any) -> int:
                 or w.active[at + i] == s.contact_point_start[c + 1] - 1
             ):
                 return OFF_THE_PAD
-        x, y, limit = w.frame[c, 2], w.frame[c, 3], s.contact_limits[c]
+        x, y, limit = w.relative[c, 0], w.relative[c, 1], s.contact_limits[c]
         if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
             return LOST
     return CONVERGED
 
 
 @compiled
-def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
-    """Powers [W] of the actuators, of gravity, of the drives of bodies, and the sum of the positive
-    ones."""
-    at = s.pad_base.size + 2
-    x, out, J = w.effort_x, w.effort, w.effort_J
-    for i in range(s.act_pushed.size):
-        powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[s.act_pushed[i]]
-    at += s.act_pushed.size
-    gravity = 0.0
-    for i in range(s.body_coordinate.size):
-        gravity -= (
-            s.body_weight[i]
-            * s.p[s.body_mass_at[i]]
-            * s.p[s.body_gravity_at]
-            * w.V[s.body_coordinate[i]]
-        )
-    powers[at] = gravity
-    for b in range(s.body_free.size // 3 - 1):
-        drive = 0.0
-        for c in range(3 * b, 3 * b + 3):
-            if s.body_free[c] < 0:
-                drive -= w.load[c] * w.V[c]
-        for i in range(
-            s.act_pushed.size
-        ):  # what pushes a driven coordinate is held by what drives it
-            if s.act_pushed[i] // 3 == b and s.body_free[s.act_pushed[i]] < 0:
-                drive -= powers[s.pad_base.size + 2 + i]
-        powers[at + 1 + b] = drive
-    total = 0.0
-    for i in range(s.pad_base.size + 2, powers.size - 1):
-        total += max(powers[i], 0.0)
-    powers[-1] = total
-
-
-@compiled
-def record(s: Any, w: Any, y: Array, wrenches: Array, out: Array) -> None:
-    """One row of forces at the state y, as `recorded_size` orders them."""
+def record(s: Any, w: Any, wrenches: Array, out: Array) -> None:
+    """One row of forces, as `recorded_size` orders them."""
     out[:] = 0.0
     for pad in range(s.pad_base.size):
         at = s.pad_point_start[pad]
         for i in range(w.actives[pad]):
             k = w.active[at + i]
-            out[2 * k], out[2 * k + 1] = w.out[k, 3], w.out[k, 4]
+            felt = WRENCH + s.contact_states[s.point_contact[k]]
+            out[2 * k], out[2 * k + 1] = w.out[k, felt], w.out[k, felt + 1]
     first = 2 * s.point_contact.size
-    loads = out[first + wrenches.size :]
-    put(w.load, loads)
-    for pad in range(s.pad_base.size):
-        wrench, base = out[first + 3 * pad : first + 3 * pad + 3], s.pad_base[pad]
-        put(wrenches[pad], wrench)
-        if s.pad_v_start[pad] >= 0:
-            elastic_wrench(s, w, pad, y, wrench)
-            change = wrench[0] - wrenches[pad, 0], wrench[1] - wrenches[pad, 1]
-            X, Y = to_world(s, w, pad, change[0], change[1])
-            loads[base] += X
-            loads[base + 1] += Y
+    put(wrenches, out[first : first + wrenches.size])
+    put(w.load, out[first + wrenches.size :])
 
 
 @compiled
@@ -166,6 +120,7 @@ def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
     put(integrals, d.integrals)
     put(w.V, d.V)
     put(w.u_dot, d.u_dot)
+    put(w.rate, d.rate)
     put(w.travelled, d.travelled)
     status = CONVERGED
     for stage in range(2):
@@ -180,7 +135,7 @@ def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
         if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y, 0.0):
             status = TAPE_FULL
             break
-        supply(s, w, signals[stage], powers)
+        sources.supply(s, w, signals[stage], powers, s.pad_base.size + 2)
         put(w.k, d.K[stage])
         d.speed[stage] = speed
         dt = a if stage == 1 else h - a
@@ -203,6 +158,7 @@ def take_back(r: Any) -> None:
     put(d.integrals, r.integrals)
     put(d.V, w.V)
     put(d.u_dot, w.u_dot)
+    put(d.rate, w.rate)
     w.travelled[0] = np.inf
 
 
@@ -228,13 +184,13 @@ def dense_states(part: float) -> tuple[float, float, float]:
 def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
     """The outputs from `first` to `last` of the step just taken. At its end they are what the last
     stage found; before it, dense output with the forces that belong to it, which take a stage of no
-    length (of `s0`); that is what `out.tape` holds, if it has rows. Returns status and linear
-    solves."""
+    length; that is what `out.tape` holds, if it has rows. Returns status and linear solves."""
     s, w, d, y, integrals, out = r.s, r.w, r.d, r.y, r.integrals, r.out
     parts, ys, tape = out.part, out.y, out.tape
     solves, here = 0, w.travelled[0]
     put(w.V, d.guess_V)
     put(w.u_dot, d.guess)
+    put(w.rate, d.guess_rate)
     for i in range(
         last - 1, first - 1, -1
     ):  # the end comes first: the others disturb what the last stage left
@@ -259,7 +215,7 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
             gone_by = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
             w.travelled[0] = gone_by if scans == d.travelled[2] else np.inf
             converged, count, _ = solve_near(
-                r.s0, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.wrenches
+                s, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.wrenches
             )
             solves += count
             if not converged:
@@ -267,8 +223,9 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
         if tape.count.shape[0] > 0 and not write_tape(s, w, tape, i, ys[i], way):
             return TAPE_FULL, solves
         put(d.at_row, out.integrals[i])
-        record(s, w, ys[i], d.wrenches, out.recorded[i])
+        record(s, w, d.wrenches, out.recorded[i])
         put(d.guess_V, w.V)
         put(d.guess, w.u_dot)
+        put(d.guess_rate, w.rate)
         w.travelled[0] = here if w.travelled[2] == scans else np.inf
     return CONVERGED, solves
