@@ -21,7 +21,7 @@ FLOWS = {
     "codegen": "graph operations trace emit . stops",
     "physics": """
         arguments mesh shapes contact material pads multibond state parts names motion
-        validity rig summary extensions energy statics start setup .
+        validity graph energy statics start namespace rig extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour .",

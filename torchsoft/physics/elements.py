@@ -31,9 +31,7 @@ def element_constants(corners: Array) -> Array:
     return np.concatenate(parts, 1)
 
 
-def linear_forces(
-    u: Tensor, constants: Tensor, lame_lambda: Tensor, lame_mu: Tensor
-) -> Tensor:
+def linear_forces(u: Tensor, constants: Tensor, lame_lambda: Tensor, lame_mu: Tensor) -> Tensor:
     """Forces (..., 8) [N/m] per depth of a linear element under u (..., 8) [m]; the Lame moduli
     [Pa]. The volume's part is that of the centre, so that the element does not lock."""
     ux, uy = u[..., 0::2], u[..., 1::2]

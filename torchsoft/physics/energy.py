@@ -18,14 +18,14 @@ from torchsoft.physics.contact import (
     point_place,
     turned,
 )
+from torchsoft.physics.graph import Evaluation, Graph
 from torchsoft.physics.pads import free_rates, nodal
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rig import Evaluation, Rig
 from torchsoft.physics.state import State
 
 
 def stored(
-    rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = None
+    rig: Graph, state: State, displacement: Mapping[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
     """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic
     energies of bodies and pads that move freely.
@@ -76,7 +76,7 @@ def stored(
     return energies
 
 
-def stores(rig: Rig) -> tuple[str, ...]:
+def stores(rig: Graph) -> tuple[str, ...]:
     """Names of the energies that `stored` returns, in its order."""
     names = [f"strain_{name}" for name in rig.pads] + ["normal_springs", "tangential_springs"]
     for name, axes in rig.layout.free.items():
@@ -85,7 +85,7 @@ def stores(rig: Rig) -> tuple[str, ...]:
     return tuple(names)
 
 
-def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
+def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]:
     """Powers [W] that the R elements take out, each shaped like the batch and never negative."""
     powers, dashpots, slip = {}, 0.0, 0.0
     for name, pad in rig.pads.items():
@@ -124,7 +124,7 @@ SEPARATED, STICKING, SLIPPING = 0, 1, 2
 
 
 @torch.no_grad()
-def contact_states(rig: Rig, state: State, force: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def contact_states(rig: Graph, state: State, force: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """State of every point by contact, int8 (..., points); `force` as a run records it (...,
     points, 2) [N].
 
@@ -148,7 +148,7 @@ def contact_states(rig: Rig, state: State, force: Mapping[str, Tensor]) -> dict[
 
 
 def _rates(
-    rig: Rig, name: str, touched: Mapping[str, Tensor], state: State, u: Tensor,
+    rig: Graph, name: str, touched: Mapping[str, Tensor], state: State, u: Tensor,
     force: Mapping[str, Tensor],
 ) -> Tensor:  # fmt: skip
     """Rates (..., nodes, 2) [m/s] of the displacements u of a pad's nodes, in its base's frame."""

@@ -14,6 +14,9 @@ from typing import NamedTuple
 import networkx as nx
 from torch import Tensor
 
+GROUND = "ground"
+"""Junction of the ground."""
+
 
 class Junction(NamedTuple):
     """A 1-junction: how many flow vectors it has, the field that stores or sets its flow, and the

@@ -1,45 +1,16 @@
-"""Names of a rig's parts and signals, and of what follows from them: one namespace of channels and
-arrays of files, one of junctions. Two of one name would replace each other in silence.
-"""
+"""Names that a rig's parts and signals may have, and those of channels that follow from them."""
 
 import re
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 from torch import nn
 
 from torchsoft.physics.arguments import line
-from torchsoft.physics.parts import COORDINATES, coordinate_unit
-
-if TYPE_CHECKING:
-    from torchsoft.physics.rig import Rig
-
-GROUND = "ground"
-"""Junction of the ground."""
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 TAKEN = frozenset(dir(nn.ModuleDict()))
 """Names that parts of a torch module cannot have."""
-
-FORMAT = (
-    "t", "time", "axis", "coordinate", "body", "pose", "velocity", "loads", "injected",
-    "energy_residual", "knot", "knots", "component", "unknown", "sensitivities",
-)  # fmt: skip
-"""Arrays and dimensions of every file of a run."""
-
-OF_CONTACT = "normal_force_{}", "friction_force_{}", "stretch_{}", "contact_state_{}", "{}_point"
-OF_PAD = (
-    "displacement_{}", "velocity_{}", "nodal_force_{}", "mesh_nodes_{}", "mesh_elements_{}",
-    "mesh_bonded_{}", "mesh_face_{}", "energy_strain_{}", "energy_kinetic_{}", "dissipated_pad_{}",
-    "{}_node", "{}_branch", "{}_mesh_node", "{}_element", "{}_face",
-)  # fmt: skip
-OF_BODY = "outline_{}", "energy_{}", "energy_{}_spin", "supplied_drive_{}", "{}_outline"
-OF_RIG = (
-    "energy_normal_springs", "energy_tangential_springs", "dissipated_contact_dashpots",
-    "dissipated_slip", "supplied_gravity",
-)  # fmt: skip
-"""Arrays and dimensions of a file by the part that they belong to."""
 
 FORCES = "normal", "shear"
 """Channels of touch at the points of a contact and of taxels."""
@@ -71,97 +42,3 @@ def rate_channel(key: str) -> str:
 def effort_channel(actuator: str) -> str:
     """Channel of an actuator's effort."""
     return f"effort_{actuator}"
-
-
-def declared(rig: "Rig") -> Iterator[tuple[str, str, str]]:
-    """Name, SI unit and owner of every channel; a signal's unit follows from its use, and one with
-    several uses comes several times."""
-
-    def signal(name: str, unit: str) -> Iterator[tuple[str, str, str]]:
-        yield name, unit, f"the motion `{name}`"
-        yield f"{name}_dot", f"{unit}/s", f"the rate of the motion `{name}`"
-
-    for name, symbol in rig.symbols.items():
-        for axis in COORDINATES:
-            key, unit = f"{axis}_{symbol}", coordinate_unit(axis)
-            yield key, unit, f"{name}.{axis}"
-            yield rate_channel(key), f"{unit}/s", f"the rate of {name}.{axis}"
-            if rig.bodies[name].freedom[axis] == "driven":
-                yield from signal(f"{name}.{axis}", unit)
-        yield f"angular_momentum_{symbol}", "kg.m2/s", f"the angular momentum of the body `{name}`"
-    for name, actuator in rig.actuators.items():
-        for coordinate, setpoint in actuator.follows:
-            yield from signal(setpoint, coordinate_unit(coordinate))
-        if actuator.feed_forward is not None:
-            yield from signal(actuator.feed_forward, actuator.effort_unit)
-        yield effort_channel(name), actuator.effort_unit, f"the effort of the actuator `{name}`"
-    for name in rig.pads:
-        yield f"M_{name}", "N.m", f"the moment on the pad `{name}`"
-
-
-def arrays(rig: "Rig") -> Iterator[tuple[str, str]]:
-    """Key and owner of every other array and dimension of a run's file, and of the channels of
-    touch."""
-    for name in (*FORMAT, *OF_RIG):
-        yield name, f"an array `{name}` of files of runs"
-    touch = [f"{{}}.{key}" for key in ("centre", *FORCES)]
-    for kind, parts, keys in (
-        ("contact", rig.contacts, OF_CONTACT), ("pad", rig.pads, OF_PAD),
-        ("body", rig.bodies, OF_BODY), ("actuator", rig.actuators, ("supplied_control_{}",)),
-        ("contact", rig.contacts, touch), ("taxels", rig.taxels, touch),
-        ("pad", rig.pads, ("{}.force_x", "{}.force_y")),
-        ("body", rig.bodies, [f"{{}}.{key}" for key in ON_BODY]),
-    ):  # fmt: skip
-        for name in parts:
-            for key in keys:
-                yield key.format(name), f"`{key.format(name)}` of the {kind} `{name}`"
-
-
-def junctions(rig: "Rig") -> Iterator[tuple[str, str]]:
-    """Key and owner of every junction of the multibond graph."""
-    yield GROUND, "the ground"
-    for name in rig.pads:
-        yield f"pad_{name}", f"the pad `{name}`"
-    for name in rig.bodies:
-        yield name, f"the body `{name}`"
-        yield f"{name}_spin", f"the spin of the body `{name}`"
-
-
-def check_unique(rig: "Rig") -> None:
-    """Raises `ValueError` where two of a rig's channels, arrays or junctions have one name."""
-    channels = ((key, owner) for key, _, owner in declared(rig))
-    for what, entries in (
-        ("junction", junctions(rig)),
-        ("channel", (*channels, *arrays(rig))),
-    ):
-        owners = dict[str, str]()
-        for key, owner in entries:
-            if (other := owners.setdefault(key, owner)) != owner:
-                raise ValueError(
-                    f"two would be the {what} `{key}`: {other} and {owner}; call one of them "
-                    "otherwise"
-                )
-
-
-def check_pairs(rig: "Rig") -> None:
-    """Raises `ValueError` for contacts of parts that are not there, cannot touch, or are twins."""
-    between = {(contact.pad, contact.body): name for name, contact in rig.contacts.items()}
-    for name, contact in rig.contacts.items():
-        if (twin := between[contact.pad, contact.body]) != name:
-            raise ValueError(
-                f"contacts.{twin}: it is between the same pad and body as `{name}`; leave one out"
-            )
-        if contact.pad not in rig.pads or contact.body not in rig.bodies:
-            raise ValueError(
-                f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are "
-                "not both there"
-            )
-        if rig.bodies[contact.body].shape is None:
-            raise ValueError(
-                f"contact `{name}` needs a shape, but the body `{contact.body}` has none"
-            )
-        if rig.pads[contact.pad].base == contact.body:
-            raise ValueError(
-                f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
-                f"`{contact.body}` itself"
-            )

@@ -277,7 +277,8 @@ class Actuator(nn.Module):
         values, rates = x[..., 0::2], x[..., 1::2]
         goals, read = len(self.setpoints), len(self.reads)
         w, w_dot, q, q_dot = (
-            part for both in (slice(goals), slice(read, None))
+            part
+            for both in (slice(goals), slice(read, None))
             for part in (values[..., both], rates[..., both])
         )
         if not self.several[0]:

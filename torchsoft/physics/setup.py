@@ -15,7 +15,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torchsoft.physics.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
 from torchsoft.physics.mesh.mesh import gradients, strains
 from torchsoft.physics.names import effort_channel
-from torchsoft.physics.pads import contact_points, shape_functions
+from torchsoft.physics.pads import Pad, contact_points, shape_functions
 from torchsoft.physics.rig import Rig
 
 
@@ -54,6 +54,14 @@ class PadSetup:
     E: float
     nu: float
     depth: float
+
+    @classmethod
+    def of(cls, pad: Pad) -> Self:
+        """A pad as it is now."""
+        return cls(
+            pad.mesh, pad.axes.numpy(), pad.origin.numpy(), pad.base, pad.inertial, pad.points,
+            *(getattr(pad.material, x).item() for x in ("E", "nu", "depth")),
+        )  # fmt: skip
 
     def placed(self, own: Array) -> Array:
         """Places (..., 2) in the pad's own frame, in the base's."""
@@ -184,13 +192,7 @@ class Setup:
                 )
                 for name, body in rig.bodies.items()
             },
-            pads={
-                name: PadSetup(
-                    pad.mesh, pad.axes.numpy(), pad.origin.numpy(), pad.base, pad.inertial,
-                    pad.points, *(getattr(pad.material, x).item() for x in ("E", "nu", "depth")),
-                )
-                for name, pad in rig.pads.items()
-            },
+            pads={name: PadSetup.of(pad) for name, pad in rig.pads.items()},
             contacts={
                 name: ContactSetup(
                     contact.pad, contact.body,

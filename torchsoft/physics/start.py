@@ -10,9 +10,9 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, tensor
 from torchsoft.physics.contact import turned
+from torchsoft.physics.graph import Graph
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, resting, standing, unstretched
 from torchsoft.physics.validity import check_values
@@ -57,7 +57,7 @@ class NoPlace(NoEquilibrium):
         self.body, self.axis, self.reason = body, axis, reason
 
 
-def start(rig: Rig, bodies: Starts) -> Tensor:
+def start(rig: Graph, bodies: Starts) -> Tensor:
     """Implementation of `Rig.state`."""
     for name in bodies:
         if name not in rig.bodies:
@@ -74,7 +74,7 @@ def start(rig: Rig, bodies: Starts) -> Tensor:
 
 
 @torch.no_grad()
-def warn_of_moments(rig: Rig, y: Tensor, bodies: Starts) -> None:
+def warn_of_moments(rig: Graph, y: Tensor, bodies: Starts) -> None:
     """Warns of bodies at rest whose angle was not given, where pads turn them."""
     named = [
         name for name, given in bodies.items()
@@ -97,7 +97,7 @@ def warn_of_moments(rig: Rig, y: Tensor, bodies: Starts) -> None:
             )
 
 
-def moving(rig: Rig, y: Tensor, bodies: Starts) -> Tensor:
+def moving(rig: Graph, y: Tensor, bodies: Starts) -> Tensor:
     """The state y (size,) with the bodies' rates as given."""
     own = {}
     for name, axes in rig.layout.free.items():
@@ -109,7 +109,7 @@ def moving(rig: Rig, y: Tensor, bodies: Starts) -> Tensor:
     return torch.cat([parts[part] for part in rig.layout.slices]) if own else y
 
 
-def placed(rig: Rig, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
+def placed(rig: Graph, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
     """Poses of bodies that start as given, by what `held` has of coordinates that are not free.
 
     First bodies rest, then others come down until they touch, then these are pressed and the
@@ -200,7 +200,7 @@ def scalar(name: str, value: Any) -> Tensor:
 
 
 @torch.no_grad()
-def above(rig: Rig, pose: Mapping[str, Tensor], body: str) -> float:
+def above(rig: Graph, pose: Mapping[str, Tensor], body: str) -> float:
     """A height [m] at which a body is clear of the pads under it. Raises `NoPlace` where there is
     none."""
     shape, (x, _, theta) = rig.bodies[body].shape, pose[body]
@@ -234,7 +234,7 @@ def above(rig: Rig, pose: Mapping[str, Tensor], body: str) -> float:
     return max(heights)
 
 
-def upon(rig: Rig, pose: Mapping[str, Tensor], body: str) -> Tensor:
+def upon(rig: Graph, pose: Mapping[str, Tensor], body: str) -> Tensor:
     """Height [m] at which the undeformed pads of a body, lowered from above, just touch: one step
     of Newton's method with a graph after those without. Raises `NoPlace` where they touch
     nothing."""

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from torchsoft.parallel import one_torch_thread
+from torchsoft.physics.graph import Graph
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.pads import nodal_forces
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.validity import check_array, check_points, check_values
 
@@ -47,7 +47,7 @@ class NoEquilibrium(RuntimeError):
 
 @one_torch_thread()
 def settled(
-    rig: Rig,
+    rig: Graph,
     pose: Mapping[str, Tensor],
     velocity: Mapping[str, Tensor],
     stretch: Mapping[str, Tensor],
@@ -106,7 +106,7 @@ def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, i
             )
 
 
-def carried(rig: Rig, name: str, state: State) -> Tensor:
+def carried(rig: Graph, name: str, state: State) -> Tensor:
     """Nodal forces (..., branches, nodes, 2) [N] of a pad, by semi-smooth Newton from the
     undeformed pad.
 
@@ -131,19 +131,19 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
     return F[..., None, :, :].expand(*batch, pad.branches, -1, -1)
 
 
-def massless(rig: Rig) -> Rig:
+def massless(rig: Graph) -> Graph:
     """The rig with its inertial pads condensed onto their surfaces, which in statics is the same;
     itself if it has none."""
     if not any(pad.inertial for pad in rig.pads.values()):
         return rig
-    return Rig(
+    return Graph(
         bodies=rig.bodies, pads={name: pad.condensed() for name, pad in rig.pads.items()},
         contacts=rig.contacts, actuators=rig.actuators, reference=rig.reference,
         gravity=float(rig.gravity.detach()), symbols=rig.symbols, taxels=rig.taxels,
     )  # fmt: skip
 
 
-def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
+def standing(rig: Graph, pose: Mapping[str, Tensor]) -> Tensor:
     """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled
     around them and no point stretched. Differentiable and raises as `settled`, but takes inertial
     pads."""
@@ -161,7 +161,7 @@ def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
     return rig.pack(own._replace(pads=pads, pose=state.pose))
 
 
-def unstretched(rig: Rig, batch: Sequence[int]) -> dict[str, Tensor]:
+def unstretched(rig: Graph, batch: Sequence[int]) -> dict[str, Tensor]:
     """No stretch (*batch, points) [m] at any contact."""
     return {
         name: torch.zeros(*batch, n, dtype=torch.float64) for name, n in rig.point_counts.items()
@@ -170,7 +170,7 @@ def unstretched(rig: Rig, batch: Sequence[int]) -> dict[str, Tensor]:
 
 @one_torch_thread()
 def resting(
-    rig: Rig, pose: Mapping[str, Tensor], free: Mapping[str, Sequence[int]] | None = None, *,
+    rig: Graph, pose: Mapping[str, Tensor], free: Mapping[str, Sequence[int]] | None = None, *,
     signals: Tensor | None = None, actuators: Container[str] | None = None,
     pushed: Mapping[str, Tensor] | None = None, residual: float = RESIDUAL,
 ) -> dict[str, Tensor]:  # fmt: skip
@@ -256,7 +256,7 @@ def resting(
 
 
 def net_loads(
-    rig: Rig, state: State, signals: Tensor, actuators: Container[str] | None = None
+    rig: Graph, state: State, signals: Tensor, actuators: Container[str] | None = None
 ) -> dict[str, Tensor]:
     """Forces and moments left on the bodies (..., 3) [N, N, N.m] in a state without rates;
     `actuators` names those that push, by default all."""

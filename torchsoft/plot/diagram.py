@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from torchsoft.physics.mesh import Array
-from torchsoft.physics.multibond import to_dot, topology
-from torchsoft.physics.names import GROUND
+from torchsoft.physics.multibond import GROUND, to_dot, topology
 from torchsoft.physics.rig import Rig
 from torchsoft.plot.figures import STYLE, new_figure
 from torchsoft.plot.scene import INK

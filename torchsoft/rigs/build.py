@@ -13,6 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from torchsoft.display import Shown, suggestion
 from torchsoft.parallel import single_threaded
+from torchsoft.physics.graph import Graph
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.names import check_names
@@ -550,7 +551,7 @@ class RigFile(Shown, Group):
         return out
 
     def _rested(
-        self, rig: Rig, pose: Mapping[str, Array], axes: Mapping[str, list[int]]
+        self, rig: Graph, pose: Mapping[str, Array], axes: Mapping[str, list[int]]
     ) -> dict[str, Array]:
         """Poses with these coordinates in equilibrium, without efforts of actuators. Raises
         `NoEquilibrium`."""

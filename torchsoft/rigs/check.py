@@ -16,7 +16,7 @@ from torchsoft.diagnostic import SEVERITIES, Diagnostic
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.motion import hold
 from torchsoft.physics.pads import Pad
-from torchsoft.physics.setup import Setup
+from torchsoft.physics.setup import PadSetup
 from torchsoft.physics.statics import NoEquilibrium, massless, standing
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, signals
@@ -140,7 +140,8 @@ def strains(there: list[Moment]) -> Iterator[Diagnostic]:
     """Warnings on pads that are indented beyond linear elasticity, and notes on strains that are
     not small."""
     rig = there[0].scene.rig
-    for name, pad in Setup.of(rig).pads.items():
+    for name, soft in rig.pads.items():
+        pad = PadSetup.of(soft)
         u = torch.stack([rig.displacement(name, m.state) for m in there])
         parts = u.norm(dim=-1).amax(-1) / pad.mesh.height
         worst = int(parts.argmax())

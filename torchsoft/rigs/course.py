@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from torchsoft.physics.graph import Graph
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, resting
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
@@ -172,6 +172,6 @@ class Estimate:
         return [seen[i][0] for i in sorted({0, int(np.argmax(grips)), *spread})][:most]
 
 
-def signals(rig: Rig, time: float) -> dict[str, float]:
+def signals(rig: Graph, time: float) -> dict[str, float]:
     """The values of all motions at a time [s]."""
     return dict(zip(rig.signals, rig.follow(time).detach()[:, 0].tolist()))

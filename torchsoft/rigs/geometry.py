@@ -8,10 +8,10 @@ import networkx as nx
 import numpy as np
 import torch
 
+from torchsoft.physics.graph import Graph
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
 
 FACING = -0.9
@@ -120,7 +120,7 @@ def depth_inside(places: Array, corners: Array) -> float:
 class Scene(NamedTuple):
     """A rig with its bodies at given poses and its pads undeformed."""
 
-    rig: Rig
+    rig: Graph
     pose: Poses
 
     def shape(self, body: str) -> Shape:
@@ -183,7 +183,7 @@ class Scene(NamedTuple):
         ]  # fmt: skip
 
 
-def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:
+def tied(rig: Graph, contacts: Iterable[str]) -> nx.Graph:
     """Graph of the bodies, with an edge where one of the contacts is between a body and a pad on
     another body. The ground connects nothing."""
     graph = nx.Graph()

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.energy import SLIPPING
+from torchsoft.physics.graph import Graph
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -160,7 +161,7 @@ AT_ONCE = 64
 
 @torch.no_grad()
 def linearised(
-    model: Rig, y: Tensor, reference: Reference, only: Sequence[int] | None = None
+    model: Graph, y: Tensor, reference: Reference, only: Sequence[int] | None = None
 ) -> Tensor:
     """dy'/dy (size, size) at a state y (size,) of rest, with touching and sticking as they are
     there; `only` takes some of the components. In plain torch: compiling the kernels would take
@@ -191,7 +192,7 @@ class Modes(NamedTuple):
 
 
 @torch.no_grad()
-def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
+def modes(rig: Graph, y: Tensor, reference: Reference) -> Modes:
     """Modes of a rig with massless pads about a state y (size,) at rest, pads settled, under a
     constant `reference`. Unbalanced constant loads do not change them; touching and sticking points
     do.
@@ -246,7 +247,7 @@ def instability(rig: Rig, run: Trajectory) -> str:
     except NoEquilibrium:
         return ""
     values, moves = modes(rig, y, still)
-    free = Rig(
+    free = Graph(
         bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, reference=rig.reference,
         gravity=float(rig.gravity), symbols=rig.symbols,
     )  # fmt: skip

@@ -20,7 +20,13 @@ from torchsoft.codegen.emit import check_pointwise
 from torchsoft.codegen.graph import Graph
 from torchsoft.codegen.stops import left_out
 from torchsoft.codegen.trace import check_backward, traced
-from torchsoft.physics.contact import distance_law, free_law, friction_states, interface_law, relative_motion
+from torchsoft.physics.contact import (
+    distance_law,
+    free_law,
+    friction_states,
+    interface_law,
+    relative_motion,
+)
 from torchsoft.physics.elements import CONSTANTS, linear_element
 from torchsoft.physics.material import Material
 from torchsoft.physics.motion import Reference, polynomial

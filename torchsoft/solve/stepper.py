@@ -1,6 +1,5 @@
 """The implicit stepper: the compiled kernels fed from a rig, chunk by chunk."""
 
-import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import Any

@@ -219,8 +219,10 @@ class Compiled:
             [np.zeros((0, *shape)), *(kind(pad) for pad in pads if pad is not None)]
         )
         surface = [
-            np.full(2 * len(pad.mesh.surface), -1) if not pad.nodal
-            else dofs_of(pad.surface.numpy()) for pad in rig.pads.values()
+            np.full(2 * len(pad.mesh.surface), -1)
+            if not pad.nodal
+            else dofs_of(pad.surface.numpy())
+            for pad in rig.pads.values()
         ]
         address = lambda name: [0 if law is None else getattr(law, name)] * len(pads)
         return filled(

@@ -16,7 +16,8 @@ from torch import Tensor
 from torchsoft.display import Shown, amount, suggestion
 from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.energy import contact_states
-from torchsoft.physics.names import FORCES, ON_BODY, declared, effort_channel, rate_channel
+from torchsoft.physics.names import FORCES, ON_BODY, effort_channel, rate_channel
+from torchsoft.physics.namespace import declared
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup

@@ -128,7 +128,9 @@ def entry_module(name: str) -> llvm.ModuleRef:
     for number, inside in enumerate([*whole.functions, *whole.global_variables]):
         if inside.name == result.fndesc.llvm_func_name:
             inside.name = name
-        elif not inside.is_declaration and inside.name != f"{name}.data":  # numba's names count what was compiled before
+        elif (
+            not inside.is_declaration and inside.name != f"{name}.data"
+        ):  # numba's names count what was compiled before
             inside.name, inside.linkage = f"{name}.{number}", "internal"
     whole.verify()
     return whole

@@ -218,7 +218,12 @@ def push(s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: fl
 @compiled
 def push_rates(s: Any, w: Any, z: Any, pad: int, a: float, X: Array) -> None:
     """Tangents of the touched nodes' rates, less z.v, under those of the nodal forces X."""
-    first, n, size, scale = s.pad_node_start[pad], w.counts[pad], size_of(s, pad), mobility(s, pad, a)
+    first, n, size, scale = (
+        s.pad_node_start[pad],
+        w.counts[pad],
+        size_of(s, pad),
+        mobility(s, pad, a),
+    )
     for i in range(n):
         for o in range(2):
             dof = 2 * (w.touched[first + i] - first) + o
@@ -310,4 +315,3 @@ def pull_state(
             if c != 0.0 or d != 0.0:
                 row = row_of(s.condensed_dC, start_C, 2 * (node - first) + r, size)[left:right]
                 p_bar[material + 1] += c * dot(row, z_dot[left:]) + d * dot(row, zeta[left:])
-

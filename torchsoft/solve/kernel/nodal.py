@@ -315,9 +315,7 @@ def move(s: Any, w: Any, pad: int, part: float) -> None:
 
 
 @compiled
-def finish(
-    s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array
-) -> float:
+def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array) -> float:
     """Rates of the state into w.k, and the power [W] that the pad dissipates; with inertia also the
     force on it, its moment and its base's load, which are those of the elements. Returns a bound of
     the nodes' speeds [m/s]."""
@@ -418,7 +416,9 @@ def push(
         for i in range(first, last):
             change = change_of_speed(s, w, pad, i, y, vx if i % 2 == 0 else vy)
             M = mass_rate(s, pad, i, a)
-            push = M * (free[i, k] - dy[W + i - first, k]) + s.nodal_area[i] / a * change * dp[at, k]
+            push = (
+                M * (free[i, k] - dy[W + i - first, k]) + s.nodal_area[i] / a * change * dp[at, k]
+            )
             if i % 2 == 0:
                 along += push
             else:
@@ -475,9 +475,7 @@ def push_state(s: Any, w: Any, z: Any, pad: int, a: float, dy: Array) -> None:
 
 
 @compiled
-def push_felt(
-    s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array
-) -> None:
+def push_felt(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array) -> None:
     """Tangents of the force and the moment of the elements, and of the base's load, in
     z.recorded."""
     first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]

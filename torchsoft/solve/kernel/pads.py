@@ -13,6 +13,7 @@ from torchsoft.solve.kernel.contacts import outputs
 from torchsoft.solve.kernel.linear import add
 from torchsoft.solve.kernel.table import Array
 
+
 @compiled
 def begin(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
     """Start of a stage from y."""
@@ -105,9 +106,7 @@ def move(s: Any, w: Any, pad: int, part: float) -> None:
 
 
 @compiled
-def finish(
-    s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array
-) -> float:
+def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array) -> float:
     """Rates of the pad's state into w.k, and the power that it dissipates; returns a bound of its
     nodes' speeds [m/s]."""
     if s.pad_kind[pad] == CONDENSED:

@@ -1,0 +1,555 @@
+"""The multibond graph of a rig as a torch module: lists of bodies, pads, contacts and actuators;
+`forward(t, y)` is the right-hand side of the ODE.
+
+The equations of motion are not written down anywhere: `forward` evaluates the ports of the
+multibond graph at the state and integrates the net efforts at its 1-junctions.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.display import suggestion
+from torchsoft.physics.contact import (
+    Frame,
+    PointLaw,
+    cross,
+    friction_states,
+    interface_law,
+    moving_frame,
+    point_place,
+    relative_motion,
+    turned,
+)
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
+from torchsoft.physics.names import check_names
+from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
+from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, weight
+from torchsoft.physics.shapes import Shape, parameter
+from torchsoft.physics.state import Layout, State
+from torchsoft.physics.validity import Backwards
+from torchsoft.quantity import Gravity
+
+RATE_TOLERANCE, RATE_ITERATIONS = 1e-13, 30
+"""Residual [m/s] to which the rates of massless pads are solved, and steps of Newton's method for
+it at the most."""
+
+
+class Interface(NamedTuple):
+    """One contact at one state: moving frame (world axes), the law at its points, the port's
+    transformer, and g', v_T (..., points, 2)."""
+
+    frame: Frame
+    law: PointLaw
+    transformer: Transformer
+    flow: Tensor
+
+    @property
+    def F_N(self) -> Tensor:
+        """Normal forces [N] (..., points)."""
+        return self.law.force[..., 0]
+
+
+class Evaluation(NamedTuple):
+    """The graph at one state: ports and junction flows by name, and the interfaces by contact."""
+
+    ports: dict[str, Port]
+    flows: dict[str, Tensor]
+    interfaces: dict[str, Interface]
+
+
+class Graph(nn.Module):
+    """Lists of bodies, pads, contacts and actuators, and the equations of motion that their
+    multibond graph makes. `Rig` tells of the arguments and of `forward`."""
+
+    def __init__(
+        self, *, bodies: Mapping[str, Body], pads: Mapping[str, Pad],
+        contacts: Mapping[str, Contact], actuators: Mapping[str, Actuator] | None = None,
+        reference: Reference | None = None, gravity: Gravity = 9.81,
+        symbols: Mapping[str, str] | None = None, groups: Mapping[str, nn.Module] | None = None,
+        taxels: Mapping[str, Taxels] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.groups = tuple(groups or {})
+        for name, module in (groups or {}).items():
+            self.add_module(name, module)
+        order = sorted(
+            contacts,
+            key=lambda k: list(pads).index(contacts[k].pad) if contacts[k].pad in pads else -1,
+        )
+        lists: Any = bodies, pads, {name: contacts[name] for name in order}, actuators or {}
+        for name, parts in zip(("bodies", "pads", "contacts", "actuators"), lists):
+            check_names(name, parts)
+            self.add_module(name, nn.ModuleDict(parts))
+        self.gravity = parameter(gravity)
+        self.reference = reference or Reference()
+        self.taxels = dict(taxels or {})
+        self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}
+        self.watch = Backwards()
+        self.check_names()
+
+    bodies: Mapping[str, Body]
+    pads: Mapping[str, Pad]
+    contacts: Mapping[str, Contact]
+    actuators: Mapping[str, Actuator]
+
+    def check_names(self) -> None:
+        """Raises the errors of the class for parts that do not fit together."""
+        for name, pad in self.pads.items():
+            if pad.base is not None and pad.base not in self.bodies:
+                raise ValueError(
+                    f"pad `{name}` is bonded to `{pad.base}`, "
+                    f"{suggestion(pad.base, self.bodies, 'but the bodies are')}"
+                )
+            if not pad.inertial:
+                continue
+            pad.retardation_time(name)
+            if pad.base is not None and self.bodies[pad.base].freedom["theta"] != "fixed":
+                raise NotImplementedError(
+                    f"pad `{name}` is inertial and its base `{pad.base}` may turn: nodal "
+                    "accelerations in a turning frame are not modelled; fix the base's theta or "
+                    "take a massless pad"
+                )
+        self._check_pairs()
+        check_names("taxels", self.taxels)
+        check_names("symbols", self.symbols.values())
+        check_taxels(self.taxels, self.pads, self.contacts)
+        for name, actuator in self.actuators.items():
+            for coordinate in (*actuator.measures, actuator.pushes):
+                self.coordinate(coordinate, f"actuator `{name}`")
+        check_names("motion", self.signals, dotted=True)
+
+    def _check_pairs(self) -> None:
+        """Raises `ValueError` for contacts of parts that are missing or cannot touch, or twins."""
+        between = {(contact.pad, contact.body): name for name, contact in self.contacts.items()}
+        for name, contact in self.contacts.items():
+            if (twin := between[contact.pad, contact.body]) != name:
+                raise ValueError(
+                    f"contacts.{twin}: it is between the same pad and body as `{name}`; leave one "
+                    "out"
+                )
+            if contact.pad not in self.pads or contact.body not in self.bodies:
+                raise ValueError(
+                    f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are "
+                    "not both there"
+                )
+            if self.bodies[contact.body].shape is None:
+                raise ValueError(
+                    f"contact `{name}` needs a shape, but the body `{contact.body}` has none"
+                )
+            if self.pads[contact.pad].base == contact.body:
+                raise ValueError(
+                    f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
+                    f"`{contact.body}` itself"
+                )
+
+    def coordinate(self, name: str, owner: str = "`name`") -> int:
+        """Number of a coordinate such as "disc.x" among those of all bodies. Raises
+        `ValueError`."""
+        body, _, axis = name.partition(".")
+        if body not in self.bodies or axis not in COORDINATES:
+            known = [f"{b}.{axis}" for b in self.bodies for axis in COORDINATES]
+            raise ValueError(
+                f"{owner} speaks of `{name}`, which is not a coordinate; "
+                f"{suggestion(name, known, 'there are')}"
+            )
+        return 3 * list(self.bodies).index(body) + COORDINATES.index(axis)
+
+    def named_modules(
+        self, memo: Any = None, prefix: str = "", remove_duplicate: bool = True
+    ) -> Any:
+        """Each module once, with any arguments: `torch.func.functional_call` would put back the
+        wrong tensors of a part that several of the lists share."""
+        return super().named_modules(memo, prefix, True)
+
+    @property
+    def loops(self) -> dict[str, Actuator]:
+        """The actuators that are loops of one coordinate; the others are laws of several."""
+        return {name: one for name, one in self.actuators.items() if one.is_loop}
+
+    aliases: Mapping[str, str] = {}
+    """Parameters by their names in the rig file."""
+
+    extended: Mapping[str, str] = {}
+    """Parameters that were added to the rig, by name."""
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Names of parameters by their other names."""
+        return {**self.aliases, **self.extended}
+
+    def weight(self, name: str) -> Tensor:
+        """Factors of a contact's law at its points: their lengths of surface over its spacing."""
+        contact = self.contacts[name]
+        return torch.from_numpy(self.pads[contact.pad].point_lengths / contact.law.node_spacing)
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the state vector."""
+        return Layout(
+            pads={name: pad.state_shape for name, pad in self.pads.items()},
+            stretch=self.point_counts,
+            free={
+                name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
+                for name, body in self.bodies.items()
+            },
+            inertial={name: (p.nodes, 2) for name, p in self.pads.items() if p.inertial},
+            friction={
+                name: len(friction_states(one.law.friction)) for name, one in self.contacts.items()
+            },
+        )
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The reference's signals that the rig follows: setpoints, feed-forward efforts, driven
+        coordinates."""
+        names: list[str | None] = []
+        for actuator in self.actuators.values():
+            names += [*actuator.setpoints, actuator.feed_forward]
+        for body_name, body in self.bodies.items():
+            names += [
+                f"{body_name}.{axis}" for axis in COORDINATES if body.freedom[axis] == "driven"
+            ]
+        return tuple(dict.fromkeys(name for name in names if name is not None))
+
+    @property
+    def fixed_values(self) -> list[Tensor]:
+        """Values of the fixed coordinates, in the order of all coordinates."""
+        every = [(body.fixed, axis) for body in self.bodies.values() for axis in COORDINATES]
+        return [fixed[axis] for fixed, axis in every if axis in fixed]
+
+    def follow(self, t: Tensor | float, reference: Reference | None = None) -> Tensor:
+        """The signals at t (...) [s]: values and rates (..., signals, 2)."""
+        followed = self.reference if reference is None else reference
+        return followed(torch.as_tensor(t, dtype=torch.float64), self.signals)
+
+    def held(self, signals: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Fixed and driven coordinates and their rates by body (..., 3), zero where a coordinate is
+        free."""
+        pose, velocity = {}, {}
+        for name, body in self.bodies.items():
+            rows = []
+            for axis in COORDINATES:
+                zero = signals.new_zeros(signals.shape[:-2])
+                if body.freedom[axis] == "driven":
+                    at = signals[..., self.signals.index(f"{name}.{axis}"), :]
+                    rows.append((at[..., 0], at[..., 1]))
+                else:
+                    rows.append((zero + body.fixed[axis] if axis in body.fixed else zero, zero))
+            pose[name], velocity[name] = (torch.stack(part, -1) for part in zip(*rows))
+        return pose, velocity
+
+    def unpack(self, y: Tensor, signals: Tensor | None = None, t: Tensor | float = 0.0) -> State:
+        """The state's parts by name; `signals` (..., signals, 2) place driven bodies, by default
+        those of the reference at t."""
+        return self.layout.unpack(y, *self.held(self.follow(t) if signals is None else signals))
+
+    def pack(self, state: State) -> Tensor:
+        """The flat vector (..., size) of a state; states of friction that it lacks are those that
+        they begin with."""
+        friction = {name: self.friction_of(name, state) for name in self.contacts}
+        own = {name: both[0] for name, both in friction.items() if both}
+        return self.layout.pack(state._replace(friction=own))
+
+    def base_motion(self, name: str, state: State) -> tuple[Tensor, Tensor]:
+        """Pose and velocity (..., 3) of a pad's base."""
+        base = self.pads[name].base
+        if base is None:
+            like = next(iter(state.pose.values()))
+            return torch.zeros_like(like), torch.zeros_like(like)
+        return state.pose[base], state.velocity[base]
+
+    def displacement(self, name: str, state: State) -> Tensor:
+        """Displacements of the nodes of a pad's state in its base's frame (..., nodes, 2) [m]."""
+        pad, part = self.pads[name], state.pads[name]
+        if pad.inertial:
+            return part
+        fractions, _ = pad.chain()
+        return nodal(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
+
+    def penetration(self, name: str, state: State, u: Tensor | None = None) -> Tensor:
+        """Depth of the points of a contact in the body [m], (..., points); negative where they are
+        apart. `u` are the pad's displacements, where they are known already."""
+        pad = self.contacts[name].pad
+        u = self.displacement(pad, state) if u is None else u
+        p = self.pads[pad].point_positions + self.pads[pad].at_points(u)
+        motion = self.relative(name, state)[..., None, :]
+        x = torch.cat((p, motion[..., :3].expand(*p.shape[:-1], 3)), -1)
+        return moving_frame(self.shape_of(name), *point_place(x)).g
+
+    def relative(self, name: str, state: State) -> Tensor:
+        """Pose and rates (..., 6) of a contact's body in the frame of the pad's base."""
+        contact = self.contacts[name]
+        (r_B, v_B), r_C = self.base_motion(contact.pad, state), state.pose[contact.body]
+        none = torch.zeros_like(r_C)
+        both = torch.cat((r_C, r_B, state.velocity[contact.body], v_B, none), -1)
+        return relative_motion(both)[..., :6]
+
+    def shape_of(self, name: str) -> Shape:
+        """Shape of a contact's body."""
+        shape = self.bodies[self.contacts[name].body].shape
+        assert shape is not None
+        return shape
+
+    def contacts_of(self, pad: str) -> list[str]:
+        """Names of the contacts of a pad."""
+        return [name for name, contact in self.contacts.items() if contact.pad == pad]
+
+    @property
+    def weighted(self) -> dict[str, Body]:
+        """Bodies that gravity pulls along a free coordinate."""
+        free = {name: one for name, one in self.bodies.items() if one.freedom["y"] == "free"}
+        return {name: one for name, one in free.items() if one.weighted}
+
+    @property
+    def point_counts(self) -> dict[str, int]:
+        """Numbers of contact points, by contact."""
+        return {name: len(self.pads[c.pad].point_nodes) for name, c in self.contacts.items()}
+
+    def forward(self, t: Tensor | float, y: Tensor, reference: Reference | None = None) -> Tensor:
+        """dy/dt, shaped like y. Raises `ValueError` for a state of another length or dtype."""
+        self.layout.check(y)
+        self.watch.see(t)
+        signals = self.follow(
+            torch.as_tensor(t, dtype=torch.float64).expand(y.shape[:-1]), reference
+        )
+        state = self.unpack(y, signals)
+        graph = self.evaluate(t, state, signals)
+        effort = net_efforts(graph.ports, self.junctions)
+        pads, rates = {}, {}
+        for name, pad in self.pads.items():
+            u_dot = graph.ports[f"pad_{name}"].transformer.flow(graph.flows)
+            if pad.inertial:
+                angle = self.base_motion(name, state)[0][..., 2]
+                pads[name] = u_dot
+                rates[name] = (
+                    turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
+                )
+            else:
+                f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.chain()
+                pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
+        loads = self.loads(graph, effort)
+        velocity = {
+            name: loads[name] / torch.stack(body.masses) for name, body in self.bodies.items()
+        }  # (17), (18)
+        points = {name: one.law.rates.mT for name, one in graph.interfaces.items()}
+        stretch = {name: own[..., 0, :] for name, own in points.items()}
+        friction = {name: own[..., 1:, :] for name, own in points.items()}
+        return self.pack(State(pads, stretch, state.velocity, rates, velocity, friction))
+
+    def loads(self, graph: Evaluation, effort: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Net forces and moments on the bodies (..., 3) [N, N, N.m], of the net efforts at the
+        graph's junctions."""
+        out = {}
+        for name in self.bodies:
+            force, moment = (
+                effort.get(k, torch.zeros_like(graph.flows[k])) for k in (name, f"{name}_spin")
+            )
+            out[name] = torch.cat((force[..., 0, :], moment[..., 0, :]), -1)
+        return out
+
+    @property
+    def junctions(self) -> dict[str, Junction]:
+        """The graph's 1-junctions: the nodes of every pad, the ground, every body and its spin."""
+        out = {}
+        for name, pad in self.pads.items():
+            element = f"I: [I_{name}]" if pad.inertial else "R: tau K"
+            out[f"pad_{name}"] = Junction(pad.nodes, element, f"1: nodes of pad {name}")
+        out[GROUND] = Junction(1, "Sf: 0", "1: ground")
+        for name, body in self.bodies.items():
+            free = [body.freedom[axis] for axis in COORDINATES]
+            source = {"driven": "Sf: drive", "fixed": "Sf: 0"}
+            flow = f"I: m_{self.symbols[name]}" if "free" in free[:2] else source[free[0]]
+            spin = f"I: I_{self.symbols[name]}" if free[2] == "free" else source[free[2]] + " "
+            out[name] = Junction(1, flow, f"1: {name}")
+            out[f"{name}_spin"] = Junction(1, spin, f"1: {name} spin")
+        return out
+
+    def evaluate(
+        self, t: Tensor | float, state: State, signals: Tensor | None = None, settled: bool = False
+    ) -> Evaluation:
+        """The multibond graph at time t [s] and one state: every port with its transformer and
+        effort, world axes. `settled` takes massless pads to have no rates, which are solved for
+        otherwise."""
+        like = next(iter(state.pose.values()))
+        signals = (
+            self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1]))
+            if signals is None
+            else signals
+        )
+        flows = {GROUND: torch.zeros_like(like)[..., None, :2]}
+        for name in self.bodies:
+            flows[name] = state.velocity[name][..., None, :2]
+            flows[f"{name}_spin"] = state.velocity[name][..., None, 2:]
+        ports, interfaces = {}, {}
+        for name, pad in self.pads.items():
+            own = self.contacts_of(name)
+            r_B, v_B = self.base_motion(name, state)
+            u, angle = self.displacement(name, state), r_B[..., 2, None]
+            moment_arm = turned(pad.positions + u, angle)
+            base_rate = v_B[..., None, :2] + v_B[..., None, 2:] * cross(moment_arm)
+            if pad.inertial:
+                flows[f"pad_{name}"] = turned(state.rates[name], angle)
+                u_dot = turned(flows[f"pad_{name}"] - base_rate, -angle)
+            else:
+                u_dot = torch.zeros_like(u) if settled else self._rates(name, own, state, u)
+                flows[f"pad_{name}"] = base_rate + turned(u_dot, angle)
+            for key in own:
+                interfaces[key] = self._interface(key, state, u, u_dot, flows)
+                element = (
+                    f"C: K_n,{key}",
+                    f"R: R_n,{key}",
+                    f"C: K_t,{key}",
+                    f"R: R_t,{key}",
+                    f"R: slip_{key}",
+                )
+                ports[f"contact_{key}"] = Port(
+                    interfaces[key].transformer, interfaces[key].law.force, element
+                )
+            ports[f"pad_{name}"] = self._pad_port(name, own, ports, u, u_dot, moment_arm, angle)
+        return Evaluation(ports | self._sources(state, signals), flows, interfaces)
+
+    def point_inputs(
+        self,
+        key: str,
+        state: State,
+        u: Tensor,
+        u_dot: Tensor,
+        which: Tensor | None = None,
+    ) -> Tensor:
+        """Inputs x (..., points, 12 + states) of a contact's law: u and u_dot (..., points, 2) are
+        the points' own, in the base's frame. `which` takes some of the points."""
+        contact = self.contacts[key]
+        u, u_dot = torch.broadcast_tensors(u, u_dot)
+        X, weight = self.pads[contact.pad].point_positions, self.weight(key)
+        states = [state.stretch[key][..., None, :], *self.friction_of(key, state)]
+        states = torch.cat(states, -2).mT
+        if which is not None:
+            X, weight, states = X[which], weight[which], states[..., which, :]
+        motion = self.relative(key, state)[..., None, :]
+        parts = (X + u, motion[..., :3], u_dot, motion[..., 3:], states, weight[..., None])
+        size = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        none = torch.zeros(1, dtype=torch.float64)
+        return torch.cat([part.expand(*size, part.shape[-1]) for part in (*parts, none)], -1)
+
+    def friction_of(self, key: str, state: State) -> list[Tensor]:
+        """States (..., states, points) of a contact's law of friction, as they begin where `state`
+        has none; an empty list for a law without."""
+        friction = self.contacts[key].law.friction
+        begin = [getattr(friction, one.start) for one in friction_states(friction).values()]
+        if not begin:
+            return []
+        if key in state.friction:
+            return [state.friction[key]]
+        s = state.stretch[key]
+        return [torch.stack(begin)[:, None].expand(*s.shape[:-1], len(begin), s.shape[-1])]
+
+    def point_forces(self, own: Sequence[str], state: State, u: Tensor, u_dot: Tensor) -> Tensor:
+        """Sum of the forces of some contacts on the points of their pad (..., points, 2) [N], in
+        the base's frame."""
+        total = torch.zeros_like(u)
+        for key in own:
+            x = self.point_inputs(key, state, u, u_dot)
+            total = total + interface_law(self.contacts[key].law, self.shape_of(key), x)[..., :2]
+        return total
+
+    def _rates(self, name: str, own: Sequence[str], state: State, u: Tensor) -> Tensor:
+        """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises
+        `RuntimeError` where Newton's method does not converge."""
+        pad = self.pads[name]
+        free, P = free_rates(pad, state.pads[name], 0.0)
+        law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
+        with torch.no_grad():  # without rates the springs alone push, which holds the pad nearly
+            first = law(torch.zeros_like(pad.spread @ free))
+        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
+        if not left <= 1e3 * RATE_TOLERANCE:
+            raise RuntimeError(
+                f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s "
+                f"after {RATE_ITERATIONS} iterations; is v_s large enough for the pads' damping to "
+                "balance the fall of friction with slip?"
+            )
+        return free + nodal(P, F)
+
+    def _interface(
+        self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]
+    ) -> Interface:
+        contact = self.contacts[key]
+        pad, shape = self.pads[contact.pad], self.shape_of(key)
+        r_B, _ = self.base_motion(contact.pad, state)
+        x = self.point_inputs(key, state, pad.spread @ u, pad.spread @ u_dot)
+        (d, theta), angle = point_place(x), r_B[..., 2, None]
+        local = moving_frame(shape, d, theta)
+        n, moment_arm = turned(local.n, angle), turned(d, angle)
+        R = torch.stack((n, cross(n)), -2)  # world -> (normal, tangential), the rows of [iR0]
+        arm = torch.einsum("...ij,...j->...i", R, cross(moment_arm))[..., None]
+        transformer = Transformer(
+            {
+                contact.body: Block(R),
+                f"{contact.body}_spin": Block(arm),
+                f"pad_{contact.pad}": Block(-R, pad.spread),
+            }
+        )
+        frame = Frame(moment_arm, n, cross(n), local.g)
+        law = PointLaw.of(interface_law(contact.law, shape, x))
+        return Interface(frame, law, transformer, transformer.flow(flows))
+
+    def _pad_port(
+        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor,
+        moment_arm: Tensor, angle: Tensor
+    ) -> Port:  # fmt: skip
+        """The pad's viscoelastic field on its strain rate: node velocities less those of its base
+        (Fig. 7)."""
+        pad, key = self.pads[name], f"pad_{name}"
+        eye = torch.eye(2, dtype=u.dtype).expand(*angle.shape, 2, 2)
+        Q_T = torch.stack((turned(eye[..., 0], -angle), turned(eye[..., 1], -angle)), -1)
+        blocks = {key: Block(Q_T)}
+        if pad.base is None:
+            blocks[GROUND] = Block(-Q_T)
+        else:
+            blocks[pad.base] = Block(-Q_T)
+            blocks[f"{pad.base}_spin"] = Block(
+                -turned(cross(moment_arm), -angle)[..., None]
+            )  # (35)
+        if pad.inertial:
+            effort = pad.elastic_force(u + pad.retardation_time(name) * u_dot)
+        else:  # no I field: the field's effort is whatever the contacts leave at the junction
+            contacts = net_efforts({k: ports[f"contact_{k}"] for k in own}, self.junctions)
+            effort = turned(contacts[key], -angle) if own else torch.zeros_like(u)
+        return Port(Transformer(blocks), effort, pad.elements(name))
+
+    def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:
+        """Weights and actuators."""
+        out = {}
+        for name, body in self.weighted.items():
+            force = weight(body.mass, self.gravity).expand(signals.shape[:-2])
+            down = Transformer({name: Block(torch.eye(2, dtype=torch.float64)[None, 1:])})
+            out[f"weight_{name}"] = Port(
+                down, force[..., None, None], (f"Se: m_{self.symbols[name]} g",), True
+            )
+        for name, actuator in self.actuators.items():
+            body, _, axis = actuator.pushes.partition(".")
+            measured = (coordinate.partition(".") for coordinate in actuator.measures)
+            sensed = dict.fromkeys(
+                f"{one}_spin" if of == "theta" else one for one, _, of in measured
+            )
+            force = self.actuator_effort(name, state, signals)
+            spin = axis == "theta"
+            own = f"{body}_spin" if spin else body
+            row = (
+                torch.ones(1, 1, 1, dtype=torch.float64)
+                if spin
+                else torch.eye(2, dtype=torch.float64)[None, COORDINATES.index(axis), None]
+            )
+            out[f"control_{name}"] = Port(
+                Transformer({own: Block(row)}), force[..., None, None], actuator.elements, True,
+                senses=tuple(one for one in sensed if one != own),
+            )  # fmt: skip
+        return out
+
+    def actuator_effort(self, name: str, state: State, signals: Tensor) -> Tensor:
+        """Effort (...) [N or N.m] of an actuator on the coordinate that it pushes."""
+        rows = dict(zip(self.signals, signals.unbind(-2)))
+        return self.actuators[name](self.actuators[name].seen(rows, state, signals.shape[:-2]))
