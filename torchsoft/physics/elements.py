@@ -1,9 +1,9 @@
 """Elements of nodal pads: bilinear quadrilaterals in plane strain, each a law of the displacements
 and rates of its corners.
 
-The law's inputs x are displacements u (8), rates u' (8), x and y corner by corner, and the element's
-constants, as `element_constants` orders them; its outputs the forces (8) of the corners on the
-element and the power that it dissipates.
+The law's inputs x are displacements u (8), rates u' (8), x and y corner by corner, and the
+element's constants, as `element_constants` orders them; its outputs the forces (8) of the corners
+on the element and the power that it dissipates.
 """
 
 import numpy as np

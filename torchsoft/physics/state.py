@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -24,7 +25,7 @@ class State(NamedTuple):
     pose: dict[str, Tensor]
     rates: dict[str, Tensor]
     velocity: dict[str, Tensor]
-    friction: dict[str, Tensor] = {}
+    friction: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class Layout:

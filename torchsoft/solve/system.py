@@ -312,13 +312,14 @@ class Compiled:
         made = filled(
             Contacts, pad=owners, number=self._bodies.free[coordinate], coordinate=coordinate,
             states=[one.states for one in laws], distance=[one.distance.value for one in laws],
+            value=[one.interface.value for one in laws],
             linearise=[one.interface.linearise for one in laws],
             pullback=[one.interface.pullback for one in laws],
-            free=[one.free.value for one in laws],
             free_linearise=[one.free.linearise for one in laws],
             free_pullback=[one.free.pullback for one in laws], p_start=[*starts, self._count],
             point_start=np.cumsum([0, *counts]), size=[shape.size() for shape in shapes],
-            limits=limits, relative=motion_law().linearise,
+            limits=limits, relative=motion_law().value,
+            relative_linearise=motion_law().linearise,
         )  # fmt: skip
         pads = [rig.pads[contact.pad] for contact in contacts]
         joined = lambda parts, *shape: np.concatenate([np.zeros((0, *shape)), *parts])

@@ -135,16 +135,17 @@ class Contacts(NamedTuple):
     """Per contact: pad, free numbers of the coordinates of the body and of the pad's base (., 6) or
     -1, and those coordinates; states of each of its points, law addresses, p_start of its
     parameters, point_start, size of the body, limits (x from, x to, y from, y to) of the body's
-    centre in the base's frame. relative: address of the law of relative motion."""
+    centre in the base's frame. relative,
+    relative_linearise: addresses of the law of relative motion."""
 
     pad: Index
     number: IndexMatrix
     coordinate: IndexMatrix
     states: Index
     distance: Index
+    value: Index
     linearise: Index
     pullback: Index
-    free: Index
     free_linearise: Index
     free_pullback: Index
     p_start: Index
@@ -152,6 +153,7 @@ class Contacts(NamedTuple):
     size: Array
     limits: Matrix
     relative: int
+    relative_linearise: int
 
 
 class Points(NamedTuple):
@@ -259,7 +261,8 @@ SCRATCH: dict[str, dict[str, str]] = {
         "condensed": "zeta zeta_rate",  # of a chain
         # displacement u*, rates (without contact, now, before and after a Newton step), forces by
         # the law and by the linear relations (now, before, after)
-        "nodes 2": "u free u_dot u_dot_old u_dot_new F F_linear F_old F_new",
+        "nodes 2": "u free u_dot u_dot_old F F_linear F_old F_new",
+        "nodes2": "u_dot_new",
         "points inputs": "x",  # the law's inputs, outputs and Jacobian by rows
         "points outputs": "out",
         "points jacobian": "J",

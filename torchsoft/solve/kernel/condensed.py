@@ -107,18 +107,15 @@ def relation(s: Any, w: Any, pad: int, a: float) -> None:
 def propose(s: Any, w: Any, pad: int, a: float) -> None:
     """Nodal rates w.u_dot_new under the forces w.F_new, in the window."""
     first, start, size = s.pad_node_start[pad], s.condensed_C_start[pad], size_of(s, pad)
-    scale, new = mobility(s, pad, a), w.u_dot_new
-    low, high = w.low[pad], w.high[pad]
-    for node in range(low, high):
-        new[node, 0], new[node, 1] = w.free[node, 0], w.free[node, 1]
+    scale, low, high = mobility(s, pad, a), 2 * w.low[pad], 2 * w.high[pad]
+    rates = w.u_dot_new[low:high]
+    for i in range(rates.size):
+        rates[i] = w.free[(low + i) // 2, i % 2]
     for i in range(w.counts[pad]):
         node = w.touched[first + i]
         for r in range(2):
-            f = scale * w.F_new[node, r]
-            row = row_of(s.condensed_C, start, 2 * (node - first) + r, size)[2 * (low - first) :]
-            for other in range(high - low):
-                new[low + other, 0] += f * row[2 * other]
-                new[low + other, 1] += f * row[2 * other + 1]
+            row = row_of(s.condensed_C, start, 2 * (node - first) + r, size)
+            add(scale * w.F_new[node, r], row[low - 2 * first :], rates)
 
 
 @compiled

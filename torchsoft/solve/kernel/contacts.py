@@ -25,14 +25,16 @@ from torchsoft.solve.kernel.table import Array
 
 
 @compiled
-def relate(s: Any, w: Any, c: int) -> None:
-    """Relative motion of contact c and its loads under the wrench in w.pair[c], with their
-    derivatives."""
+def relate(s: Any, w: Any, c: int, derivatives: bool) -> None:
+    """Relative motion of contact c and its loads under the wrench in w.pair[c]."""
     x = w.pair[c]
     for i in range(6):
         coordinate = s.contact_coordinate[c, i]
         x[i], x[6 + i] = w.q[coordinate], w.V[coordinate]
-    call_linearise(s.contact_relative, x, s.p, w.relative[c], w.by_pair[c])
+    if derivatives:
+        call_linearise(s.contact_relative_linearise, x, s.p, w.relative[c], w.by_pair[c])
+    else:
+        call_value(s.contact_relative, x, s.p, w.relative[c])
 
 
 @compiled
@@ -40,7 +42,17 @@ def relate_all(s: Any, w: Any) -> None:
     """The same of all contacts, without a wrench."""
     for c in range(s.contact_pad.size):
         w.pair[c, 12:] = 0.0
-        relate(s, w, c)
+        relate(s, w, c, False)
+
+
+@compiled
+def load(s: Any, w: Any, c: int) -> None:
+    """Sum of the points' wrenches on the pad of contact c into w.pair[c]."""
+    at, wrench = s.pad_point_start[s.contact_pad[c]], w.pair[c, 12:]
+    wrench[:] = 0.0
+    for i in range(at, at + w.actives[s.contact_pad[c]]):
+        if s.point_contact[w.active[i]] == c:
+            add(1.0, w.out[w.active[i]], wrench)
 
 
 @compiled
@@ -75,16 +87,17 @@ def state_at(s: Any, k: int, j: int) -> int:
 
 
 @compiled
-def apply_law(s: Any, w: Any, k: int, y: Array, a: float) -> None:
-    """The law at point k with its derivatives, into w.out and w.J, and its force at the nodes, into
-    w.F."""
-    c, x = s.point_contact[k], w.x[k]
-    n = s.contact_states[c]
+def fill(s: Any, w: Any, k: int, y: Array, a: float) -> None:
+    """The inputs of the law at point k besides its motion."""
+    n, x = s.contact_states[s.point_contact[k]], w.x[k]
     for j in range(n):
         x[MOTION + j] = y[state_at(s, k, j)]
     x[MOTION + n], x[MOTION + n + 1] = s.point_weight[k], a
-    own = s.p[bounds(s.contact_p_start, c)]
-    call_linearise(s.contact_linearise[c], x, own, w.out[k], w.J[k])
+
+
+@compiled
+def press(s: Any, w: Any, k: int) -> None:
+    """Add the force of point k to its nodes, in w.F."""
     for j in range(2):
         for r in range(2):
             w.F[s.point_node[k, j], r] += s.point_N[k, j] * w.out[k, r]
@@ -118,45 +131,66 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
         place(s, w, k, ux + a * vx, uy + a * vy, vx, vy, w.x[k])
         if separation(s, w, k, w.x[k]) >= 0.0:
             continue
-        apply_law(s, w, k, y, a)
+        fill(s, w, k, y, a)
+        own = s.p[bounds(s.contact_p_start, s.point_contact[k])]
+        call_value(s.contact_value[s.point_contact[k]], w.x[k], own, w.out[k])
+        press(s, w, k)
         w.active[at + actives] = k
         actives += 1
     w.actives[pad] = actives
 
 
 @compiled
+def combine(J: Array, by: Array, out: Array) -> None:
+    """Derivatives (6,) of an output by a contact's coordinates, from its row J (10,) of derivatives
+    by a point's motion, and from those of the relative motion, rows of `by`."""
+    x, y, theta, x_dot, y_dot, theta_dot = J[2], J[3], J[4], J[7], J[8], J[9]
+    for j in range(6):
+        position = x * by[0, j] + y * by[1, j] + theta * by[2, j]
+        out[j] = position + x_dot * by[3, j] + y_dot * by[4, j] + theta_dot * by[5, j]
+
+
+@compiled
 def linearise(s: Any, w: Any, pad: int, a: float, felt: bool) -> None:
-    """H and S of the touching points of a pad, and its contacts' loads with their derivatives."""
+    """The law at the touching points of a pad with its derivatives, H, and the contacts' loads with
+    theirs."""
     at = s.pad_point_start[pad]
+    for i in range(at, at + w.actives[pad]):
+        k = w.active[i]
+        c = s.point_contact[k]
+        own = s.p[bounds(s.contact_p_start, c)]
+        call_linearise(s.contact_linearise[c], w.x[k], own, w.out[k], w.J[k])
     for c in range(s.contact_pad.size):
         if s.contact_pad[c] != pad:
             continue
-        w.pair[c, 12:] = 0.0
-        for i in range(w.actives[pad]):
-            k = w.active[at + i]
-            if s.point_contact[k] == c:
-                for o in range(WRENCH):
-                    w.pair[c, 12 + o] += w.out[k, o]
-        relate(s, w, c)
+        load(s, w, c)
+        relate(s, w, c, True)
         J = w.by_pair[c]
         for i in range(6):
             for j in range(6):
                 w.by_stage[c, i, j] = J[i, 6 + j] + a * J[i, j]
-    for i in range(w.actives[pad]):
-        k = w.active[at + i]
+    for i in range(at, at + w.actives[pad]):
+        k = w.active[i]
         c = s.point_contact[k]
-        columns, by, stage = MOTION + s.contact_states[c], w.by_pair[c], w.by_stage[c]
+        columns, stage, own = MOTION + s.contact_states[c], w.by_stage[c], w.J[k]
         for o in range(outputs(s, c, felt)):
-            J = w.J[k, o * columns : (o + 1) * columns]
-            H, S = w.H[at + i, o], w.S[at + i, o]
-            S[0], S[1] = J[0], J[1]
+            J, H = own[o * columns : o * columns + MOTION], w.H[i, o]
             H[0], H[1] = J[5] + a * J[0], J[6] + a * J[1]
-            for j in range(6):
-                position = rate = 0.0
-                for m in range(3):
-                    position += J[2 + m] * by[m, j] + J[7 + m] * by[3 + m, j]
-                    rate += J[2 + m] * stage[m, j] + J[7 + m] * stage[3 + m, j]
-                S[2 + j], H[2 + j] = position, rate
+            combine(J, stage, H[2:])
+
+
+@compiled
+def by_positions(s: Any, w: Any, pad: int, felt: bool) -> None:
+    """S of the touching points of a pad; needs `linearise`."""
+    at = s.pad_point_start[pad]
+    for i in range(at, at + w.actives[pad]):
+        k = w.active[i]
+        c = s.point_contact[k]
+        columns, by = MOTION + s.contact_states[c], w.by_pair[c]
+        for o in range(outputs(s, c, felt)):
+            J, S = w.J[k, o * columns : o * columns + MOTION], w.S[i, o]
+            S[0], S[1] = J[0], J[1]
+            combine(J, by, S[2:])
 
 
 @compiled
@@ -327,19 +361,15 @@ def loads(s: Any, w: Any) -> None:
     """The contacts' generalised forces on all coordinates into w.load."""
     w.load[:] = 0.0
     for c in range(s.contact_pad.size):
-        at, pad = s.pad_point_start[s.contact_pad[c]], s.contact_pad[c]
-        for i in range(w.actives[pad]):
-            k = w.active[at + i]
-            if s.point_contact[k] == c:
-                for row in range(6):
-                    for o in range(WRENCH):
-                        push = w.by_pair[c, 6 + row, 12 + o] * w.out[k, o]
-                        w.load[s.contact_coordinate[c, row]] += push
+        load(s, w, c)
+        relate(s, w, c, False)
+        for row in range(6):
+            w.load[s.contact_coordinate[c, row]] += w.relative[c, 6 + row]
 
 
 @compiled
 def restore(s: Any, w: Any, tape: Any, row: int, a: float, felt: bool) -> None:
-    """A stage from the tape: coordinates, touching points with the law's derivatives, touched nodes
+    """A stage from the tape: coordinates, touching points with their laws' derivatives, touched nodes
     and nodal forces (w.F)."""
     put(tape.q[row], w.q)
     put(tape.V[row], w.V)
@@ -360,8 +390,11 @@ def restore(s: Any, w: Any, tape: Any, row: int, a: float, felt: bool) -> None:
             k, state = tape.point[row, slot], tape.state[row, slot]
             ux, uy = state[0] + a * state[2], state[1] + a * state[3]
             place(s, w, k, ux, uy, state[2], state[3], w.x[k])
-            apply_law(s, w, k, tape.y[row], a)
+            fill(s, w, k, tape.y[row], a)
             w.active[at + i] = k
             slot += 1
         linearise(s, w, pad, a, felt)
+        for i in range(at, at + w.actives[pad]):
+            press(s, w, w.active[i])
+        by_positions(s, w, pad, felt)
         touched_nodes(s, w, pad)

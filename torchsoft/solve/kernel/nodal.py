@@ -304,7 +304,7 @@ def propose(s: Any, w: Any, pad: int, dV: Array) -> None:
         w.rate_old[first + i] = w.rate[first + i]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
-            w.u_dot_new[node, r] = new[s.nodal_surface[2 * node + r]]
+            w.u_dot_new[2 * node + r] = new[s.nodal_surface[2 * node + r]]
 
 
 @compiled

@@ -100,7 +100,7 @@ def move(s: Any, w: Any, pad: int, part: float) -> None:
         for r in range(2):
             F, rate = w.F_old[node, r], w.u_dot_old[node, r]
             w.F_linear[node, r] = F + part * (w.F_new[node, r] - F)
-            w.u_dot[node, r] = rate + part * (w.u_dot_new[node, r] - rate)
+            w.u_dot[node, r] = rate + part * (w.u_dot_new[2 * node + r] - rate)
     if s.pad_kind[pad] != CONDENSED:
         nodal.move(s, w, pad, part)
 
