@@ -28,8 +28,8 @@ from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.written import template, to_toml
 from torchsoft.solve.diagnostics import linearised, modes
+from torchsoft.solve.formats import load
 from torchsoft.solve.simulate import Interrupted
-from torchsoft.solve.trajectory import load
 
 READY = [RigFile.path(name) for name in ready()]
 

@@ -27,8 +27,9 @@ from torchsoft.physics.extensions import extend
 from torchsoft.physics.setup import von_mises
 from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.rigs.written import template
+from torchsoft.solve.formats import load, save
 from torchsoft.solve.simulate import SharedStart
-from torchsoft.solve.trajectory import Stats, load, save
+from torchsoft.solve.trajectory import Stats
 from torchsoft.sysid.columns import read_csv
 from torchsoft.sysid.measured import vocabulary
 

@@ -1,8 +1,11 @@
 """Representations of objects at a prompt and in a notebook, and near names for wrong ones."""
 
+import base64
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from difflib import SequenceMatcher
 from html import escape
+from pathlib import Path
 
 ALIKE = 0.6
 """Least ratio of common letters of two names that are alike."""
@@ -87,6 +90,24 @@ class Shown:
             for name, text in rows
         )
         return f"<div><b>{escape(title)}</b><table>{cells}</table></div>"
+
+
+@dataclass(frozen=True)
+class Film:
+    """A video, or a player, in a file; a notebook shows it."""
+
+    path: Path
+
+    def __repr__(self) -> str:
+        return f"Film: {self.path}, {1e-6 * self.path.stat().st_size:.2g} MB"
+
+    def _repr_html_(self) -> str:
+        if self.path.suffix == ".html":
+            page = escape(self.path.read_text(encoding="utf-8"))
+            return f'<iframe srcdoc="{page}" style="width:100%;height:640px;border:0"></iframe>'
+        kind = "video/mp4" if self.path.suffix == ".mp4" else "image/gif"
+        data = f"data:{kind};base64,{base64.b64encode(self.path.read_bytes()).decode()}"
+        return f'<video controls src="{data}"></video>' if kind[0] == "v" else f'<img src="{data}">'
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -7,7 +7,6 @@ import re
 import secrets
 import stat
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
@@ -16,11 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-try:
-    import fcntl
-except ImportError:  # no such locks: partial files are then left where they are
-    fcntl = None
+from filelock import FileLock, Timeout
 
 SEAL, DIGEST = b"\ntorchsoft-sha256\n", 64
 """End of a file with a checksum, and length of the checksum before it."""
@@ -34,8 +29,11 @@ CHECKPOINT = "torchsoft-checkpoint"
 PARTIAL = re.compile(r"\.[0-9a-f]{16}\.partial$")
 """End of the name of a partial file, after the name of the file that it becomes."""
 
-TRIES = 5
-"""Attempts to open a file that another process holds."""
+WAIT = 0.25
+"""Time [s] to wait for a file that another process holds, perhaps for an instant."""
+
+NO_LOCKS = errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK
+"""Errors of file systems without locks."""
 
 
 @contextmanager
@@ -54,13 +52,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
     remove_partials(path.parent.glob(f"{escape(path.name)}.*.partial"))
     partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
     try:
-        handle = hold(partial)
+        own = held(partial)
     except UnicodeEncodeError:
         raise ValueError(
             f"{str(path)!r} cannot be a file's name in this locale, whose names are in "
             f"{sys.getfilesystemencoding()}; take another name, or set LC_ALL=C.UTF-8"
         ) from None
-    assert handle is not None  # of a name of its own
+    assert own is not None  # of a name of its own
     try:
         yield partial
         flush(partial)
@@ -71,57 +69,53 @@ def replacing(path: str | Path) -> Iterator[Path]:
             error.filename = str(path)  # a full disk does not say for which file
         raise
     finally:
-        os.close(handle)
+        own.release()
     flush_folder(path.parent)
 
 
 @contextmanager
-def claimed(path: Path) -> Iterator[int | None]:
-    """Handle of the partial file `path`, emptied, while nobody else has it; None where somebody
-    does. It goes with its holder. Where a file system has no locks, everybody is given it."""
-    handle = hold(path)
+def claimed(path: Path) -> Iterator[bool]:
+    """Whether the partial file `path`, emptied, is this process's: nobody else has it. It goes with
+    its holder. Where a file system has no locks, everybody is given it."""
+    own = held(path)
     try:
-        if handle is not None:
-            os.truncate(handle, 0)
-        yield handle
+        if own is not None:
+            os.truncate(path, 0)
+        yield own is not None
     finally:
-        if handle is not None:
+        if own is not None:
             path.unlink(missing_ok=True)
-            os.close(handle)
+            own.release()
 
 
-def hold(path: Path) -> int | None:
-    """A locked handle of a file that is there; None where another process has it."""
+def held(path: Path, wait: float = WAIT) -> FileLock | None:
+    """A lock on the file `path` itself, made where it is not there and left as it is; None where
+    another process has it. It is not locked where a file system has no locks."""
     make_folder(path.parent)
-    for _ in range(TRIES):
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            if fcntl is not None:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:  # by its holder, or for an instant by who removes partial files
-            os.close(handle)
-            time.sleep(0.05)
-            continue
-        except OSError:  # no such locks
-            return handle
-        if path.exists() and os.path.samestat(os.fstat(handle), os.stat(path)):
-            return handle
-        os.close(handle)  # removed between its making and its lock
-    return None
+    own = FileLock(path, timeout=wait, fallback_to_soft=False)
+    try:
+        own.acquire()
+    except Timeout:
+        return None
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+    return own
 
 
 def remove_partials(paths: Iterable[Path]) -> None:
     """Remove those of the paths that are partial files whose writers are gone."""
     for path in paths:
-        if fcntl is None or not PARTIAL.search(path.name):
+        if not PARTIAL.search(path.name):
             continue
-        with suppress(OSError):  # gone by now, or not ours to touch
-            handle = os.open(path, os.O_RDWR)
+        with suppress(OSError):  # not ours to touch
+            if (own := held(path, 0.0)) is None:
+                continue
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                path.unlink(missing_ok=True)
+                if own.is_locked:
+                    path.unlink(missing_ok=True)
             finally:
-                os.close(handle)
+                own.release()
 
 
 def make_folder(path: Path) -> None:

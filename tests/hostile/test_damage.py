@@ -36,8 +36,8 @@ from torchsoft.datasets.check import check
 from torchsoft.datasets.files import StoreError
 from torchsoft.files import sealed
 from torchsoft.rigs import RigFile
+from torchsoft.solve.formats import load, save
 from torchsoft.solve.kernel import objects
-from torchsoft.solve.trajectory import load, save
 from torchsoft.sysid import IdentificationResult, Problem, identify
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.measured import vocabulary

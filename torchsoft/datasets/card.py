@@ -9,7 +9,6 @@ from torchsoft.datasets.config import Config
 from torchsoft.datasets.distributions import Choice, Distribution, Normal
 from torchsoft.datasets.files import CARD, Manifest, read_bytes, store_errors, write_bytes
 from torchsoft.datasets.reader import Vouched
-from torchsoft.datasets.schema import variables
 from torchsoft.datasets.subject import SPLITS
 from torchsoft.display import markdown
 from torchsoft.tables import line
@@ -94,7 +93,7 @@ def rig(config: Config) -> str:
 def drawn(config: Config) -> Iterable[tuple[str, ...]]:
     """Rows of the table of drawn parameters: name, distribution, unit."""
     for name, one in config.parameters.items():
-        unit = "1" if one.ratio_to else variables(config)[name].unit
+        unit = "1" if one.ratio_to else config.subject.variables[name].unit
         yield f"`{name}`", distribution(one), unit
     for kind in config.kinds:
         parts = (f"`{name}` {distribution(one)}" for name, one in kind.parameters.items())
@@ -116,7 +115,7 @@ def distribution(one: Distribution) -> str:
 
 def arrays(config: Config) -> Iterable[tuple[str, ...]]:
     """Rows of the table of arrays: name, dimensions, unit, meaning."""
-    for name, one in variables(config).items():
+    for name, one in config.subject.variables.items():
         parts = f": {', '.join(one.components)}" if one.components else ""
         yield f"`{name}`", ", ".join(one.sizes), one.unit, one.meaning + parts
 

@@ -25,7 +25,6 @@ from torchsoft.datasets.files import (
 )
 from torchsoft.datasets.generate import points
 from torchsoft.datasets.reader import Vouched, open_dataset
-from torchsoft.datasets.schema import not_finite, variables
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import STYLE, save
 from torchsoft.tables import line
@@ -113,7 +112,7 @@ def check_files(url: str, manifest: Manifest) -> Iterator[str]:
 
 def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
     """Arrays that are missing, or whose dimensions, unit or shard size differ from the schema."""
-    for name, variable in variables(config).items():
+    for name, variable in config.subject.variables.items():
         if name not in data:
             yield f"{name}: missing"
             continue
@@ -135,7 +134,7 @@ def check_shard(
     data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]
 ) -> Iterator[str]:
     """Findings on the trajectories of one finished shard."""
-    schema, columns, here = variables(config), dict[str, Any](), config.rows(shard)
+    schema, columns, here = config.subject.variables, dict[str, Any](), config.rows(shard)
     for name in schema:
         try:
             columns[name] = data[name][here.start : here.stop].values
@@ -158,13 +157,15 @@ def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]
             yield f"{name} is {one[name]}, but the design has {value}"
     if one["failed"]:
         series = [
-            name for name, v in variables(config).items() if v.kept.kind == "f" and len(v.shape) > 1
+            name
+            for name, v in config.subject.variables.items()
+            if v.kept.kind == "f" and len(v.shape) > 1
         ]
         if not one["reason"]:
             yield "failed without a reason"
         elif filled := [name for name in series if not np.isnan(one[name]).all()]:
             yield f"failed, but {', '.join(filled)} hold numbers"
-    elif bad := not_finite(config, one):
+    elif bad := config.subject.not_finite(one):
         yield f"not finite: {', '.join(bad)}"
     else:
         yield from check_physics(config, one)

@@ -1,41 +1,17 @@
 """Configuration of a dataset: the TOML file, validated."""
 
-import hashlib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Self
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import model_validator
 
-from torchsoft.datasets.distributions import Distribution, Kind
-from torchsoft.datasets.rig_files import embedded, outputs_of
+from torchsoft.datasets.fields import Fields
+from torchsoft.datasets.rig_files import embedded
 from torchsoft.datasets.subject import Subject
-from torchsoft.tables import LISTED, SEED, Table, from_toml
-
-STEP = 0.02
-"""Largest step [s] of the stepper: twice the pads' own time, and the energy balance is off by
-percents."""
-
-OUTDATED = ("grasp_depth", "settle", "feed_forward")
-"""Fields of configurations from before version 0.3, which had no rig file."""
+from torchsoft.tables import from_toml
 
 
-class Fractions(Table):
-    """Fractions of the trajectories; the rest is for testing."""
-
-    train: float = Field(0.7, gt=0, lt=1)
-    validation: float = Field(0.15, ge=0, lt=1)
-
-    @model_validator(mode="after")
-    def _leave_some_for_testing(self) -> Self:
-        if self.train + self.validation >= 1:
-            raise ValueError(
-                f"train + validation must stay below 1, but is {self.train + self.validation}"
-            )
-        return self
-
-
-class Config(Table):
+class Config(Fields):
     """One dataset, of the rig of a file. `ValueError` names the field that is wrong.
 
     Everything but `title`, `description` and `license` decides the data; `trajectories_per_shard`
@@ -43,89 +19,10 @@ class Config(Table):
     rig file's tables.
     """
 
-    title: str
-    """of the card and of pictures"""
-    description: str = ""
-    """a paragraph of the card"""
-    license: str = ""
-    """of the data, by its name in SPDX, such as CC-BY-4.0"""
-    seed: int = Field(ge=0, le=SEED)
-    """of the design, the splits and random phases"""
-    trajectories: int = Field(ge=1, le=10_000_000)
-    """of the whole set"""
-    trajectories_per_shard: int = Field(16, ge=1, le=100_000)
-    """what a worker makes at once, what its memory holds, and what a file of an array holds"""
-    samples_per_chunk: int = Field(250, ge=1, le=10_000_000)
-    """of one trajectory, read and decompressed at once"""
-    method: Literal["sobol", "latin_hypercube"] = "sobol"
-    """design of what is drawn; a longer Sobol sequence begins with the shorter one"""
-    duration: float = Field(ge=1e-3, le=1e4)
-    """of every trajectory [s]; that of the rig file by default"""
-    sample_interval: float = Field(5e-3, ge=1e-6, le=1.0)
-    """between samples [s]; that of the rig file by default"""
-    rtol: float | None = Field(None, ge=1e-9, le=1e-2)
-    """relative tolerance of the stepper [1]; 1e-4 by default, or what the rig file says"""
-    step: float | None = Field(None, ge=1e-6, le=STEP)
-    """equal steps no longer than this [s] instead"""
-    node_precision: Literal["float32", "float64"] = "float32"
-    """of everything that is kept per node; the rest is float64"""
-    ledger_tolerance: float = Field(0.02, ge=1e-12, le=1.0)
-    """largest energy residual over the energy injected [1] that the check accepts"""
-    splits: Fractions = Fractions(train=0.7, validation=0.15)
-    """fractions of the trajectories; the rest is for testing"""
-    fixed: dict[str, Any] = Field(default_factory=dict)
-    """parameters that differ from the rig file in every trajectory"""
-    parameters: dict[str, Distribution] = Field(default_factory=dict)
-    """distributions of the parameters that differ between trajectories, by name"""
-    kinds: Annotated[tuple[Kind, ...], LISTED] = Field((), max_length=100)
-    """kinds of trajectories, such as those of one motion or another; one kind by default"""
-    rig: dict[str, Any]
-    """the tables of the rig file; its name, from the folder of the configuration, in a TOML file"""
-    files: dict[str, str] = Field(default_factory=dict)
-    """contents of the files that the rig file names, in base 64"""
-    channels: Annotated[tuple[str, ...], LISTED] | None = None
-    """channels of the rig that are kept; all by default"""
-    nodal: bool = True
-    """whether forces and displacements of every contact point are kept"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _times_are_those_of_the_rig(cls, data: Any) -> Any:
-        if not isinstance(data, Mapping):
-            return data
-        if "rig" not in data and (old := [name for name in OUTDATED if name in data]):
-            raise ValueError(
-                f"{old[0]} is of torchsoft 0.2.0 and before, which makes, checks and exports such "
-                'datasets; now every configuration names a rig, such as rig = "paper", and '
-                "`fixed`, `parameters` and `kinds` speak of its tables"
-            )
-        if not isinstance(data.get("rig"), Mapping):
-            return data
-        return outputs_of(data["rig"]) | dict(data)
-
     @model_validator(mode="after")
-    def _is_possible(self) -> Self:
-        if abs(self.duration / self.sample_interval - (self.samples - 1)) > 1e-6:
-            raise ValueError(
-                f"duration = {self.duration} s is not a whole number of sample_interval = "
-                f"{self.sample_interval} s"
-            )
-        if self.step is not None and self.rtol is not None:
-            raise ValueError(
-                f"rtol = {self.rtol:g} and step = {self.step:g} s each say which steps to take; "
-                "give one of them"
-            )
-        if self.step is not None and self.step > self.sample_interval:
-            raise ValueError(
-                f"step = {self.step} s exceeds sample_interval = {self.sample_interval} s"
-            )
+    def _fits_the_rig(self) -> Self:
         Subject(self).check()
         return self
-
-    @model_serializer(mode="wrap")
-    def _own_fields(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        unsaid = [name for name in ("license", "kinds") if not getattr(self, name)]
-        return {name: x for name, x in handler(self).items() if name not in unsaid}
 
     @property
     def subject(self) -> Subject:
@@ -136,25 +33,6 @@ class Config(Table):
                 _subjects.pop(next(iter(_subjects)), None)
             _subjects[key] = Subject(self)
         return _subjects[key]
-
-    @property
-    def samples(self) -> int:
-        """Times on the output grid, both ends included."""
-        return round(self.duration / self.sample_interval) + 1
-
-    @property
-    def shards(self) -> int:
-        return -(-self.trajectories // self.trajectories_per_shard)
-
-    def rows(self, shard: int) -> range:
-        """The trajectories of a shard."""
-        size = self.trajectories_per_shard
-        return range(shard * size, min((shard + 1) * size, self.trajectories))
-
-    @property
-    def hash(self) -> str:
-        """Sixteen hexadecimal digits of the SHA-256 of the configuration."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Config":

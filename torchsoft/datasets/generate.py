@@ -25,7 +25,6 @@ from torchsoft.cost import Cost, rig_row, rig_step, span, steps_per_second
 from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, folder, read_bytes
-from torchsoft.datasets.schema import energies, not_finite, variables
 from torchsoft.datasets.subject import Row, Subject, Task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.parallel import executor, local_processes, single_threaded
@@ -61,7 +60,7 @@ def simulate_task(config: Config, task: Task) -> Row:
     """
     subject = config.subject
     out = (
-        {name: variable.empty for name, variable in variables(config).items()}
+        {name: variable.empty for name, variable in config.subject.variables.items()}
         | task.labels
         | {"failed": 1}
     )
@@ -79,7 +78,7 @@ def simulate_task(config: Config, task: Task) -> Row:
     except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
         return out | {"reason": f"{type(failure).__name__}: {failure}"}
     row = out | series(subject, rig, run) | {"failed": 0}
-    bad = not_finite(config, row)
+    bad = config.subject.not_finite(row)
     return out | {"reason": f"not finite: {', '.join(bad)}"} if bad else row
 
 
@@ -94,7 +93,7 @@ def series(subject: Subject, rig: Rig, run: Trajectory) -> Row:
             depth = rig.penetration(name, run.state)
             out[f"contact_{name}"] = (depth > 0).numpy().astype(np.uint8)
         out[f"displacement_{pad}"] = (rig.pads[pad].spread @ run.displacement[pad]).numpy()
-    for kind, (_, parts) in energies(subject).items():
+    for kind, (_, parts) in subject.energies.items():
         known = run.energy if kind == "stored" else getattr(run, kind)
         out[f"{kind}_energy"] = np.stack([known[part].numpy() for part in parts], -1)
     out["injected_energy"], out["energy_residual"] = (
@@ -169,7 +168,7 @@ def cost(
     at_once = max(min(workers, config.shards), 1)
     least, most, steps = usual(config) if each is None else each
     kept = sum(  # of one trajectory [GiB]
-        v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in variables(config).values()
+        v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in config.subject.variables.values()
     )
     shard = 2 * kept * min(
         config.trajectories_per_shard, config.trajectories

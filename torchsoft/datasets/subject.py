@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.datasets.distributions import Distribution, Kind
+from torchsoft.datasets.fields import Fields
 from torchsoft.datasets.rig_files import (
     differs,
     own_points,
     place,
 )
-from torchsoft.datasets.schema import Label, Variable, arrays
+from torchsoft.datasets.schema import KIND, RUN, SPLIT, Label, Variable
+from torchsoft.physics.energy import stores
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.places import unit
 from torchsoft.solve.formats import meanings
+from torchsoft.solve.progress import Integrals
 from torchsoft.solve.trajectory import channels, units
 from torchsoft.tables import line, shown
-
-if TYPE_CHECKING:
-    from torchsoft.datasets.config import Config
 
 RTOL = 1e-4
 """Default relative tolerance of the stepper: coarse, since data are not differentiated."""
@@ -65,7 +65,7 @@ class Subject:
     """The rig file of a configuration and the trajectories made from it. Any number of the rig file
     can be a parameter, by the names of its tables, those of its motions included."""
 
-    def __init__(self, config: "Config") -> None:
+    def __init__(self, config: Fields) -> None:
         self.config = config
 
     @cached_property
@@ -146,9 +146,84 @@ class Subject:
         return {name: out[name] for name in self.template.pads if name in out}
 
     @cached_property
+    def energies(self) -> dict[str, tuple[str, tuple[str, ...]]]:
+        """Dimension and parts of each kind of energy, by its name in a run."""
+        integrals = Integrals(self.template)
+        active = tuple(name for name in integrals.supplied if name in integrals.active)
+        return {
+            "stored": ("store", stores(self.template)),
+            "dissipated": ("resistor", integrals.dissipated),
+            "supplied": ("source", active),
+        }
+
+    def _nodal(self) -> dict[str, Variable]:
+        """Arrays of every contact point: forces by contact, displacements by pad."""
+        config, rig, out = self.config, self.template, dict[str, Variable]()
+        series = {"trajectory": config.trajectories, "time": config.samples}
+        precision = config.node_precision
+        for pad, touching in self.surfaces.items():
+            point = "contact point" if rig.pads[pad].points else "surface node"
+            per = f"each {point} of the {pad} pad"
+            where = series | {f"{pad}_point": len(rig.pads[pad].point_nodes)}
+            for name in touching:
+                out[f"normal_force_{name}"] = Variable(
+                    where, "N", f"normal force at {per}", precision
+                )
+                out[f"friction_force_{name}"] = Variable(
+                    where, "N", f"friction force at {per}", precision
+                )
+                body = rig.contacts[name].body
+                meaning = f"1 where the {body} penetrates {per}, else 0"
+                out[f"contact_{name}"] = Variable(where, "1", meaning, "uint8")
+            meaning = f"displacement of {per}"
+            out[f"displacement_{pad}"] = Variable(where | {"axis": 2}, "m", meaning, precision)
+        return out
+
+    @cached_property
     def variables(self) -> dict[str, Variable]:
-        """Every array of the dataset by its name."""
-        return arrays(self)
+        """Every array of the dataset by its name. Raises `ValueError` for a name that two arrays
+        would share."""
+        config, out = self.config, dict[str, Variable]()
+        single = {"trajectory": config.trajectories}
+        series = single | {"time": config.samples}
+        for name, one in self.signals.items():
+            out[name] = Variable(series, *one)
+        more = self._nodal() if config.nodal else {}
+        for kind, (dimension, parts) in self.energies.items():
+            meaning = "energy stored" if kind == "stored" else f"{kind} since t = 0"
+            more[f"{kind}_energy"] = Variable(
+                series | {dimension: len(parts)}, "J", meaning, components=parts
+            )
+        more["injected_energy"] = Variable(
+            series, "J", "positive part of what the sources supplied since t = 0"
+        )
+        more["energy_residual"] = Variable(
+            series, "J", "stored - supplied + dissipated since t = 0"
+        )
+        labels = (self.labels, RUN, KIND if config.kinds else {}, SPLIT)
+        rows = [
+            more,
+            *({name: Variable(single, *one) for name, one in some.items()} for some in labels),
+        ]
+        coordinates = {"time", "trajectory", "axis", *self.columns()}
+        for some in rows:
+            for name, variable in some.items():
+                if name in out:
+                    raise ValueError(taken(name))
+                out[name] = variable
+        if twice := sorted(coordinates & out.keys()):
+            raise ValueError(taken(twice[0]))
+        return out
+
+    def not_finite(self, row: Row) -> list[str]:
+        """Names of arrays with numbers that are not finite, in a trajectory that is not marked as
+        failed."""
+        known = (
+            name
+            for name, v in self.variables.items()
+            if v.kept.kind == "f" and name != "failure_time"
+        )
+        return [] if row["failed"] else [name for name in known if not np.isfinite(row[name]).all()]
 
     def columns(self) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64], str, str]]:
         """Coordinates of the contact points: dimensions, values, unit and meaning."""
@@ -338,6 +413,13 @@ class Drawn(NamedTuple):
         return change and f"it changes {change}, which all trajectories share; set it in `fixed`"
 
 
+def taken(name: str) -> str:
+    return (
+        f"two arrays of the dataset would be called `{name}`; call the body's symbol, the "
+        "actuator, the contact or the motion otherwise in the rig file"
+    )
+
+
 def with_fixed(file: RigFile, fixed: Mapping[str, Any], where: str) -> RigFile:
     """The rig file with these values set. Raises `ValueError`."""
     for name, value in fixed.items():
@@ -366,7 +448,7 @@ def extremes(ends: Mapping[str, float]) -> tuple[str, str]:
     return min(ends, key=lambda where: ends[where]), max(ends, key=lambda where: ends[where])
 
 
-def split(config: "Config", index: int) -> str:
+def split(config: Fields, index: int) -> str:
     """Train, validation or test, by the golden-ratio sequence from a seeded start, so that small
     sets keep the fractions."""
     u = (np.random.default_rng((config.seed, 0)).random() + index * GOLDEN) % 1.0

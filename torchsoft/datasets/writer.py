@@ -1,7 +1,6 @@
 """Writing of a dataset: the whole layout first, then one shard at a time, and its record after its
 data."""
 
-import os
 import subprocess
 import warnings
 from collections.abc import Callable, Iterator
@@ -33,7 +32,6 @@ from torchsoft.datasets.files import (
     store_errors,
     write_bytes,
 )  # fmt: skip
-from torchsoft.datasets.schema import not_finite, variables
 from torchsoft.files import PARTIAL, claimed, finite, remove_partials
 
 SMALL = (ZstdCodec(level=3), Crc32cCodec())
@@ -72,8 +70,13 @@ class Store:
         if (path := self.claim_file(shard)) is None:
             yield lambda: None
             return
-        with store_errors(self.url), claimed(path) as handle:
-            yield None if handle is None else lambda: os.write(handle, b".")
+
+        def simulated() -> None:
+            with path.open("ab") as file:
+                file.write(b".")
+
+        with store_errors(self.url), claimed(path) as mine:
+            yield simulated if mine else None
 
     def claim_file(self, shard: int) -> Path | None:
         """The lock file of a shard in the making, which has one byte for every simulated
@@ -92,7 +95,7 @@ class Store:
         permission, and `ValueError` for a trajectory that is neither finite nor failed."""
         here, digests = self.config.rows(shard), dict[str, str]()
         for index, row in zip(here, rows, strict=True):
-            if bad := not_finite(self.config, row):
+            if bad := self.config.subject.not_finite(row):
                 raise ValueError(
                     f"trajectory {index} is not marked as failed, but not finite: {', '.join(bad)}"
                 )
@@ -102,7 +105,7 @@ class Store:
             }
             group = zarr.open_group(MemoryStore(encoded), mode="r+", zarr_format=3)
             for (name, variable), key in zip(
-                variables(self.config).items(), self.manifest.layout.of(shard), strict=True
+                self.config.subject.variables.items(), self.manifest.layout.of(shard), strict=True
             ):
                 array = group[name]
                 assert isinstance(array, zarr.Array)
@@ -185,7 +188,7 @@ def laid_out(config: Config) -> dict[str, bytes]:
     }
     group = zarr.create_group(MemoryStore(content), zarr_format=3, attributes=about)
     size = config.trajectories_per_shard
-    for name, variable in variables(config).items():
+    for name, variable in config.subject.variables.items():
         _, *series = variable.shape
         storage: dict[str, Any] = {"chunks": (size,), "compressors": SMALL}
         if series:  # a chunk is one trajectory's stretch of time, a shard is one task's
@@ -229,7 +232,8 @@ def laid_out(config: Config) -> dict[str, bytes]:
 def manifest(config: Config, content: dict[str, bytes]) -> Manifest:
     """The manifest of a dataset with these files. Every array has one file in each shard."""
     files = (
-        f"{name}/c/{{shard}}" + "/0" * (len(v.shape) - 1) for name, v in variables(config).items()
+        f"{name}/c/{{shard}}" + "/0" * (len(v.shape) - 1)
+        for name, v in config.subject.variables.items()
     )
     size = config.trajectories_per_shard
     return Manifest(

@@ -261,8 +261,6 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The picture (height, width, 3), or None in the mode "human", which shows it in a
         window."""
-        from torchsoft.envs.rig_env import View
-
         if self.moment is None or self.render_mode is None:
             raise ValueError("nothing to render: give a `render_mode`, and call `reset` first")
         if self._view is None:

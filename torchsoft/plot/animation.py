@@ -4,8 +4,6 @@ import base64
 import importlib.util
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -117,24 +115,6 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> 
             assert artist.axes is not None
             artist.axes.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-@dataclass(frozen=True)
-class Film:
-    """A video, or a player, in a file; a notebook shows it."""
-
-    path: Path
-
-    def __repr__(self) -> str:
-        return f"Film: {self.path}, {1e-6 * self.path.stat().st_size:.2g} MB"
-
-    def _repr_html_(self) -> str:
-        if self.path.suffix == ".html":
-            page = escape(self.path.read_text(encoding="utf-8"))
-            return f'<iframe srcdoc="{page}" style="width:100%;height:640px;border:0"></iframe>'
-        kind = "video/mp4" if self.path.suffix == ".mp4" else "image/gif"
-        data = f"data:{kind};base64,{base64.b64encode(self.path.read_bytes()).decode()}"
-        return f'<video controls src="{data}"></video>' if kind[0] == "v" else f'<img src="{data}">'
 
 
 def animate(

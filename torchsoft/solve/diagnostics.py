@@ -152,7 +152,7 @@ DISPLACEMENT, VELOCITY = 1e-9, 1e-8
 so that nodes stick."""
 
 NEUTRAL = 0.1
-"""Growth rate [1/s] up to which a mode counts as neutral; the disc's angle is one."""
+"""Growth rate [1/s] up to which a mode counts as neutral, as the angle of a round body is."""
 
 
 AT_ONCE = 64

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as xml
@@ -13,12 +14,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchsoft.extras import needed
-from torchsoft.files import check_file, replacing
+from torchsoft.files import check_file, replacing, sealed, unsealed
 from torchsoft.physics.mesh import Array, StoredMesh
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.setup import Setup, von_mises
 from torchsoft.physics.state import Layout, State
-from torchsoft.solve.trajectory import Stats, Trajectory, load, rate_channel
+from torchsoft.solve.trajectory import Stats, Trajectory, rate_channel
 from torchsoft.tables import line
 
 # A run as an xarray Dataset, and back: everything that a `Trajectory` holds but its graph, under
@@ -173,7 +174,7 @@ def from_xarray(data: xr.Dataset, source: str = "the dataset") -> Trajectory:
     def refused(what: str) -> NoWholeRun:
         return NoWholeRun(
             f"{source} is no whole run: {what}; simulate it again, or read its arrays with "
-            "torchsoft.solve.trajectory.load"
+            "torchsoft.solve.formats.load"
         )
 
     def of(name: str) -> Tensor:
@@ -282,6 +283,23 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
         units={name: data[name].attrs.get("units", "") for name in parts["channels"]},
         setup=setup, known_contact_state=by("contact_state", contacts),
     )  # fmt: skip
+
+
+def save(data: xr.Dataset, path: str | Path) -> None:
+    """Write a trajectory's dataset, perhaps a changed one, as NetCDF with a checksum at the end of
+    the file."""
+    with replacing(path) as partial:
+        partial.write_bytes(sealed(data.to_netcdf(engine="h5netcdf")))
+
+
+def load(path: str | Path) -> xr.Dataset:
+    """The run in a file of `save`. Raises `ValueError` for any other file and for one that is
+    damaged, and `OSError`."""
+    content = BytesIO(unsealed(path))
+    try:
+        return xr.load_dataset(content, engine="h5netcdf", decode_times=False)
+    except Exception as error:  # whatever the libraries make of other content
+        raise ValueError(f"{path} is not a NetCDF file ({type(error).__name__})") from error
 
 
 def read(path: str | Path) -> Trajectory:

@@ -6,15 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from torchsoft.display import Shown, amount, suggestion
-from torchsoft.files import replacing, sealed, unsealed
+from torchsoft.display import Film, Shown, amount, suggestion
 from torchsoft.physics.energy import contact_states
 from torchsoft.physics.names import FORCES, ON_BODY, effort_channel, rate_channel
 from torchsoft.physics.namespace import declared
@@ -27,8 +25,6 @@ if TYPE_CHECKING:  # these take as long to import as all of this package
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
-
-    from torchsoft.plot.animation import Film
 from typing import NamedTuple
 
 import numpy as np
@@ -222,7 +218,7 @@ class Trajectory(Shown):
     def animate(self, path: str | Path, **options: Any) -> Film:
         """Write a video, .mp4 or .gif, or the interactive player, .html, which a notebook shows;
         options of `torchsoft.plot.animation.animate` or `torchsoft.plot.animation.player`."""
-        from torchsoft.plot.animation import Film, animate, player
+        from torchsoft.plot.animation import animate, player
 
         (player if Path(path).suffix == ".html" else animate)(self, Path(path), **options)
         return Film(Path(path))
@@ -235,7 +231,7 @@ class Trajectory(Shown):
 
     def to_pandas(self, *, units: bool = False) -> pd.DataFrame:
         """The channels as columns over time [s]; their units are in `attrs`, and with `units` in
-        the headings too, as `torchsoft identify` reads them: `x_disc [m]`."""
+        the headings too, as `torchsoft identify` reads them: `x_BODY [m]`."""
         import pandas as pd
 
         def heading(name: str) -> str:
@@ -263,6 +259,8 @@ class Trajectory(Shown):
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF with a checksum. The file appears whole or not at all."""
+        from torchsoft.solve.formats import save
+
         save(self.to_xarray(), path)
 
     @staticmethod
@@ -272,25 +270,6 @@ class Trajectory(Shown):
         from torchsoft.solve.formats import read
 
         return read(path)
-
-
-def save(data: xr.Dataset, path: str | Path) -> None:
-    """Write a trajectory's dataset, perhaps a changed one, as NetCDF with a checksum at the end of
-    the file."""
-    with replacing(path) as partial:
-        partial.write_bytes(sealed(data.to_netcdf(engine="h5netcdf")))
-
-
-def load(path: str | Path) -> xr.Dataset:
-    """The run in a file of `save`. Raises `ValueError` for any other file and for one that is
-    damaged, and `OSError`."""
-    import xarray as xr
-
-    content = BytesIO(unsealed(path))
-    try:
-        return xr.load_dataset(content, engine="h5netcdf", decode_times=False)
-    except Exception as error:  # whatever the libraries make of other content
-        raise ValueError(f"{path} is not a NetCDF file ({type(error).__name__})") from error
 
 
 def channels(

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
 from torchsoft.display import enumerated, nearest, suggestion
-from torchsoft.solve.formats import read_log
-from torchsoft.solve.trajectory import load
+from torchsoft.solve.formats import load, read_log
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
 

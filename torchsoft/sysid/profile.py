@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,8 @@ from torchsoft.parallel import parallel_map, single_threaded
 from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.result import IdentificationResult
 from torchsoft.sysid.runs import Runner
-
-if TYPE_CHECKING:
-    from torchsoft.sysid.result import IdentificationResult
 
 CHOSEN_ANEW = 1.0
 """Largest acceptable change of |r|^2 by steps that are chosen anew, in place of those of the
@@ -55,7 +53,7 @@ class Optimum:
         self.square = float(self.at.r @ self.at.r)
 
     @classmethod
-    def of(cls, problem: Problem, answer: "IdentificationResult", workers: int = 1) -> Self:
+    def of(cls, problem: Problem, answer: IdentificationResult, workers: int = 1) -> Self:
         """The end of the identification of `problem`, with its estimated noise. Raises `ValueError`
         for another problem's answer, or one of a robust loss, which is no likelihood."""
         last, labels = answer.stages[-1], problem.coordinates.labels
