@@ -20,8 +20,8 @@ FLOWS = {
     """,
     "codegen": "graph operations trace emit . stops",
     "physics": """
-        arguments mesh shapes contact material pads multibond state parts names motion
-        validity graph energy statics start namespace rig extensions setup .
+        arguments mesh shapes contact rate_and_state material elements pads multibond state parts
+        names motion validity graph energy statics start namespace rig extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour .",
@@ -44,7 +44,8 @@ FLOWS = {
     """,
     "cli": "results rigs plan identify design material dataset reduce plot .",
     "solve.kernel": """
-        table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
+        table arrays objects . invoke linear sources contacts condensed nodal pads stage step run
+        adjoint tangent build
     """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's

@@ -104,7 +104,7 @@ def test_a_stage_acts_through_the_stretch_at_its_end():
     for v_T in (1e-3, 0.5):
         stage = at(law(), g=5e-5, g_dot=1e-3, v_T=v_T, s=1e-6, stage=6e-4)
         now = at(law(), g=5e-5, g_dot=1e-3, v_T=v_T, s=1e-6 + 6e-4 * float(stage.s_dot))
-        for name in ContactState._fields:
+        for name in set(ContactState._fields) - {"z_dot"}:  # this friction has no states
             assert float(getattr(now, name)) == pytest.approx(
                 float(getattr(stage, name)), rel=1e-11
             ), name

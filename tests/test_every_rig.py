@@ -36,6 +36,7 @@ from torchsoft import (
     PadMesh,
     Profile,
     Prony,
+    RateAndState,
     Reference,
     Rig,
     RoundedBox,
@@ -260,6 +261,7 @@ RIGS: dict[str, Callable[[], Start]] = {
     "points between nodes": lambda: grip(points=2),
     "inertial pads": lambda: grip(inertial=True),
     "Coulomb": lambda: grip(friction=Coulomb(0.5, 0.4)),
+    "rate and state": lambda: grip(friction=RateAndState(0.4, 0.02, 0.03, 4e-5, 1e-3, 0.05)),
     "network of friction": lambda: grip(friction=NetworkFriction()),
     "turning jaws": lambda: grip(
         jaw=Body(**TURNING), lower=Body(**TURNING),

@@ -50,7 +50,7 @@ def test_gradients_are_the_differences_in_every_regime(name):
     with torch.no_grad():
         faces = model.evaluate(run.t, model.unpack(run.y, t=run.t)).interfaces.values()
     on = torch.cat([face.frame.g > 0 for face in faces], -1)
-    slips = on & torch.cat([face.out[..., 6] != 0 for face in faces], -1)
+    slips = on & torch.cat([face.law.slip != 0 for face in faces], -1)
     touching, leaving = int((on[1:] & ~on[:-1]).sum()), int((on[:-1] & ~on[1:]).sum())
     if name != "jerk":
         assert (touching > 0 and leaving > 0) if name == "make-break" else touching + leaving == 0

@@ -106,7 +106,7 @@ def test_a_second_folder_is_read_and_the_first_is_written(folder, tmp_path, monk
 
 def test_objects_are_named_after_all_that_is_compiled(tmp_path):
     assert objects.digest(objects.HERE) == objects.NAME
-    assert {"stage.py", "interface.py", "arrays.py", "invoke.py", "table.py", "build.py"} <= {
+    assert {"stage.py", "contacts.py", "arrays.py", "invoke.py", "table.py", "build.py"} <= {
         path.name for path in objects.HERE.glob("*.py")
     }
     names = set()

@@ -186,7 +186,7 @@ def test_points_stick_slip_and_part_as_the_graph_says(extended):
     state = model.unpack(run.y[rows], model.follow(t[rows]))
     found = torch.zeros(3)
     for name, interface in model.evaluate(t[rows], state).interfaces.items():
-        slips, touches = interface.out[..., 6] > 0, interface.F_N > 0
+        slips, touches = interface.law.slip > 0, interface.F_N > 0
         expected = torch.where(touches, 1 + slips.int(), 0)
         assert torch.equal(run.contact_state[name][rows].int(), expected)
         found += torch.bincount(expected.flatten(), minlength=3)

@@ -15,7 +15,7 @@ rigs        RigFile, BuiltRig, excite; Rig, Body, Pad, Contact, SoftContact, Act
 meshes      PadMesh, CurvedPadMesh, FingertipMesh, QuadMesh
 materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony
 shapes      Circle, Ellipse, Superellipse, RoundedBox, RoundedPolygon, Contour
-friction    SmoothSlip, Coulomb, or any torch function
+friction    SmoothSlip, Coulomb, RateAndState, or any torch function
 motions     Reference, Profile, Sampled, hold
 runs        simulate, simulate_batch, Trajectory, Batch; register_method (torchdiffeq)
 beyond      torchsoft.sysid (identification), torchsoft.reduced, torchsoft.datasets, torchsoft.envs

@@ -6,6 +6,7 @@ from .physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
 from .physics.motion import Profile, Reference, Sampled, hold
 from .physics.pads import Pad, Taxels
 from .physics.parts import PD, Actuator, Body, Contact, StateFeedback, controller
+from .physics.rate_and_state import RateAndState
 from .physics.rig import Rig
 from .physics.shapes import (
     Circle,
@@ -52,6 +53,7 @@ __all__ = [
     "Profile",
     "Prony",
     "QuadMesh",
+    "RateAndState",
     "Reference",
     "Rig",
     "RigFile",

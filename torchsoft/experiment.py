@@ -99,8 +99,9 @@ def at_the_points(rig: Rig, t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     for name, interface in rig.evaluate(t, state).interfaces.items():
         depths.append(interface.frame.g)
         at = rig.contacts[name].law(
-            depths[-1], *interface.flow.unbind(-1), state.stretch[name], rig.weight(name)
-        )
+            depths[-1], *interface.flow.unbind(-1), state.stretch[name], rig.weight(name),
+            z=state.friction[name].mT if name in state.friction else None,
+        )  # fmt: skip
         speeds.append(at.gamma_dot.abs())
     return torch.cat(depths, -1), torch.cat(speeds, -1)
 

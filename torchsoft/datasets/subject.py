@@ -460,7 +460,9 @@ def rounded(rig: Rig, y0: Tensor) -> Tensor:
     """The initial state (size,), rounded."""
     y0 = y0.detach().clone()
     for (part, name), where in rig.layout.slices.items():
-        forces = part == "pads" and not rig.pads[name].inertial
+        if part == "friction":  # of any unit
+            continue
+        forces = part == "pads" and not rig.pads[name].nodal
         y0[where] = (
             torch.round(y0[where], decimals=NODAL_FORCE if forces else POSITION) + 0.0
         )  # no negative zeros

@@ -44,6 +44,21 @@ def friction_states(friction: object) -> dict[str, FrictionState]:
     return dict(getattr(friction, "states", {}))
 
 
+def slip_of(
+    friction: SlipLaw, E: Tensor, F_N: Tensor, R: Tensor, z: Tensor | None = None,
+    stage: Tensor | float = 0.0,
+) -> tuple[Tensor, Tensor | None]:  # fmt: skip
+    """Slip rate of a friction law, and the rates of its states, which begin where none are
+    given."""
+    states = friction_states(friction)
+    if not states:
+        return friction(E, F_N, R), None
+    if z is None:
+        begin = torch.stack([getattr(friction, one.start) for one in states.values()])
+        z = begin.expand(*E.shape, len(begin))
+    return friction(E, F_N, R, z, stage)
+
+
 class Frame(NamedTuple):
     """The moving frame at points: moment arm d [m], normal n, tangent t (..., 2), penetration g [m]
     (...)."""
@@ -277,10 +292,7 @@ class SoftContact(nn.Module):
         trial = self.K_t * s + R * slides  # (10), (11): the effort if nothing slipped
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
-        if friction_states(self.friction):
-            slip, z_dot = self.friction(sign * trial, F_N, R, z, stage)
-        else:
-            slip, z_dot = self.friction(sign * trial, F_N, R), None
+        slip, z_dot = slip_of(self.friction, sign * trial, F_N, R, z, stage)
         gamma_dot = sign * slip  # (12), (13)
         s_dot = slides - gamma_dot
         e = self.K_t * s + R * s_dot

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the only way to tell
 
 from torchsoft.physics.arguments import check_transforms
+from torchsoft.physics.contact import slip_of
 from torchsoft.physics.material import Material
 from torchsoft.physics.shapes import Shape
 from torchsoft.quantity import quantities, quantity_of
@@ -310,7 +311,7 @@ def slip_rates(where: str, law: Any, E: Tensor, F_N: Tensor, R: float) -> Tensor
     """Slip rates [m/s] of efforts and normal forces (...). Raises `ValueError` for a law that gives
     no such tensor."""
     try:
-        rate = law(E, F_N, torch.tensor(R, dtype=torch.float64))
+        rate, _ = slip_of(law, E, F_N, torch.tensor(R, dtype=torch.float64))
     except Exception as error:  # any error of user code
         raise ValueError(
             f"the slip law of `{where}` must take three tensors (effort, normal force, dashpot) "

@@ -17,6 +17,7 @@ from torchsoft.physics.material import KINDS, Material
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, PadMesh, QuadMesh
 from torchsoft.physics.pads import Pad, Taxels
 from torchsoft.physics.parts import COORDINATES, Body, Contact
+from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.shapes import (
     Circle,
     Contour,
@@ -495,7 +496,11 @@ else:
     LawTable = table_of(
         SoftContact,
         base=SpringsTable,
-        friction=one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb")),
+        friction=one_of(
+            table_of(SmoothSlip, "smooth"),
+            table_of(Coulomb, "coulomb"),
+            table_of(RateAndState, "rate_and_state"),
+        ),
         **{
             name: Annotated[signature(SoftContact).parameters[name].annotation, OrAuto()]
             for name in ("K_n", "R_n", "K_t", "R_t")

@@ -168,8 +168,10 @@ def linearised(
     longer."""
     size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
     for (part, name), where in model.layout.slices.items():
-        if (
-            part == "pads" and not model.pads[name].inertial
+        if part == "friction":
+            size[where] = DISPLACEMENT * y[where].abs()
+        elif (
+            part == "pads" and not model.pads[name].nodal
         ):  # forces, counted by the displacement they make
             size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
         elif part in ("rates", "velocity"):

@@ -107,6 +107,9 @@ def add_results(run: Trajectory, add: Add) -> None:
             add(f"{kind}_force_{key}", points, force[..., i], "N", meaning)
         meaning = "stretch of the momentary springs"
         add(f"stretch_{key}", points, run.state.stretch[key], "m", meaning)
+        if key in run.state.friction:
+            own, meaning = ("time", f"{key}_state", f"{key}_point"), "states of the law of friction"
+            add(f"friction_state_{key}", own, run.state.friction[key], "", meaning)
         meaning = "0 separated, 1 sticking, 2 slipping; -1 not known"
         add(f"contact_state_{key}", points, run.contact_state[key], "1", meaning)
     for key, u in run.displacement.items():
@@ -256,7 +259,8 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
         for name, own in inertial.items()
     }
     rates = by("velocity", [name for name, own in inertial.items() if own])
-    state = State(pads, by("stretch", contacts), pose, rates, velocity)
+    friction = by("friction_state", [name for name in contacts if f"friction_state_{name}" in data])
+    state = State(pads, by("stretch", contacts), pose, rates, velocity, friction)
     layout = Layout(
         {name: tuple(x.shape[1:]) for name, x in pads.items()},
         {name: x.shape[1] for name, x in state.stretch.items()},
@@ -265,6 +269,7 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
             for name, body in setup.bodies.items()
         },
         {name: tuple(x.shape[1:]) for name, x in rates.items()},
+        {name: x.shape[1] for name, x in friction.items()},
     )
     return Trajectory(
         t=of("time"), y=layout.pack(state), state=state,

@@ -26,6 +26,7 @@ from torchsoft.physics.contact import (
     friction_states,
     interface_law,
     relative_motion,
+    slip_of,
 )
 from torchsoft.physics.elements import CONSTANTS, linear_element
 from torchsoft.physics.material import Material
@@ -229,6 +230,8 @@ def outputs_of(law: Callable[..., Any], x: Tensor) -> Tensor:
     """Outputs of a law of tensors, of an actuator or a shape; the chain of a material."""
     if isinstance(law, Material):
         out = law.chain()
+    elif friction_states(law):
+        out, _ = slip_of(law, *x.unbind(-1))
     else:
         out = law(x) if isinstance(law, Actuator | Shape) else law(*x.unbind(-1))
     parts = out if isinstance(out, tuple) else (out,)
@@ -256,9 +259,8 @@ def tried_states(actuator: Actuator) -> Tensor:
 
 def actuator_fault(name: str, actuator: Actuator) -> str:
     """`gradient_fault` of an actuator's law."""
-    inputs = [x for setpoint in actuator.setpoints for x in (setpoint, f"{setpoint}'s rate")]
-    inputs.append(actuator.feed_forward or "the feed-forward")
-    inputs += [x for measured in actuator.measures for x in (measured, f"{measured}'s rate")]
+    read = (*actuator.reads, *actuator.measures)
+    inputs = [x for one in read for x in (one, f"{one}'s rate")]
     return gradient_fault(
         f"the law of `actuators.{name}`", actuator, tried_states(actuator), inputs
     )

@@ -204,19 +204,18 @@ def own_units(rig: Rig) -> dict[str, float]:
 
 def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
     """Parts of the state whose error is judged together: each pad's forces, each contact's
-    stretches, a body's position, its angle. A rate's error counts by the displacement within a
-    step. A position's size is how far it has come from y0."""
+    stretches, a state of its law of friction, in units of its start, a body's position, its angle.
+    A rate's error counts by the displacement within a step. A position's size is how far it has
+    come from y0."""
     first, last, rate, unit, size, origin = [], [], [], [], [], np.zeros(len(y0))
     layout, units = rig.layout, own_units(rig)
     for (kind, name), here in layout.slices.items():
-        if kind in ("pads", "stretch", "rates"):
-            parts = [
-                (
-                    here.start,
-                    here.stop,
-                    "force" if kind == "pads" and not rig.pads[name].inertial else "length",
-                )
-            ]
+        if kind == "friction":
+            one_by_one = torch.arange(here.start, here.stop).unflatten(0, layout.shapes[kind, name])
+            parts = [(int(row[0]), int(row[-1]) + 1, "own") for row in one_by_one]
+        elif kind in ("pads", "stretch", "rates"):
+            forces = kind == "pads" and not rig.pads[name].nodal
+            parts = [(here.start, here.stop, "force" if forces else "length")]
         else:
             axes = layout.free[name]
             turning = "theta" in [COORDINATES[i] for i in axes]
@@ -229,7 +228,8 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
                 first.append(begin)
                 last.append(end)
                 rate.append(kind in ("rates", "velocity"))
-                unit.append(units[dimension])
+                own = np.linalg.norm(y0[begin:end]) if dimension == "own" else 0.0
+                unit.append(own or units.get(dimension, 1.0))
                 size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
     whole = [np.array(numbers, np.int64) for numbers in (first, last, rate)]
     return Errors(whole[0], whole[1], whole[2], atol * np.array(unit), np.array(size), origin)
@@ -240,7 +240,7 @@ def part_name(rig: Rig, errors: Errors, number: int) -> str:
     quantities = {
         "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
         "pose": "the pose of body", "rates": "the nodal velocities of pad",
-        "velocity": "the velocity of body",
+        "velocity": "the velocity of body", "friction": "the states of friction of contact",
     }  # fmt: skip
     for (kind, name), here in rig.layout.slices.items():
         if here.start <= errors.first[number] < here.stop:

@@ -22,6 +22,7 @@ from torchsoft.physics.mesh import dofs_of
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
 from torchsoft.physics.validity import (
@@ -276,7 +277,7 @@ class Compiled:
         if key not in self._known:
             check_shape(self.rig.contacts[name].body, shape)
             slip = law.friction
-            own = structure(law) is None or not isinstance(slip, Friction)
+            own = structure(law) is None or not isinstance(slip, Friction | RateAndState)
             stiffness = law.R_t.item() + NOMINAL * law.K_t.item()
             if own:
                 one = torch.ones(()).double()

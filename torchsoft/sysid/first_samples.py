@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.physics.contact import cross, point_place
+from torchsoft.physics.contact import cross, point_place, slip_of
 from torchsoft.physics.parts import COORDINATES, PD, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import above
@@ -314,7 +314,7 @@ def lasting_stretch(contact: Contact, F_N: float, time: float) -> float:
     def slips(s: float) -> float:
         """Slip [m] of a stretch s in that time, less s."""
         N = torch.tensor(F_N, dtype=torch.float64)
-        return float(law.friction(law.K_t * s, N, law.R_t)) * time - s
+        return float(slip_of(law.friction, law.K_t * s, N, law.R_t)[0]) * time - s
 
     with torch.no_grad():
         if slips(SHORTEST) > 0:

@@ -139,8 +139,8 @@ def demanded(
 ) -> Tensor:
     """Effort (n,) of the controller for a set-point, with its coordinate at x and its rate at v."""
     known = cubic(feed, every, is_derived(feed)) if isinstance(feed, Sampled) else feed
-    more = torch.zeros_like(x) if known is None else known(t)[0]
-    return actuator(torch.stack((place, rate, more, x, v), -1))
+    more = () if known is None else known(t)
+    return actuator(torch.stack((place, rate, *more, x, v), -1))
 
 
 def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
@@ -325,17 +325,14 @@ def controller_findings(
             t, F = t[near], F[near]
         if len(t) < FEWEST:
             continue
-        setpoints = [
-            part for one in actuator.setpoints for part in rig.reference[one](torch.tensor(t))
-        ]
+        read = [part for one in actuator.reads for part in rig.reference[one](torch.tensor(t))]
         feed = actuator.feed_forward
-        fed = rig.reference[feed](torch.tensor(t))[0] if feed else torch.zeros(len(t)).double()
         splines = [CubicSpline(*recording.samples[one]) for one in others]
         seen = [torch.from_numpy(s(t, order)) for s in splines for order in (0, 1)]
-        inputs = torch.stack((*setpoints, fed, *seen), -1).detach().requires_grad_(True)
+        inputs = torch.stack((*read, *seen), -1).detach().requires_grad_(True)
         given = actuator(inputs)
         (slopes,) = torch.autograd.grad(given.sum(), inputs)
-        by = slopes[:, len(setpoints) + 1 :: 2].square().mean(0).tolist()
+        by = slopes[:, len(read) :: 2].square().mean(0).tolist()
         noise = [sensors[force].noise ** 2]
         noise += [slope * sensors[one].noise ** 2 for slope, one in zip(by, others)]
         off = float(np.mean(F - given.detach().numpy()))

@@ -369,8 +369,8 @@ def loads(s: Any, w: Any) -> None:
 
 @compiled
 def restore(s: Any, w: Any, tape: Any, row: int, a: float, felt: bool) -> None:
-    """A stage from the tape: coordinates, touching points with their laws' derivatives, touched nodes
-    and nodal forces (w.F)."""
+    """A stage from the tape: coordinates, touching points with their laws' derivatives, touched
+    nodes and nodal forces (w.F)."""
     put(tape.q[row], w.q)
     put(tape.V[row], w.V)
     relate_all(s, w)

@@ -1,0 +1,144 @@
+"""Rate-and-state friction: the slip element's equation, velocity steps as textbooks draw them, and
+its numbers found again from a run."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchsoft import BuiltRig, RateAndState, Reference, RigFile, Trajectory, simulate
+from torchsoft.physics.motion import Lines
+
+MU_0, A, B, D_C, V_0 = 0.6, 0.012, 0.02, 50e-6, 1e-3
+SLOW, FAST, JUMP = 1e-3, 1e-2, 0.6
+
+
+def test_the_slip_rate_solves_the_elements_equation():
+    """R V + a F_N asinh(V / (2 V_0) exp((mu_0 + b ln(V_0 theta / D_c)) / a)) = E at the end of a
+    stage, over many orders of magnitude."""
+    random = np.random.default_rng(0)
+    E, F_N, R, h, theta = torch.from_numpy(
+        10 ** random.uniform([[-6], [-5], [-1], [-7], [-5]], [[2], [1], [3], [-1], [3]], (5, 20000))
+    )
+    law = RateAndState(MU_0, A, B, D_C, V_0)
+    R = R + h * (B - A) * F_N / D_C  # where the spring outweighs the fall of friction
+    with torch.no_grad():
+        V, rate = law(E, F_N, R, theta[:, None], h)
+    aged = theta + h * rate[:, 0]
+    assert (
+        float(((aged - theta) / h - (1 - V * aged / D_C)).abs().max()) < 1e-6 * float(V.max()) / D_C
+    )
+    strength = (MU_0 + B * torch.log(V_0 * aged / D_C)) / A
+    x = torch.log(V / (2 * V_0)) + strength  # asinh(e^x)
+    asinh = torch.where(x > 20, x + np.log(2), torch.asinh(torch.exp(x.clamp(max=20))))
+    assert float(((R * V + A * F_N * asinh) / E - 1).abs().max()) < 1e-9
+    assert torch.equal(law(E, 0 * F_N, R, theta[:, None], h)[0], torch.exp(torch.log(E / R)))
+
+
+def sled(**friction: float) -> RigFile:
+    """A block that is drawn over a stiff pad, slowly and then ten times as fast."""
+    return RigFile.from_tree({
+        "title": "velocity steps",
+        "bodies": {"block": {
+            "mass": 0.1, "x": "driven", "y": 13.99e-3, "theta": 0.0, "weighted": False,
+            "shape": {"kind": "rounded_box", "half_width": 6e-3, "half_height": 4e-3,
+                      "radius": 2e-3},
+        }},
+        "materials": {"plastic": {"kind": "kelvin_voigt", "E": 2e8, "nu": 0.3, "tau": 1e-4,
+                                  "depth": 10e-3}},
+        "pads": {"track": {"material": "plastic", "origin": [-20e-3, 0.0], "length": 40e-3,
+                           "height": 10e-3, "elements_x": 40, "elements_y": 4}},
+        "laws": {"dry": {"K_n": 1e5, "R_n": 10.0, "K_t": 1e6, "R_t": 20.0, "friction": {
+            "kind": "rate_and_state", "mu_0": MU_0, "a": A, "b": B, "D_c": D_C, "V_0": V_0,
+            "theta_0": D_C / SLOW} | friction}},
+        "contacts": {"track": {"pad": "track", "body": "block", "law": "dry"}},
+        "motion": {"block.x": {"kind": "profile", "times": [0.0, 1.0], "values": [0.0, 1e-3]}},
+        "outputs": {"duration": JUMP + 0.1, "interval": 1e-3, "video": "none", "figures": False},
+    })  # fmt: skip
+
+
+WAY = Lines(
+    np.array([0.0, JUMP, JUMP + 0.1]), np.array([0.0, SLOW * JUMP, SLOW * JUMP + FAST * 0.1])
+)  # fmt: skip
+STEP = Reference(**{"block.x": WAY})
+
+
+def drawn(built: BuiltRig, rows: int | None = None, **how: Any) -> Trajectory:
+    """A run along the velocity step."""
+    return simulate(built.rig, built.t[:rows], y0=built.y0, reference=STEP, rtol=1e-5, **how)
+
+
+def steady(V: float) -> float:
+    """Friction of steady slip."""
+    return MU_0 + (A - B) * np.log(V / V_0)
+
+
+def test_a_velocity_step_raises_friction_by_a_and_lowers_it_by_b_over_D_c():
+    """Of a block on a track that is stiff over D_c: the direct effect a ln(V_2 / V_1), then the
+    ageing law's way, theta = D_c / V_2 (1 + (V_2 / V_1 - 1) exp(-slip / D_c)), to the new steady
+    friction. Energies balance."""
+    built = sled().build()
+    run = drawn(built)
+    force = run.force["track"].sum(1)
+    mu = (force[:, 1] / force[:, 0]).numpy()
+    before, after = run.at(JUMP - 2e-3), run.t.numpy() - JUMP
+    assert mu[before] == pytest.approx(steady(SLOW), abs=2e-4)
+    assert mu[-1] == pytest.approx(steady(FAST), abs=2e-4)
+    rise = mu.max() - steady(SLOW)
+    assert 0.9 * A * np.log(10) < rise < A * np.log(10)
+    for slips in (1.0, 2.0, 3.0):  # in D_c
+        i = int(np.argmin(abs(after - slips * D_C / FAST)))
+        aged = 1 + (FAST / SLOW - 1) * np.exp(-after[i] * FAST / D_C)
+        assert mu[i] == pytest.approx(steady(FAST) + B * np.log(aged), abs=0.05 * B * np.log(10))
+    assert run.energy_residual_rel < 1e-3
+
+
+def test_a_contact_at_rest_grows_stronger_by_b():
+    """Static friction after ten times the rest is higher by b ln 10: the age of points that do not
+    slip is the time."""
+    tops = []
+    for rest in (1.0, 10.0):
+        built = sled(theta_0=rest, D_c=2e-4).build()
+        run = drawn(built, 200)
+        force = run.force["track"].sum(1)
+        tops.append(float((force[:, 1] / force[:, 0]).max()))
+    assert tops[1] - tops[0] == pytest.approx(B * np.log(10), rel=0.1)
+
+
+def test_points_without_load_age_and_runs_are_saved(tmp_path):
+    """Away from contact theta' = 1; states of friction are kept with the run."""
+    built = sled(theta_0=0.5).build()
+    run = drawn(built, 50)
+    theta, touches = run.state.friction["track"][:, 0], run.force["track"][..., 0].amax(0) > 0
+    assert bool(touches.any()) and not bool(touches.all())
+    assert torch.allclose(theta[:, ~touches], 0.5 + run.t[:, None], rtol=1e-12)
+    run.save(tmp_path / "run.nc")
+    again = type(run).load(tmp_path / "run.nc")
+    assert torch.equal(again.state.friction["track"], run.state.friction["track"])
+    assert torch.equal(again.y, run.y)
+
+
+def test_its_numbers_are_found_again_from_a_velocity_step():
+    """Gauss-Newton on the forces of a run, by exact sensitivities, from numbers that are off by 5
+    to 30 %."""
+    names = [f"laws.dry.friction.{name}" for name in ("mu_0", "a", "b", "D_c")]
+    built = sled().build()
+    rows = slice(500, 660, 2)
+
+    def pulled(values: list[float] | None) -> tuple[np.ndarray, np.ndarray]:
+        with torch.no_grad():
+            for name, value in zip(names, values or []):
+                built.rig.parameter(name).fill_(value)
+            run = drawn(built, 661, gradient="forward", wrt=names, touch=["block.load_x"])
+        J = run.touch_sensitivities["block.load_x"]
+        return run["block.load_x"].numpy()[rows], J.numpy()[rows]
+
+    true = np.array([MU_0, A, B, D_C])
+    data, _ = pulled(None)
+    x = true * [1.05, 0.8, 1.2, 1.3]
+    for _ in range(6):
+        force, J = pulled(x.tolist())
+        change = np.linalg.lstsq(J * x, data - force, rcond=None)[0]
+        x = x * np.exp(change.clip(-0.3, 0.3))
+    assert x == pytest.approx(true, rel=1e-3)
