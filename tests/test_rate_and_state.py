@@ -111,7 +111,7 @@ def test_points_without_load_age_and_runs_are_saved(tmp_path):
     built = sled(theta_0=0.5).build()
     run = drawn(built, 50)
     theta, touches = run.state.friction["track"][:, 0], run.force["track"][..., 0].amax(0) > 0
-    assert bool(touches.any()) and not bool(touches.all())
+    assert 0 < int(touches.sum()) < len(touches)
     assert torch.allclose(theta[:, ~touches], 0.5 + run.t[:, None], rtol=1e-12)
     run.save(tmp_path / "run.nc")
     again = type(run).load(tmp_path / "run.nc")

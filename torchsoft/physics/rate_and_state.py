@@ -1,4 +1,4 @@
-"""Rate-and-state friction with the ageing law (Dieterich, J. Geophys. Res. 84, 1979), regularised at
+"""Rate-and-state friction: the ageing law of Dieterich (J. Geophys. Res. 84, 1979), regularised at
 rest (Lapusta et al., J. Geophys. Res. 105, 2000).
 
 A contact point has a state of its own, the age theta [s] of its asperities. At a steady slip rate V
