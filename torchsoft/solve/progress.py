@@ -129,4 +129,5 @@ class RunState:
                 counts = 2 * len(plan.h), len(plan.out_step) if self.outputs_too else 0
                 kept = first_rows(tapes[0], counts[0]), first_rows(tapes[1], counts[1])
                 self.taped += sum(x.nbytes for tape in kept for x in tape)
-            self.segments.append(Segment(plan, signals, at_outputs, *before[:4], rows, kept))
+            y, V, u_dot, rate, _ = before
+            self.segments.append(Segment(plan, signals, at_outputs, y, V, u_dot, rate, rows, kept))

@@ -295,7 +295,10 @@ def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
 def by_motion(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
     """Derivatives (T, channels, n) of channels that the bodies' motion determines."""
     assert run.sensitivities is not None
-    bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
+    bodies, signals = (
+        Layout({}, {}, rig.layout.free, {}, {}),
+        rig.follow(run.t, rig.reference).detach(),
+    )
     along = [
         torch.zeros((), dtype=torch.float64, requires_grad=True)
         for _ in range(run.sensitivities.shape[-1])

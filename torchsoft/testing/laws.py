@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchsoft.codegen import compile_law
 from torchsoft.codegen.stops import evaluate
-from torchsoft.physics.contact import SlipLaw, SoftContact
+from torchsoft.physics.contact import SlipLaw, SoftContact, slip_of
 from torchsoft.physics.parts import Actuator
 from torchsoft.physics.shapes import Circle
 from torchsoft.physics.validity import NORMALS, check_slip
@@ -119,7 +119,7 @@ def _jump(name: str, slip: Any, R: float) -> str:
     where there is none."""
     dashpot = torch.tensor(R, dtype=torch.float64)
     for F_N in NORMALS[1:]:
-        rate = lambda E, F_N=F_N: slip(E, torch.full_like(E, F_N), dashpot)
+        rate = lambda E, F_N=F_N: slip_of(slip, E, torch.full_like(E, F_N), dashpot)[0]
         E = torch.linspace(0.0, STEEPEST * F_N, 2001, dtype=torch.float64)
         at = int(rate(E).diff().abs().argmax())
         low, high = E[at], E[at + 1]
