@@ -15,7 +15,10 @@ FORMAT = (
 )  # fmt: skip
 """Arrays and dimensions of every file of a run."""
 
-OF_CONTACT = "normal_force_{}", "friction_force_{}", "stretch_{}", "contact_state_{}", "{}_point"
+OF_CONTACT = (
+    "normal_force_{}", "friction_force_{}", "stretch_{}", "friction_state_{}", "contact_state_{}",
+    "{}_state", "{}_point",
+)  # fmt: skip
 OF_PAD = (
     "displacement_{}", "velocity_{}", "nodal_force_{}", "mesh_nodes_{}", "mesh_elements_{}",
     "mesh_bonded_{}", "mesh_face_{}", "energy_strain_{}", "energy_kinetic_{}", "dissipated_pad_{}",

@@ -12,7 +12,6 @@ from torchsoft.physics.mesh.mesh import (
     Index,
     Mesh,
     StoredMesh,
-    banded,
     dofs_of,
     lame_moduli,
     lame_slopes,
@@ -23,6 +22,6 @@ from torchsoft.physics.mesh.quads import QuadMesh
 
 __all__ = [
     "Array", "CurvedPadMesh", "FingertipMesh", "Index", "Mesh", "PadMesh", "QuadMesh",
-    "StoredMesh", "banded", "dofs_of", "lame_moduli", "lame_slopes", "unit_compliance",
+    "StoredMesh", "dofs_of", "lame_moduli", "lame_slopes", "unit_compliance",
     "unit_loads",
 ]  # fmt: skip

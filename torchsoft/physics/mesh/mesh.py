@@ -265,17 +265,7 @@ def in_band(nodes: Array, elements: Index) -> Index:
     return reverse_cuthill_mckee(sparse.csr_matrix(graph), symmetric_mode=True).astype(np.int64)
 
 
-# Stiffness of a pad's mesh, in a band, and compliance of its surface.
-
-
-def banded(matrix: sparse.csr_array) -> Array:
-    """Lower banded storage of a symmetric sparse matrix: `out[i - j, j]` is entry (i, j)."""
-    entries = matrix.tocoo()
-    row, col = entries.row, entries.col
-    lower = row >= col
-    out = np.zeros(((row - col).max() + 1, matrix.shape[0]))  # pyright: ignore[reportOptionalSubscript]
-    out[(row - col)[lower], col[lower]] = entries.data[lower]
-    return out
+# Compliance of a pad's surface.
 
 
 SMALLEST_BLOCK = 96
