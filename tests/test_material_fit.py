@@ -183,6 +183,23 @@ def test_one_odd_row_at_the_end_changes_nothing():
     assert found.values == pytest.approx(regular.values, rel=0.1)
 
 
+def test_a_term_that_the_rows_do_not_determine_is_left_out():
+    """A jerk in the first rows of a pull, which a term at the shortest time would take for itself;
+    asked for, it stays."""
+    t = np.arange(0.0, 40.0, 0.02)
+    strain = 0.05 * np.clip(t / 2.0, 0, 1)
+    stress = responses("relaxation", t, strain, TIMES[1:]) @ np.append(2e5, MODULI[1:])
+    stress += 2e-3 * stress.max() * np.random.default_rng(1).normal(size=len(t))
+    stress[1:5] += 0.03 * stress.max() * np.array([1.0, 3.0, 2.0, 0.5])
+    made = Measured(Path("made"), "relaxation", t, strain, stress)
+    found, asked = fit(made), fit(made, terms=3)
+    assert not found.undetermined
+    assert asked.undetermined
+    assert found.terms < min(found.scores, key=lambda k: found.scores[k])
+    assert found.values["tau_1"] == pytest.approx(2.0, rel=0.2)
+    assert f"but {found.terms} are taken: the rows do not determine E_1" in found.notices[-1]
+
+
 def test_a_compliance_over_decades_counts_row_by_row():
     """A power law over twelve decades of time: the series is as good at the first row."""
     t = np.geomspace(1e-8, 1e4, 121)

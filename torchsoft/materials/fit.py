@@ -8,7 +8,7 @@ count relative to the largest response, or to the response of each row (`Measure
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,6 +85,17 @@ class Fit:
         return (len(self.values) - 1) // 2
 
     @property
+    def undetermined(self) -> list[str]:
+        """Terms, with their values, whose strength the rows do not determine."""
+        symbol = "E" if self.kind == "prony" else "J"
+        found = [(f"{symbol}_{k}", f"tau_{k}") for k in range(1, self.terms + 1)]
+        return [
+            f"{name} = {self.values[name]:.3g} at {self.values[tau]:.3g} s"
+            for name, tau in found
+            if not self.sd[name] <= UNSURE * self.values[name]
+        ]
+
+    @property
     def residual(self) -> Array:
         """Measured less fitted (n,)."""
         return self.measured.answer - self.fitted
@@ -133,8 +144,9 @@ class Trial(NamedTuple):
 
 
 def fit(measured: Measured | Spectrum, *, terms: int | None = None) -> Fit:
-    """The series with the least criterion, or with as many `terms` as asked for. Raises
-    `ValueError` where the rows are too few for these, or tell no modulus that remains."""
+    """The series with the least criterion among those whose every strength the rows determine, if
+    there is one, or with as many `terms` as asked for. Raises `ValueError` where the rows are too
+    few for these, or tell no modulus that remains."""
     shortest, longest = measured.window
     most = min(MOST, 2 + int(math.log10(longest / shortest)), (len(measured.answer) - 2) // 2)
     if terms is not None and not 1 <= terms <= most:
@@ -158,7 +170,14 @@ def fit(measured: Measured | Spectrum, *, terms: int | None = None) -> Fit:
             f"{measured.path}: no relaxed modulus remains, or nothing changes in time: a series "
             "needs an E above zero, and terms; measure for longer, or look at the columns"
         )
-    return concluded(measured, tried[best], {count: trial.score for count, trial in tried.items()})
+    scores = {count: trial.score for count, trial in tried.items()}
+    fits = [concluded(measured, tried[k], scores) for k in sorted(tried, key=scores.__getitem__)]
+    told = [one for one in fits if not one.undetermined]
+    if terms is not None or not told or told[0] is fits[0]:
+        return fits[0]
+    left = f"{fits[0].terms} terms fit better, but {told[0].terms} are taken: the rows do not "
+    left += f"determine {', '.join(fits[0].undetermined)} of the others"
+    return replace(told[0], notices=(*told[0].notices, left))
 
 
 def beginnings(measured: Measured | Spectrum, count: int) -> list[Array]:
