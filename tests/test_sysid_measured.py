@@ -19,8 +19,8 @@ from conftest import PAPER, paper
 from torchsoft.csvfile import UNITS
 from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
+from torchsoft.physics.namespace import measurable
 from torchsoft.solve.formats import save
-from torchsoft.solve.trajectory import measurable
 from torchsoft.sysid import Sensor, record
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.initial_state import MovingStart, StartCoordinate

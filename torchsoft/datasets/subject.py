@@ -25,13 +25,12 @@ from torchsoft.datasets.rig_files import (
 )
 from torchsoft.datasets.schema import KIND, RUN, SPLIT, Label, Variable
 from torchsoft.physics.energy import stores
+from torchsoft.physics.namespace import declared
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.setup import Setup
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.places import unit
-from torchsoft.solve.formats import meanings
 from torchsoft.solve.progress import Integrals
-from torchsoft.solve.trajectory import channels, units
+from torchsoft.solve.trajectory import channels
 from torchsoft.tables import line, shown
 
 RTOL = 1e-4
@@ -128,8 +127,8 @@ class Subject:
         moments = {name: torch.zeros((), dtype=torch.float64) for name in rig.pads}
         with torch.no_grad():
             known = channels(rig, state, signals, moments)
-        of, named = units(rig), meanings(Setup.of(rig))
-        return {key: Label(of[key], named.get(key, f"motion {key}")) for key in known}
+        of = {one.name: Label(one.unit, one.meaning) for one in declared(rig)}
+        return {key: of[key] for key in known}
 
     @property
     def signals(self) -> dict[str, Label]:

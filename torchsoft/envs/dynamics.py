@@ -12,13 +12,14 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, positive, whole
 from torchsoft.physics.motion import Lines, Reference
+from torchsoft.physics.namespace import measurable
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
 from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.steps import check_knots
-from torchsoft.solve.trajectory import Touch, Trajectory, channels, measurable
+from torchsoft.solve.trajectory import Touch, Trajectory, channels
 
 Ranges = Mapping[str, tuple[float, float]]
 """Lower and upper bound by name, in SI units."""

@@ -3,6 +3,7 @@ junctions. Two of one name would replace each other in silence.
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 from torchsoft.physics.graph import Graph
 from torchsoft.physics.multibond import GROUND
@@ -32,30 +33,67 @@ OF_RIG = (
 """Arrays and dimensions of a file by the part that they belong to."""
 
 
-def declared(rig: Graph) -> Iterator[tuple[str, str, str]]:
-    """Name, SI unit and owner of every channel; a signal's unit follows from its use, and one with
-    several uses comes several times."""
+POSE, RATE, EFFORT = "pose", "rate", "effort"
+"""Kinds of channels that a sensor can measure."""
 
-    def signal(name: str, unit: str) -> Iterator[tuple[str, str, str]]:
-        yield name, unit, f"the motion `{name}`"
-        yield f"{name}_dot", f"{unit}/s", f"the rate of the motion `{name}`"
+
+class Channel(NamedTuple):
+    """A channel of a run: its name, SI unit, owner and meaning, and what it measures of the motion
+    of a free coordinate, if anything."""
+
+    name: str
+    unit: str
+    owner: str
+    meaning: str
+    measures: str = ""
+
+
+def declared(rig: Graph) -> Iterator[Channel]:
+    """Every channel; a signal's unit follows from its use, and one with several uses comes several
+    times."""
+
+    def signal(name: str, unit: str, meaning: str) -> Iterator[Channel]:
+        yield Channel(name, unit, f"the motion `{name}`", meaning)
+        yield Channel(
+            f"{name}_dot", f"{unit}/s", f"the rate of the motion `{name}`", f"rate of {name}"
+        )
 
     for name, symbol in rig.symbols.items():
         for axis in COORDINATES:
-            key, unit = f"{axis}_{symbol}", coordinate_unit(axis)
-            yield key, unit, f"{name}.{axis}"
-            yield rate_channel(key), f"{unit}/s", f"the rate of {name}.{axis}"
-            if rig.bodies[name].freedom[axis] == "driven":
-                yield from signal(f"{name}.{axis}", unit)
-        yield f"angular_momentum_{symbol}", "kg.m2/s", f"the angular momentum of the body `{name}`"
+            own, unit = f"{name}.{axis}", coordinate_unit(axis)
+            key, freedom = f"{axis}_{symbol}", rig.bodies[name].freedom[axis]
+            pose, rate = (POSE, RATE) if freedom == "free" else ("", "")
+            what = f"{'angle (anticlockwise)' if axis == 'theta' else axis} of the body {name}"
+            yield Channel(key, unit, own, what, pose)
+            yield Channel(
+                rate_channel(key), f"{unit}/s", f"the rate of {own}", f"rate of {what}", rate
+            )
+            if freedom == "driven":
+                yield from signal(own, unit, f"motion that drives {own}")
+        what = f"angular momentum of the body {name}"
+        owner = f"the angular momentum of the body `{name}`"
+        yield Channel(f"angular_momentum_{symbol}", "kg.m2/s", owner, what)
     for name, actuator in rig.actuators.items():
+        unit, feed = actuator.effort_unit, actuator.feed_forward
         for coordinate, setpoint in actuator.follows:
-            yield from signal(setpoint, coordinate_unit(coordinate))
-        if actuator.feed_forward is not None:
-            yield from signal(actuator.feed_forward, actuator.effort_unit)
-        yield effort_channel(name), actuator.effort_unit, f"the effort of the actuator `{name}`"
+            of = f"set-point of {coordinate}" if setpoint != feed else f"signal {setpoint}"
+            yield from signal(setpoint, coordinate_unit(coordinate), of)
+        if feed is not None:
+            yield from signal(feed, unit, f"signal {feed}")
+        what = f"effort of the actuator {name} on {actuator.pushes}"
+        yield Channel(
+            effort_channel(name), unit, f"the effort of the actuator `{name}`", what, EFFORT
+        )
     for name in rig.pads:
-        yield f"M_{name}", "N.m", f"the moment on the pad `{name}`"
+        what = f"moment of the pad {name} on its base"
+        yield Channel(f"M_{name}", "N.m", f"the moment on the pad `{name}`", what)
+
+
+def measurable(rig: Graph) -> tuple[str, ...]:
+    """Channels that a sensor can measure, whose derivatives follow from the bodies' motion: free
+    coordinates, their rates in the same order, and the actuators' efforts."""
+    every = [*declared(rig)]
+    return tuple(one.name for kind in (POSE, RATE, EFFORT) for one in every if one.measures == kind)
 
 
 def arrays(rig: Graph) -> Iterator[tuple[str, str]]:
@@ -88,7 +126,7 @@ def junctions(rig: Graph) -> Iterator[tuple[str, str]]:
 
 def check_unique(rig: Graph) -> None:
     """Raises `ValueError` where two of a rig's channels, arrays or junctions have one name."""
-    channels = ((key, owner) for key, _, owner in declared(rig))
+    channels = ((one.name, one.owner) for one in declared(rig))
     for what, entries in (
         ("junction", junctions(rig)),
         ("channel", (*channels, *arrays(rig))),

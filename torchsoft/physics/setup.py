@@ -15,6 +15,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torchsoft.physics.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
 from torchsoft.physics.mesh.mesh import gradients, strains
 from torchsoft.physics.names import effort_channel
+from torchsoft.physics.namespace import declared
 from torchsoft.physics.pads import Pad, contact_points, shape_functions
 from torchsoft.physics.rig import Rig
 
@@ -170,13 +171,15 @@ class ActuatorSetup:
 
 @dataclass(frozen=True)
 class Setup:
-    """Bodies, pads, contacts and actuators as a run had them, and short names of channels."""
+    """Bodies, pads, contacts and actuators as a run had them, and short names and meanings of
+    channels."""
 
     bodies: dict[str, BodySetup] = field(default_factory=dict)
     pads: dict[str, PadSetup] = field(default_factory=dict)
     contacts: dict[str, ContactSetup] = field(default_factory=dict)
     actuators: dict[str, ActuatorSetup] = field(default_factory=dict)
     short: dict[str, str] = field(default_factory=dict)
+    meanings: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     @torch.inference_mode(False)  # outlines need torch's graphs
@@ -212,7 +215,7 @@ class Setup:
                 )
                 for name, one in rig.actuators.items()
             },
-            short=dict(rig.short),
+            short=dict(rig.short), meanings={one.name: one.meaning for one in declared(rig)},
         )  # fmt: skip
 
     def plain(self) -> dict[str, Any]:
@@ -231,6 +234,7 @@ class Setup:
             "contacts": {name: rest(one) for name, one in self.contacts.items()},
             "actuators": {name: rest(one) for name, one in self.actuators.items()},
             "short": self.short,
+            "meanings": self.meanings,
         }
 
     @classmethod
@@ -251,4 +255,5 @@ class Setup:
             {name: ContactSetup(**one) for name, one in plain["contacts"].items()},
             {name: ActuatorSetup(**one) for name, one in plain["actuators"].items()},
             plain.get("short", {}),
+            plain.get("meanings", {}),
         )

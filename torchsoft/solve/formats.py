@@ -19,7 +19,7 @@ from torchsoft.physics.mesh import Array, StoredMesh
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.setup import Setup, von_mises
 from torchsoft.physics.state import Layout, State
-from torchsoft.solve.trajectory import Stats, Trajectory, rate_channel
+from torchsoft.solve.trajectory import Stats, Trajectory
 from torchsoft.tables import line
 
 # A run as an xarray Dataset, and back: everything that a `Trajectory` holds but its graph, under
@@ -71,32 +71,9 @@ def to_xarray(run: Trajectory) -> xr.Dataset:
     return xr.Dataset(data, coords, {name: json.dumps(value) for name, value in about.items()})
 
 
-def meanings(setup: Setup) -> dict[str, str]:
-    """What channels are, by their names."""
-    out, known = dict[str, str](), {"theta": "angle (anticlockwise)"}
-    for name, body in setup.bodies.items():
-        for axis, channel in body.channels.items():
-            what = f"{known.get(axis, axis)} of the body {name}"
-            out |= {channel: what, rate_channel(channel): f"rate of {what}"}
-            if body.freedom.get(axis) == "driven":
-                signal = f"{name}.{axis}"
-                out |= {
-                    signal: f"motion that drives {signal}",
-                    f"{signal}_dot": f"rate of {signal}",
-                }
-        if turns := body.channels.get("theta"):
-            own = turns.removeprefix("theta_")
-            out[f"angular_momentum_{own}"] = f"angular momentum of the body {name}"
-    for name, one in setup.actuators.items():
-        out[one.channel] = f"effort of the actuator {name} on {one.pushes}"
-        for at, signal in one.follows.items():
-            out |= {signal: f"set-point of {at}", f"{signal}_dot": f"rate of {signal}"}
-    return out | {f"M_{name}": f"moment of the pad {name} on its base" for name in setup.pads}
-
-
 def add_results(run: Trajectory, add: Add) -> None:
     """Results of the run."""
-    time, named = ("time",), meanings(run.setup)
+    time, named = ("time",), run.setup.meanings
     for name, value in run.channels.items():
         meaning = f"rate of {name[:-4]}" if name.endswith("_dot") else f"signal {name}"
         add(name, time, value, run.units.get(name, ""), named.get(name, meaning))

@@ -298,18 +298,7 @@ def channels(
 
 def units(rig: Rig) -> dict[str, str]:
     """SI unit of every channel, by its key."""
-    return {name: unit for name, unit, _ in declared(rig)}
-
-
-def measurable(rig: Rig) -> tuple[str, ...]:
-    """Channels that a sensor can measure, whose derivatives follow from the bodies' motion: free
-    coordinates, their rates in the same order, and the actuators' efforts."""
-    poses, rates = [], []
-    for name, axes in rig.layout.free.items():
-        for axis in axes:
-            poses.append(f"{COORDINATES[axis]}_{rig.symbols[name]}")
-            rates.append(rate_channel(poses[-1]))
-    return *poses, *rates, *map(effort_channel, rig.actuators)
+    return {one.name: one.unit for one in declared(rig)}
 
 
 # Channels of touch: recorded forces of a run as read by sensors on pads, under them and at

@@ -12,11 +12,12 @@ from scipy.special import log_ndtr
 from torch import Tensor
 
 from torchsoft.physics.names import effort_channel, rate_channel
+from torchsoft.physics.namespace import measurable
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout
 from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import simulate
-from torchsoft.solve.trajectory import Trajectory, channels, measurable
+from torchsoft.solve.trajectory import Trajectory, channels
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.recording import REACH, Array, Grid, RunContext
 from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
