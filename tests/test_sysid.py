@@ -224,10 +224,10 @@ def shaking():
 
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking):
     problem = Problem([shaking], SENSORS, {E: Unknown(), TAU: Unknown()})
-    plan = [Stage("all", ("shaking",), (E, TAU), 2e-2)]
+    plan = [Stage("all", ("shaking",), (E, TAU), 3e-2)]
     coarse = identify(problem, plan=plan, tightenings=0, **TRUSTED)
     assert any(
-        "rtol = 0.02 is too coarse" in notice and "take rtol = 0.002" in notice
+        "rtol = 0.03 is too coarse" in notice and "take rtol = 0.003" in notice
         for notice in coarse.notices
     )
     worst = max(coarse.estimates, key=lambda e: abs(e.step_bias_sd))
@@ -239,7 +239,7 @@ def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking):
     )  # and its size is about right
     better = identify(problem, plan=plan, **TRUSTED)
     assert not any("too coarse" in notice for notice in better.notices)
-    assert better.made_by["rtol"] < 2e-2
+    assert better.made_by["rtol"] < 3e-2
     assert abs(np.log(better[worst.name].last / nominal)) < 0.2 * abs(error)
 
 

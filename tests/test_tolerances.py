@@ -217,8 +217,7 @@ def test_inertial_pads_take_steps_by_tolerance():
     t = times(0.15, 7)
     loose, tight = (simulate(model, t, y0=y0, rtol=rtol) for rtol in (1e-3, 1e-5))
     assert float((loose["y_C"] - tight["y_C"]).abs().max()) < 1e-6
-    h = loose.knots.diff()
-    assert np.allclose(np.log2(h.numpy()), np.round(np.log2(h.numpy())), atol=1e-6)
+    assert len(np.unique(loose.knots.diff().numpy().round(12))) > 0.5 * len(loose.knots)
     again = simulate(model, t, y0=y0, knots=loose.knots)
     assert float((again.y - loose.y).abs().max()) < 1e-9
 

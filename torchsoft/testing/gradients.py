@@ -47,6 +47,10 @@ with."""
 TOGETHER = "all together"
 """Name of the direction in which all parameters weigh alike, as far as they weigh at all."""
 
+REST = 1.0 / (1.0 - 0.1 ** (2.0 / 3.0))
+"""Error of the steps over the change by a tenth of the tolerance: that of a method of second order
+falls with the tolerance to the power of two thirds."""
+
 NOTHING = 1e-9
 """Part of the largest derivative below which one is rounding."""
 
@@ -55,8 +59,9 @@ class Derivative(NamedTuple):
     """The derivative of a value by the relative change of a parameter, or along a random direction
     of one of several entries, of the start or of the knots of the reference: by the adjoint,
     forward (None: of values of one's own, and of parameters of several entries), by central
-    differences with their uncertainty (None: taken together only), and how much it changes at a
-    tenth of the tolerance (None: not asked for). `scale` is the largest derivative of the value."""
+    differences with their uncertainty (None: taken together only), and its error by the steps, as
+    the change at a tenth of the tolerance shows it (None: not asked for). `scale` is the largest
+    derivative of the value."""
 
     value: str
     by: str
@@ -326,7 +331,7 @@ def _checked(
                 {kind: found[name] for kind, found in own.items()}, largest, bound,
             )  # fmt: skip
         for kind, found in own.items():
-            change = abs(finer[kind][name] - found[name]) if finer else None
+            change = REST * abs(finer[kind][name] - found[name]) if finer else None
             forward = ahead.get(kind, {}).get(name)
             one = Derivative(kind, name, found[name], forward, *judged[kind], change, largest[kind])
             derivatives.append(one)
@@ -344,8 +349,8 @@ def _checked(
     for one in check.unsigned:
         warnings.warn(
             f"the sign of the derivative of `{one.value}` by `{one.by}` depends on the steps: it "
-            f"is {one.adjoint:.3g} and changes by {one.step_error:.3g} at a tenth of rtol = "
-            f"{rtol:g}; take a smaller `rtol`",
+            f"is {one.adjoint:.3g} with an error of {one.step_error:.3g} at rtol = {rtol:g}; take "
+            "a smaller `rtol`",
             stacklevel=3,
         )
     return check
