@@ -147,8 +147,8 @@ def gradients(
 
 
 def test_odeint_adjoint_equals_odeint(rolling):
-    """Interval by interval, for a batch of two, every parameter and the initial states: the same but
-    for the order of sums, whose terms cancel."""
+    """Interval by interval, for a batch of two, every parameter and the initial states: the same
+    but for the order of sums, whose terms cancel."""
     model, y0 = rolling
     y0_bar, bars = gradients(model, y0, odeint)
     y0_bar_adjoint, bars_adjoint = gradients(model, y0, odeint_adjoint)
