@@ -9,6 +9,7 @@ import torch
 
 from torchsoft import BuiltRig, RateAndState, Reference, RigFile, Trajectory, simulate
 from torchsoft.physics.motion import Lines
+from torchsoft.rigs.check import check
 
 MU_0, A, B, D_C, V_0 = 0.6, 0.012, 0.02, 50e-6, 1e-3
 SLOW, FAST, JUMP = 1e-3, 1e-2, 0.6
@@ -104,6 +105,14 @@ def test_a_contact_at_rest_grows_stronger_by_b():
         force = run.force["track"].sum(1)
         tops.append(float((force[:, 1] / force[:, 0]).max()))
     assert tops[1] - tops[0] == pytest.approx(B * np.log(10), rel=0.1)
+
+
+def test_a_spring_that_is_too_soft_for_the_fall_of_friction_is_told_of():
+    """(b - a) F_N / D_c at the points' share of the load, by the check of a file."""
+    (found,) = [one for one in check(sled(D_c=2e-9)) if "single-valued" in one.message]
+    assert found.severity == "warning"
+    assert "K_t = 1e+06 N/m is below (b - a) F_N / D_c" in found.message
+    assert not [one for one in check(sled()) if "single-valued" in one.message]
 
 
 def test_points_without_load_age_and_runs_are_saved(tmp_path):

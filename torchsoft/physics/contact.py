@@ -177,6 +177,18 @@ class SmoothSlip(Friction):
         least = (self.mu_s - self.mu_k) * F_N * (1 / R + 1 / self.R_pad)
         return torch.maximum(self.v_s, least)
 
+    def jumps(self, F_N: float, R_t: Tensor, K_t: Tensor) -> str:
+        """Why the slip rate jumps under F_N [N] between a dashpot [N.s/m] and a spring [N/m]; empty
+        if it does not."""
+        over = self.range(torch.tensor(F_N, dtype=torch.float64), R_t)
+        falls, damps = ((self.mu_s - self.mu_k) * F_N / over).item(), R_t.item()
+        if damps >= falls:
+            return ""
+        return (
+            f"R_t = {damps:.3g} N.s/m is below (mu_s - mu_k) F_N / v_s = {falls:.3g}; raise v_s or "
+            "R_t"
+        )
+
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         v_s = self.range(F_N, R)
         b = R * v_s - (E - self.mu_k * F_N)
@@ -255,17 +267,12 @@ class SoftContact(nn.Module):
 
     def jumps(self, F_N: float) -> str:
         """Why the slip rate jumps under a normal force F_N [N] per reference spacing: friction
-        falls with slip faster than the dashpots balance. Empty if it does not."""
-        slip = self.friction
-        if not isinstance(slip, SmoothSlip):
-            return ""
-        over = slip.range(torch.tensor(F_N, dtype=torch.float64), self.R_t)
-        falls, damps = ((slip.mu_s - slip.mu_k) * F_N / over).item(), self.R_t.item()
-        if damps >= falls:
-            return ""
-        return (
-            f"slip is not single-valued at a normal force of {F_N:.3g} N: R_t = {damps:.3g} "
-            f"N.s/m is below (mu_s - mu_k) F_N / v_s = {falls:.3g}"
+        falls with slip faster than spring and dashpot balance, as far as the law of friction knows.
+        Empty if it does not."""
+        judge = getattr(self.friction, "jumps", None)
+        reason = judge(F_N, self.R_t, self.K_t) if judge is not None else ""
+        return f"slip is not single-valued at a normal force of {F_N:.3g} N: {reason}" * bool(
+            reason
         )
 
     def forward(

@@ -61,6 +61,14 @@ class RateAndState(nn.Module):
         age = torch.log(theta / self.D_c * self.V_0)
         return (self.mu_0 + self.b * age) / self.a - torch.log(self.V_0)
 
+    def jumps(self, F_N: float, R_t: Tensor, K_t: Tensor) -> str:
+        """Why the slip rate jumps under F_N [N] between a dashpot [N.s/m] and a spring [N/m]; empty
+        if it does not."""
+        falls, holds = ((self.b - self.a) * F_N / self.D_c).item(), K_t.item()
+        if holds >= falls:
+            return ""
+        return f"K_t = {holds:.3g} N/m is below (b - a) F_N / D_c = {falls:.3g}; raise K_t or D_c"
+
     def forward(
         self, E: Tensor, F_N: Tensor, R: Tensor, z: Tensor, stage: Tensor | float
     ) -> tuple[Tensor, Tensor]:

@@ -301,11 +301,7 @@ def slips(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             continue
         force = max(float(m.state.pads[contact.pad][0].norm(dim=-1).max()) for m in there)
         if reason := contact.law.jumps(force / float(rig.weight(key).max())):
-            yield Diagnostic(
-                "warning",
-                f"laws.{e.file.contacts[key].law}.friction",
-                f"{reason}; raise v_s or R_t",
-            )
+            yield Diagnostic("warning", f"laws.{e.file.contacts[key].law}.friction", reason)
 
 
 # Checks along the course of the bodies

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel import compiled, inlined
 from torchsoft.solve.kernel.arrays import CORNERS
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback, call_value
 from torchsoft.solve.kernel.linear import (
@@ -133,13 +133,19 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
     return worst, squares
 
 
+@inlined
+def matrix(s: Any, w: Any, pad: int) -> Array:
+    """A of a pad, a view."""
+    n = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad]
+    at = s.nodal_band_start[pad]
+    return w.band[at : at + n * (2 * s.nodal_band[pad] + 1)]
+
+
 @compiled
 def factor(s: Any, w: Any, pad: int, y: Array, a: float, forces: Array) -> None:
     """A of a pad, factorised, in w.band; adds the elements' forces to `forces` (dofs,)."""
-    first, n, band = s.nodal_dof_start[pad], 0, s.nodal_band[pad]
-    n = s.nodal_dof_start[pad + 1] - first
-    at, width, own = s.nodal_band_start[pad], 2 * band + 1, s.p[element_parameters(s, pad)]
-    A, J = w.band[at : at + n * width], w.element_J
+    first, last, band = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.nodal_band[pad]
+    width, own, A, J = 2 * band + 1, s.p[element_parameters(s, pad)], matrix(s, w, pad), w.element_J
     A[:] = 0.0
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         element_inputs(s, w, pad, e, y, a)
@@ -151,25 +157,22 @@ def factor(s: Any, w: Any, pad: int, y: Array, a: float, forces: Array) -> None:
                 column = s.nodal_dof[e, d]
                 if column >= 0:
                     A[row * width + band + column - row] += a * J[c, d] + J[c, CORNERS + d]
-    for i in range(n):
+    for i in range(last - first):
         A[i * width + band] += mass_rate(s, pad, first + i, a)
-    factor_banded(A, n, band)
+    factor_banded(A, last - first, band)
 
 
 @compiled
 def solve(s: Any, w: Any, pad: int, b: Array, m: int) -> None:
     """A^-1 of m right-hand sides b (dofs m,) in place."""
-    n, band, at = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad], 0, s.nodal_band_start[pad]
-    band = s.nodal_band[pad]
-    solve_banded(w.band[at : at + n * (2 * band + 1)], n, band, b, m)
+    n = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad]
+    solve_banded(matrix(s, w, pad), n, s.nodal_band[pad], b, m)
 
 
 @compiled
 def solve_back(s: Any, w: Any, pad: int, b: Array) -> None:
     """A^-T of b (dofs,) in place."""
-    n, band, at = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad], 0, s.nodal_band_start[pad]
-    band = s.nodal_band[pad]
-    solve_transposed(w.band[at : at + n * (2 * band + 1)], n, band, b)
+    solve_transposed(matrix(s, w, pad), b.size, s.nodal_band[pad], b)
 
 
 @compiled
@@ -222,7 +225,7 @@ def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 def couple(s: Any, w: Any, pad: int, Rv: Array) -> None:
     """Effects of the motion of the base of a pad with inertia on the points' rates, and its
     reaction to nodal forces and to its own velocity, in w.Hc, w.Rf and Rv."""
-    at, base, free, first = s.pad_point_start[pad], s.pad_base[pad], s.body_free, 0
+    at, base, free = s.pad_point_start[pad], s.pad_base[pad], s.body_free
     first = s.nodal_dof_start[pad]
     for axis in range(2):
         towards = free[base + axis]
@@ -600,7 +603,7 @@ def pull_state(
             own[first + s.nodal_surface[2 * node + r]] += z.rate[node, r]
             y_bar[U + s.nodal_surface[2 * node + r]] += z.u[node, r]
     solve_back(s, w, pad, own[first:last])  # now the multiplier of the pad's equation
-    unused = z.multiplier
+    unused = z.multiplier  # the cotangents of rates are those of the solution
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         element_inputs(s, w, pad, e, y, a)
         gather(s, pad, e, -1.0, own, z.element)
@@ -610,7 +613,7 @@ def pull_state(
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
     local[:] = 0.0
     for i in range(first, last):
-        M, change = mass_rate(s, pad, i, a), 0.0
+        M = mass_rate(s, pad, i, a)
         change = change_of_speed(s, w, pad, i, y, vx if i % 2 == 0 else vy)
         balance = M * (reaction[i % 2] - own[i])
         local[i % 2] += y_bar[W + i - first] + balance
