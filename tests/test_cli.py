@@ -331,7 +331,7 @@ def test_a_file_to_start_from_is_whole_or_not_there(monkeypatch, tmp_path, capsy
     assert main(["init", os.fsdecode(bytes(tmp_path) + b"/r\xff")]) == 0
     assert RigFile.from_toml(os.fsdecode(bytes(tmp_path) + b"/r\xff.toml")).title == "r\ufffd"
     with monkeypatch.context() as ascii_only:
-        ascii_only.setattr(files, "hold", lambda _: "\xf6".encode("ascii"))
+        ascii_only.setattr(files, "held", lambda _: "\xf6".encode("ascii"))
         assert main(["init", str(tmp_path / "m\xf6bel")]) == 2
         assert "cannot be a file's name in this locale" in capsys.readouterr().err
     assert main(["init", str(path)]) == 0
