@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 import torchsoft.envs
 from torchsoft import Trajectory, simulate
-from torchsoft.envs import Goal, Moment, RigEnv, RigVectorEnv, reorient
+from torchsoft.envs import Moment, RigEnv, RigVectorEnv, TargetPose, reorient
 from torchsoft.envs.rig_env import RedrawnStart, View
 from torchsoft.physics.motion import Lines, Reference
 from torchsoft.rigs.build import RigFile
@@ -330,8 +330,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "late": ({"begin": 9.0, "duration": 0.5}, "9 s is not before the end of the rig's own motion"),
     "begin": ({"begin": -1.0}, "`begin` must be a time from 0 s on"),
     "both": ({"reward": lambda *_: 0.0}, "give either a `goal` or a `reward`"),
-    "body": ({"goal": Goal("disk", {"x": 0.0}, {"x": 1.0})}, "`goal.target` names `disk.x`; did"),
-    "scale": ({"goal": Goal("disc", {"x": 0.0}, {"y": 1.0})}, "must have the coordinates of"),
+    "body": (
+        {"goal": TargetPose("disk", {"x": 0.0}, {"x": 1.0})},
+        "`goal.target` names `disk.x`; did",
+    ),
+    "scale": ({"goal": TargetPose("disc", {"x": 0.0}, {"y": 1.0})}, "must have the coordinates of"),
     "bounds": ({"bounds": {"lower.y": (0, 1)}}, "`bounds` names `lower.y`; free are disc.x"),
     "held": ({"held": ["disk"]}, "`held` names `disk`; did you mean `disc`"),
     "parameter": ({"parameters": {"materials.rubber.e": (1, 2)}}, "is not in the rig file"),

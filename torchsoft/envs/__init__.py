@@ -13,10 +13,10 @@ from torchsoft.extras import needed
 gymnasium = needed("gymnasium", "learn")
 
 # these need gymnasium
-from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Transition  # noqa: E402
+from torchsoft.envs.dynamics import Dynamics, Moment, TargetPose, Transition  # noqa: E402
 from torchsoft.envs.rig_env import RigEnv, RigVectorEnv  # noqa: E402
 
-__all__ = ["Dynamics", "Goal", "Moment", "RigEnv", "RigVectorEnv", "Transition", "reorient"]
+__all__ = ["Dynamics", "Moment", "RigEnv", "RigVectorEnv", "TargetPose", "Transition", "reorient"]
 
 
 RIG = Path(__file__).with_name("reorient.toml")
@@ -34,7 +34,7 @@ def reorient(**changes: Any) -> RigEnv:
             **{f"x_{jaw}": (-12e-3, 12e-3) for jaw in jaws},
             **{f"{jaw}_skin.normal": (0.0, 10.0) for jaw in jaws},
         },
-        "goal": Goal("disc", {"theta": (-0.6, 0.6), "x": 0.0}, {"theta": 0.1, "x": 2e-3}),
+        "goal": TargetPose("disc", {"theta": (-0.6, 0.6), "x": 0.0}, {"theta": 0.1, "x": 2e-3}),
         "begin": 0.3, "bounds": {"disc.x": (-20e-3, 20e-3)}, "held": ["disc"],
     }  # fmt: skip
     return RigEnv(**stated | changes)

@@ -34,10 +34,10 @@ LOOK = 1e-3
 
 
 @dataclass(frozen=True)
-class Goal:
-    """Target pose of a body. The reward of a step is 1 / (1 + d^2) less `changes` times the squared
-    change of the action; d^2 is the sum of squared distances of the coordinates over their `scale`
-    [m, rad].
+class TargetPose:
+    """Pose that a body is to reach. The reward of a step is 1 / (1 + d^2) less `changes` times the
+    squared change of the action; d^2 is the sum of squared distances of the coordinates over their
+    `scale` [m, rad].
 
     target: by coordinate ("x", "y", "theta"), a number [m, rad], or lower and upper bound of a
     uniform draw in each episode.
@@ -95,7 +95,7 @@ class Dynamics:
 
     def __init__(
         self, built: BuiltRig, *, actions: Ranges, observations: Ranges, interval: float,
-        goal: Goal | None, reward: Reward | None, begin: float, samples: int,
+        goal: TargetPose | None, reward: Reward | None, begin: float, samples: int,
         solver: Mapping[str, Any], disturbances: Ranges,
     ) -> None:  # fmt: skip
         self.rig, self._y0, self.solver = built.rig, built.y0, dict(solver)

@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, check_names, checked
+from torchsoft.envs.dynamics import (
+    Dynamics,
+    Moment,
+    Ranges,
+    Reward,
+    TargetPose,
+    check_names,
+    checked,
+)
 from torchsoft.parallel import cores, executor, parallel_map
 from torchsoft.physics.arguments import number, whole
 from torchsoft.plot.scene import Scene, force_scale, instants
@@ -71,7 +79,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __init__(
         self, rig: RigFile | BuiltRig | str | Path, *, actions: Ranges,
-        observations: Ranges, interval: float = 0.1, goal: Goal | None = None,
+        observations: Ranges, interval: float = 0.1, goal: TargetPose | None = None,
         reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
         bounds: Ranges | None = None, held: Sequence[str] = (), failure_reward: float = -1.0,
         parameters: Ranges | None = None, disturbances: Ranges | None = None, samples: int = 1,
