@@ -134,7 +134,7 @@ def dataset(config: Config) -> str:
         'title = "A heavy disc between two fast jaws"', 'rig = "rig.toml"',
         f"seed = {config.seed}", f"trajectories = {config.trajectories}",
         "trajectories_per_shard = 16", "duration = 0.48", "sample_interval = 4e-3", "nodal = true",
-        "[parameters]", *ranges, '"motion.grip.values.1" = { low = -8.0, high = -4.0 }',
+        "[parameters]", *ranges, '"motion.grip.values_2" = { low = -8.0, high = -4.0 }',
     )), encoding="utf-8")  # fmt: skip
     url = str(config.out / "data")
     generate(Dataset.from_toml(path), url, Serial())
@@ -163,7 +163,7 @@ def runs(config: Config, url: str, split: str, count: int) -> Runs:
                 float(one[f"motion.{jaw}_x.values.{k}"]) for k in (1, 2, 3)])
             for jaw in JAWS
         }  # fmt: skip
-        grip = Profile([0.0, 0.2], [-5.0, float(one["motion.grip.values.1"])])
+        grip = Profile([0.0, 0.2], [-5.0, float(one["motion.grip.values_2"])])
         references.append(Reference(**held, grip=grip, upper_rate=Profile([0.0], [0.0])))
         columns = [
             one[name].values + sd * draws.standard_normal(one.sizes["time"])

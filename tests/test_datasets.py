@@ -57,11 +57,11 @@ samples_per_chunk = 40
 "pads.U.elements_x" = 60
 "pads.U.elements_y" = 2
 "laws.steel_on_rubber.friction.v_s" = 0.05
-"motion.F_ff.values.1" = "held"
+"motion.F_ff.values_2" = "held"
 [parameters]
 "materials.rubber.E" = {{ low = 7e5, high = 8e5, scale = "log" }}
 "laws.steel_on_rubber.friction.mu_s" = {{ low = 0.7, high = 0.9 }}
-"motion.y_d.values.1" = {{ low = 48.6e-3, high = 48.8e-3 }}
+"motion.y_d.values_2" = {{ low = 48.6e-3, high = 48.8e-3 }}
 [[kinds]]
 name = "slow_roll"
 fixed."motion.x_d" = {{ kind = "strokes", since = 0.5, stroke_time = 0.4, travel = 1e-3 }}
@@ -325,7 +325,7 @@ def test_wrong_content_is_found(made, tmp_path, change, message):
             edit("theta_C/c/0/0", flipped),
             r"theta_C/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
         ),
-        (edit("motion.y_d.values.1/c/2", flipped), "motion.y_d.values.1/c/2 is damaged"),
+        (edit("motion.y_d.values_2/c/2", flipped), "motion.y_d.values_2/c/2 is damaged"),
         (remove("omega_C/c/1/0"), "omega_C/c/1/0 is missing"),
         (swap("omega_C/c/0/0", "omega_C/c/1/0"), "omega_C/c/0/0 is damaged"),
         (write("finished/1.sha256", b""), r"finished/1\.sha256 is damaged"),
@@ -355,7 +355,7 @@ def test_damage_is_found(made, tmp_path, damage, message):
     with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished") as refused:
         open_dataset(str(folder)).load()
     assert "\n" not in str(refused.value)
-    names = ["theta_C", "F_ff", "motion.y_d.values.1", "omega_C"]
+    names = ["theta_C", "F_ff", "motion.y_d.values_2", "omega_C"]
     if (
         "time" not in message and "/c/1" not in message
     ):  # what is damaged may be of an array that it does not read
@@ -380,7 +380,7 @@ def test_damage_to_what_readers_do_not_open_is_found_by_the_check(made, tmp_path
 def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made, tmp_path):
     """By the checksums of the arrays, without this package's reader."""
     folder = copy(made[0], tmp_path / "set")
-    for name in ("theta_C/c/0/0", "motion.y_d.values.1/c/1"):
+    for name in ("theta_C/c/0/0", "motion.y_d.values_2/c/1"):
         edit(name, flipped)(folder)
         with pytest.raises(ValueError, match="checksum"):
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
@@ -618,7 +618,7 @@ def partial(made, tmp_path_factory):
     is not finished."""
     folder = copy(made[0], tmp_path_factory.mktemp("partial") / "set")
     set_value("failed", (2,), 1)(folder)
-    set_value("motion.y_d.values.1", (0,), np.inf)(folder)
+    set_value("motion.y_d.values_2", (0,), np.inf)(folder)
     vouch(folder)
     remove("finished/2.sha256")(folder)
     return str(folder)
@@ -724,7 +724,7 @@ def test_a_reading_that_is_none_is_refused(partial, names, how, message):
 def test_numbers_that_the_dtype_cannot_hold_are_refused(partial):
     """And those that are not finite in the store are given as they are."""
     assert torch.isinf(
-        reading(partial, ["motion.y_d.values.1"], dtype=torch.float16)[0]["motion.y_d.values.1"]
+        reading(partial, ["motion.y_d.values_2"], dtype=torch.float16)[0]["motion.y_d.values_2"]
     )
     with pytest.raises(
         ValueError,

@@ -60,9 +60,9 @@ def test_numbers_that_are_whole_are_numbers():
             "kinds.0.parameters.materials.rubber.E is in `fixed` as well",
         ),
         (
-            ("kinds", 1, "parameters", "motion.x_d.values.1"),
+            ("kinds", 1, "parameters", "motion.x_d.values_2"),
             {"low": 0.0, "high": 1.0},
-            "kinds.1.parameters.motion.x_d.values.1: `motion.x_d.values.1` is not in the rig file",
+            "kinds.1.parameters.motion.x_d.values_2: `motion.x_d.values_2` is not in the rig file",
         ),
         (
             ("kinds", 1, "parameters", "motion.x_d.stroke_time", "low"),
@@ -78,12 +78,12 @@ def test_numbers_that_are_whole_are_numbers():
         (
             ("kinds", 4, "fixed", "motion.y_d"),
             {"kind": "hold", "value": 48.6e-3},
-            "kinds.4.parameters.motion.y_d.components.0.amplitude: `motion.y_d.components",
+            "kinds.4.parameters.motion.y_d.components_1.amplitude: `motion.y_d.components",
         ),
         (
             ("kinds", 0, "fixed", "motion.y_d"),
             {"kind": "hold", "value": 48.6e-3},
-            "kinds.0.parameters in their middle: impossible: `motion.y_d.values.1` is not in",
+            "kinds.0.parameters in their middle: impossible: `motion.y_d.values_2` is not in",
         ),
         (
             ("kinds", 0, "fixed", "motion.x_d", "values"),
@@ -119,7 +119,7 @@ def test_a_configuration_of_before_says_what_reads_it():
 def test_kinds_are_drawn_by_weight_with_their_own_numbers():
     """Files that a kind names are part of the configuration; its numbers may be those of all
     kinds, otherwise distributed."""
-    light = {"name": "light", "weight": 3.0, "parameters": {"motion.y_d.values.1": LIGHT}}
+    light = {"name": "light", "weight": 3.0, "parameters": {"motion.y_d.values_2": LIGHT}}
     config = Config.model_validate(SMOKE | {"trajectories": 256, "kinds": [*SMOKE["kinds"], light]})
     tasks = [config.subject.task(i, u) for i, u in enumerate(points(config))]
     of = {
@@ -128,7 +128,7 @@ def test_kinds_are_drawn_by_weight_with_their_own_numbers():
     }
     assert [len(of[name]) for name in of] == [32, 32, 32, 32, 32, 96]
     for name, low, high in (("light", 49.6e-3, 49.8e-3), ("chirp", 48.5e-3, 48.9e-3)):
-        heights = [one.labels["motion.y_d.values.1"] for one in of[name]]
+        heights = [one.labels["motion.y_d.values_2"] for one in of[name]]
         assert low <= min(heights) < max(heights) <= high
     travel = np.array([one.values["motion.x_d.travel"] for one in of["strokes"]])
     assert (np.abs(np.abs(travel) - 1.5e-3) <= 0.5e-3).all()

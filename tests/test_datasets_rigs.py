@@ -103,9 +103,9 @@ rig = "rigs/pressed.toml"
 "laws.dry.friction.mu_s" = { low = 0.7, high = 0.9 }
 "laws.dry.friction.mu_k" = { low = 0.8, high = 1.0, ratio_to = "laws.dry.friction.mu_s" }
 "actuators.x.Kp" = { low = 0.8e5, high = 1.2e5 }
-"controllers.lift.gain.0.1" = { low = 300.0, high = 500.0 }
-"motion.y_d.values.1" = { low = 49.4e-3, high = 49.6e-3 }
-"pads.upper.origin.0" = { low = -41e-3, high = -39e-3 }
+"controllers.lift.gain_1_2" = { low = 300.0, high = 500.0 }
+"motion.y_d.values_2" = { low = 49.4e-3, high = 49.6e-3 }
+"pads.upper.origin_1" = { low = -41e-3, high = -39e-3 }
 """
 
 
@@ -154,15 +154,15 @@ def test_a_trajectory_is_the_run_of_the_rig_file_with_its_numbers(made, tmp_path
         RigFile.from_toml(tmp_path / "rigs" / "pressed.toml")
         .override(
             pads={"lower": {"elements_x": 20},
-                  "upper": {"origin": [p["pads.upper.origin.0"], 0.0]}},
+                  "upper": {"origin": [p["pads.upper.origin_1"], 0.0]}},
             materials={"rubber": {"E": p["materials.rubber.E"]}},
             bodies={"disc": {"mass": p["bodies.disc.mass"],
                              "start": {"x": p["bodies.disc.start.x"]}}},
             laws={"dry": {"friction": {"v_s": 0.06, "mu_s": p["laws.dry.friction.mu_s"],
                                        "mu_k": p["laws.dry.friction.mu_k"]}}},
             actuators={"x": {"Kp": p["actuators.x.Kp"]}},
-            controllers={"lift": {"gain": [[1e5, p["controllers.lift.gain.0.1"]]]}},
-            motion={"y_d": {"values": ["start", p["motion.y_d.values.1"]]}},
+            controllers={"lift": {"gain": [[1e5, p["controllers.lift.gain_1_2"]]]}},
+            motion={"y_d": {"values": ["start", p["motion.y_d.values_2"]]}},
         )
         .build()
     )  # fmt: skip
@@ -190,8 +190,8 @@ def test_arrays_have_the_names_of_the_rigs_parts_and_their_units(
     np.testing.assert_allclose(data.upper_places[:, 1], 5e-3)
     units = {name: data[name].attrs["units"] for name in data.data_vars}
     wanted = {
-        "omega_disc": "rad/s", "effort_x": "N", "actuators.x.Kp": "N/m", "motion.y_d.values.1": "m",
-        "bodies.disc.mass": "kg", "laws.dry.friction.mu_k": "1", "pads.upper.origin.0": "m",
+        "omega_disc": "rad/s", "effort_x": "N", "actuators.x.Kp": "N/m", "motion.y_d.values_2": "m",
+        "bodies.disc.mass": "kg", "laws.dry.friction.mu_k": "1", "pads.upper.origin_1": "m",
         "materials.rubber.E": "Pa", "angular_momentum_disc": "kg.m2/s",
     }  # fmt: skip
     assert {name: units[name] for name in wanted} == wanted
@@ -272,8 +272,8 @@ def tree(folder: Path) -> Any:
         (("parameters", "materials.silicone.E"), {"low": 1.0, "high": 2.0},
          r"parameters.materials.silicone.E: `materials.silicone.E` is not in the rig file: "
          "materials has rubber"),
-        (("parameters", "motion.y_d.values.7"), {"low": 1.0, "high": 2.0},
-         "motion.y_d.values has 0 to 1"),
+        (("parameters", "motion.y_d.values_8"), {"low": 1.0, "high": 2.0},
+         "it has motion.y_d.values_1 to _2"),
         (("parameters", "materials.rubber.nu"), {"low": 0.3, "high": 0.7},
          r"parameters.materials.rubber.nu.high = 0.7: impossible: .*nu.*0\.4999"),
         (("parameters", "bodies.disc.mass"), {"choices": [0.3, -0.4]},

@@ -104,7 +104,7 @@ def test_a_number_that_is_changed_loses_its_source():
         assert changed.override({name: 0.75e6}).sources == changed.sources
     assert PAPER.override(materials={"rubber": {"E": 8e5}}).sources == changed.sources
     assert PAPER.override({"pad.E": 0.75e6}).sources == PAPER.sources  # the same number
-    kept = PAPER.override({"motion.x_d.values.1": 41e-3})
+    kept = PAPER.override({"motion.x_d.values_2": 41e-3})
     assert PAPER.sources.keys() - kept.sources.keys() == {"motion.x_d.values"}
 
 
@@ -144,7 +144,7 @@ def test_the_table_tells_published_from_assumed():
     [
         ("materials.rubber.E", "Pa"), ("pad.E", "Pa"), ("contact.mu_s", "1"), ("gravity", "m/s2"),
         ("actuators.x.Kp", "N/m"), ("control.R_99", "N.s/m"), ("motion.F_ff.values", "N"),
-        ("motion.x_d.values.1", "m"), ("motion.x_d.times", "s"), ("pad.elements_x", "1"),
+        ("motion.x_d.values_2", "m"), ("motion.x_d.times", "s"), ("pad.elements_x", "1"),
         ("bodies.bracket.theta", "rad"), ("outputs.duration", "s"),
     ],
 )  # fmt: skip
@@ -202,7 +202,10 @@ def test_names_replace_what_is_there_and_tables_merge():
     assert one.outputs.interval == PAPER.outputs.interval
     merged = PAPER.override(motion={"y_d": {"values_2": 48e-3}})
     assert merged.motion["y_d"].values == ("start", 48e-3)
-    assert PAPER.override({"motion.y_d.values.1": 48e-3}) == merged
+    assert PAPER.override({"motion.y_d.values_2": 48e-3}) == merged
+    assert PAPER.override({"motion.y_d.values.1": 48e-3}) == merged  # as in files of before
+    with pytest.raises(ValueError, match=r"it has motion\.y_d\.values_1 to _2"):
+        PAPER.override({"motion.y_d.values_7": 48e-3})
     hold = PAPER.override({"motion.y_d": {"kind": "hold", "value": 50e-3}})
     assert hold.motion["y_d"].model_dump() == {"kind": "hold", "value": 50e-3}
     assert PAPER.override(motion={"y_d": {"kind": "hold", "value": 50e-3}}) == hold

@@ -36,11 +36,11 @@ samples_per_chunk = 16
 "pads.U.elements_x" = 40
 "pads.U.elements_y" = 1
 "laws.steel_on_rubber.friction.v_s" = 0.05
-"motion.y_d.times.1" = 0.1
+"motion.y_d.times_2" = 0.1
 "motion.F_ff" = { kind = "profile", times = [0.0, 0.1], values = [0.0, "held"] }
 [parameters]
 "materials.rubber.E" = { low = 7e5, high = 8e5, scale = "log" }
-"motion.y_d.values.1" = { low = 48.6e-3, high = 48.8e-3 }
+"motion.y_d.values_2" = { low = 48.6e-3, high = 48.8e-3 }
 [[kinds]]
 name = "shake"
 fixed."motion.x_d" = { kind = "chirp", since = 0.1, amplitude = 1e-3, first = 2.0, last = 5.0 }

@@ -39,14 +39,11 @@ from torchsoft.rigs.parts import (
     MaterialTable,
     TaxelsTable,
 )
-from torchsoft.rigs.places import entries, listed, place, replaced, unit
+from torchsoft.rigs.places import entries, entry, listed, place, replaced, unit
 from torchsoft.solve.trajectory import units
 from torchsoft.tables import LISTED, InvalidTable, from_toml, line
 
 M = TypeVar("M")
-
-ENTRY = re.compile(r"(.+?)((?:_\d+)+)")
-"""Name of an entry of a list, such as tau_2."""
 
 PARTS = (
     "bodies", "materials", "pads", "laws", "contacts", "taxels", "actuators", "controllers",
@@ -151,12 +148,12 @@ class RigFile(Shown, Group):
         self, values: Mapping[str, Any] | None = None, /, **groups: dict[str, Any]
     ) -> Self:
         """A copy with some entries replaced, by their names, full or short, or by tables:
-        `override({"materials.rubber.E": 1e6}, outputs={"duration": 0.1})`.
+        `override({"materials.rubber.E": 1e6}, outputs={"duration": 0.1})`. Entries of lists are
+        counted from one: tau_2, or gain_1_3, the third of the first row.
 
         A name stands for what is there, of which nothing is left. Tables are merged with those that
-        are there; entries of lists in them are counted from one: tau_2, or gain_1_3, the third of
-        the first row; a table of another kind replaces the old one as a whole. What was replaced
-        loses its source. Raises `ValueError`.
+        are there; a table of another kind replaces the old one as a whole. What was replaced loses
+        its source. Raises `ValueError`.
         """
 
         def merged(old: Any, new: Any) -> Any:
@@ -165,10 +162,9 @@ class RigFile(Shown, Group):
                 return new
             out = dict(old)
             for key, value in new.items():
-                entry = ENTRY.fullmatch(key)
-                if entry and key not in old and isinstance(old.get(entry[1]), list | tuple):
-                    places = [int(one) for one in entry[2].split("_")[1:]]
-                    out[entry[1]] = with_entry(key, out[entry[1]], places, value)
+                name, within = entry(key, old)
+                if within and isinstance(old[name], list | tuple):
+                    out[name] = with_entry(key, out[name], within, value)
                 else:
                     out[key] = merged(old.get(key), value)
             return out

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -69,18 +69,6 @@ class Planned(NamedTuple):
     file: RigFile
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested tables from values by dotted names."""
-    out: dict[str, Any] = {}
-    for name, value in values.items():
-        *tables, last = name.split(".")
-        inner = out
-        for table in tables:
-            inner = inner.setdefault(table, {})
-        inner[last] = value
-    return out
-
-
 def drawn(
     file: RigFile, goal: Goal, count: int, seed: int, known: Draws | None = None
 ) -> tuple[BuiltRig, dict[str, Tensor], Tensor]:
@@ -94,7 +82,7 @@ def drawn(
         values = {name: rng.uniform(one.low, one.high) for name, one in goal.uncertain.items()}
         values = (values if i else {}) | {name: float(one[i]) for name, one in known.items()}
         with at_field("uncertain"):
-            every.append((file.override(**nested(values)) if values else file).build())
+            every.append(file.override(values).build())
     over = {
         name: torch.stack([one.rig.parameter(name).detach() for one in every])
         for name in (*goal.uncertain, *known)
@@ -114,9 +102,8 @@ def plan_file(
     run.
     """
     if known:
-        estimates = nested({name: float(one[0]) for name, one in known.items()})
         with at_field("uncertain"):
-            file = file.override(**estimates)
+            file = file.override({name: float(one[0]) for name, one in known.items()})
     if goal.uncertain or known:
         built, over, y0 = drawn(file, goal, goal.draws, goal.seed, known)
     else:
@@ -129,7 +116,7 @@ def plan_file(
     )  # fmt: skip
     moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
     numbers = {name: value.tolist() for name, value in found.parameters.items()}
-    written = file.override(motion=knots(found.reference, moved), **nested(numbers))
+    written = file.override(motion=knots(found.reference, moved)).override(numbers)
     return Planned(run_again(found, written, goal), written)
 
 

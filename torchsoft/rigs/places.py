@@ -1,6 +1,8 @@
-"""Places in a rig file by dotted names, such as "materials.silicone.E"."""
+"""Places in a rig file by dotted names, such as "materials.silicone.E" or "motion.lift.values_2",
+the second of a list."""
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from pydantic.fields import FieldInfo
@@ -10,25 +12,46 @@ from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.fields import NumberOr
 from torchsoft.tables import Table, line
 
+ENTRY = re.compile(r"(.+?)((?:_\d+)+)")
+"""Name of an entry of a list."""
+
+FROM_ZERO = re.compile(r"\.(\d+)(?=\.|$)")
+"""Number of an entry in files of before: values.1 for values_2."""
+
 
 class Place(NamedTuple):
-    """A place in a rig file: keys of its tables, the value, and its field."""
+    """A place in a rig file: keys of its tables and lists, the value, and its field."""
 
     keys: tuple[str | int, ...]
     value: Any
     field: FieldInfo
 
 
+def entry(key: str, known: Container[str]) -> tuple[str, list[int]]:
+    """A known list and the place in it that a key stands for, counted from one: tau_2, or gain_1_3,
+    the third of the first row; the key and no place where it stands for itself."""
+    found = ENTRY.fullmatch(key)
+    if key in known or found is None or found[1] not in known:
+        return key, []
+    return found[1], [int(one) for one in found[2].split("_")[1:]]
+
+
+def named(keys: Sequence[str | int]) -> str:
+    """Name of a place."""
+    return "".join(f".{key}" if isinstance(key, str) else f"_{key + 1}" for key in keys)[1:]
+
+
 def place(file: Table, name: str) -> Place:
-    """The place of a name such as "materials.silicone.E" or "motion.lift.values.2". Raises
-    `ValueError` for an unknown name."""
+    """The place of a name such as "materials.silicone.E" or "controllers.turn.gain_1_3", the third
+    of the first row. Raises `ValueError` for an unknown name."""
     at: Any = file
-    keys, left, field = list[str | int](), name.split("."), FieldInfo()
+    left = FROM_ZERO.sub(lambda found: f"_{int(found[1]) + 1}", name).split(".")
+    keys, field = list[str | int](), FieldInfo()
     while left:
-        here = ".".join(map(str, keys)) or "the rig file"
+        here, within = named(keys) or "the rig file", list[int]()
         if isinstance(at, Table):
             known, n = list(type(at).model_fields), 1
-            key: str | int = left[0]
+            key, within = entry(left[0], known)
             if key in known:
                 field, at = type(at).model_fields[key], getattr(at, key)
         elif isinstance(at, Mapping):  # names of motions may have dots in them
@@ -36,17 +59,19 @@ def place(file: Table, name: str) -> Place:
             n = next((n for n in range(len(left), 0, -1) if ".".join(left[:n]) in at), 1)
             key = ".".join(left[:n])
             at = at.get(key)
-        elif isinstance(at, tuple):
-            known, n = [str(i) for i in range(len(at))], 1
-            key = int(left[0]) if left[0] in known else left[0]
-            at = at[key] if isinstance(key, int) else at
         else:
             known, n, key = [], 1, left[0]
-        if str(key) not in known:
+        if key not in known:
             wrong, short = (left[0], []) if keys else (name, getattr(file, "names", ()))
             there = suggestion(wrong, [*known, *short], f"{here} has")
             raise ValueError(f"`{line(name, 80)}` is not in the rig file: {there}")
         keys, left = [*keys, key], left[n:]
+        for number in within:
+            values, own = at if isinstance(at, tuple) else (), named(keys)
+            if not 1 <= number <= len(values):
+                there = f"it has {own}_1 to _{len(values)}" if values else f"{own} is no list"
+                raise ValueError(f"`{line(name, 80)}` is not in the rig file: {there}")
+            keys, at = [*keys, number - 1], values[number - 1]
     return Place(tuple(keys), at, field)
 
 
