@@ -431,9 +431,8 @@ class Graph(nn.Module):
             X, weight, states = X[which], weight[which], states[..., which, :]
         motion = self.relative(key, state)[..., None, :]
         parts = (X + u, motion[..., :3], u_dot, motion[..., 3:], states, weight[..., None])
-        size = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        none = torch.zeros(1, dtype=torch.float64)
-        return torch.cat([part.expand(*size, part.shape[-1]) for part in (*parts, none)], -1)
+        zero = 0.0 * (parts[0][..., :1] + motion[..., :1] + states[..., :1])  # of all dimensions
+        return torch.cat([part + zero for part in (*parts, zero)], -1)
 
     def friction_of(self, key: str, state: State) -> list[Tensor]:
         """States (..., states, points) of a contact's law of friction, as they begin where `state`
