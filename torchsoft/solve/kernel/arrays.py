@@ -321,7 +321,7 @@ SCRATCH: dict[str, dict[str, str]] = {
     },
     "Cotangents": {  # of u', rate and u, q and V, of a law's outputs and a point's bodies (by)
         "4 widest": "surface",
-        "dofs": "rate_of own multiplier",
+        "dofs": "rate_of own",
         "2 2": "pair",
         "free free": "matrix",
         "free 1": "nu",

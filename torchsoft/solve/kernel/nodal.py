@@ -142,15 +142,14 @@ def matrix(s: Any, w: Any, pad: int) -> Array:
 
 
 @compiled
-def factor(s: Any, w: Any, pad: int, y: Array, a: float, forces: Array) -> None:
-    """A of a pad, factorised, in w.band; adds the elements' forces to `forces` (dofs,)."""
+def factor(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
+    """A of a pad, factorised, in w.band."""
     first, last, band = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.nodal_band[pad]
     width, own, A, J = 2 * band + 1, s.p[element_parameters(s, pad)], matrix(s, w, pad), w.element_J
     A[:] = 0.0
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         element_inputs(s, w, pad, e, y, a)
         call_linearise(s.nodal_linearise[pad], w.element_x, own, w.element, J)
-        scatter(s, pad, e, w.element, forces)
         for c in range(CORNERS):
             row = s.nodal_dof[e, c]
             for d in range(CORNERS if row >= 0 else 0):
@@ -177,13 +176,13 @@ def solve_back(s: Any, w: Any, pad: int, b: Array) -> None:
 
 @compiled
 def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """The pad's relation at the rates w.rate: free rates, w.P between the touched nodes, D and B of
-    the base's motion."""
+    """The pad's relation at the rates w.rate and the forces w.internal that `evaluate` found there:
+    free rates, which only Newton's method takes, w.P between the touched nodes, D and B of the
+    base's motion."""
     first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
     nodes, n, moved = s.pad_node_start[pad], w.counts[pad], 2 if inertial(s, pad) else 0
     m = 1 + 2 * n + moved
-    w.internal[first:last] = 0.0
-    factor(s, w, pad, y, a, w.internal)
+    factor(s, w, pad, y, a)
     b = w.solves[: (last - first) * m]
     b[:] = 0.0
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
@@ -603,11 +602,11 @@ def pull_state(
             own[first + s.nodal_surface[2 * node + r]] += z.rate[node, r]
             y_bar[U + s.nodal_surface[2 * node + r]] += z.u[node, r]
     solve_back(s, w, pad, own[first:last])  # now the multiplier of the pad's equation
-    unused = z.multiplier  # the cotangents of rates are those of the solution
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         element_inputs(s, w, pad, e, y, a)
         gather(s, pad, e, -1.0, own, z.element)
-        element_pull(s, w, pad, e, z.element, y_bar[U : U + last - first], unused, p_bar)
+        # the rates' cotangents are spent: what comes to them here is not read
+        element_pull(s, w, pad, e, z.element, y_bar[U : U + last - first], z.rate_of, p_bar)
     if not inertial(s, pad):
         return
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
