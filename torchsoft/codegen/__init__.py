@@ -45,6 +45,7 @@ def compile_law(
     *,
     linear: int | None = None,
     differentiated: int | None = None,
+    conjugates: int | None = None,
     kind: type[Trace] = Trace,
 ) -> Law:
     """Compile function(x, parameters), which gives an (outputs,) float64 tensor for x (inputs,) and
@@ -55,6 +56,11 @@ def compile_law(
     parameter vector is the parameters' entries in the order of the mapping. The first `linear`
     outputs are differentiated, in all parameters and in the first `differentiated` inputs; None
     stands for all.
+
+    With `conjugates` = n the function gives an energy of the first n inputs, displacements, and a
+    dissipation potential of these and of the n inputs after them, their rates; the law's outputs
+    are then the n forces, each the derivative of the energy by a displacement plus that of the
+    potential by its rate, and the power that the rates take out.
 
     Raises UnknownOperation (a TypeError) naming the line of the function that cannot be compiled,
     and TypeError or ValueError for arguments or results of another kind.
@@ -69,12 +75,24 @@ def compile_law(
             "The law gives other expressions at other values, so it reads a tensor outside torch "
             "or keeps a state."
         )
+    if conjugates is not None:
+        outputs = _forces(graph, outputs, conjugates)
     linear = _count("linear", linear, len(outputs))
     differentiated = _count("differentiated", differentiated, x.numel())
     count = sum(tensor.numel() for tensor in parameters.values())
     engine = emit.compiled(_functions(graph, outputs, linear, differentiated, count))
     addresses = [engine.get_function_address(name) for name in ("value", "linearise", "pullback")]
     return Law(count, len(outputs), linear, differentiated, *addresses)
+
+
+def _forces(g: Graph, potentials: list[int], n: int) -> list[int]:
+    """Forces (n,) and power of an energy and a dissipation potential."""
+    energy, potential = potentials
+    u, rate = ([g.leaf("x", first + i) for i in range(n)] for first in (0, n))
+    elastic = adjoints(g, {energy: g.one}, {}, dependent(g, u), u)
+    viscous = adjoints(g, {potential: g.one}, {}, dependent(g, rate), rate)
+    power = g.total(g("mul", own, force) for own, force in zip(rate, viscous))
+    return [*(g("add", *both) for both in zip(elastic, viscous)), power]
 
 
 def _functions(

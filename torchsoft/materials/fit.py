@@ -15,7 +15,8 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from torchsoft.materials.measured import SMALL_STRAIN, Array, Measured, Spectrum, instant_time
-from torchsoft.physics.material import KINDS, Material
+from torchsoft.physics.hyperelastic import KINDS
+from torchsoft.physics.material import Material
 
 GRID = 10
 """Times a decade of the grid that fits begin on."""

@@ -1,22 +1,45 @@
-"""Elements of nodal pads: bilinear quadrilaterals in plane strain, each a law of the displacements
-and rates of its corners.
+"""Elements of nodal pads: bilinear quadrilaterals in plane strain, each an energy of the
+displacements of its corners and a dissipation potential of their rates.
 
-The law's inputs x are displacements u (8), rates u' (8), x and y corner by corner, and the
-element's constants, as `element_constants` orders them; its outputs the forces (8) of the corners
-on the element and the power that it dissipates.
+An element's inputs x are displacements u (8), rates u' (8), x and y corner by corner, and its
+constants, as `element_constants` orders them. The force on a corner is the derivative of the energy
+by its displacement plus that of the potential by its rate; the power that the element dissipates is
+twice the potential.
+
+The volume counts by its change at the centre, so that nearly incompressible elements do not lock.
+At finite strain the energy of distortion is one of the deformation gradient F at the Gauss points,
+that of dilatation one of J_0 = det F at the centre; mu (J - J_0)^2 / 3 is added, which opposes
+changes of volume within the element that nothing else would: with it the limit of small strains is
+the linear element.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchsoft.physics.hyperelastic import Hyperelastic, power
+from torchsoft.physics.material import Material
 from torchsoft.physics.mesh.mesh import Array, gradients
 
 GAUSS = [(a / np.sqrt(3), b / np.sqrt(3)) for a in (-1, 1) for b in (-1, 1)]
 """Places of the quadrature in the reference square."""
 
+CORNERS = 8
+"""Displacements of an element."""
+
 CONSTANTS = 9 * (1 + len(GAUSS))
 """Number of an element's constants."""
+
+
+class Factors(nn.Module):
+    """Numbers (..., 4) of a pad's elements besides the material's energy: depth [m], retardation
+    time tau [s], and the Lame moduli lambda and mu [Pa] of small strains."""
+
+    def __init__(self, values: Tensor) -> None:
+        super().__init__()
+        self.values = nn.Parameter(values)
 
 
 def element_constants(corners: Array) -> Array:
@@ -31,33 +54,92 @@ def element_constants(corners: Array) -> Array:
     return np.concatenate(parts, 1)
 
 
-def linear_forces(u: Tensor, constants: Tensor, lame_lambda: Tensor, lame_mu: Tensor) -> Tensor:
-    """Forces (..., 8) [N/m] per depth of a linear element under u (..., 8) [m]; the Lame moduli
-    [Pa]. The volume's part is that of the centre, so that the element does not lock."""
-    ux, uy = u[..., 0::2], u[..., 1::2]
+class Place(NamedTuple):
+    """An area of an element, and gradients there of the displacements and of their rates, each as
+    (xx, xy, yx, yy), xy that of x along y."""
 
-    def at(place: int) -> tuple[Tensor, Tensor, Tensor]:
-        own = constants[..., 9 * place : 9 * place + 9]
-        return own[..., 0:8:2], own[..., 1:8:2], own[..., 8:]
-
-    gx, gy, area = at(0)
-    pressure = lame_lambda * area * (gx * ux + gy * uy).sum(-1, keepdim=True)
-    fx, fy = pressure * gx, pressure * gy
-    for place in range(1, 1 + len(GAUSS)):
-        gx, gy, area = at(place)
-        weight = lame_mu * area
-        xx = 2 * weight * (gx * ux).sum(-1, keepdim=True)
-        yy = 2 * weight * (gy * uy).sum(-1, keepdim=True)
-        xy = weight * (gy * ux + gx * uy).sum(-1, keepdim=True)
-        fx, fy = fx + xx * gx + xy * gy, fy + yy * gy + xy * gx
-    return torch.stack((fx, fy), -1).flatten(-2)
+    area: Tensor
+    gradient: tuple[Tensor, Tensor, Tensor, Tensor]
+    rate: tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def linear_element(x: Tensor, moduli: Tensor) -> Tensor:
-    """A linear Kelvin-Voigt element (..., 9): K (u + tau u') and tau u' K u' of x (..., 61), with
-    moduli = (depth lambda, depth mu, tau)."""
+def places(x: Tensor) -> list[Place]:
+    """The centre, for the whole element, and the Gauss points."""
     u, rate, constants = x[..., :8], x[..., 8:16], x[..., 16:]
-    lame_lambda, lame_mu, tau = moduli.unbind(-1)
-    viscous = tau * linear_forces(rate, constants, lame_lambda, lame_mu)
-    forces = linear_forces(u, constants, lame_lambda, lame_mu) + viscous
-    return torch.cat((forces, (rate * viscous).sum(-1, keepdim=True)), -1)
+
+    def at(number: int) -> Place:
+        own = constants[..., 9 * number : 9 * number + 9]
+        gx, gy = own[..., 0:8:2], own[..., 1:8:2]
+
+        def gradient(of: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            ux, uy = of[..., 0::2], of[..., 1::2]
+            xx, xy = (gx * ux).sum(-1), (gy * ux).sum(-1)
+            return xx, xy, (gx * uy).sum(-1), (gy * uy).sum(-1)
+
+        return Place(own[..., 8], gradient(u), gradient(rate))
+
+    return [at(number) for number in range(1 + len(GAUSS))]
+
+
+def element_potentials(material: Material, factors: Factors, x: Tensor) -> Tensor:
+    """Energy [J] and dissipation potential [W] (..., 2) of an element in the state x (..., 61)."""
+    depth, tau, lame_lambda, lame_mu = factors.values.unbind(-1)
+    centre, *gauss = places(x)
+    if isinstance(material, Hyperelastic):
+        energy, potential = finite(material, lame_lambda + 2 / 3 * lame_mu, lame_mu, centre, gauss)
+    else:
+        energy, potential = (
+            linear(lame_lambda, lame_mu, centre, gauss, kind) for kind in ("gradient", "rate")
+        )
+    return torch.stack((depth * energy, depth * tau * potential), -1)
+
+
+def linear(
+    lame_lambda: Tensor, lame_mu: Tensor, centre: Place, gauss: list[Place], kind: str
+) -> Tensor:
+    """Energy per depth at small strains, or the same of their rates."""
+    xx, _, _, yy = getattr(centre, kind)
+    total = 0.5 * lame_lambda * centre.area * (xx + yy) ** 2
+    for place in gauss:
+        xx, xy, yx, yy = getattr(place, kind)
+        total = total + lame_mu * place.area * (xx**2 + yy**2 + 0.5 * (xy + yx) ** 2)
+    return total
+
+
+def finite(
+    material: Hyperelastic, bulk: Tensor, shear: Tensor, centre: Place, gauss: list[Place]
+) -> tuple[Tensor, Tensor]:
+    """Energy per depth at finite strain, and dissipation potential per depth and retardation time:
+    quadratic in the rates of J_0, of J - J_0, and of (C J^(-2/3) - 1) / 2, C = F^T F."""
+    J_0, J_0_rate = volume(centre)
+    energy, potential = (
+        centre.area * material.dilatation(J_0),
+        0.5 * bulk * centre.area * J_0_rate**2,
+    )
+    for place in gauss:
+        (xx, xy, yx, yy), G = place.gradient, place.rate
+        F = 1 + xx, xy, yx, 1 + yy
+        J, J_rate = volume(place)
+        zero, one = torch.zeros_like(J), torch.ones_like(J)
+        rows = (F[0], F[1], zero), (F[2], F[3], zero), (zero, zero, one)
+        W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
+        energy = energy + place.area * (W + shear / 3 * (J - J_0) ** 2)
+        C = F[0] ** 2 + F[2] ** 2, F[1] ** 2 + F[3] ** 2, F[0] * F[1] + F[2] * F[3]
+        half = (  # of the rate of C
+            F[0] * G[0] + F[2] * G[2],
+            F[1] * G[1] + F[3] * G[3],
+            0.5 * (F[0] * G[1] + F[1] * G[0] + F[2] * G[3] + F[3] * G[2]),
+        )
+        isochoric, part = power(J, -2 / 3), J_rate / (3 * J)
+        e_xx, e_yy, e_xy = (isochoric * (one - part * c) for one, c in zip(half, C))
+        e_zz = -isochoric * part
+        square = e_xx**2 + e_yy**2 + e_zz**2 + 2 * e_xy**2
+        potential = potential + place.area * shear * (square + (J_rate - J_0_rate) ** 2 / 3)
+    return energy, potential
+
+
+def volume(place: Place) -> tuple[Tensor, Tensor]:
+    """J = det F and its rate."""
+    (xx, xy, yx, yy), (a, b, c, d) = place.gradient, place.rate
+    J = (1 + xx) * (1 + yy) - xy * yx
+    return J, a * (1 + yy) + (1 + xx) * d - b * yx - xy * c

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchsoft.physics.balance import Balance, solved
 from torchsoft.physics.contact import (
     PointLaw,
     cross,
@@ -19,7 +20,7 @@ from torchsoft.physics.contact import (
     turned,
 )
 from torchsoft.physics.graph import Evaluation, Graph
-from torchsoft.physics.pads import free_rates, nodal
+from torchsoft.physics.pads import Pad, free_rates, nodal
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.state import State
 
@@ -36,8 +37,8 @@ def stored(
     energies = {}
     for name, pad in rig.pads.items():
         part = state.pads[name]
-        if pad.inertial:
-            energies[f"strain_{name}"] = 0.5 * (part * pad.elastic_force(part)).sum((-2, -1))
+        if pad.nodal:
+            energies[f"strain_{name}"], _ = pad.energies(part, torch.zeros_like(part))
         else:
             fractions, _ = pad.chain()
             if len(fractions) == 1:
@@ -90,11 +91,10 @@ def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]
     powers, dashpots, slip = {}, 0.0, 0.0
     for name, pad in rig.pads.items():
         port = graph.ports[f"pad_{name}"]
-        if pad.inertial:
-            u_dot = port.transformer.flow(graph.flows)
-            powers[f"pad_{name}"] = (
-                pad.retardation_time(name) * u_dot * pad.elastic_force(u_dot)
-            ).sum((-2, -1))
+        if pad.nodal:
+            _, powers[f"pad_{name}"] = pad.energies(
+                state.pads[name], port.transformer.flow(graph.flows)
+            )
         else:
             fractions, times = pad.chain()
             rate = (
@@ -121,6 +121,9 @@ def supplied(graph: Evaluation) -> dict[str, Tensor]:
 
 SEPARATED, STICKING, SLIPPING = 0, 1, 2
 """States of a contact point."""
+
+SAMPLES = 64
+"""States whose nodal rates are found side by side."""
 
 
 @torch.no_grad()
@@ -167,5 +170,22 @@ def _rates(
         frame = moving_frame(rig.shape_of(key), *point_place(x))
         F_N, F_T = force[key][..., which, :].split(1, -1)
         f = f + spread.mT @ (F_N * frame.n + F_T * frame.t)
+    if pad.nodal:
+        return torch.cat([_given_way(pad, *some) for some in _split(u, f)]).reshape(u.shape)
     free, P = free_rates(pad, state.pads[name], 0.0)
     return free + nodal(P, f)
+
+
+def _split(*values: Tensor) -> list[tuple[Tensor, ...]]:
+    """Values (..., nodes, 2), some samples at a time."""
+    return list(zip(*(value.reshape(-1, *value.shape[-2:]).split(SAMPLES) for value in values)))
+
+
+def _given_way(pad: Pad, u: Tensor, f: Tensor) -> Tensor:
+    """Rates (samples, nodes, 2) [m/s] of a massless nodal pad at displacements u under forces f on
+    its nodes."""
+    at = pad.at_corners(u)
+    balance = Balance(pad, lambda rate: pad.element_forces(at, rate))
+    left = f + balance.residual(torch.zeros_like(u))
+    factors = balance.linearised(torch.zeros_like(u))
+    return solved(left.flatten(1), factors).reshape(u.shape)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft.display import suggestion
+from torchsoft.physics.balance import Balance
 from torchsoft.physics.contact import (
     Frame,
     PointLaw,
@@ -104,9 +105,9 @@ class Graph(nn.Module):
                     f"pad `{name}` is bonded to `{pad.base}`, "
                     f"{suggestion(pad.base, self.bodies, 'but the bodies are')}"
                 )
+            pad.check_chain(name)
             if not pad.inertial:
                 continue
-            pad.retardation_time(name)
             if pad.base is not None and self.bodies[pad.base].freedom["theta"] != "fixed":
                 raise NotImplementedError(
                     f"pad `{name}` is inertial and its base `{pad.base}` may turn: nodal "
@@ -265,7 +266,7 @@ class Graph(nn.Module):
     def displacement(self, name: str, state: State) -> Tensor:
         """Displacements of the nodes of a pad's state in its base's frame (..., nodes, 2) [m]."""
         pad, part = self.pads[name], state.pads[name]
-        if pad.inertial:
+        if pad.nodal:
             return part
         fractions, _ = pad.chain()
         return nodal(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
@@ -324,10 +325,11 @@ class Graph(nn.Module):
             u_dot = graph.ports[f"pad_{name}"].transformer.flow(graph.flows)
             if pad.inertial:
                 angle = self.base_motion(name, state)[0][..., 2]
-                pads[name] = u_dot
                 rates[name] = (
                     turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
                 )
+            if pad.nodal:
+                pads[name] = u_dot
             else:
                 f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.chain()
                 pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
@@ -372,8 +374,8 @@ class Graph(nn.Module):
         self, t: Tensor | float, state: State, signals: Tensor | None = None, settled: bool = False
     ) -> Evaluation:
         """The multibond graph at time t [s] and one state: every port with its transformer and
-        effort, world axes. `settled` takes massless pads to have no rates, which are solved for
-        otherwise."""
+        effort, world axes. `settled` takes pads to have no rates, which are solved for otherwise
+        where a pad is massless."""
         like = next(iter(state.pose.values()))
         signals = (
             self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1]))
@@ -391,7 +393,7 @@ class Graph(nn.Module):
             u, angle = self.displacement(name, state), r_B[..., 2, None]
             moment_arm = turned(pad.positions + u, angle)
             base_rate = v_B[..., None, :2] + v_B[..., None, 2:] * cross(moment_arm)
-            if pad.inertial:
+            if pad.inertial and not settled:
                 flows[f"pad_{name}"] = turned(state.rates[name], angle)
                 u_dot = turned(flows[f"pad_{name}"] - base_rate, -angle)
             else:
@@ -409,7 +411,12 @@ class Graph(nn.Module):
                 ports[f"contact_{key}"] = Port(
                     interfaces[key].transformer, interfaces[key].law.force, element
                 )
-            ports[f"pad_{name}"] = self._pad_port(name, own, ports, u, u_dot, moment_arm, angle)
+            effort = (
+                pad.internal_force(u, u_dot)
+                if pad.inertial and not settled
+                else self._left(name, own, ports, u, angle)
+            )
+            ports[f"pad_{name}"] = self._pad_port(name, effort, moment_arm, angle)
         return Evaluation(ports | self._sources(state, signals), flows, interfaces)
 
     def point_inputs(
@@ -459,18 +466,26 @@ class Graph(nn.Module):
         """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises
         `RuntimeError` where Newton's method does not converge."""
         pad = self.pads[name]
-        free, P = free_rates(pad, state.pads[name], 0.0)
         law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
-        with torch.no_grad():  # without rates the springs alone push, which holds the pad nearly
-            first = law(torch.zeros_like(pad.spread @ free))
-        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
+        if pad.nodal:
+            at, none = pad.at_corners(u), torch.zeros_like(u)
+            internal = lambda rate: pad.element_forces(*torch.broadcast_tensors(at, rate))
+            balance = Balance(pad, internal, law if own else None)
+            u_dot, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
+            u_dot = balance.corrected(u_dot, factors)
+        else:
+            free, P = free_rates(pad, state.pads[name], 0.0)
+            with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
+                first = law(torch.zeros_like(pad.spread @ free))
+            F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
+            u_dot = free + nodal(P, F)
         if not left <= 1e3 * RATE_TOLERANCE:
             raise RuntimeError(
                 f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s "
                 f"after {RATE_ITERATIONS} iterations; is v_s large enough for the pads' damping to "
                 "balance the fall of friction with slip?"
             )
-        return free + nodal(P, F)
+        return u_dot
 
     def _interface(
         self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]
@@ -495,14 +510,19 @@ class Graph(nn.Module):
         law = PointLaw.of(interface_law(contact.law, shape, x))
         return Interface(frame, law, transformer, transformer.flow(flows))
 
-    def _pad_port(
-        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor,
-        moment_arm: Tensor, angle: Tensor
-    ) -> Port:  # fmt: skip
+    def _left(
+        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, angle: Tensor
+    ) -> Tensor:
+        """Effort (..., nodes, 2) [N] of the field of a pad without an I field, in its base's axes:
+        what the contacts leave at the junction."""
+        contacts = net_efforts({k: ports[f"contact_{k}"] for k in own}, self.junctions)
+        return turned(contacts[f"pad_{name}"], -angle) if own else torch.zeros_like(u)
+
+    def _pad_port(self, name: str, effort: Tensor, moment_arm: Tensor, angle: Tensor) -> Port:
         """The pad's viscoelastic field on its strain rate: node velocities less those of its base
         (Fig. 7)."""
         pad, key = self.pads[name], f"pad_{name}"
-        eye = torch.eye(2, dtype=u.dtype).expand(*angle.shape, 2, 2)
+        eye = torch.eye(2, dtype=effort.dtype).expand(*angle.shape, 2, 2)
         Q_T = torch.stack((turned(eye[..., 0], -angle), turned(eye[..., 1], -angle)), -1)
         blocks = {key: Block(Q_T)}
         if pad.base is None:
@@ -512,11 +532,6 @@ class Graph(nn.Module):
             blocks[f"{pad.base}_spin"] = Block(
                 -turned(cross(moment_arm), -angle)[..., None]
             )  # (35)
-        if pad.inertial:
-            effort = pad.elastic_force(u + pad.retardation_time(name) * u_dot)
-        else:  # no I field: the field's effort is whatever the contacts leave at the junction
-            contacts = net_efforts({k: ports[f"contact_{k}"] for k in own}, self.junctions)
-            effort = turned(contacts[key], -angle) if own else torch.zeros_like(u)
         return Port(Transformer(blocks), effort, pad.elements(name))
 
     def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:

@@ -57,9 +57,14 @@ class Material(nn.Module):
 
     slow: SlowBranch | None
 
-    def __init__(self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
+    E: Tensor
+
+    def __init__(self, E: Modulus | None, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
+        """E is None where a material makes it of other numbers."""
         super().__init__()
-        self.E, self.nu, self.rho, self.depth = (parameter(value) for value in (E, nu, rho, depth))
+        if E is not None:
+            self.E = parameter(E)
+        self.nu, self.rho, self.depth = (parameter(value) for value in (nu, rho, depth))
         self.slow = None
 
     def chain(self) -> tuple[Tensor, Tensor]:
@@ -309,11 +314,10 @@ def terms(name: str, values: Iterable[float]) -> list[float]:
     return [number(f"{name}_{k}", value) for k, value in enumerate(values, 1)]
 
 
-KINDS: Mapping[str, type[Material]] = {
+LINEAR: Mapping[str, type[Material]] = {
     "kelvin_voigt": KelvinVoigt,
     "standard_linear_solid": StandardLinearSolid,
     "generalised_kelvin": GeneralisedKelvin,
     "prony": Prony,
 }
-"""The materials by their names in files; their tables have the names of the constructors'
-arguments."""
+"""Linear materials by their names in files."""

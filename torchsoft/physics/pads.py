@@ -12,24 +12,20 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from scipy import sparse
-from scipy.sparse.linalg import splu
 from scipy.special import ndtr
 from torch import Tensor, nn
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import tensor, whole
-from torchsoft.physics.elements import element_constants, linear_forces
+from torchsoft.physics.elements import Factors, element_constants, element_potentials
+from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import (
     Array,
     Index,
     Mesh,
-    dofs_of,
     lame_moduli,
-    lame_slopes,
     unit_compliance,
-    unit_loads,
 )
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Length, Quantity, Ratio, quantities
@@ -83,7 +79,7 @@ class Pad(nn.Module):
             None if ratio is None else parameter(ratio) for ratio in (E_ratio, tau_ratio)
         )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
-        kept = np.arange(len(mesh.free)) if inertial else mesh.surface
+        kept = np.arange(len(mesh.free)) if self.nodal else mesh.surface
         c, s = np.cos(angle), np.sin(angle)
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
         self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
@@ -93,7 +89,7 @@ class Pad(nn.Module):
             torch.from_numpy(self.placed(mesh.nodes[mesh.free][kept])),
             persistent=False,
         )
-        own = mesh.surface if inertial else np.arange(len(kept))
+        own = mesh.surface if self.nodal else np.arange(len(kept))
         self.register_buffer("surface", torch.from_numpy(own.copy()), persistent=False)
         self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
         spread = shape_functions(own[self.point_nodes], self.point_shares, len(kept))
@@ -102,16 +98,18 @@ class Pad(nn.Module):
     def remeshed(self, finer: int, points: int) -> "Pad":
         """The same pad of `finer` times as many elements each way, with so many contact points an
         element."""
-        return self._again(self.mesh.refined(finer), self.inertial, points)
+        return self._again(self.mesh.refined(finer), self.material, self.inertial, points)
 
     def condensed(self) -> "Pad":
-        """The same pad without inertia."""
-        return self._again(self.mesh, False, self.points)
+        """The same pad, linear and without inertia."""
+        material = self.material
+        linear = material.linear() if isinstance(material, Hyperelastic) else material
+        return self._again(self.mesh, linear, False, self.points)
 
-    def _again(self, mesh: Mesh, inertial: bool, points: int) -> "Pad":
+    def _again(self, mesh: Mesh, material: Material, inertial: bool, points: int) -> "Pad":
         c, s = self.axes[:, 0].tolist()
         pad = Pad(
-            mesh, self.material, base=self.base,
+            mesh, material, base=self.base,
             origin=(float(self.origin[0]), float(self.origin[1])), angle=float(np.arctan2(s, c)),
             mirrored=float(self.axes.det()) < 0, inertial=inertial, points=points,
         )  # fmt: skip
@@ -127,10 +125,6 @@ class Pad(nn.Module):
         """Fractions J [1] and retardation times tau [s], shape (branches,) each."""
         fractions, times = self.material.whole_chain()
         return fractions, times if self.tau_ratio is None else self.tau_ratio * times
-
-    def lame(self) -> tuple[Tensor, Tensor]:
-        """Lame moduli (lambda, mu) [Pa]."""
-        return lame_moduli(self.E, self.material.nu)
 
     @property
     def branches(self) -> int:
@@ -152,7 +146,7 @@ class Pad(nn.Module):
     def state_shape(self) -> tuple[int, ...]:
         """Shape of the pad's part of the state: displacements (nodes, 2), or forces that have set
         in (branches, nodes, 2)."""
-        return (self.nodes, 2) if self.inertial else (self.branches, self.nodes, 2)
+        return (self.nodes, 2) if self.nodal else (self.branches, self.nodes, 2)
 
     def placed(self, own: Array) -> Array:
         """Places (..., 2) in the pad's own frame, in the base's."""
@@ -192,16 +186,15 @@ class Pad(nn.Module):
             C = C + dC * (material.nu - material.nu.detach())
         return C / (self.E * material.depth)
 
-    def retardation_time(self, name: str) -> Tensor:
-        """tau [s] of an inertial pad, R = tau K. Raises `NotImplementedError` naming the pad for a
-        material with several."""
-        _, tau = self.chain()
-        if len(tau) != 1:
+    def check_chain(self, name: str) -> None:
+        """Raises `NotImplementedError` naming the nodal pad for a material with several retardation
+        times."""
+        if self.nodal and self.branches != 1:
             raise NotImplementedError(
-                f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time), "
-                f"but has {len(tau)}; take a massless pad"
+                f"the pad `{name}` needs a material of one retardation time, being "
+                f"{'inertial' if self.inertial else 'at finite strain'}, but has {self.branches}; "
+                "take a massless pad of a linear material"
             )
-        return tau[0]
 
     def elements(self, name: str) -> tuple[str, ...]:
         """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
@@ -214,41 +207,64 @@ class Pad(nn.Module):
         out, as in the paper."""
         return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
 
-    def stiffness(self, lame_lambda: float, lame_mu: float) -> sparse.csr_array:
-        """Global stiffness per depth, in the base's axes."""
-        turn = sparse.kron(sparse.eye_array(len(self.mesh.free)), self.axes.numpy())
-        return sparse.csr_array(turn @ self.mesh.stiffness(lame_lambda, lame_mu) @ turn.T)
+    def factors(self) -> Tensor:
+        """Numbers (4,) of the elements besides the material's energy, as `Factors` has them."""
+        material, (_, times) = self.material, self.chain()
+        depth = material.depth if self.E_ratio is None else self.E_ratio * material.depth
+        return torch.stack((depth, times[0], *lame_moduli(material.E, material.nu)))
 
-    def static_displacement(self, F: Tensor) -> Tensor:
-        """Displacements (nodes, 2) [m] of an inertial pad's nodes under forces F (surface, 2) [N]
-        on its surface; their derivative by nu is exact to first order."""
-        nu = self.material.nu
-        K = splu(self.stiffness(*lame_moduli(1.0, nu.item())).tocsc())
-        loads = unit_loads(2 * self.nodes, dofs_of(self.surface.numpy()))
-        u = torch.from_numpy(K.solve(loads)) @ F.flatten()
-        if nu.requires_grad and torch.is_grad_enabled():
-            slope = -K.solve(self.stiffness(*lame_slopes(nu.item())) @ u.detach().numpy())
-            u = u + torch.from_numpy(slope) * (nu - nu.detach())
-        return (u / (self.E * self.material.depth)).unflatten(0, (-1, 2))
+    def at_corners(self, x: Tensor) -> Tensor:
+        """Nodal vectors (..., nodes, 2) at the corners of the elements (..., elements, 8), zero
+        where they are bonded."""
+        held, dofs = torch.from_numpy(self.corners < 0), torch.from_numpy(self.corners.clip(0))
+        return torch.where(held, 0.0, x.flatten(-2)[..., dofs])
 
-    def elastic_force(self, u: Tensor) -> Tensor:
-        """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape
-        [N]."""
-        depth = self.material.depth
-        lame_lambda, lame_mu = (depth * modulus for modulus in self.lame())
-        held = torch.from_numpy(self.corners < 0)
-        dofs = torch.from_numpy(self.corners.clip(0))
-        own = torch.where(held, 0.0, u.flatten(-2)[..., dofs])
-        f_e = linear_forces(own, torch.from_numpy(self.constants), lame_lambda, lame_mu)
-        f = torch.zeros_like(u.flatten(-2))
-        f = f.index_add(-1, dofs.flatten(), torch.where(held, 0.0, f_e).flatten(-2))
-        return f.unflatten(-1, (-1, 2))
+    def from_corners(self, f: Tensor) -> Tensor:
+        """Sum (..., nodes, 2) of vectors at the corners of the elements (..., elements, 8)."""
+        held, dofs = torch.from_numpy(self.corners < 0), torch.from_numpy(self.corners.clip(0))
+        total = f.new_zeros(*f.shape[:-2], 2 * self.nodes)
+        values = torch.where(held, 0.0, f).flatten(-2)
+        return total.index_add(-1, dofs.flatten(), values).unflatten(-1, (-1, 2))
+
+    def potentials(self, u: Tensor, rate: Tensor) -> Tensor:
+        """Energy [J] and dissipation potential [W] (..., elements, 2) of a nodal pad's elements,
+        with displacements and rates (..., elements, 8) at their corners."""
+        constants = torch.from_numpy(self.constants).expand(*u.shape[:-1], -1)
+        return element_potentials(
+            self.material, factors_of(self.factors()), torch.cat((u, rate, constants), -1)
+        )
+
+    def element_forces(self, u: Tensor, rate: Tensor) -> Tensor:
+        """Forces (..., elements, 8) [N] on the corners of a nodal pad's elements."""
+        recorded = torch.is_grad_enabled()
+        with torch.enable_grad():
+            if not (recorded and u.requires_grad):
+                u = u.detach().requires_grad_()
+            if not (recorded and rate.requires_grad):
+                rate = rate.detach().requires_grad_()
+            energy, potential = self.potentials(u, rate).unbind(-1)
+            (elastic,) = torch.autograd.grad(
+                energy.sum(), u, create_graph=recorded, retain_graph=True
+            )
+            (viscous,) = torch.autograd.grad(potential.sum(), rate, create_graph=recorded)
+        return elastic + viscous
+
+    def internal_force(self, u: Tensor, rate: Tensor) -> Tensor:
+        """Forces of a nodal pad (..., nodes, 2) [N] at displacements u (..., nodes, 2) [m] and
+        their rates [m/s]."""
+        u, rate = torch.broadcast_tensors(u, rate)
+        return self.from_corners(self.element_forces(self.at_corners(u), self.at_corners(rate)))
+
+    def energies(self, u: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
+        """Strain energy [J] and power that is dissipated [W] of a nodal pad, (...) each."""
+        both = self.potentials(self.at_corners(u), self.at_corners(rate)).sum(-2)
+        return both[..., 0], 2 * both[..., 1]
 
     @property
     def nodal(self) -> bool:
         """Whether the state holds the displacements of all nodes, and not those of the surface
         alone."""
-        return self.inertial
+        return self.inertial or isinstance(self.material, Hyperelastic)
 
     @cached_property
     def corners(self) -> Index:
@@ -263,6 +279,14 @@ class Pad(nn.Module):
     def constants(self) -> Array:
         """Constants of every element (elements, 45) in the base's frame."""
         return element_constants(self.placed(self.mesh.nodes)[self.mesh.elements])
+
+
+def factors_of(values: Tensor) -> Factors:
+    """The factors of elements over a tensor with a graph."""
+    out = Factors(values.detach())
+    del out.values
+    out.values = values  # pyright: ignore[reportAttributeAccessIssue]
+    return out
 
 
 def shape_functions(nodes: Any, shares: Array, count: int) -> Array:

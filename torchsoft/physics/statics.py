@@ -1,18 +1,21 @@
 """Statics of any rig, without friction: pads settled around given bodies, and free coordinates in
 balance on them.
 
-Without rates all branches of a massless pad carry the contact force itself, z_b = f, and its
+Without rates all branches of a condensed pad carry the contact force itself, z_b = f, and its
 displacements are u = C f. At the contact points that is u = A f(u), with A the pad's compliance
 from point to point and f the contact law, without any rate, at the bodies' given poses and the
-points' given stretches.
+points' given stretches. A nodal pad's elements are in balance with f(u).
 """
 
+import math
 from collections.abc import Container, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from torchsoft.parallel import one_torch_thread
+from torchsoft.physics.balance import Balance
+from torchsoft.physics.contact import cross, turned
 from torchsoft.physics.graph import Graph
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.pads import nodal_forces
@@ -52,7 +55,7 @@ def settled(
     velocity: Mapping[str, Tensor],
     stretch: Mapping[str, Tensor],
 ) -> Tensor:
-    """State (size,) with massless pads settled around bodies at `pose` [m, rad], by body (3,), and
+    """State (size,) with pads settled around bodies at `pose` [m, rad], by body (3,), and
     contacts whose points are stretched by `stretch` [m], by contact (points,).
 
     The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry the loads of bodies
@@ -62,7 +65,7 @@ def settled(
     Called again with the same numbers it gives the same bits.
 
     Raises `ValueError` for other shapes or a rig with parameters that are not physical,
-    `NotImplementedError` for inertial pads, `NoEquilibrium` where Newton's method fails.
+    `NoEquilibrium` where Newton's method fails.
     """
     if torch.is_inference_mode_enabled():
         raise ValueError(
@@ -71,11 +74,6 @@ def settled(
         )
     check_values(rig)
     check_points(rig)
-    for name, pad in rig.pads.items():
-        if pad.inertial:
-            raise NotImplementedError(
-                f"pad `{name}` is inertial; only massless pads can be settled"
-            )
     check_given("pose", pose, dict.fromkeys(rig.bodies, 3))
     check_given("velocity", velocity, dict.fromkeys(rig.bodies, 3))
     check_given("stretch", stretch, rig.point_counts)
@@ -87,7 +85,10 @@ def settled(
         {name: torch.zeros_like(v) for name, v in velocity.items()},
     )
     pads = {name: carried(rig, name, still) for name in rig.pads}
-    return rig.pack(still._replace(pads=pads, velocity=dict(velocity)))
+    moving = still._replace(velocity=dict(velocity))
+    inertial = [name for name, pad in rig.pads.items() if pad.inertial]
+    rates = {name: carried_along(rig, name, moving, pads[name]) for name in inertial}
+    return rig.pack(moving._replace(pads=pads, rates=rates))
 
 
 def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, int]) -> None:
@@ -107,8 +108,8 @@ def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, i
 
 
 def carried(rig: Graph, name: str, state: State) -> Tensor:
-    """Nodal forces (..., branches, nodes, 2) [N] of a pad, by semi-smooth Newton from the
-    undeformed pad.
+    """A pad's part of the state at rest, by semi-smooth Newton from the undeformed pad: its nodes'
+    displacements (..., nodes, 2) [m], or the forces on them (..., branches, nodes, 2) [N].
 
     Batch dimensions of `state` hold copies of one state: one backward pass then gives as many rows
     of a Jacobian.
@@ -116,25 +117,52 @@ def carried(rig: Graph, name: str, state: State) -> Tensor:
     pad = rig.pads[name]
     own = rig.contacts_of(name)
     batch = next(iter(state.pose.values())).shape[:-1]
-    law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
     undeformed = torch.zeros(*batch, pad.nodes, 2, dtype=torch.float64)
-    F, left = (
-        nodal_forces(pad.compliance(), pad.spread, undeformed, law, RESIDUAL, SETTLING)
-        if own
-        else (undeformed, 0.0)
-    )
+    found, left = undeformed, 0.0
+    if own and pad.nodal:
+        found, left = displaced(rig, name, state, batch)
+    elif own:
+        law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
+        found, left = nodal_forces(
+            pad.compliance(), pad.spread, undeformed, law, RESIDUAL, SETTLING
+        )
     if not left <= RESIDUAL:
         raise NoEquilibrium(
-            f"the massless pad `{name}` does not settle (residual {left:.2g} m after {SETTLING} "
+            f"the pad `{name}` does not settle (residual {left:.2g} m after {SETTLING} "
             "iterations); is a body deep in it, or are the stretches large?"
         )
-    return F[..., None, :, :].expand(*batch, pad.branches, -1, -1)
+    return found if pad.nodal else found[..., None, :, :].expand(*batch, pad.branches, -1, -1)
 
 
-def massless(rig: Graph) -> Graph:
-    """The rig with its inertial pads condensed onto their surfaces, which in statics is the same;
-    itself if it has none."""
-    if not any(pad.inertial for pad in rig.pads.values()):
+def displaced(
+    rig: Graph, name: str, state: State, batch: Sequence[int]
+) -> tuple[Tensor, float]:
+    """Displacements (*batch, nodes, 2) [m] of a nodal pad in balance with its contacts, in a batch
+    of copies of one state, and the largest step that is left."""
+    pad, own, first = rig.pads[name], rig.contacts_of(name), (0,) * len(batch)
+    part = lambda values: {key: value[first].detach() for key, value in values.items()}
+    alone = State({}, part(state.stretch), part(state.pose), {}, part(state.velocity))
+    balances = []
+    for one in (alone, state):
+        law = lambda u, one=one: rig.point_forces(own, one, u, torch.zeros_like(u))
+        balances.append(Balance(pad, lambda u: pad.element_forces(u, torch.zeros_like(u)), law))
+    undeformed = torch.zeros(pad.nodes, 2, dtype=torch.float64)
+    try:
+        u, factors, left = balances[0].found(undeformed, RESIDUAL, SETTLING)
+    except FloatingPointError:
+        return undeformed, torch.inf
+    return balances[1].corrected(u.expand(*batch, -1, -1), math.prod(batch) * factors), left
+
+
+def carried_along(rig: Graph, name: str, state: State, u: Tensor) -> Tensor:
+    """Velocities (nodes, 2) [m/s] of a pad's nodes that its base carries along, displaced by u."""
+    pose, velocity = rig.base_motion(name, state)
+    return velocity[:2] + velocity[2] * cross(turned(rig.pads[name].positions + u, pose[2]))
+
+
+def condensed(rig: Graph) -> Graph:
+    """The rig with all pads linear and massless, on their surface alone; itself if they are."""
+    if not any(pad.nodal for pad in rig.pads.values()):
         return rig
     return Graph(
         bodies=rig.bodies, pads={name: pad.condensed() for name, pad in rig.pads.items()},
@@ -145,20 +173,9 @@ def massless(rig: Graph) -> Graph:
 
 def standing(rig: Graph, pose: Mapping[str, Tensor]) -> Tensor:
     """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled
-    around them and no point stretched. Differentiable and raises as `settled`, but takes inertial
-    pads."""
-    soft = massless(rig)
-    still = {name: torch.zeros(3, dtype=torch.float64) for name in soft.bodies}
-    y = settled(soft, pose, still, unstretched(soft, ()))
-    if soft is rig:
-        return y
-    state = soft.layout.unpack(y, pose, still)
-    own = rig.layout.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), pose, still)
-    pads = {
-        name: pad.static_displacement(state.pads[name][0]) if pad.inertial else state.pads[name]
-        for name, pad in rig.pads.items()
-    }
-    return rig.pack(own._replace(pads=pads, pose=state.pose))
+    around them and no point stretched. Differentiable and raises as `settled`."""
+    still = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
+    return settled(rig, pose, still, unstretched(rig, ()))
 
 
 def unstretched(rig: Graph, batch: Sequence[int]) -> dict[str, Tensor]:
@@ -187,17 +204,16 @@ def resting(
     and as `settled`.
     """
     check_points(rig)
-    soft = massless(rig)
     sought = {
         k: torch.tensor(axes, dtype=torch.long)
-        for k, axes in (free or soft.layout.free).items()
+        for k, axes in (free or rig.layout.free).items()
         if len(axes)
     }
     if not sought:
         return dict(pose)
-    followed = soft.follow(0.0) if signals is None else signals
+    followed = rig.follow(0.0) if signals is None else signals
     with torch.no_grad():
-        masses = {name: torch.stack(soft.bodies[name].masses) for name in sought}
+        masses = {name: torch.stack(rig.bodies[name].masses) for name in sought}
         # an angle counts by the way of a point at the radius of gyration, so that all are lengths
         # and forces
         sizes = {
@@ -207,7 +223,7 @@ def resting(
         }
         scale = torch.cat([sizes[name][axes] for name, axes in sought.items()])
         q = torch.cat([pose[name][axes] for name, axes in sought.items()]) * scale
-        stride = STRIDE * min(pad.mesh.height for pad in soft.pads.values())
+        stride = STRIDE * min(pad.mesh.height for pad in rig.pads.values())
     counts = [len(axes) for axes in sought.values()]
 
     def poses(q: Tensor) -> dict[str, Tensor]:
@@ -220,10 +236,10 @@ def resting(
     def loads(q: Tensor) -> Tensor:
         """Net loads on the free coordinates (..., n) [N]."""
         batch = q.shape[:-1]
-        still = {name: torch.zeros(*batch, 3, dtype=q.dtype) for name in soft.bodies}
-        state = State({}, unstretched(soft, batch), poses(q), {}, still)
-        state = state._replace(pads={name: carried(soft, name, state) for name in soft.pads})
-        net = net_loads(soft, state, followed.expand(*batch, -1, -1), actuators)
+        still = {name: torch.zeros(*batch, 3, dtype=q.dtype) for name in rig.bodies}
+        state = State({}, unstretched(rig, batch), poses(q), {}, still)
+        state = state._replace(pads={name: carried(rig, name, state) for name in rig.pads})
+        net = net_loads(rig, state, followed.expand(*batch, -1, -1), actuators)
         net |= {name: net[name] + load for name, load in (pushed or {}).items()}
         return torch.cat([net[name][..., axes] for name, axes in sought.items()], -1) / scale
 

@@ -22,7 +22,7 @@ from torchsoft.physics.names import check_names
 from torchsoft.physics.parts import COORDINATES, PD, Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed, warn_of_moments
-from torchsoft.physics.statics import NoEquilibrium, massless, net_loads, resting, standing
+from torchsoft.physics.statics import NoEquilibrium, net_loads, resting, standing
 from torchsoft.physics.validity import check_numbers, sound
 from torchsoft.quantity import Gravity
 from torchsoft.rigs.built import BuiltRig
@@ -622,17 +622,17 @@ class RigFile(Shown, Group):
         set-points at a time [s], or else where they rest or start. Raises `ValueError`."""
         pose = {name: x.copy() for name, x in start.items()}
         known = self._follow(pose, time, ("driven", "setpoint"), start)
-        soft, (body, axis) = massless(rig), at(coordinate)
+        body, axis = at(coordinate)
         still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
         try:
-            pose = self._rested(soft, pose, self.rests(known))
-            y = standing(soft, {name: torch.from_numpy(x) for name, x in pose.items()})
+            pose = self._rested(rig, pose, self.rests(known))
+            y = standing(rig, {name: torch.from_numpy(x) for name, x in pose.items()})
         except NoEquilibrium as error:
             raise ValueError(
                 f'"{HELD}" asks for balance where set-points are at t = {time:g} s, and there is '
                 f"none: {error}"
             ) from None
-        return -float(net_loads(soft, soft.unpack(y, still), still, ())[body][axis])
+        return -float(net_loads(rig, rig.unpack(y, still), still, ())[body][axis])
 
 
 def checked(part: M) -> M:

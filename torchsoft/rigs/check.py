@@ -17,7 +17,7 @@ from torchsoft.parallel import single_threaded
 from torchsoft.physics.motion import hold
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.setup import PadSetup
-from torchsoft.physics.statics import NoEquilibrium, massless, standing
+from torchsoft.physics.statics import NoEquilibrium, condensed, standing
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, signals
 from torchsoft.rigs.fields import Refused
@@ -53,7 +53,7 @@ STEPS_PER_PROFILE = 20
 def at_moments(e: Estimate) -> list[Diagnostic]:
     """Findings on the rig in equilibrium at some knots of its motions: room, strains, modes, steps,
     friction."""
-    rig, found, there = massless(e.rig), list[Diagnostic](), list[Moment]()
+    rig, found, there = condensed(e.rig), list[Diagnostic](), list[Moment]()
     for time in e.moments(MOMENTS):
         scene = Scene(rig, e.balanced(time))
         found += [

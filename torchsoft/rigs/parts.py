@@ -13,7 +13,8 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, TypeAdapter, mo
 from torchsoft.display import suggestion
 from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
-from torchsoft.physics.material import KINDS, Material
+from torchsoft.physics.hyperelastic import KINDS
+from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, PadMesh, QuadMesh
 from torchsoft.physics.pads import Pad, Taxels
 from torchsoft.physics.parts import COORDINATES, Body, Contact

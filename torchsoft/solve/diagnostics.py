@@ -12,7 +12,7 @@ from torchsoft.physics.graph import Graph
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, standing
+from torchsoft.physics.statics import NoEquilibrium, condensed, standing
 from torchsoft.solve.steps import own_units
 from torchsoft.solve.trajectory import Trajectory
 
@@ -239,18 +239,19 @@ def instability(rig: Rig, run: Trajectory) -> str:
     """A sentence on an unstable loop with its remedy, from the modes about the poses in which the
     contacts of a run carried most, each of them; empty where no mode grows there, or one does
     without loops."""
-    if not run.force or not rig.actuators or any(pad.inertial for pad in rig.pads.values()):
+    if not run.force or not rig.actuators:
         return ""
+    soft = condensed(rig)
     least = torch.stack([force.detach()[..., 0].sum(-1) for force in run.force.values()]).amin(0)
     k = int(least.argmax())
     still = Reference(**{name: Profile([0.0], [float(run[name][k])]) for name in rig.signals})
     try:
-        y = standing(rig, {name: pose[k].detach() for name, pose in run.state.pose.items()})
+        y = standing(soft, {name: pose[k].detach() for name, pose in run.state.pose.items()})
     except NoEquilibrium:
         return ""
-    values, moves = modes(rig, y, still)
+    values, moves = modes(soft, y, still)
     free = Graph(
-        bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, reference=rig.reference,
+        bodies=rig.bodies, pads=soft.pads, contacts=rig.contacts, reference=rig.reference,
         gravity=float(rig.gravity), symbols=rig.symbols,
     )  # fmt: skip
     alone = float(modes(free, y, still).values.real.amax()) if len(values) else 0.0

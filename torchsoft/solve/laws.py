@@ -28,14 +28,15 @@ from torchsoft.physics.contact import (
     relative_motion,
     slip_of,
 )
-from torchsoft.physics.elements import CONSTANTS, linear_element
+from torchsoft.physics.elements import CONSTANTS, CORNERS, Factors, element_potentials
+from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.motion import Reference, polynomial
 from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
 from torchsoft.physics.validity import tried
-from torchsoft.solve.kernel.arrays import CORNERS, MOTION, WRENCH
+from torchsoft.solve.kernel.arrays import MOTION, WRENCH
 
 
 class LawSet(NamedTuple):
@@ -160,17 +161,18 @@ def compiled_law(
     linear: int,
     differentiated: int,
     points: bool = False,
+    conjugates: int | None = None,
     **modules: Any,
 ) -> Law:
     """The law of a function of modules and x (size,), differentiable in the first inputs and in the
     parameters `names`, of which it may not use all; `points` says that it is the law of a contact
-    point, whatever the others do. Raises `UnknownOperation` naming the line of a law that cannot be
+    point, whatever the others do; `conjugates` are those of `compile_law`. Raises `UnknownOperation` naming the line of a law that cannot be
     compiled."""
     decided = tuple((name, structure(module)) for name, module in modules.items())
     shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
     with _compiling:
         known = all(part is not None for _, part in decided)
-        key = (function, decided, shapes, linear, differentiated)
+        key = (function, decided, shapes, linear, differentiated, conjugates)
         if known and key in _laws:
             return _laws[key]
         law, _ = as_law(function, modules)
@@ -186,6 +188,7 @@ def compiled_law(
                 shapes,
                 linear,
                 differentiated,
+                conjugates,
             )
 
         if not known:  # user code is known by a trace only, and may change any time
@@ -201,8 +204,9 @@ def compiled_law(
             if points:
                 check_pointwise(law, example, names)
             _laws[key] = compile_law(
-                law, example, names, linear=linear, differentiated=differentiated
-            )
+                law, example, names, linear=linear, differentiated=differentiated,
+                conjugates=conjugates,
+            )  # fmt: skip
         return _laws[key]
 
 
@@ -343,12 +347,20 @@ def weight_law() -> Law:
     return compile_law(law, torch.zeros(0, dtype=torch.float64), {"numbers": numbers})
 
 
-@cache
-def element_law() -> Law:
-    """The law of a linear element; its parameters are depth lambda, depth mu and tau."""
-    x = torch.linspace(0.1, 1.0, 2 * CORNERS + CONSTANTS, dtype=torch.float64)
-    moduli = torch.linspace(0.3, 0.5, 3, dtype=torch.float64)
-    return compile_law(
-        lambda x, own: linear_element(x, own["moduli"]), x, {"moduli": moduli},
-        linear=CORNERS, differentiated=2 * CORNERS,
-    )  # fmt: skip
+def element_law(name: str, material: Material, factors: Tensor) -> tuple[Law, dict[str, Tensor]]:
+    """The law of the elements of the pad called `name`, and its parameters.
+
+    Raises `UnknownOperation` for an energy that cannot be compiled, with the pad's name.
+    """
+    own = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
+    parameters = {f"material.{key}": value for key, value in own.items()}
+    parameters["factors.values"] = factors
+    size = 2 * CORNERS + CONSTANTS
+    try:
+        law = compiled_law(
+            parameters, element_potentials, size, CORNERS, 2 * CORNERS, conjugates=CORNERS,
+            material=material, factors=Factors(factors.detach()),
+        )  # fmt: skip
+    except UnknownOperation as error:
+        raise UnknownOperation(f"the material of the pad `{name}`: {error}") from error
+    return law, parameters

@@ -20,7 +20,6 @@ from torchsoft.physics.contact import Friction, SoftContact
 from torchsoft.physics.elements import CONSTANTS
 from torchsoft.physics.mesh import dofs_of
 from torchsoft.physics.motion import Reference
-from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.rig import Rig
@@ -213,9 +212,15 @@ class Compiled:
         pads = [pad if pad.nodal else None for pad in rig.pads.values()]
         dofs = [0 if pad is None else 2 * pad.nodes for pad in pads]
         band = [0 if pad is None else 2 * spread(pad.corners // 2) + 1 for pad in pads]
-        law = element_law() if any(pads) else None
-        none = torch.zeros(0, dtype=torch.float64)
-        starts = [self._add(none if pad is None else element_moduli(pad)) for pad in pads]
+        laws, starts, ends, density = list[Law | None](), list[int](), list[int](), list[int]()
+        for name, pad in rig.pads.items():
+            law, parameters = (
+                (None, {}) if not pad.nodal else element_law(name, pad.material, pad.factors())
+            )
+            laws.append(law)
+            starts.append(self._add_all(parameters))
+            ends.append(self._count)
+            density.append(self._add(pad.material.rho * pad.material.depth))
         joined = lambda kind, *shape: np.concatenate(
             [np.zeros((0, *shape)), *(kind(pad) for pad in pads if pad is not None)]
         )
@@ -225,16 +230,16 @@ class Compiled:
             else dofs_of(pad.surface.numpy())
             for pad in rig.pads.values()
         ]
-        address = lambda name: [0 if law is None else getattr(law, name)] * len(pads)
+        address = lambda name: [0 if law is None else getattr(law, name) for law in laws]
         return filled(
             Nodal, dof_start=np.cumsum([0, *dofs]),
             element_start=np.cumsum([0, *(0 if pad is None else len(pad.corners) for pad in pads)]),
             v_start=[slices["rates", name].start if pad.inertial else -1
                      for name, pad in rig.pads.items()],
-            density_at=[at + 3 for at in starts], band=band,
+            density_at=density, band=band,
             band_start=np.cumsum([0, *(n * (2 * b + 1) for n, b in zip(dofs, band))])[:-1],
             value=address("value"), linearise=address("linearise"), pullback=address("pullback"),
-            p_first=starts, p_last=[at + (3 if pad else 0) for at, pad in zip(starts, pads)],
+            p_first=starts, p_last=ends,
             X=joined(lambda pad: pad.positions.numpy().ravel()),
             area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2)),
             dof=joined(lambda pad: pad.corners, 8), constants=joined(
@@ -336,13 +341,6 @@ class Compiled:
                 for name in rig.contacts
             ),
         )  # fmt: skip
-
-
-def element_moduli(pad: Pad) -> Tensor:
-    """Parameters of a nodal pad's elements, depth lambda, depth mu and tau, and then rho depth."""
-    material = pad.material
-    lame = (material.depth * modulus for modulus in pad.lame())
-    return torch.stack((*lame, pad.chain()[1][0], material.rho * material.depth))
 
 
 def spread(corners: Index) -> int:
