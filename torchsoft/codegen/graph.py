@@ -22,7 +22,7 @@ ARITHMETIC = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "ne
 FOLDED = {**COMPARISONS, **LOGIC, **ARITHMETIC}
 COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
 # the value is the first argument; the derivative rule speaks of the arguments after it
-NAMED = {"stop", "norm", "sigmoid", "maximum", "minimum"}
+NAMED = {"stop", "norm", "sigmoid", "maximum", "minimum", "guarded"}
 # finite for every finite argument, overflow apart
 ENTIRE = {
     "add",
@@ -136,8 +136,9 @@ class Graph:
         return self.guarded(adjoint, self("div", adjoint, divisor))
 
     def guarded(self, adjoint: int, result: int) -> int:
-        """`result`, and 0 where the adjoint is exactly 0."""
-        return self("select", self("eq", adjoint, self.zero), self.zero, result)
+        """`result`, and 0 where the adjoint is exactly 0; its own derivative is that of `result`."""
+        value = self("select", self("eq", adjoint, self.zero), self.zero, result)
+        return value if value == result else self("guarded", value, result)
 
     def _node(self, op: str, args: tuple, key: tuple, boolean: bool, finite: bool) -> int:
         node = self._known.setdefault(key, len(self.ops))
@@ -301,6 +302,7 @@ RULES: dict[str, Callable[..., tuple]] = {
     ),
     "sigmoid": lambda g, adj, y, value, a: (None, g.product(adj, g("mul", y, g("sub", g.one, y)))),
     "select": _select,
+    "guarded": lambda g, adj, y, value, result: (None, adj),
     "maximum": _extremum("gt"),
     "minimum": _extremum("lt"),
     "norm": _norm,

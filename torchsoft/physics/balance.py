@@ -102,13 +102,10 @@ class Balance:
         """Factors of the derivative of internal less contact forces, sample by sample."""
         pad = self.pad
         with torch.enable_grad():
-            at = pad.at_corners(x).requires_grad_()
-            forces = self.internal(at)
-            rows = [
-                torch.autograd.grad(forces[..., i].sum(), at, retain_graph=True)[0]
-                for i in range(8)
-            ]
-            elements = torch.stack(rows, -2).reshape(-1, *pad.corners.shape, 8)
+            at = pad.at_corners(x).expand(8, *x.shape[:-2], -1, -1).clone().requires_grad_()
+            each = self.internal(at).movedim(-1, 0).diagonal(0, 0, 1)  # a copy for each component
+            (rows,) = torch.autograd.grad(each.sum(), at)
+            elements = rows.movedim(0, -2).reshape(-1, *pad.corners.shape, 8)
             contacts = torch.zeros(len(elements), len(pad.spread), 2, 2, dtype=x.dtype)
             if self.law is not None:
                 twice = torch.stack((pad.spread @ x,) * 2).requires_grad_()

@@ -234,20 +234,23 @@ class Pad(nn.Module):
             self.material, factors_of(self.factors()), torch.cat((u, rate, constants), -1)
         )
 
-    def element_forces(self, u: Tensor, rate: Tensor) -> Tensor:
-        """Forces (..., elements, 8) [N] on the corners of a nodal pad's elements."""
-        recorded = torch.is_grad_enabled()
+    def element_forces(self, u: Tensor, rate: Tensor | None = None) -> Tensor:
+        """Forces (..., elements, 8) [N] on the corners of a nodal pad's elements, by default at
+        rest."""
+        recorded, still = torch.is_grad_enabled(), torch.zeros_like(u) if rate is None else rate
         with torch.enable_grad():
             if not (recorded and u.requires_grad):
                 u = u.detach().requires_grad_()
-            if not (recorded and rate.requires_grad):
-                rate = rate.detach().requires_grad_()
-            energy, potential = self.potentials(u, rate).unbind(-1)
-            (elastic,) = torch.autograd.grad(
+            if not (recorded and still.requires_grad):
+                still = still.detach().requires_grad_()
+            energy, potential = self.potentials(u, still).unbind(-1)
+            (force,) = torch.autograd.grad(
                 energy.sum(), u, create_graph=recorded, retain_graph=True
             )
-            (viscous,) = torch.autograd.grad(potential.sum(), rate, create_graph=recorded)
-        return elastic + viscous
+            if rate is not None:
+                (viscous,) = torch.autograd.grad(potential.sum(), still, create_graph=recorded)
+                force = force + viscous
+        return force
 
     def internal_force(self, u: Tensor, rate: Tensor) -> Tensor:
         """Forces of a nodal pad (..., nodes, 2) [N] at displacements u (..., nodes, 2) [m] and

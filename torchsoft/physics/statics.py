@@ -134,9 +134,7 @@ def carried(rig: Graph, name: str, state: State) -> Tensor:
     return found if pad.nodal else found[..., None, :, :].expand(*batch, pad.branches, -1, -1)
 
 
-def displaced(
-    rig: Graph, name: str, state: State, batch: Sequence[int]
-) -> tuple[Tensor, float]:
+def displaced(rig: Graph, name: str, state: State, batch: Sequence[int]) -> tuple[Tensor, float]:
     """Displacements (*batch, nodes, 2) [m] of a nodal pad in balance with its contacts, in a batch
     of copies of one state, and the largest step that is left."""
     pad, own, first = rig.pads[name], rig.contacts_of(name), (0,) * len(batch)
@@ -145,7 +143,7 @@ def displaced(
     balances = []
     for one in (alone, state):
         law = lambda u, one=one: rig.point_forces(own, one, u, torch.zeros_like(u))
-        balances.append(Balance(pad, lambda u: pad.element_forces(u, torch.zeros_like(u)), law))
+        balances.append(Balance(pad, pad.element_forces, law))
     undeformed = torch.zeros(pad.nodes, 2, dtype=torch.float64)
     try:
         u, factors, left = balances[0].found(undeformed, RESIDUAL, SETTLING)

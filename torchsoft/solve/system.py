@@ -18,6 +18,7 @@ from torch import Tensor
 from torchsoft.codegen import Law
 from torchsoft.physics.contact import Friction, SoftContact
 from torchsoft.physics.elements import CONSTANTS
+from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.mesh import dofs_of
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
@@ -67,6 +68,11 @@ from torchsoft.solve.steps import Followed
 
 NOMINAL = 1e-3
 """Stage length a h [s] at which slip laws of users are tried."""
+
+
+HELD = 2e-3
+"""Strain up to which the derivatives of an element's forces are held while it changes, in Newton's
+method."""
 
 
 @contextmanager
@@ -236,7 +242,8 @@ class Compiled:
             element_start=np.cumsum([0, *(0 if pad is None else len(pad.corners) for pad in pads)]),
             v_start=[slices["rates", name].start if pad.inertial else -1
                      for name, pad in rig.pads.items()],
-            density_at=density, band=band,
+            density_at=density, hold=[HELD if isinstance(pad.material, Hyperelastic) else np.inf
+                                      for pad in rig.pads.values()], band=band,
             band_start=np.cumsum([0, *(n * (2 * b + 1) for n, b in zip(dofs, band))])[:-1],
             value=address("value"), linearise=address("linearise"), pullback=address("pullback"),
             p_first=starts, p_last=ends,

@@ -74,6 +74,8 @@ def stage_adjoint(
     free, count, y, felt = s.body_coordinate.size, s.pad_base.size, tape.y[row], forces_bar.size > 0
     contacts.restore(s, w, tape, row, a, felt)
     put(tape.rate[row], w.rate)
+    for pad in range(s.pad_base.size):
+        pads.relinearise(s, w, pad, tape.y[row], a)
     seed(s, w, z, tape, row, a, y_bar, p_bar, forces_bar)
     Rv, matrix, nu, V_bar = w.Rv, z.matrix, z.nu, z.V_bar
     balance(s, w, y, signals, a, w.r, Rv)

@@ -108,7 +108,8 @@ class Condensed(NamedTuple):
 
 class Nodal(NamedTuple):
     """Per pad: ends in the dofs and the elements, v_start of its velocities (-1: without inertia),
-    density_at of rho depth in p, band: the largest difference between dofs of one element, its
+    density_at of rho depth in p, hold: strain up to which an element's derivatives are held while it
+    changes, band: the largest difference between dofs of one element, its
     place in the banded matrices; law addresses of its elements, ends of their parameters in p. Per
     dof: X, place of its node (its own coordinate), and area. Per element: its dofs, -1 where it is
     bonded, and constants. surface: dof of every surface dof."""
@@ -117,6 +118,7 @@ class Nodal(NamedTuple):
     element_start: Index
     v_start: Index
     density_at: Index
+    hold: Array
     band: Index
     band_start: Index
     value: Index
@@ -271,9 +273,10 @@ SCRATCH: dict[str, dict[str, str]] = {
         # numbers of points near and touching, from every pad's first point on
         "int points": "window active",
         # numbers of those, nodes of the window, numbers of touched nodes
-        "int pads": "windows actives low high counts",
-        "pads": "power",  # of nodal pads [W]
-        "int nodes": "slot touched",
+        "int pads": "windows actives low high counts held_count",
+        # of nodal pads: power [W], and the a h that the held factor is of, or 0
+        "pads": "power held",
+        "int nodes": "slot touched held_touched",
         "widest widest": "A P",  # one pad's share of Newton's system
         "2 widest": "PB",
         "6 8": "K",
@@ -302,7 +305,10 @@ SCRATCH: dict[str, dict[str, str]] = {
         "solves": "solves",
         "element_inputs": "element_x",
         "9": "element",
-        "8 16": "element_J",
+        # held of every element: its derivatives, and the displacements and rates that they are of
+        "elements 8 16": "element_J",
+        "elements 16": "element_at",
+        "pads held_widest held_widest": "held_P",
         "state": "k",
     },
     # what one step leaves: its start with Newton's guesses; rates, powers, bounds of the speeds of
@@ -525,6 +531,8 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         "inputs": MOTION + states + 2, "jacobian": (WRENCH + states + 2) * (MOTION + states),
         "most": max(WRENCH + states + 2, CORNERS),
         "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
+        "held_widest": widest if s.nodal_dof_start[-1] else 0,
+        "elements": int(s.nodal_element_start[-1]),
         "dofs": int(s.nodal_dof_start[-1]), "banded": int((dofs * band).sum()),
         "element_inputs": 2 * CORNERS + s.nodal_constants.shape[1], "parameters": len(s.p),
         "recorded": recorded_size(s),

@@ -142,14 +142,45 @@ def matrix(s: Any, w: Any, pad: int) -> Array:
 
 
 @compiled
-def factor(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """A of a pad, factorised, in w.band."""
-    first, last, band = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.nodal_band[pad]
-    width, own, A, J = 2 * band + 1, s.p[element_parameters(s, pad)], matrix(s, w, pad), w.element_J
-    A[:] = 0.0
+def strained(s: Any, w: Any, e: int, a: float) -> float:
+    """A bound of how far element e, in w.element_x, is strained from where its derivatives are
+    held."""
+    x, held, total = w.element_x, w.element_at[e], 0.0
+    for c in range(CORNERS):
+        off = abs(x[c] - held[c]) + a * abs(x[CORNERS + c] - held[CORNERS + c])
+        total += off * abs(s.nodal_constants[e, c])
+    return total
+
+
+@compiled
+def linearise(s: Any, w: Any, pad: int, y: Array, a: float, hold: float) -> bool:
+    """Derivatives of the elements' forces, w.element_J, anew where they are strained by more than
+    `hold`; whether any are."""
+    own, changed = s.p[element_parameters(s, pad)], False
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         element_inputs(s, w, pad, e, y, a)
-        call_linearise(s.nodal_linearise[pad], w.element_x, own, w.element, J)
+        if w.held[pad] == 0.0 or not strained(s, w, e, a) <= hold:
+            call_linearise(s.nodal_linearise[pad], w.element_x, own, w.element, w.element_J[e])
+            put(w.element_x[: 2 * CORNERS], w.element_at[e])
+            changed = True
+    return changed
+
+
+@compiled
+def relinearise(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
+    """Derivatives of all elements at the rates w.rate; `relation` factorises them."""
+    w.held[pad] = 0.0
+    linearise(s, w, pad, y, a, 0.0)
+
+
+@compiled
+def factor(s: Any, w: Any, pad: int, a: float) -> None:
+    """A of a pad, factorised, in w.band, from the elements' derivatives."""
+    first, last, band = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.nodal_band[pad]
+    width, A = 2 * band + 1, matrix(s, w, pad)
+    A[:] = 0.0
+    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
+        J = w.element_J[e]
         for c in range(CORNERS):
             row = s.nodal_dof[e, c]
             for d in range(CORNERS if row >= 0 else 0):
@@ -178,32 +209,54 @@ def solve_back(s: Any, w: Any, pad: int, b: Array) -> None:
 def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
     """The pad's relation at the rates w.rate and the forces w.internal that `evaluate` found there:
     free rates, which only Newton's method takes, w.P between the touched nodes, D and B of the
-    base's motion."""
+    base's motion. What nothing has changed since is held."""
     first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    nodes, n, moved = s.pad_node_start[pad], w.counts[pad], 2 if inertial(s, pad) else 0
-    m = 1 + 2 * n + moved
-    factor(s, w, pad, y, a)
-    b = w.solves[: (last - first) * m]
-    b[:] = 0.0
+    nodes, n = s.pad_node_start[pad], w.counts[pad]
+    fresh = w.held[pad] != a
+    if linearise(s, w, pad, y, a, s.nodal_hold[pad]) or fresh:
+        factor(s, w, pad, a)
+        w.held[pad], fresh = a, True
+    same = not fresh and n == w.held_count[pad]
+    for i in range(nodes, nodes + (n if same else 0)):
+        same &= w.touched[i] == w.held_touched[i]
+    if not same:
+        respond(s, w, pad, a)
+    for i in range(2 * n):
+        put(w.held_P[pad, i, : 2 * n], w.P[i, : 2 * n])
+    free = w.rate_free[first:last]
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
     for i in range(last - first):
-        M = mass_rate(s, pad, first + i, a)
         change = change_of_speed(s, w, pad, first + i, y, vx if i % 2 == 0 else vy)
-        b[i * m] = -w.internal[first + i] - M * change
-        if moved:
-            b[i * m + 1 + 2 * n + i % 2] = M
-            w.D_left[first + i, i % 2], w.D_left[first + i, 1 - i % 2] = M, 0.0
-    for j in range(2 * n):
-        b[s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2] * m + 1 + j] = 1.0
-    solve(s, w, pad, b, m)
+        free[i] = -w.internal[first + i] - mass_rate(s, pad, first + i, a) * change
+    solve(s, w, pad, free, 1)
     for i in range(last - first):
-        w.rate_free[first + i] = w.rate[first + i] + b[i * m]
+        free[i] += w.rate[first + i]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
-            w.free[node, r] = w.rate_free[first + s.nodal_surface[2 * node + r]]
+            w.free[node, r] = free[s.nodal_surface[2 * node + r]]
+
+
+@compiled
+def respond(s: Any, w: Any, pad: int, a: float) -> None:
+    """Answers to unit forces on the touched nodes, w.held_P between them, and to the base's motion,
+    D and B."""
+    first, last, nodes = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_node_start[pad]
+    n, moved = w.counts[pad], 2 if inertial(s, pad) else 0
+    m = 2 * n + moved
+    b = w.solves[: (last - first) * m]
+    b[:] = 0.0
+    for i in range(last - first if moved else 0):
+        M = mass_rate(s, pad, first + i, a)
+        b[i * m + 2 * n + i % 2] = M
+        w.D_left[first + i, i % 2], w.D_left[first + i, 1 - i % 2] = M, 0.0
+    for j in range(2 * n):
+        b[s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2] * m + j] = 1.0
+    solve(s, w, pad, b, m)
     for j in range(2 * n):
         dof = s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2]
-        put(b[dof * m + 1 : dof * m + 1 + 2 * n], w.P[j, : 2 * n])
+        put(b[dof * m : dof * m + 2 * n], w.held_P[pad, j, : 2 * n])
+    w.held_count[pad] = n
+    put(w.touched[nodes : nodes + n], w.held_touched[nodes : nodes + n])
     if moved:
         B = w.B[pad]
         B[:] = 0.0
@@ -211,7 +264,7 @@ def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
             M = mass_rate(s, pad, first + i, a)
             B[i % 2, i % 2] += M
             for axis in range(2):
-                w.D[first + i, axis] = b[i * m + 1 + 2 * n + axis]
+                w.D[first + i, axis] = b[i * m + 2 * n + axis]
                 B[i % 2, axis] -= M * w.D[first + i, axis]
         for axis in range(2):
             left = w.load_dof[first:last]
@@ -355,8 +408,7 @@ def element_push(
 ) -> None:  # fmt: skip
     """Add the tangents of element e's forces to `out` (dofs, m): by displacements du (dofs, m), by
     the parameters, and with `rates` by rates dv (dofs, m)."""
-    own, J, i0 = element_parameters(s, pad), w.element_J, s.nodal_dof_start[pad]
-    call_linearise(s.nodal_linearise[pad], w.element_x, s.p[own], w.element, J)
+    own, J, i0 = element_parameters(s, pad), w.element_J[e], s.nodal_dof_start[pad]
     moved = False
     for j in range(own.start, own.stop):
         for k in range(dp.shape[1]):
@@ -510,8 +562,7 @@ def element_pull(
 ) -> None:
     """Add to the cotangents of displacements and rates (dofs,) and of the parameters those of the
     forces of element e, `bar` (8,)."""
-    own, J, i0 = element_parameters(s, pad), w.element_J, s.nodal_dof_start[pad]
-    call_linearise(s.nodal_linearise[pad], w.element_x, s.p[own], w.element, J)
+    own, J, i0 = element_parameters(s, pad), w.element_J[e], s.nodal_dof_start[pad]
     call_pullback(s.nodal_pullback[pad], w.element_x, s.p[own], bar, p_bar[own])
     for d in range(CORNERS):
         dof = s.nodal_dof[e, d]

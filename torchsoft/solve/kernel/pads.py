@@ -57,6 +57,13 @@ def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 
 
 @compiled
+def relinearise(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
+    """Derivatives of a pad's material where a stage from y ended."""
+    if s.pad_kind[pad] != CONDENSED:
+        nodal.relinearise(s, w, pad, y, a)
+
+
+@compiled
 def couple(s: Any, w: Any, pad: int, Rv: Array) -> None:
     """Effects of a pad's inertia on the assembled block."""
     if nodal.inertial(s, pad):

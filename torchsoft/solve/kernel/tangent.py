@@ -111,6 +111,8 @@ def stage_tangent(
     free, y, m = s.body_coordinate.size, tape.y[row], dy.shape[1]
     contacts.restore(s, w, tape, row, a, felt)
     put(tape.rate[row], w.rate)
+    for pad in range(s.pad_base.size):
+        pads.relinearise(s, w, pad, tape.y[row], a)
     if felt:
         z.recorded[:] = 0.0
     Rv, r = w.Rv, z.r
