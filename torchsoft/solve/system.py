@@ -70,7 +70,7 @@ NOMINAL = 1e-3
 """Stage length a h [s] at which slip laws of users are tried."""
 
 
-HELD = 2e-3
+HELD = 3e-4
 """Strain up to which the derivatives of an element's forces are held while it changes, in Newton's
 method."""
 

@@ -303,12 +303,14 @@ SCRATCH: dict[str, dict[str, str]] = {
         "pads 2 2": "B",  # the base's reaction per velocity
         "banded": "band",
         "solves": "solves",
-        "element_inputs": "element_x",
-        "9": "element",
-        # held of every element: its derivatives, and the displacements and rates that they are of
+        # of every element: inputs of its law, and held its derivatives with the displacements and
+        # rates that they are of
+        "elements element_inputs": "element_x",
         "elements 8 16": "element_J",
         "elements 16": "element_at",
-        "pads held_widest held_widest": "held_P",
+        "9": "element",
+        # of every nodal pad held: its dofs' rates per unit force on the touched nodes, row by row
+        "responses": "responses",
         "state": "k",
     },
     # what one step leaves: its start with Newton's guesses; rates, powers, bounds of the speeds of
@@ -531,12 +533,12 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         "inputs": MOTION + states + 2, "jacobian": (WRENCH + states + 2) * (MOTION + states),
         "most": max(WRENCH + states + 2, CORNERS),
         "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
-        "held_widest": widest if s.nodal_dof_start[-1] else 0,
         "elements": int(s.nodal_element_start[-1]),
         "dofs": int(s.nodal_dof_start[-1]), "banded": int((dofs * band).sum()),
         "element_inputs": 2 * CORNERS + s.nodal_constants.shape[1], "parameters": len(s.p),
         "recorded": recorded_size(s),
     }  # fmt: skip
+    sizes["responses"] = sizes["dofs"] * (widest + 2)
     sizes["solves"] = int(dofs.max(initial=0)) * max(widest + 3, sizes.get("columns", 1))
     made = {}
     for shape, names in SCRATCH[kind].items():
@@ -548,6 +550,8 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         made |= {
             name: np.zeros(lengths, np.int64 if whole else np.float64) for name in names.split()
         }
+    if kind == "Work":
+        made["element_x"][:, 2 * CORNERS :] = s.nodal_constants
     return KINDS[kind](**made)
 
 

@@ -93,9 +93,40 @@ def factor_banded(A: Array, n: int, band: int) -> None:
 
 
 @compiled
+def dot_of_four(x: Array, y: Array) -> float:
+    """Product of two vectors of x's length, as four sums, which do not wait for each other."""
+    a = b = c = d = 0.0
+    end = x.size - x.size % 4
+    for i in range(0, end, 4):
+        a += x[i] * y[i]
+        b += x[i + 1] * y[i + 1]
+        c += x[i + 2] * y[i + 2]
+        d += x[i + 3] * y[i + 3]
+    for i in range(end, x.size):
+        a += x[i] * y[i]
+    return (a + b) + (c + d)
+
+
+@compiled
+def solve_one_banded(A: Array, n: int, band: int, b: Array) -> None:
+    """Solution of A x = b (n,) in place; A is factorised."""
+    width = 2 * band + 1
+    for i in range(n):
+        k = max(0, i - band)
+        b[i] -= dot_of_four(A[i * width + band + k - i : i * width + band], b[k:i])
+    for i in range(n - 1, -1, -1):
+        last = min(n, i + band + 1)
+        at = i * width + band
+        b[i] = (b[i] - dot_of_four(A[at + 1 : at + last - i], b[i + 1 : last])) / A[at]
+
+
+@compiled
 def solve_banded(A: Array, n: int, band: int, b: Array, m: int) -> None:
     """Solution of A x = b for the m right-hand sides b (n m,), row by row, in place; A is
     factorised."""
+    if m == 1:
+        solve_one_banded(A, n, band, b)
+        return
     width = 2 * band + 1
     for i in range(n):
         row = b[i * m : (i + 1) * m]

@@ -16,6 +16,7 @@ from torchsoft.solve.kernel.arrays import CORNERS
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback, call_value
 from torchsoft.solve.kernel.linear import (
     add,
+    dot,
     factor_banded,
     put,
     solve_banded,
@@ -62,16 +63,15 @@ def change_of_speed(s: Any, w: Any, pad: int, i: int, y: Array, v_base: float) -
 
 @compiled
 def element_inputs(s: Any, w: Any, pad: int, e: int, y: Array, a: float) -> None:
-    """Displacements and rates of the corners of element e at the stage's end, and its constants,
-    into w.element_x."""
-    x, i0, U = w.element_x, s.nodal_dof_start[pad], s.pad_y_start[pad]
+    """Displacements and rates of the corners of element e at the stage's end into its row of
+    w.element_x, whose constants stand there."""
+    x, i0, U = w.element_x[e], s.nodal_dof_start[pad], s.pad_y_start[pad]
     for c in range(CORNERS):
         dof = s.nodal_dof[e, c]
         x[c], x[CORNERS + c] = 0.0, 0.0
         if dof >= 0:
             rate = w.rate[i0 + dof]
             x[c], x[CORNERS + c] = y[U + dof] + a * rate, rate
-    put(s.nodal_constants[e], x[2 * CORNERS :])
 
 
 @compiled
@@ -109,7 +109,7 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
     w.internal[first:last], w.noise[first:last], w.power[pad] = 0.0, 0.0, 0.0
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         element_inputs(s, w, pad, e, y, a)
-        call_value(s.nodal_value[pad], w.element_x, own, w.element)
+        call_value(s.nodal_value[pad], w.element_x[e], own, w.element)
         scatter(s, pad, e, w.element, w.internal)
         w.power[pad] += w.element[CORNERS]
         for c in range(CORNERS):
@@ -143,9 +143,9 @@ def matrix(s: Any, w: Any, pad: int) -> Array:
 
 @compiled
 def strained(s: Any, w: Any, e: int, a: float) -> float:
-    """A bound of how far element e, in w.element_x, is strained from where its derivatives are
+    """A bound of how far element e is strained from where its derivatives are
     held."""
-    x, held, total = w.element_x, w.element_at[e], 0.0
+    x, held, total = w.element_x[e], w.element_at[e], 0.0
     for c in range(CORNERS):
         off = abs(x[c] - held[c]) + a * abs(x[CORNERS + c] - held[CORNERS + c])
         total += off * abs(s.nodal_constants[e, c])
@@ -160,8 +160,8 @@ def linearise(s: Any, w: Any, pad: int, y: Array, a: float, hold: float) -> bool
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         element_inputs(s, w, pad, e, y, a)
         if w.held[pad] == 0.0 or not strained(s, w, e, a) <= hold:
-            call_linearise(s.nodal_linearise[pad], w.element_x, own, w.element, w.element_J[e])
-            put(w.element_x[: 2 * CORNERS], w.element_at[e])
+            call_linearise(s.nodal_linearise[pad], w.element_x[e], own, w.element, w.element_J[e])
+            put(w.element_x[e, : 2 * CORNERS], w.element_at[e])
             changed = True
     return changed
 
@@ -221,8 +221,10 @@ def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
         same &= w.touched[i] == w.held_touched[i]
     if not same:
         respond(s, w, pad, a)
-    for i in range(2 * n):
-        put(w.held_P[pad, i, : 2 * n], w.P[i, : 2 * n])
+    b, m = responses(s, w, pad), responses_width(s, w, pad)
+    for j in range(2 * n):
+        dof = s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2]
+        put(b[dof * m : dof * m + 2 * n], w.P[j, : 2 * n])
     free = w.rate_free[first:last]
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
     for i in range(last - first):
@@ -237,13 +239,27 @@ def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 
 
 @compiled
+def responses_width(s: Any, w: Any, pad: int) -> int:
+    """Number of held responses of a pad."""
+    return 2 * w.held_count[pad] + (2 if inertial(s, pad) else 0)
+
+
+@inlined
+def responses(s: Any, w: Any, pad: int) -> Array:
+    """Held responses of a pad's dofs, row by row, a view."""
+    n = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad]
+    at = s.nodal_dof_start[pad] * (w.responses.size // s.nodal_dof_start[-1])
+    return w.responses[at : at + n * responses_width(s, w, pad)]
+
+
+@compiled
 def respond(s: Any, w: Any, pad: int, a: float) -> None:
-    """Answers to unit forces on the touched nodes, w.held_P between them, and to the base's motion,
-    D and B."""
+    """Responses to unit forces on the touched nodes, and to the base's motion, D and B."""
     first, last, nodes = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_node_start[pad]
     n, moved = w.counts[pad], 2 if inertial(s, pad) else 0
-    m = 2 * n + moved
-    b = w.solves[: (last - first) * m]
+    w.held_count[pad] = n
+    put(w.touched[nodes : nodes + n], w.held_touched[nodes : nodes + n])
+    b, m = responses(s, w, pad), responses_width(s, w, pad)
     b[:] = 0.0
     for i in range(last - first if moved else 0):
         M = mass_rate(s, pad, first + i, a)
@@ -252,11 +268,6 @@ def respond(s: Any, w: Any, pad: int, a: float) -> None:
     for j in range(2 * n):
         b[s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2] * m + j] = 1.0
     solve(s, w, pad, b, m)
-    for j in range(2 * n):
-        dof = s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2]
-        put(b[dof * m : dof * m + 2 * n], w.held_P[pad, j, : 2 * n])
-    w.held_count[pad] = n
-    put(w.touched[nodes : nodes + n], w.held_touched[nodes : nodes + n])
     if moved:
         B = w.B[pad]
         B[:] = 0.0
@@ -340,20 +351,18 @@ def propose(s: Any, w: Any, pad: int, dV: Array) -> None:
     """Rates of all nodes, w.rate_new, and of the surface, w.u_dot_new, under the forces w.F_new and
     the change of velocity dV."""
     first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    new, free = w.rate_new[first:last], s.body_free
-    new[:] = 0.0
+    new, free, forces = w.rate_new[first:last], s.body_free, w.load_dof[: 2 * w.counts[pad]]
     for i in range(w.counts[pad]):
         node = w.touched[s.pad_node_start[pad] + i]
-        for r in range(2):
-            new[s.nodal_surface[2 * node + r]] = w.F_new[node, r]
-    solve(s, w, pad, new, 1)
+        forces[2 * i], forces[2 * i + 1] = w.F_new[node, 0], w.F_new[node, 1]
+    b, m = responses(s, w, pad), responses_width(s, w, pad)
     x, y = 0.0, 0.0
     if inertial(s, pad):
         x = dV[free[base]] if free[base] >= 0 else 0.0
         y = dV[free[base + 1]] if free[base + 1] >= 0 else 0.0
     vx, vy = to_base(w, base, x, y)
     for i in range(last - first):
-        new[i] += w.rate_free[first + i]
+        new[i] = w.rate_free[first + i] + dot(forces, b[i * m :])
         if inertial(s, pad):
             new[i] -= w.D[first + i, 0] * vx + w.D[first + i, 1] * vy
         w.rate_old[first + i] = w.rate[first + i]
@@ -427,7 +436,7 @@ def element_push(
             weights, gradient = z.weights, z.gradient[: own.stop - own.start]
             weights[:], gradient[:] = 0.0, 0.0
             weights[c] = 1.0
-            call_pullback(s.nodal_pullback[pad], w.element_x, s.p[own], weights, gradient)
+            call_pullback(s.nodal_pullback[pad], w.element_x[e], s.p[own], weights, gradient)
             for j in range(gradient.size):
                 add(gradient[j], dp[own.start + j], out[i0 + row])
 
@@ -563,7 +572,7 @@ def element_pull(
     """Add to the cotangents of displacements and rates (dofs,) and of the parameters those of the
     forces of element e, `bar` (8,)."""
     own, J, i0 = element_parameters(s, pad), w.element_J[e], s.nodal_dof_start[pad]
-    call_pullback(s.nodal_pullback[pad], w.element_x, s.p[own], bar, p_bar[own])
+    call_pullback(s.nodal_pullback[pad], w.element_x[e], s.p[own], bar, p_bar[own])
     for d in range(CORNERS):
         dof = s.nodal_dof[e, d]
         if dof >= 0:
