@@ -46,6 +46,7 @@ def compile_law(
     linear: int | None = None,
     differentiated: int | None = None,
     conjugates: int | None = None,
+    lanes: int = 1,
     kind: type[Trace] = Trace,
 ) -> Law:
     """Compile function(x, parameters), which gives an (outputs,) float64 tensor for x (inputs,) and
@@ -80,7 +81,7 @@ def compile_law(
     linear = _count("linear", linear, len(outputs))
     differentiated = _count("differentiated", differentiated, x.numel())
     count = sum(tensor.numel() for tensor in parameters.values())
-    engine = emit.compiled(_functions(graph, outputs, linear, differentiated, count))
+    engine = emit.compiled(_functions(graph, outputs, linear, differentiated, count, lanes))
     addresses = [engine.get_function_address(name) for name in ("value", "linearise", "pullback")]
     return Law(count, len(outputs), linear, differentiated, *addresses)
 
@@ -96,7 +97,7 @@ def _forces(g: Graph, potentials: list[int], n: int) -> list[int]:
 
 
 def _functions(
-    g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int
+    g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int, lanes: int
 ) -> list[str]:
     """IR of the three entry points."""
     x = [g.leaf("x", i) for i in range(differentiated)]
@@ -111,8 +112,10 @@ def _functions(
     ]  # of parameters: known when it runs of which
     p_bar = adjoints(g, seeds, {}, dependent(g, p + lookups), p + lookups)
     return [
-        emit.function(g, "value", ("x", "p", "out"), {"out": outputs}),
-        emit.function(g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}),
+        emit.function(g, "value", ("x", "p", "out"), {"out": outputs}, lanes=lanes),
+        emit.function(
+            g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}, lanes=lanes
+        ),
         emit.function(
             g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p + lookups, p_bar)}
         ),

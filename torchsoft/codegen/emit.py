@@ -21,22 +21,21 @@ from torchsoft.codegen.operations import Nodes
 from torchsoft.codegen.trace import Trace, UnknownOperation, traced
 
 POINTER = "ptr" if llvm.llvm_version_info[0] >= 17 else "double*"
-INSTRUCTIONS = {
-    "add": "fadd double {}, {}",
-    "sub": "fsub double {}, {}",
-    "mul": "fmul double {}, {}",
-    "div": "fdiv double {}, {}",
-    "neg": "fneg double {}",
-    "lt": "fcmp olt double {}, {}",
-    "le": "fcmp ole double {}, {}",
-    "gt": "fcmp ogt double {}, {}",
-    "ge": "fcmp oge double {}, {}",
-    "eq": "fcmp oeq double {}, {}",
-    "ne": "fcmp une double {}, {}",
-    "and": "and i1 {}, {}",
-    "or": "or i1 {}, {}",
-    "not": "xor i1 {}, true",
-    "select": "select i1 {}, double {}, double {}",
+INSTRUCTIONS = {  # F is the type of a number, B that of a truth value
+    "add": "fadd F {}, {}",
+    "sub": "fsub F {}, {}",
+    "mul": "fmul F {}, {}",
+    "div": "fdiv F {}, {}",
+    "neg": "fneg F {}",
+    "lt": "fcmp olt F {}, {}",
+    "le": "fcmp ole F {}, {}",
+    "gt": "fcmp ogt F {}, {}",
+    "ge": "fcmp oge F {}, {}",
+    "eq": "fcmp oeq F {}, {}",
+    "ne": "fcmp une F {}, {}",
+    "and": "and B {}, {}",
+    "or": "or B {}, {}",
+    "select": "select B {}, F {}, F {}",
 }
 FUNCTIONS = {  # one argument, but for pow and atan2
     "abs": "llvm.fabs.f64",
@@ -52,71 +51,131 @@ _engines: dict[str, llvm.ExecutionEngine] = {}
 
 def function(
     g: Graph, name: str, pointers: Iterable[str], results: Mapping[str, Iterable[int]],
-    added: Mapping[str, Iterable[tuple[int, int]]] | None = None,
+    added: Mapping[str, Iterable[tuple[int, int]]] | None = None, lanes: int = 1,
 ) -> str:  # fmt: skip
     """IR of void `name`(pointers...), which stores the nodes of `results` where the pointer of that
     name points.
 
     `added` has pairs of nodes, a parameter or a look-up of one and what is added where it stands
-    from that pointer on.
+    from that pointer on. With several `lanes` it is the function of as many x at once, entry by
+    entry side by side, as are the results, and of one p.
     """
-    text: dict[int, str] = {}
-    lines = [f"define void @{name}({', '.join(f'{POINTER} %{p}' for p in pointers)}) nounwind {{"]
+    body = _Body(g, lanes)
     for letter, nodes in results.items():
         for index, node in enumerate(nodes):
-            lines += _evaluation(g, node, text)
-            lines.append(
-                f"%{letter}{index} = getelementptr double, {POINTER} %{letter}, i64 {index}"
-            )
-            lines.append(f"store double {text[node]}, {POINTER} %{letter}{index}")
+            body.store(letter, index, node)
     for letter, pairs in (added or {}).items():
         for index, (target, node) in enumerate(pairs):
-            if g.value(node) == 0.0:
+            if g.value(node) != 0.0:
+                body.add(letter, index, target, node)
+    head = f"define void @{name}({', '.join(f'{POINTER} %{p}' for p in pointers)}) nounwind {{"
+    return "\n".join([head, *body.lines, "ret void", "}"])
+
+
+class _Body:
+    """Instructions of a function, with the name of every value that they have made."""
+
+    def __init__(self, g: Graph, lanes: int) -> None:
+        self.g, self.lanes = g, lanes
+        self.lines: list[str] = []
+        self.text: dict[int, str] = {}
+        many = lanes > 1
+        self.number, self.truth = (f"<{lanes} x {t}>" if many else t for t in ("double", "i1"))
+
+    def store(self, letter: str, index: int, node: int) -> None:
+        """Store a node as entry `index` from the pointer on."""
+        self.evaluate(node)
+        place, at = f"%{letter}{index}", index * self.lanes
+        self.lines += [
+            f"{place} = getelementptr double, {POINTER} %{letter}, i64 {at}",
+            f"store {self.number} {self.text[node]}, {POINTER} {place}, align 8",
+        ]
+
+    def add(self, letter: str, index: int, target: int, node: int) -> None:
+        """Add a node where the target stands, from the pointer on."""
+        for needed in (node, *self.g.operands(target)):
+            self.evaluate(needed)
+        place = f"%{letter}{index}"
+        operands = [self.text[a] for a in self.g.operands(target)]
+        self.lines += [
+            *_address(self.g, target, letter, place, operands),
+            f"{place}.old = load double, {POINTER} {place}",
+            f"{place}.new = fadd double {place}.old, {self.text[node]}",
+            f"store double {place}.new, {POINTER} {place}",
+        ]
+
+    def evaluate(self, root: int) -> None:
+        """Give `root` its value."""
+        g, text, pending = self.g, self.text, [root]
+        while pending:
+            node = pending.pop()
+            if node in text:
                 continue
-            lines += _evaluation(g, node, text)
-            for needed in g.operands(target):
-                lines += _evaluation(g, needed, text)
-            place = f"%{letter}{index}"
-            lines += _address(g, target, letter, place, [text[a] for a in g.operands(target)])
-            lines.append(f"{place}.old = load double, {POINTER} {place}")
-            lines.append(f"{place}.new = fadd double {place}.old, {text[node]}")
-            lines.append(f"store double {place}.new, {POINTER} {place}")
-    return "\n".join([*lines, "ret void", "}"])
+            op = g.ops[node]
+            needed = g.operands(node)
+            missing = [a for a in needed if a not in text]
+            if missing:
+                pending += [node, *reversed(missing)]
+                continue
+            if op == "constant":
+                text[node] = self.literal(g.args[node][0])
+            elif op in NAMED:
+                text[node] = text[g.args[node][0]]
+            else:
+                text[node] = f"%v{node}"
+                self.lines += self.instruction(node, [text[a] for a in needed])
 
+    def literal(self, value: float | bool) -> str:
+        """A constant in every lane."""
+        one, kind = _literal(value), "i1" if isinstance(value, bool) else "double"
+        return one if self.lanes == 1 else f"<{', '.join([f'{kind} {one}'] * self.lanes)}>"
 
-def _evaluation(g: Graph, root: int, text: dict[int, str]) -> Iterator[str]:
-    """The instructions that give `root` its value, and the name of every value in `text`."""
-    pending = [root]
-    while pending:
-        node = pending.pop()
-        if node in text:
-            continue
-        op = g.ops[node]
-        needed = g.operands(node)
-        missing = [a for a in needed if a not in text]
-        if missing:
-            pending += [node, *reversed(missing)]
-            continue
-        if op == "constant":
-            text[node] = _literal(g.args[node][0])
-        elif op in NAMED:
-            text[node] = text[g.args[node][0]]
+    def instruction(self, node: int, operands: list[str]) -> Iterator[str]:
+        g, op, v = self.g, self.g.ops[node], f"%v{node}"
+        if op in LEAVES:
+            at = g.args[node][0]
+            if op == "x" and self.lanes > 1:
+                yield f"%a{node} = getelementptr double, {POINTER} %x, i64 {at * self.lanes}"
+                yield f"{v} = load {self.number}, {POINTER} %a{node}, align 8"
+                return
+            yield from _address(g, node, op, f"%a{node}", operands)
+            one = v if self.lanes == 1 else f"{v}.0"
+            yield f"{one} = load double, {POINTER} %a{node}"
+            if self.lanes > 1:  # of a parameter, in every lane
+                yield f"{v}.1 = insertelement {self.number} undef, double {one}, i32 0"
+                yield (
+                    f"{v} = shufflevector {self.number} {v}.1, {self.number} undef, "
+                    f"<{self.lanes} x i32> zeroinitializer"
+                )
+        elif op in INSTRUCTIONS:
+            text = INSTRUCTIONS[op].replace("F", self.number).replace("B", self.truth)
+            yield f"{v} = {text.format(*operands)}"
+        elif op == "not":
+            yield f"{v} = xor {self.truth} {operands[0]}, {self.literal(True)}"
+        elif self.lanes == 1:
+            yield from self.called(node, v, operands)
+        else:  # lane by lane
+            before = "undef"
+            for lane in range(self.lanes):
+                own = [f"{v}.{lane}.{i}" for i in range(len(operands))]
+                for name, operand in zip(own, operands):
+                    yield f"{name} = extractelement {self.number} {operand}, i32 {lane}"
+                yield from self.called(node, f"{v}.{lane}", own)
+                after = v if lane == self.lanes - 1 else f"{v}.{lane}.all"
+                yield (
+                    f"{after} = insertelement {self.number} {before}, double {v}.{lane}, i32 {lane}"
+                )
+                before = after
+
+    def called(self, node: int, name: str, operands: list[str]) -> Iterator[str]:
+        """A function, or a look-up, of single numbers."""
+        op = self.g.ops[node]
+        if op == "lookup":
+            yield from _address(self.g, node, "p", f"{name}.at", operands)
+            yield f"{name} = load double, {POINTER} {name}.at"
         else:
-            text[node] = f"%v{node}"
-            yield from _instruction(g, node, [text[a] for a in needed])
-
-
-def _instruction(g: Graph, node: int, operands: list[str]) -> Iterator[str]:
-    op = g.ops[node]
-    if op in LEAVES or op == "lookup":
-        yield from _address(g, node, op if op in LEAVES else "p", f"%a{node}", operands)
-        yield f"%v{node} = load double, {POINTER} %a{node}"
-    elif op in INSTRUCTIONS:
-        yield f"%v{node} = {INSTRUCTIONS[op].format(*operands)}"
-    else:
-        yield (
-            f"%v{node} = call double @{FUNCTIONS[op]}({', '.join('double ' + a for a in operands)})"
-        )
+            given = ", ".join("double " + a for a in operands)
+            yield f"{name} = call double @{FUNCTIONS[op]}({given})"
 
 
 def _address(g: Graph, node: int, pointer: str, name: str, operands: list[str]) -> Iterator[str]:

@@ -36,7 +36,7 @@ from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
 from torchsoft.physics.validity import tried
-from torchsoft.solve.kernel.arrays import MOTION, WRENCH
+from torchsoft.solve.kernel.arrays import LANES, MOTION, WRENCH
 
 
 class LawSet(NamedTuple):
@@ -162,17 +162,18 @@ def compiled_law(
     differentiated: int,
     points: bool = False,
     conjugates: int | None = None,
+    lanes: int = 1,
     **modules: Any,
 ) -> Law:
     """The law of a function of modules and x (size,), differentiable in the first inputs and in the
     parameters `names`, of which it may not use all; `points` says that it is the law of a contact
-    point, whatever the others do; `conjugates` are those of `compile_law`. Raises `UnknownOperation` naming the line of a law that cannot be
+    point, whatever the others do; `conjugates` and `lanes` are those of `compile_law`. Raises `UnknownOperation` naming the line of a law that cannot be
     compiled."""
     decided = tuple((name, structure(module)) for name, module in modules.items())
     shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
     with _compiling:
         known = all(part is not None for _, part in decided)
-        key = (function, decided, shapes, linear, differentiated, conjugates)
+        key = (function, decided, shapes, linear, differentiated, conjugates, lanes)
         if known and key in _laws:
             return _laws[key]
         law, _ = as_law(function, modules)
@@ -189,6 +190,7 @@ def compiled_law(
                 linear,
                 differentiated,
                 conjugates,
+                lanes,
             )
 
         if not known:  # user code is known by a trace only, and may change any time
@@ -205,7 +207,7 @@ def compiled_law(
                 check_pointwise(law, example, names)
             _laws[key] = compile_law(
                 law, example, names, linear=linear, differentiated=differentiated,
-                conjugates=conjugates,
+                conjugates=conjugates, lanes=lanes,
             )  # fmt: skip
         return _laws[key]
 
@@ -358,7 +360,7 @@ def element_law(name: str, material: Material, factors: Tensor) -> tuple[Law, di
     size = 2 * CORNERS + CONSTANTS
     try:
         law = compiled_law(
-            parameters, element_potentials, size, CORNERS, 2 * CORNERS, conjugates=CORNERS,
+            parameters, element_potentials, size, CORNERS, 2 * CORNERS, conjugates=CORNERS, lanes=LANES,
             material=material, factors=Factors(factors.detach()),
         )  # fmt: skip
     except UnknownOperation as error:

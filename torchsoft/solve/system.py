@@ -36,6 +36,7 @@ from torchsoft.physics.validity import (
 from torchsoft.solve.kernel import arrays
 from torchsoft.solve.kernel.arrays import (
     CONDENSED,
+    LANES,
     NODAL,
     Bodies,
     Condensed,
@@ -218,6 +219,7 @@ class Compiled:
         pads = [pad if pad.nodal else None for pad in rig.pads.values()]
         dofs = [0 if pad is None else 2 * pad.nodes for pad in pads]
         band = [0 if pad is None else 2 * spread(pad.corners // 2) + 1 for pad in pads]
+        elements = [0 if pad is None else -(-len(pad.corners) // LANES) * LANES for pad in pads]
         laws, starts, ends, density = list[Law | None](), list[int](), list[int](), list[int]()
         for name, pad in rig.pads.items():
             law, parameters = (
@@ -226,7 +228,8 @@ class Compiled:
             laws.append(law)
             starts.append(self._add_all(parameters))
             ends.append(self._count)
-            density.append(self._add(pad.material.rho * pad.material.depth))
+            own = pad.material.rho * pad.material.depth
+            density.append(self._add(own) if pad.nodal else -1)
         joined = lambda kind, *shape: np.concatenate(
             [np.zeros((0, *shape)), *(kind(pad) for pad in pads if pad is not None)]
         )
@@ -239,7 +242,7 @@ class Compiled:
         address = lambda name: [0 if law is None else getattr(law, name) for law in laws]
         return filled(
             Nodal, dof_start=np.cumsum([0, *dofs]),
-            element_start=np.cumsum([0, *(0 if pad is None else len(pad.corners) for pad in pads)]),
+            element_start=np.cumsum([0, *elements]),
             v_start=[slices["rates", name].start if pad.inertial else -1
                      for name, pad in rig.pads.items()],
             density_at=density, hold=[HELD if isinstance(pad.material, Hyperelastic) else np.inf
@@ -249,8 +252,8 @@ class Compiled:
             p_first=starts, p_last=ends,
             X=joined(lambda pad: pad.positions.numpy().ravel()),
             area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2)),
-            dof=joined(lambda pad: pad.corners, 8), constants=joined(
-                lambda pad: pad.constants, CONSTANTS),
+            dof=joined(lambda pad: lengthened(pad.corners, -1), 8),
+            constants=joined(lambda pad: lengthened(pad.constants, 0.0), CONSTANTS),
             surface=np.concatenate([np.zeros(0), *surface]),
         )  # fmt: skip
 
@@ -348,6 +351,12 @@ class Compiled:
                 for name in rig.contacts
             ),
         )  # fmt: skip
+
+
+def lengthened(rows: Any, value: float) -> Any:
+    """Rows of a pad's elements, with rows of one value up to a multiple of `LANES`."""
+    more = -len(rows) % LANES
+    return np.concatenate((rows, np.full((more, rows.shape[1]), value, rows.dtype)))
 
 
 def spread(corners: Index) -> int:

@@ -50,6 +50,9 @@ CORNERS = 8
 """Displacements of the four corners of an element: its law has them, their rates and the element's
 constants as inputs, and as outputs the forces on them and the power that it dissipates."""
 
+LANES = 4
+"""Elements whose law is called at once."""
+
 
 class Bodies(NamedTuple):
     """free (coordinates,): number among the free ones, or -1; signal (coordinates,): the one
@@ -112,7 +115,7 @@ class Nodal(NamedTuple):
     changes, band: the largest difference between dofs of one element, its
     place in the banded matrices; law addresses of its elements, ends of their parameters in p. Per
     dof: X, place of its node (its own coordinate), and area. Per element: its dofs, -1 where it is
-    bonded, and constants. surface: dof of every surface dof."""
+    bonded, and constants; their number is a multiple of `LANES`, the last without dofs. surface: dof of every surface dof."""
 
     dof_start: Index
     element_start: Index
@@ -303,12 +306,13 @@ SCRATCH: dict[str, dict[str, str]] = {
         "pads 2 2": "B",  # the base's reaction per velocity
         "banded": "band",
         "solves": "solves",
-        # of every element: inputs of its law, and held its derivatives with the displacements and
-        # rates that they are of
-        "elements element_inputs": "element_x",
-        "elements 8 16": "element_J",
-        "elements 16": "element_at",
-        "9": "element",
+        # of every group of elements: inputs of its law, and held its derivatives with the
+        # displacements and rates that they are of
+        "groups element_inputs lanes": "element_x",
+        "groups 8 16 lanes": "element_J",
+        "groups 16 lanes": "element_at",
+        "9 lanes": "element",
+        "element_inputs": "element_alone",
         # of every nodal pad held: its dofs' rates per unit force on the touched nodes, row by row
         "responses": "responses",
         "state": "k",
@@ -373,7 +377,7 @@ SCRATCH: dict[str, dict[str, str]] = {
 }
 """Arrays that the kernels write to, by name and shape: they allocate nothing."""
 
-DIMENSIONS = (Array, Matrix, Cube), (Index, IndexMatrix)
+DIMENSIONS = (Array, Matrix, Cube, Hypercube), (Index, IndexMatrix)
 
 
 def declared(kind: str) -> Any:
@@ -533,7 +537,7 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         "inputs": MOTION + states + 2, "jacobian": (WRENCH + states + 2) * (MOTION + states),
         "most": max(WRENCH + states + 2, CORNERS),
         "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
-        "elements": int(s.nodal_element_start[-1]),
+        "lanes": LANES, "groups": int(s.nodal_element_start[-1]) // LANES,
         "dofs": int(s.nodal_dof_start[-1]), "banded": int((dofs * band).sum()),
         "element_inputs": 2 * CORNERS + s.nodal_constants.shape[1], "parameters": len(s.p),
         "recorded": recorded_size(s),
@@ -551,7 +555,9 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
             name: np.zeros(lengths, np.int64 if whole else np.float64) for name in names.split()
         }
     if kind == "Work":
-        made["element_x"][:, 2 * CORNERS :] = s.nodal_constants
+        constants = s.nodal_constants
+        grouped = constants.reshape(sizes["groups"], LANES, constants.shape[1])
+        made["element_x"][:, 2 * CORNERS :] = grouped.swapaxes(1, 2)
     return KINDS[kind](**made)
 
 

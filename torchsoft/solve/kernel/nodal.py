@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled, inlined
-from torchsoft.solve.kernel.arrays import CORNERS
+from torchsoft.solve.kernel.arrays import CORNERS, LANES
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback, call_value
 from torchsoft.solve.kernel.linear import (
     add,
@@ -62,30 +62,29 @@ def change_of_speed(s: Any, w: Any, pad: int, i: int, y: Array, v_base: float) -
 
 
 @compiled
-def element_inputs(s: Any, w: Any, pad: int, e: int, y: Array, a: float) -> None:
-    """Displacements and rates of the corners of element e at the stage's end into its row of
-    w.element_x, whose constants stand there."""
-    x, i0, U = w.element_x[e], s.nodal_dof_start[pad], s.pad_y_start[pad]
-    for c in range(CORNERS):
-        dof = s.nodal_dof[e, c]
-        x[c], x[CORNERS + c] = 0.0, 0.0
-        if dof >= 0:
-            rate = w.rate[i0 + dof]
-            x[c], x[CORNERS + c] = y[U + dof] + a * rate, rate
+def groups(s: Any, pad: int) -> tuple[int, int]:
+    """Ends of a pad's elements among groups of `LANES`, whose law is called at once."""
+    return s.nodal_element_start[pad] // LANES, s.nodal_element_start[pad + 1] // LANES
+
+
+@compiled
+def element_inputs(s: Any, w: Any, pad: int, g: int, y: Array, a: float) -> None:
+    """Displacements and rates of the corners of a group of elements at the stage's end into
+    w.element_x, where their constants stand."""
+    x, i0, U = w.element_x[g], s.nodal_dof_start[pad], s.pad_y_start[pad]
+    for lane in range(LANES):
+        for c in range(CORNERS):
+            dof = s.nodal_dof[g * LANES + lane, c]
+            x[c, lane], x[CORNERS + c, lane] = 0.0, 0.0
+            if dof >= 0:
+                rate = w.rate[i0 + dof]
+                x[c, lane], x[CORNERS + c, lane] = y[U + dof] + a * rate, rate
 
 
 @compiled
 def element_parameters(s: Any, pad: int) -> slice:
     """Places of the elements' parameters in p."""
     return slice(s.nodal_p_first[pad], s.nodal_p_last[pad])
-
-
-@compiled
-def scatter(s: Any, pad: int, e: int, values: Array, out: Array) -> None:
-    """Add the corners' values (8,) to those of the dofs."""
-    for c in range(CORNERS):
-        if s.nodal_dof[e, c] >= 0:
-            out[s.nodal_dof_start[pad] + s.nodal_dof[e, c]] += values[c]
 
 
 @compiled
@@ -107,14 +106,17 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
     first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
     own = s.p[element_parameters(s, pad)]
     w.internal[first:last], w.noise[first:last], w.power[pad] = 0.0, 0.0, 0.0
-    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_inputs(s, w, pad, e, y, a)
-        call_value(s.nodal_value[pad], w.element_x[e], own, w.element)
-        scatter(s, pad, e, w.element, w.internal)
-        w.power[pad] += w.element[CORNERS]
-        for c in range(CORNERS):
-            w.element[c] = abs(w.element[c])
-        scatter(s, pad, e, w.element, w.noise)
+    low, high = groups(s, pad)
+    for g in range(low, high):
+        element_inputs(s, w, pad, g, y, a)
+        call_value(s.nodal_value[pad], w.element_x[g], own, w.element)
+        for lane in range(LANES):
+            w.power[pad] += w.element[CORNERS, lane]
+            for c in range(CORNERS):
+                dof = s.nodal_dof[g * LANES + lane, c]
+                if dof >= 0:
+                    w.internal[first + dof] += w.element[c, lane]
+                    w.noise[first + dof] += abs(w.element[c, lane])
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
     load = w.load_dof
     load[first:last] = 0.0
@@ -142,14 +144,18 @@ def matrix(s: Any, w: Any, pad: int) -> Array:
 
 
 @compiled
-def strained(s: Any, w: Any, e: int, a: float) -> float:
-    """A bound of how far element e is strained from where its derivatives are
-    held."""
-    x, held, total = w.element_x[e], w.element_at[e], 0.0
-    for c in range(CORNERS):
-        off = abs(x[c] - held[c]) + a * abs(x[CORNERS + c] - held[CORNERS + c])
-        total += off * abs(s.nodal_constants[e, c])
-    return total
+def strained(s: Any, w: Any, g: int, a: float) -> float:
+    """A bound of how far any element of a group is strained from where its derivatives are held."""
+    x, held, worst = w.element_x[g], w.element_at[g], 0.0
+    for lane in range(LANES):
+        total = 0.0
+        for c in range(CORNERS):
+            off = abs(x[c, lane] - held[c, lane])
+            off += a * abs(x[CORNERS + c, lane] - held[CORNERS + c, lane])
+            total += off * abs(x[2 * CORNERS + c, lane])  # gradients at the centre
+        if not total <= worst:
+            worst = total
+    return worst
 
 
 @compiled
@@ -157,11 +163,12 @@ def linearise(s: Any, w: Any, pad: int, y: Array, a: float, hold: float) -> bool
     """Derivatives of the elements' forces, w.element_J, anew where they are strained by more than
     `hold`; whether any are."""
     own, changed = s.p[element_parameters(s, pad)], False
-    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_inputs(s, w, pad, e, y, a)
-        if w.held[pad] == 0.0 or not strained(s, w, e, a) <= hold:
-            call_linearise(s.nodal_linearise[pad], w.element_x[e], own, w.element, w.element_J[e])
-            put(w.element_x[e, : 2 * CORNERS], w.element_at[e])
+    low, high = groups(s, pad)
+    for g in range(low, high):
+        element_inputs(s, w, pad, g, y, a)
+        if w.held[pad] == 0.0 or not strained(s, w, g, a) <= hold:
+            call_linearise(s.nodal_linearise[pad], w.element_x[g], own, w.element, w.element_J[g])
+            put(w.element_x[g, : 2 * CORNERS], w.element_at[g])
             changed = True
     return changed
 
@@ -180,13 +187,14 @@ def factor(s: Any, w: Any, pad: int, a: float) -> None:
     width, A = 2 * band + 1, matrix(s, w, pad)
     A[:] = 0.0
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        J = w.element_J[e]
+        J, lane = w.element_J[e // LANES], e % LANES
         for c in range(CORNERS):
             row = s.nodal_dof[e, c]
             for d in range(CORNERS if row >= 0 else 0):
                 column = s.nodal_dof[e, d]
                 if column >= 0:
-                    A[row * width + band + column - row] += a * J[c, d] + J[c, CORNERS + d]
+                    by = a * J[c, d, lane] + J[c, CORNERS + d, lane]
+                    A[row * width + band + column - row] += by
     for i in range(last - first):
         A[i * width + band] += mass_rate(s, pad, first + i, a)
     factor_banded(A, last - first, band)
@@ -411,13 +419,22 @@ def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: 
 
 
 @compiled
+def single(w: Any, e: int) -> None:
+    """Inputs of the law of element e, out of its group, into w.element_alone."""
+    x = w.element_x[e // LANES]
+    for i in range(w.element_alone.size):
+        w.element_alone[i] = x[i, e % LANES]
+
+
+@compiled
 def element_push(
     s: Any, w: Any, z: Any, pad: int, e: int, du: Array, dv: Array, dp: Array, rates: bool,
     out: Array,
 ) -> None:  # fmt: skip
     """Add the tangents of element e's forces to `out` (dofs, m): by displacements du (dofs, m), by
     the parameters, and with `rates` by rates dv (dofs, m)."""
-    own, J, i0 = element_parameters(s, pad), w.element_J[e], s.nodal_dof_start[pad]
+    own, J, lane = element_parameters(s, pad), w.element_J[e // LANES], e % LANES
+    i0 = s.nodal_dof_start[pad]
     moved = False
     for j in range(own.start, own.stop):
         for k in range(dp.shape[1]):
@@ -429,14 +446,15 @@ def element_push(
         for d in range(CORNERS):
             dof = s.nodal_dof[e, d]
             if dof >= 0:
-                add(J[c, d], du[dof], out[i0 + row])
+                add(J[c, d, lane], du[dof], out[i0 + row])
                 if rates:
-                    add(J[c, CORNERS + d], dv[i0 + dof], out[i0 + row])
+                    add(J[c, CORNERS + d, lane], dv[i0 + dof], out[i0 + row])
         if moved:
+            single(w, e)
             weights, gradient = z.weights, z.gradient[: own.stop - own.start]
             weights[:], gradient[:] = 0.0, 0.0
             weights[c] = 1.0
-            call_pullback(s.nodal_pullback[pad], w.element_x[e], s.p[own], weights, gradient)
+            call_pullback(s.nodal_pullback[pad], w.element_alone, s.p[own], weights, gradient)
             for j in range(gradient.size):
                 add(gradient[j], dp[own.start + j], out[i0 + row])
 
@@ -453,7 +471,6 @@ def push(
     du, at = dy[U : U + last - first], s.nodal_density_at[pad]
     free[first:last] = 0.0
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_inputs(s, w, pad, e, y, a)
         element_push(s, w, z, pad, e, du, free, dp, False, free)
     for i in range(first, last):
         for k in range(m):
@@ -548,7 +565,6 @@ def push_felt(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, d
     out[first:last] = 0.0
     du = dy[U : U + last - first]
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_inputs(s, w, pad, e, y, a)
         element_push(s, w, z, pad, e, du, z.rate_of, dp, True, out)
     for k in range(m):
         x = z_axis = moment = 0.0
@@ -571,14 +587,16 @@ def element_pull(
 ) -> None:
     """Add to the cotangents of displacements and rates (dofs,) and of the parameters those of the
     forces of element e, `bar` (8,)."""
-    own, J, i0 = element_parameters(s, pad), w.element_J[e], s.nodal_dof_start[pad]
-    call_pullback(s.nodal_pullback[pad], w.element_x[e], s.p[own], bar, p_bar[own])
+    own, J, lane = element_parameters(s, pad), w.element_J[e // LANES], e % LANES
+    i0 = s.nodal_dof_start[pad]
+    single(w, e)
+    call_pullback(s.nodal_pullback[pad], w.element_alone, s.p[own], bar, p_bar[own])
     for d in range(CORNERS):
         dof = s.nodal_dof[e, d]
         if dof >= 0:
             for c in range(CORNERS):
-                u_bar[dof] += J[c, d] * bar[c]
-                rate_bar[i0 + dof] += J[c, CORNERS + d] * bar[c]
+                u_bar[dof] += J[c, d, lane] * bar[c]
+                rate_bar[i0 + dof] += J[c, CORNERS + d, lane] * bar[c]
 
 
 @compiled
@@ -601,7 +619,6 @@ def pull_felt(
         bar[i] = wrench[0] + x - s.nodal_X[i + 1] * wrench[2]
         bar[i + 1] = wrench[1] + z_axis + s.nodal_X[i] * wrench[2]
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_inputs(s, w, pad, e, y, a)
         gather(s, pad, e, 1.0, bar, z.element)
         element_pull(s, w, pad, e, z.element, y_bar[U : U + last - first], z.rate_of, p_bar)
 
@@ -663,7 +680,6 @@ def pull_state(
             y_bar[U + s.nodal_surface[2 * node + r]] += z.u[node, r]
     solve_back(s, w, pad, own[first:last])  # now the multiplier of the pad's equation
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_inputs(s, w, pad, e, y, a)
         gather(s, pad, e, -1.0, own, z.element)
         # the rates' cotangents are spent: what comes to them here is not read
         element_pull(s, w, pad, e, z.element, y_bar[U : U + last - first], z.rate_of, p_bar)
