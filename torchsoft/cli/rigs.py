@@ -84,7 +84,7 @@ def run_rig(options: argparse.Namespace) -> int:
         f"injected; written to {out}"
     )
     said = {one.where for one in found}
-    for one in notes(largest_strains(done.trajectory)):
+    for one in notes(done.trajectory, largest_strains(done.trajectory)):
         if one.where not in said:
             say(one, error=True)
     return 0

@@ -136,7 +136,7 @@ class Graph:
         return self.guarded(adjoint, self("div", adjoint, divisor))
 
     def guarded(self, adjoint: int, result: int) -> int:
-        """`result`, and 0 where the adjoint is exactly 0; its own derivative is that of `result`."""
+        """`result`, and 0 where the adjoint is exactly 0; differentiated again it is `result`."""
         value = self("select", self("eq", adjoint, self.zero), self.zero, result)
         return value if value == result else self("guarded", value, result)
 

@@ -469,7 +469,7 @@ class Graph(nn.Module):
         law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
         if pad.nodal:
             at, none = pad.at_corners(u), torch.zeros_like(u)
-            internal = lambda rate: pad.element_forces(*torch.broadcast_tensors(at, rate))
+            internal = lambda rate: pad.element_forces(at, rate)
             balance = Balance(pad, internal, law if own else None)
             u_dot, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
             u_dot = balance.corrected(u_dot, factors)

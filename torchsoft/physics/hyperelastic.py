@@ -8,7 +8,8 @@ negative, and small strains are those of `KelvinVoigt`.
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Annotated
+from inspect import signature
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -24,12 +25,12 @@ Coefficients = Annotated[
 Exponents = Annotated[Iterable[float], Quantity("1", -50.0, 50.0, "exponents of the stretches")]
 
 ALIKE = 1e-6
-"""Largest relative difference between the moduli that a material states and those of its energy, and
-largest stress of the undeformed material over its shear modulus."""
+"""Largest relative difference between the moduli that a material states and those of its energy,
+and largest stress of the undeformed material over its shear modulus."""
 
 SERIES, SMALL = 12, 0.02
-"""Terms of the series for sums of powers of two stretches, and up to what difference between them it
-is taken: their closed form has no derivative where they are equal."""
+"""Terms of the series for sums of powers of two stretches, and up to what difference between them
+it is taken: their closed form has no derivative where they are equal."""
 
 
 class Hyperelastic(Material):
@@ -239,9 +240,9 @@ def power(x: Tensor, exponent: Tensor | float) -> Tensor:
 
 
 def invariants(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """First and second invariant of the distortion, J^(-2/3) tr C and J^(-4/3) (tr^2 C - tr C^2) / 2
-    with C = F^T F, and J = det F, (...) each, of F (..., 3, 3) with the entries xx, xy, yx, yy and
-    zz."""
+    """First and second invariant of the distortion, J^(-2/3) tr C and J^(-4/3) (tr^2 C - tr C^2) /
+    2 with C = F^T F, and J = det F, (...) each, of F (..., 3, 3) with the entries xx, xy, yx, yy
+    and zz."""
     xx, xy, yx, yy, zz = (F[..., i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 2)))
     area = xx * yy - xy * yx
     J, trace = area * zz, xx**2 + xy**2 + yx**2 + yy**2
@@ -258,3 +259,25 @@ KINDS: Mapping[str, type[Material]] = {
 }
 """The materials by their names in files; their tables have the names of the constructors'
 arguments."""
+
+
+def described(material: Material) -> dict[str, Any] | None:
+    """Kind and numbers of a material of this package, None for one of the user's own."""
+    kind = next((name for name, own in KINDS.items() if type(material) is own), None)
+    if kind is None:
+        return None
+    if isinstance(material, Ogden):
+        columns = zip(*material.series())
+        numbers = dict(zip(("mu", "alpha"), ([x.item() for x in column] for column in columns)))
+    else:
+        numbers = {}
+    for name in signature(KINDS[kind]).parameters:
+        if name not in numbers:
+            numbers[name] = getattr(material, name).item()
+    return {"kind": kind, **numbers}
+
+
+def again(described: Mapping[str, Any]) -> Any:
+    """The material of a kind with its numbers."""
+    numbers = {name: value for name, value in described.items() if name != "kind"}
+    return KINDS[described["kind"]](**numbers)

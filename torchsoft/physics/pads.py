@@ -237,7 +237,8 @@ class Pad(nn.Module):
     def element_forces(self, u: Tensor, rate: Tensor | None = None) -> Tensor:
         """Forces (..., elements, 8) [N] on the corners of a nodal pad's elements, by default at
         rest."""
-        recorded, still = torch.is_grad_enabled(), torch.zeros_like(u) if rate is None else rate
+        u, still = torch.broadcast_tensors(u, torch.zeros_like(u) if rate is None else rate)
+        recorded = torch.is_grad_enabled()
         with torch.enable_grad():
             if not (recorded and u.requires_grad):
                 u = u.detach().requires_grad_()

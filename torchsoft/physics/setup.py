@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
+from torchsoft.physics.hyperelastic import Hyperelastic, again, described
 from torchsoft.physics.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
 from torchsoft.physics.mesh.mesh import gradients, strains
 from torchsoft.physics.names import effort_channel
@@ -38,10 +39,17 @@ def strain_operator(mesh: Mesh) -> Array:
     return strains(gradients(mesh.nodes[mesh.elements], 0.0, 0.0)[1])
 
 
+@lru_cache(maxsize=8)
+def slopes(mesh: Mesh) -> Array:
+    """Gradients (elements, 4, 2) [1/m] of the shape functions at the centres of the elements."""
+    return gradients(mesh.nodes[mesh.elements], 0.0, 0.0)[1]
+
+
 @dataclass(frozen=True)
 class PadSetup:
     """A pad as it was: its mesh, own axes (2, 2) and origin [m] in the frame of its base (a body's
-    name, or the ground), relaxed modulus E [Pa], nu and depth [m], contact points an element.
+    name, or the ground), relaxed modulus E [Pa], nu and depth [m], contact points an element; of
+    one at finite strain its energy, a kind with its numbers, None for one of the user's own.
 
     Fields are (..., mesh nodes or elements, components), in the pad's own axes.
     """
@@ -55,14 +63,24 @@ class PadSetup:
     E: float
     nu: float
     depth: float
+    finite: bool = False
+    energy: dict[str, Any] | None = None
 
     @classmethod
     def of(cls, pad: Pad) -> Self:
         """A pad as it is now."""
+        material = pad.material
+        finite = isinstance(material, Hyperelastic)
         return cls(
             pad.mesh, pad.axes.numpy(), pad.origin.numpy(), pad.base, pad.inertial, pad.points,
-            *(getattr(pad.material, x).item() for x in ("E", "nu", "depth")),
+            *(getattr(material, x).item() for x in ("E", "nu", "depth")),
+            finite, described(material) if finite else None,
         )  # fmt: skip
+
+    @property
+    def nodal(self) -> bool:
+        """Whether a run records the displacements of all nodes."""
+        return self.inertial or self.finite
 
     def placed(self, own: Array) -> Array:
         """Places (..., 2) in the pad's own frame, in the base's."""
@@ -89,7 +107,7 @@ class PadSetup:
         mesh = self.mesh
         own = (u.reshape(-1, *u.shape[-2:]) @ self.axes).reshape(-1, 2 * u.shape[-2])
         free = np.zeros((len(own), 2 * len(mesh.free)))
-        if self.inertial:
+        if self.nodal:
             free[:] = own
         else:
             factor, interior, K_is = interior_solver(mesh, self.nu)
@@ -101,16 +119,29 @@ class PadSetup:
 
     def surface_points(self, u: Array) -> Array:
         """Places (..., points, 2) [m] of the contact points in the frame of the base."""
-        own = u[..., self.mesh.surface, :] if self.inertial else u
+        own = u[..., self.mesh.surface, :] if self.nodal else u
         nodes = self.placed(self.mesh.nodes[self.mesh.free[self.mesh.surface]]) + own
         return self.spread @ nodes
 
     def strain(self, displacement: Array) -> Array:
         """Strains (e_xx, e_yy, e_xy) at the centres of the elements (..., elements, 3), of
-        displacements of all nodes."""
+        displacements of all nodes; of a pad at finite strain they are U - 1, F = R U."""
+        if self.finite:
+            F = self.gradient(displacement)
+            C = np.swapaxes(F, -1, -2) @ F
+            J = np.linalg.det(F)
+            U = (C + J[..., None, None] * np.eye(2)) / np.sqrt(
+                np.trace(C, axis1=-2, axis2=-1) + 2 * J
+            )[..., None, None]
+            return np.stack((U[..., 0, 0] - 1, U[..., 1, 1] - 1, U[..., 0, 1]), -1)
         nodes = displacement[..., self.mesh.elements, :]
         flat = nodes.reshape(*nodes.shape[:-2], 8)
         return np.einsum("eij,...ej->...ei", strain_operator(self.mesh), flat) * [1.0, 1.0, 0.5]
+
+    def gradient(self, displacement: Array) -> Array:
+        """F (..., elements, 2, 2) at the centres of the elements."""
+        nodes = displacement[..., self.mesh.elements, :]
+        return np.eye(2) + np.einsum("eki,...ekj->...eji", slopes(self.mesh), nodes)
 
     def largest_strain(self, u: Array) -> Array:
         """Largest principal strain (...) at the centres of the elements, by its modulus, of
@@ -119,13 +150,37 @@ class PadSetup:
         mean, half = 0.5 * (e[..., 0] + e[..., 1]), 0.5 * (e[..., 0] - e[..., 1])
         return (np.abs(mean) + np.hypot(half, e[..., 2])).max(-1)
 
-    def stress(self, strain: Array) -> Array:
+    def stress(self, displacement: Array) -> Array:
         """Elastic stresses (s_xx, s_yy, s_zz, s_xy) [Pa] (..., elements, 4) of the relaxed material
-        in plane strain: the part that the dashpots carry is not in them."""
+        in plane strain, at the centres of the elements, of displacements of all nodes; Cauchy's of
+        a pad at finite strain. The part that the dashpots carry is not in them.
+
+        Raises `ValueError` for an energy of the user's own, which a file does not hold.
+        """
+        if self.finite:
+            return self._cauchy_stress(self.gradient(displacement))
+        strain = self.strain(displacement)
         lame_lambda, lame_mu = lame_moduli(self.E, self.nu)
         mean = lame_lambda * (strain[..., 0] + strain[..., 1])
         parts = [mean + 2 * lame_mu * strain[..., i] for i in (0, 1)]
         return np.stack((*parts, mean, 2 * lame_mu * strain[..., 2]), -1)
+
+    @torch.inference_mode(False)
+    def _cauchy_stress(self, F: Array) -> Array:
+        """P F^T / det F of the first Piola-Kirchhoff stress P = dW/dF."""
+        if self.energy is None:
+            raise ValueError(
+                "the strain energy of the pad is one of your own, which runs do not hold, so that "
+                "its stresses are not known; plot something else"
+            )
+        whole = torch.eye(3, dtype=torch.float64).repeat(*F.shape[:-2], 1, 1)
+        whole[..., :2, :2] = torch.from_numpy(F)
+        with torch.enable_grad():
+            W = again(self.energy).energy(whole.requires_grad_()).sum()
+            (P,) = torch.autograd.grad(W, whole)
+        stress = (P @ whole.detach().mT).numpy() / np.linalg.det(F)[..., None, None]
+        places = ((0, 0), (1, 1), (2, 2), (0, 1))
+        return np.stack([stress[..., i, j] for i, j in places], -1)
 
 
 def von_mises(stress: Array) -> Array:

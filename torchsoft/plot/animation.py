@@ -238,7 +238,7 @@ def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
     out = {}
     for name, pad in run.setup.pads.items():
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
-        stress = 1e-3 * pad.stress(pad.strain(whole))
+        stress = 1e-3 * pad.stress(whole)
         direct = {
             "von Mises stress": von_mises(stress),
             "pressure": -stress[..., :3].mean(-1),

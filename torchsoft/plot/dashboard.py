@@ -183,7 +183,7 @@ def stresses(axes: Axes, run: Trajectory) -> None:
     rows = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).round().astype(int))
     for (name, pad), colour in zip(run.setup.pads.items(), COLOURS * len(run.setup.pads)):
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
-        peak = 1e-3 * von_mises(pad.stress(pad.strain(whole))).max(-1)
+        peak = 1e-3 * von_mises(pad.stress(whole)).max(-1)
         timeline(axes, "von Mises,\nelastic [kPa]", run)
         axes.plot(run.t.numpy()[rows], peak, color=colour, label=f"pad {name}")
     axes.set_ylim(0, None)

@@ -91,10 +91,7 @@ def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
     rows, setup = [run.at(time) for time in times], run.setup
     u = {name: run.displacement[name][rows].detach().numpy() for name in setup.pads}
     whole = {name: pad.displacement(u[name]) for name, pad in setup.pads.items()}
-    stresses = {
-        name: 1e-3 * von_mises(pad.stress(pad.strain(whole[name])))
-        for name, pad in setup.pads.items()
-    }
+    stresses = {name: 1e-3 * von_mises(pad.stress(whole[name])) for name, pad in setup.pads.items()}
     meshes = {
         name: MM * pad.placed(pad.mesh.nodes + whole[name]) for name, pad in setup.pads.items()
     }

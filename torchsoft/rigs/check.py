@@ -14,6 +14,7 @@ import torch
 
 from torchsoft.diagnostic import SEVERITIES, Diagnostic
 from torchsoft.parallel import single_threaded
+from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.motion import hold
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.setup import PadSetup
@@ -83,7 +84,7 @@ def at_moments(e: Estimate) -> list[Diagnostic]:
             )
         )  # fmt: skip
     return [
-        *found, *presses(there), *strains(there), *drags(e, there), *softens(there),
+        *found, *presses(there), *strains(e, there), *drags(e, there), *softens(there),
         *swings(e, there), *slips(e, there),
     ]  # fmt: skip
 
@@ -136,11 +137,15 @@ def presses(there: list[Moment]) -> Iterator[Diagnostic]:
             )  # fmt: skip
 
 
-def strains(there: list[Moment]) -> Iterator[Diagnostic]:
-    """Warnings on pads that are indented beyond linear elasticity, and notes on strains that are
-    not small."""
+def strains(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
+    """Warnings on linear pads that are indented beyond linear elasticity, and notes on strains that
+    are not small."""
     rig = there[0].scene.rig
-    for name, soft in rig.pads.items():
+    linear = {
+        name: rig.pads[name] for name, pad in e.rig.pads.items()
+        if not isinstance(pad.material, Hyperelastic)
+    }  # fmt: skip
+    for name, soft in linear.items():
         pad = PadSetup.of(soft)
         u = torch.stack([rig.displacement(name, m.state) for m in there])
         parts = u.norm(dim=-1).amax(-1) / pad.mesh.height

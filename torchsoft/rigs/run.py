@@ -121,7 +121,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             "worst_imbalance_over_injected": run.energy_residual_rel,
         },
         "doubts": list(doubts(run, rig).values()),
-        "notes": [str(one) for one in notes(largest)],
+        "notes": [str(one) for one in notes(run, largest)],
         "stepping": vars(run.stats) | {"newton_per_step": run.stats.newton_per_step},
         "findings": [one._asdict() for one in found],
         "torchsoft": version("torchsoft"),
@@ -139,12 +139,12 @@ def largest_strains(run: Trajectory) -> dict[str, tuple[float, float]]:
     return found
 
 
-def notes(largest: dict[str, tuple[float, float]]) -> list[Diagnostic]:
-    """Notes on the `largest_strains` of a run."""
+def notes(run: Trajectory, largest: dict[str, tuple[float, float]]) -> list[Diagnostic]:
+    """Notes on the `largest_strains` of linear pads in a run."""
     return [
         Diagnostic("note", f"pads.{name}", strained(strain, time))
         for name, (strain, time) in largest.items()
-        if strain > SMALL_STRAIN
+        if strain > SMALL_STRAIN and not run.setup.pads[name].finite
     ]
 
 

@@ -96,7 +96,7 @@ def add_results(run: Trajectory, add: Add) -> None:
         if key in run.state.rates:
             meaning = f"velocities of the nodes of the pad {key}"
             add(f"velocity_{key}", ("time", *nodes), run.state.rates[key], "m/s", meaning)
-        else:
+        elif not run.setup.pads[key].nodal:
             meaning = f"nodal forces of the pad {key} that have set in, by retardation time"
             where = ("time", f"{key}_branch", *nodes)
             add(f"nodal_force_{key}", where, run.state.pads[key], "N", meaning)
@@ -229,13 +229,12 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
     pose, velocity, loads = (
         dict(zip(bodies, of(name).unbind(1))) for name in ("pose", "velocity", "loads")
     )
-    inertial = {name: pad.inertial for name, pad in setup.pads.items()}
-    displacement = by("displacement", list(inertial))
+    displacement = by("displacement", list(setup.pads))
     pads = {
-        name: displacement[name] if own else of(f"nodal_force_{name}")
-        for name, own in inertial.items()
+        name: displacement[name] if pad.nodal else of(f"nodal_force_{name}")
+        for name, pad in setup.pads.items()
     }
-    rates = by("velocity", [name for name, own in inertial.items() if own])
+    rates = by("velocity", [name for name, pad in setup.pads.items() if pad.inertial])
     friction = by("friction_state", [name for name in contacts if f"friction_state_{name}" in data])
     state = State(pads, by("stretch", contacts), pose, rates, velocity, friction)
     layout = Layout(
@@ -405,7 +404,7 @@ def write(run: Trajectory, path: Path, times: Sequence[float] | None = None) -> 
             points.append(pad.placed(pad.mesh.nodes) @ turn.T + [x, y])
             moved.append(own @ axes.T)
             strain = pad.strain(own)
-            stress, zero = pad.stress(strain), np.zeros(len(strain))
+            stress, zero = pad.stress(own), np.zeros(len(strain))
             fields["pad"].append(np.full(len(strain), i))
             for key, own_axes in (
                 ("strain", tensors(strain[:, 0], strain[:, 1], zero, strain[:, 2])),

@@ -167,8 +167,8 @@ def compiled_law(
 ) -> Law:
     """The law of a function of modules and x (size,), differentiable in the first inputs and in the
     parameters `names`, of which it may not use all; `points` says that it is the law of a contact
-    point, whatever the others do; `conjugates` and `lanes` are those of `compile_law`. Raises `UnknownOperation` naming the line of a law that cannot be
-    compiled."""
+    point, whatever the others do; `conjugates` and `lanes` are those of `compile_law`. Raises
+    `UnknownOperation` naming the line of a law that cannot be compiled."""
     decided = tuple((name, structure(module)) for name, module in modules.items())
     shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
     with _compiling:
@@ -360,8 +360,8 @@ def element_law(name: str, material: Material, factors: Tensor) -> tuple[Law, di
     size = 2 * CORNERS + CONSTANTS
     try:
         law = compiled_law(
-            parameters, element_potentials, size, CORNERS, 2 * CORNERS, conjugates=CORNERS, lanes=LANES,
-            material=material, factors=Factors(factors.detach()),
+            parameters, element_potentials, size, CORNERS, 2 * CORNERS, conjugates=CORNERS,
+            lanes=LANES, material=material, factors=Factors(factors.detach()),
         )  # fmt: skip
     except UnknownOperation as error:
         raise UnknownOperation(f"the material of the pad `{name}`: {error}") from error

@@ -111,11 +111,12 @@ class Condensed(NamedTuple):
 
 class Nodal(NamedTuple):
     """Per pad: ends in the dofs and the elements, v_start of its velocities (-1: without inertia),
-    density_at of rho depth in p, hold: strain up to which an element's derivatives are held while it
-    changes, band: the largest difference between dofs of one element, its
-    place in the banded matrices; law addresses of its elements, ends of their parameters in p. Per
-    dof: X, place of its node (its own coordinate), and area. Per element: its dofs, -1 where it is
-    bonded, and constants; their number is a multiple of `LANES`, the last without dofs. surface: dof of every surface dof."""
+    density_at of rho depth in p, hold: strain up to which an element's derivatives are held while
+    it changes, band: the largest difference between dofs of one element, its place in the banded
+    matrices; law addresses of its elements, ends of their parameters in p. Per dof: X, place of its
+    node (its own coordinate), and area. Per element: its dofs, -1 where it is bonded, and
+    constants; their number is a multiple of `LANES`, the last without dofs. surface: dof of every
+    surface dof."""
 
     dof_start: Index
     element_start: Index
