@@ -8,9 +8,9 @@ twice the potential.
 
 The volume counts by its change at the centre, so that nearly incompressible elements do not lock.
 At finite strain the energy of distortion is one of the deformation gradient F at the Gauss points,
-that of dilatation one of J_0 = det F at the centre; mu (J - J_0)^2 / 3 is added, which opposes
-changes of volume within the element that nothing else would: with it the limit of small strains is
-the linear element.
+that of dilatation one of J_0 = det F at the centre; mu (J - J_0)^2 / 3 is added (`WITHIN`), which
+opposes changes of volume within the element that nothing else would: with it the limit of small
+strains is the linear element.
 """
 
 from typing import NamedTuple
@@ -25,6 +25,10 @@ from torchsoft.physics.mesh.mesh import Array, gradients
 
 GAUSS = [(a / np.sqrt(3), b / np.sqrt(3)) for a in (-1, 1) for b in (-1, 1)]
 """Places of the quadrature in the reference square."""
+
+WITHIN = 1 / 3
+"""Modulus against changes of volume within an element, over the shear modulus of small strains: with
+it small strains are those of the linear element."""
 
 CORNERS = 8
 """Displacements of an element."""
@@ -123,7 +127,7 @@ def finite(
         zero, one = torch.zeros_like(J), torch.ones_like(J)
         rows = (F[0], F[1], zero), (F[2], F[3], zero), (zero, zero, one)
         W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
-        energy = energy + place.area * (W + shear / 3 * (J - J_0) ** 2)
+        energy = energy + place.area * (W + WITHIN * shear * (J - J_0) ** 2)
         C = F[0] ** 2 + F[2] ** 2, F[1] ** 2 + F[3] ** 2, F[0] * F[1] + F[2] * F[3]
         half = (  # of the rate of C
             F[0] * G[0] + F[2] * G[2],
@@ -134,7 +138,7 @@ def finite(
         e_xx, e_yy, e_xy = (isochoric * (one - part * c) for one, c in zip(half, C))
         e_zz = -isochoric * part
         square = e_xx**2 + e_yy**2 + e_zz**2 + 2 * e_xy**2
-        potential = potential + place.area * shear * (square + (J_rate - J_0_rate) ** 2 / 3)
+        potential = potential + place.area * shear * (square + WITHIN * (J_rate - J_0_rate) ** 2)
     return energy, potential
 
 

@@ -29,6 +29,10 @@ RESIDUAL = 1e-13
 SETTLING = 30
 """Iterations of Newton's method for a pad; from undeformed pads it takes about ten."""
 
+SOFTER = (1e-4, 1e-3, 1e-2, 0.1, 1.0)
+"""Parts of the contact forces under which a nodal pad settles, one after the other, where it does
+not under all of them at once."""
+
 STRIDE = 0.2
 """Longest step of the search for balance over the height of the thinnest pad."""
 
@@ -144,12 +148,20 @@ def displaced(rig: Graph, name: str, state: State, batch: Sequence[int]) -> tupl
     for one in (alone, state):
         law = lambda u, one=one: rig.point_forces(own, one, u, torch.zeros_like(u))
         balances.append(Balance(pad, pad.element_forces, law))
-    undeformed = torch.zeros(pad.nodes, 2, dtype=torch.float64)
-    try:
-        u, factors, left = balances[0].found(undeformed, RESIDUAL, SETTLING)
-    except FloatingPointError:
-        return undeformed, torch.inf
-    return balances[1].corrected(u.expand(*batch, -1, -1), math.prod(batch) * factors), left
+    undeformed, law = torch.zeros(pad.nodes, 2, dtype=torch.float64), balances[0].law
+    assert law is not None
+    for parts in ((1.0,), SOFTER):
+        u = undeformed
+        try:
+            for part in parts:
+                softer = Balance(pad, pad.element_forces, lambda u, part=part: part * law(u))
+                u, factors, left = softer.found(u, RESIDUAL, SETTLING)
+        except FloatingPointError:
+            continue
+        if left <= RESIDUAL:
+            copies = math.prod(batch)
+            return balances[1].corrected(u.expand(*batch, -1, -1), copies * factors), left
+    return undeformed, torch.inf
 
 
 def carried_along(rig: Graph, name: str, state: State, u: Tensor) -> Tensor:
