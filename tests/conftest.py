@@ -119,7 +119,8 @@ def press(rig: Rig, height: float = GRASPED, x: float = 60e-3) -> Tensor:
 def holding_force(rig: Rig, y: Tensor) -> float:
     """Downward force [N] on the paper's bracket that balances the upper pad's normal forces."""
     pad, part = rig.pads["U"], rig.unpack(y).pads["U"]
-    return float((pad.elastic_force(part) if pad.inertial else part[0])[:, 1].sum())
+    force = pad.internal_force(part, torch.zeros_like(part)) if pad.inertial else part[0]
+    return float(force[:, 1].sum())
 
 
 def coarse(**changes: object) -> Rig:
@@ -203,7 +204,7 @@ def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
         }
         return {name: x + scale * noise[name] for name, x in part.items()}
 
-    force = 2e-5 if any(pad.inertial for pad in rig.pads.values()) else 0.5  # [m] or [N]
+    force = 2e-5 if any(pad.nodal for pad in rig.pads.values()) else 0.5  # [m] or [N]
     return rig.pack(
         State(
             pads=moved(state.pads, force),

@@ -32,6 +32,9 @@ from torchsoft import (
     FingertipMesh,
     GeneralisedKelvin,
     KelvinVoigt,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
     Pad,
     PadMesh,
     Profile,
@@ -47,10 +50,12 @@ from torchsoft import (
     StandardLinearSolid,
     StateFeedback,
     Superellipse,
+    Yeoh,
     controller,
     simulate,
 )
 from torchsoft.physics.extensions import extend, extensions
+from torchsoft.physics.hyperelastic import Hyperelastic, invariants
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.statics import standing
 from torchsoft.testing import check_power
@@ -202,6 +207,22 @@ def jaws() -> Start:
     return rig, standing(rig, pose | {"disc": f64(3e-4, reach, 0.0)}).detach()
 
 
+class NetworkEnergy(Hyperelastic):
+    """A neo-Hookean energy with a network of its invariants on top, of second order in them."""
+
+    def __init__(self) -> None:
+        super().__init__(**RUBBER, tau=0.01)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            self.net = nn.Sequential(nn.Linear(2, 4), nn.Softplus(), nn.Linear(4, 1)).double()
+
+    def distortion(self, F: Tensor) -> Tensor:
+        I1, I2, _ = invariants(F)
+        x = torch.stack((I1 - 3, I2 - 3), -1)
+        bent = self.net(x)[..., 0] * (I1 - 3) * (I2 - 3)
+        return 0.5 * self.shear * (I1 - 3 + bent)
+
+
 TURNING = {"x": "driven", "y": "driven", "theta": "driven", "weighted": False}
 WHOLE = [f"{body}.{axis}" for body in ("jaw", "disc") for axis in ("x", "y", "theta")]
 SETPOINTS = ["x_d", "y_d", "theta_d"]
@@ -260,6 +281,21 @@ RIGS: dict[str, Callable[[], Start]] = {
     "enclosed pad": lambda: grip(tip=PadMesh(40e-3, 4.59e-3, 20, 2, bonded_sides=True)),
     "points between nodes": lambda: grip(points=2),
     "inertial pads": lambda: grip(inertial=True),
+    "neo-Hookean pads": lambda: grip(material=NeoHookean(**RUBBER, tau=0.01)),
+    "neo-Hookean pads with inertia": lambda: grip(
+        material=NeoHookean(**RUBBER, tau=0.01), inertial=True),
+    "Mooney-Rivlin pads on turning bases": lambda: grip(
+        jaw=Body(**TURNING), lower=Body(**TURNING), points=2,
+        material=MooneyRivlin(C10=9e4, C01=4e4, nu=0.45, rho=1100.0, tau=0.01, depth=0.044),
+        motion={f"lower.{axis}": Profile([0.0, 0.015], [0.0, to]) for axis,
+        to in (("x", -2e-3), ("y", 1e-4), ("theta", 0.03))}
+        | {"jaw.theta": Profile([0.0, 0.015], [0.0, 0.02])},
+    ),
+    "Yeoh fingertip": lambda: grip(Circle(12e-3), tip=FingertipMesh(8e-3, 12), material=Yeoh(
+        C10=1.3e5, C20=-1e4, C30=3e3, nu=0.48, rho=1100.0, tau=0.01, depth=0.044)),
+    "Ogden pads": lambda: grip(material=Ogden(
+        mu=[2.8e5, -2e4], alpha=[1.8, -3.0], nu=0.45, rho=1100.0, tau=0.01, depth=0.044)),
+    "network of energy": lambda: grip(material=NetworkEnergy()),
     "Coulomb": lambda: grip(friction=Coulomb(0.5, 0.4)),
     "rate and state": lambda: grip(friction=RateAndState(0.4, 0.02, 0.03, 4e-5, 1e-3, 0.05)),
     "network of friction": lambda: grip(friction=NetworkFriction()),

@@ -23,12 +23,15 @@ from torchsoft.solve.kernel import (
     stage,
     tangent,
 )
-from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, room
+from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, LANES, room
 from torchsoft.solve.kernel.invoke import call_linearise
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
 
-CALLED = ["circle", "turning jaws", "loops", "rate and state", "inertial pads", "three pads"]
+CALLED = [
+    "circle", "turning jaws", "loops", "rate and state", "inertial pads", "neo-Hookean pads",
+    "three pads",
+]  # fmt: skip
 STEP = 2e-4
 ANY = np.random.default_rng(0)
 
@@ -151,10 +154,11 @@ def test_a_nodal_pad_is_the_inverse_of_its_own_matrix():
     dofs = s.nodal_dof_start[1]
     A = np.diag([nodal.mass_rate(s, pad, i, now.a) for i in range(dofs)])
     for e in range(s.nodal_element_start[1]):
-        nodal.element_inputs(s, w, pad, e, now.tape.y[1], now.a)
+        nodal.element_inputs(s, w, pad, e // LANES, now.tape.y[1], now.a)
         own = s.p[nodal.element_parameters(s, pad)]
-        J, out = np.zeros((8, 16)), np.zeros(9)
-        nodal.call_linearise(s.nodal_linearise[pad], w.element_x, own, out, J)
+        four, out = np.zeros((8, 16, LANES)), np.zeros((9, LANES))
+        nodal.call_linearise(s.nodal_linearise[pad], w.element_x[e // LANES], own, out, four)
+        J = four[..., e % LANES]
         held = s.nodal_dof[e] >= 0
         A[np.ix_(s.nodal_dof[e][held], s.nodal_dof[e][held])] += (now.a * J[:, :8] + J[:, 8:])[
             np.ix_(held, held)

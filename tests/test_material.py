@@ -30,7 +30,7 @@ from torchsoft import (
     Trajectory,
     simulate,
 )
-from torchsoft.physics.material import KINDS, Material, retarded
+from torchsoft.physics.material import LINEAR, Material, retarded
 from torchsoft.plot.diagram import graph_of
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Standing, Unknown, identify
 
@@ -263,4 +263,4 @@ def test_a_recording_that_begins_before_the_pads_forget_is_named():
 
 
 def test_every_material_has_a_name_in_files():
-    assert {name: type(make()) for name, make in MATERIALS.items()} == dict(KINDS)
+    assert {name: type(make()) for name, make in MATERIALS.items()} == dict(LINEAR)

@@ -20,7 +20,8 @@ from torchsoft.materials.fit import Fit, fit
 from torchsoft.materials.measured import Measured, faded, read, responses
 from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.materials.written import FILES
-from torchsoft.physics.material import KINDS, GeneralisedKelvin, Prony
+from torchsoft.physics.hyperelastic import KINDS
+from torchsoft.physics.material import GeneralisedKelvin, Prony
 
 Array = NDArray[np.float64]
 REST = {"nu": 0.45, "rho": 1100.0, "depth": 0.044}

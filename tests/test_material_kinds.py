@@ -16,7 +16,8 @@ from torchsoft.materials.deck import read_deck
 from torchsoft.materials.fit import fit
 from torchsoft.materials.measured import Measured, Pull, Spectrum, read
 from torchsoft.materials.modulus import modulus
-from torchsoft.physics.material import KINDS, Prony
+from torchsoft.physics.hyperelastic import KINDS
+from torchsoft.physics.material import Prony
 
 REST = {"nu": 0.45, "rho": 1100.0, "depth": 0.044}
 RUBBER = Prony(E=4e5, moduli=[2e5, 1e5], tau=[0.01, 0.5], **REST)

@@ -311,7 +311,7 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: chain([1.0, 0.0]), "`chain` of the material of `L` must give two tensors, J and tau"),
     (lambda: small(pads=lambda *_: {"L": Pad(PadMesh(0.04, 4e-3, 8, 2), Prony(**RUBBER,
     moduli=[1e5], tau=[0.1]), inertial=True)}),
-     r"inertial pad `L` needs a Kelvin-Voigt material \(one retardation time\), but has"),
+     "`L` needs a material of one retardation time, being inertial, but has"),
     # laws of contact
     (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None),
      "`friction` must be a function or a module"),

@@ -143,8 +143,6 @@ def test_two_bodies_on_one_pad_and_a_chain_of_branches():
 def test_refusals():
     model = coarse()
     state = shaken(model)
-    with pytest.raises(NotImplementedError, match="inertial"):
-        around(coarse(pad__inertial=True), state)
     unknown = state.stretch | {"L": torch.full((61,), torch.nan).double()}
     far = {name: torch.full_like(s, 1e-3) for name, s in state.stretch.items()}
     away = state.pose | {"disc": f64(0.06, 0.01, 0.0)}

@@ -241,9 +241,7 @@ def test_a_run_that_cannot_begin_is_lost(cut):
     far = {"start.disc.y": 0.01} | {
         c.name: 1e-3 for c in out.start_coordinates if ".L.stretch" in c.name
     }
-    with pytest.raises(
-        SimulationFailed, match="cannot begin there: the massless pad `L` does not settle"
-    ):
+    with pytest.raises(SimulationFailed, match="cannot begin there: the pad `L` does not settle"):
         out.begin().y0(tensors(far))
 
 

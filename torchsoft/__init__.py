@@ -13,7 +13,8 @@ What there is, each with a page of its own in help():
 rigs        RigFile, BuiltRig, excite; Rig, Body, Pad, Contact, SoftContact, Actuator, PD,
             StateFeedback, controller
 meshes      PadMesh, CurvedPadMesh, FingertipMesh, QuadMesh
-materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony
+materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony; at finite strain NeoHookean,
+            MooneyRivlin, Yeoh, Ogden, Hyperelastic (an energy of one's own)
 shapes      Circle, Ellipse, Superellipse, RoundedBox, RoundedPolygon, Contour
 friction    SmoothSlip, Coulomb, RateAndState, or any torch function
 motions     Reference, Profile, Sampled, hold

@@ -1,6 +1,7 @@
 """torchsoft: a differentiable simulator of soft contact manipulation."""
 
 from .physics.contact import Coulomb, SmoothSlip, SoftContact
+from .physics.hyperelastic import Hyperelastic, MooneyRivlin, NeoHookean, Ogden, Yeoh
 from .physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
 from .physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
 from .physics.motion import Profile, Reference, Sampled, hold
@@ -45,9 +46,13 @@ __all__ = [
     "Ellipse",
     "FingertipMesh",
     "GeneralisedKelvin",
+    "Hyperelastic",
     "Interrupted",
     "KelvinVoigt",
+    "MooneyRivlin",
+    "NeoHookean",
     "NoEquilibrium",
+    "Ogden",
     "Pad",
     "PadMesh",
     "Profile",
@@ -70,6 +75,7 @@ __all__ = [
     "Superellipse",
     "Taxels",
     "Trajectory",
+    "Yeoh",
     "controller",
     "excite",
     "hold",

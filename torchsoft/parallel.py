@@ -6,11 +6,13 @@ Python code does hold a lock; a run of a second has some twenty milliseconds of 
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from contextlib import ExitStack, contextmanager, nullcontext
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from threadpoolctl import threadpool_limits
@@ -18,6 +20,7 @@ from threadpoolctl import threadpool_limits
 # Threads
 
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -40,6 +43,20 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def ungraphed(run: Callable[P, T]) -> Callable[P, T]:
+    """A function that `torch.compile` leaves to Python, with what it calls."""
+
+    @wraps(run)
+    def called(*args: P.args, **kwargs: P.kwargs) -> T:
+        if "torch._dynamo" not in sys.modules:  # whose import takes a second
+            return run(*args, **kwargs)
+        reason = "rigs are no graph for torch.compile, and their runs are compiled already"
+        plain: Any = torch.compiler.disable(run, reason=reason)
+        return plain(*args, **kwargs)
+
+    return called
 
 
 @contextmanager

@@ -27,8 +27,7 @@ GAUSS = [(a / np.sqrt(3), b / np.sqrt(3)) for a in (-1, 1) for b in (-1, 1)]
 """Places of the quadrature in the reference square."""
 
 WITHIN = 1 / 3
-"""Modulus against changes of volume within an element, over the shear modulus of small strains: with
-it small strains are those of the linear element."""
+"""Modulus against changes of volume within an element, over the shear modulus of small strains."""
 
 CORNERS = 8
 """Displacements of an element."""

@@ -471,7 +471,13 @@ class Graph(nn.Module):
             at, none = pad.at_corners(u), torch.zeros_like(u)
             internal = lambda rate: pad.element_forces(at, rate)
             balance = Balance(pad, internal, law if own else None)
-            u_dot, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
+            try:
+                u_dot, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
+            except FloatingPointError:
+                raise RuntimeError(
+                    f"the massless pad `{name}` has no rates in this state; is an element inside "
+                    "out?"
+                ) from None
             u_dot = balance.corrected(u_dot, factors)
         else:
             free, P = free_rates(pad, state.pads[name], 0.0)

@@ -13,7 +13,7 @@ from collections.abc import Container, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from torchsoft.parallel import one_torch_thread
+from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.balance import Balance
 from torchsoft.physics.contact import cross, turned
 from torchsoft.physics.graph import Graph
@@ -52,6 +52,7 @@ class NoEquilibrium(RuntimeError):
     """Newton's iteration found no static equilibrium."""
 
 
+@ungraphed
 @one_torch_thread()
 def settled(
     rig: Graph,
@@ -195,6 +196,7 @@ def unstretched(rig: Graph, batch: Sequence[int]) -> dict[str, Tensor]:
     }
 
 
+@ungraphed
 @one_torch_thread()
 def resting(
     rig: Graph, pose: Mapping[str, Tensor], free: Mapping[str, Sequence[int]] | None = None, *,

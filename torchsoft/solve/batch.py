@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchsoft.display import Shown, hidden
-from torchsoft.parallel import cores, parallel_map, single_threaded
+from torchsoft.parallel import cores, parallel_map, single_threaded, ungraphed
 from torchsoft.physics.arguments import Numbers, tensor, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
@@ -22,7 +22,7 @@ from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.laws import copied
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import RunOutcome, prepare, run, ungraphed
+from torchsoft.solve.simulate import RunOutcome, prepare, run
 from torchsoft.solve.trajectory import Trajectory
 
 

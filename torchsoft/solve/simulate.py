@@ -1,19 +1,17 @@
 """`simulate`: run a rig over given times, by the route to a derivative that is wanted, into one
 `Trajectory`."""
 
-import sys
 import time as clock
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from functools import wraps
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft.parallel import one_torch_thread
+from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.energy import stored
 from torchsoft.physics.motion import Reference
@@ -42,25 +40,8 @@ Route = Literal["none", "discrete", "forward"]
 
 VERSION = version("torchsoft")
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
 RTOL = 1e-5
 """Relative tolerance where nothing else is asked for."""
-
-
-def ungraphed(run: Callable[P, R]) -> Callable[P, R]:
-    """A function that `torch.compile` leaves to Python, with what it calls."""
-
-    @wraps(run)
-    def called(*args: P.args, **kwargs: P.kwargs) -> R:
-        if "torch._dynamo" not in sys.modules:  # whose import takes a second
-            return run(*args, **kwargs)
-        reason = "a run of a rig is no graph for torch.compile, and is compiled already"
-        plain: Any = torch.compiler.disable(run, reason=reason)
-        return plain(*args, **kwargs)
-
-    return called
 
 
 class Interrupted(KeyboardInterrupt):
