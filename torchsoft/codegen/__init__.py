@@ -117,7 +117,12 @@ def _functions(
             g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}, lanes=lanes
         ),
         emit.function(
-            g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p + lookups, p_bar)}
+            g,
+            "pullback",
+            ("x", "p", "w", "p_bar"),
+            {},
+            {"p_bar": zip(p + lookups, p_bar)},
+            lanes,
         ),
     ]
 

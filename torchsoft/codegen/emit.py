@@ -57,8 +57,8 @@ def function(
     name points.
 
     `added` has pairs of nodes, a parameter or a look-up of one and what is added where it stands
-    from that pointer on. With several `lanes` it is the function of as many x at once, entry by
-    entry side by side, as are the results, and of one p.
+    from that pointer on. With several `lanes` it is the function of as many x and w at once, entry
+    by entry side by side, as are the results, and of one p, to which all lanes add.
     """
     body = _Body(g, lanes)
     for letter, nodes in results.items():
@@ -92,17 +92,26 @@ class _Body:
         ]
 
     def add(self, letter: str, index: int, target: int, node: int) -> None:
-        """Add a node where the target stands, from the pointer on."""
+        """Add a node, of all lanes, where the target stands from the pointer on."""
         for needed in (node, *self.g.operands(target)):
             self.evaluate(needed)
-        place = f"%{letter}{index}"
         operands = [self.text[a] for a in self.g.operands(target)]
-        self.lines += [
-            *_address(self.g, target, letter, place, operands),
-            f"{place}.old = load double, {POINTER} {place}",
-            f"{place}.new = fadd double {place}.old, {self.text[node]}",
-            f"store double {place}.new, {POINTER} {place}",
-        ]
+        for lane in range(self.lanes):
+            place, value, at = f"%{letter}{index}", self.text[node], operands
+            if self.lanes > 1:
+                place, value = f"{place}.{lane}", self.lane(f"{place}.{lane}.value", value, lane)
+                at = [self.lane(f"{place}.at{i}", x, lane) for i, x in enumerate(operands)]
+            self.lines += [
+                *_address(self.g, target, letter, place, at),
+                f"{place}.old = load double, {POINTER} {place}",
+                f"{place}.new = fadd double {place}.old, {value}",
+                f"store double {place}.new, {POINTER} {place}",
+            ]
+
+    def lane(self, name: str, value: str, lane: int) -> str:
+        """The number of one lane, under a name."""
+        self.lines.append(f"{name} = extractelement {self.number} {value}, i32 {lane}")
+        return name
 
     def evaluate(self, root: int) -> None:
         """Give `root` its value."""
@@ -134,8 +143,8 @@ class _Body:
         g, op, v = self.g, self.g.ops[node], f"%v{node}"
         if op in LEAVES:
             at = g.args[node][0]
-            if op == "x" and self.lanes > 1:
-                yield f"%a{node} = getelementptr double, {POINTER} %x, i64 {at * self.lanes}"
+            if op != "p" and self.lanes > 1:
+                yield f"%a{node} = getelementptr double, {POINTER} %{op}, i64 {at * self.lanes}"
                 yield f"{v} = load {self.number}, {POINTER} %a{node}, align 8"
                 return
             yield from _address(g, node, op, f"%a{node}", operands)

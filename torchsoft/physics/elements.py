@@ -86,15 +86,27 @@ def places(x: Tensor) -> list[Place]:
 
 def element_potentials(material: Material, factors: Factors, x: Tensor) -> Tensor:
     """Energy [J] and dissipation potential [W] (..., 2) of an element in the state x (..., 61)."""
+    parts = element_energy(material, factors, x), element_potential(material, factors, x)
+    return torch.stack(parts, -1)
+
+
+def element_energy(material: Material, factors: Factors, x: Tensor) -> Tensor:
+    """Energy (...) [J] of an element in the state x (..., 61)."""
+    depth, _, lame_lambda, lame_mu = factors.values.unbind(-1)
+    centre, *gauss = places(x)
+    if isinstance(material, Hyperelastic):
+        return depth * finite_energy(material, lame_mu, centre, gauss)
+    return depth * linear(lame_lambda, lame_mu, centre, gauss, "gradient")
+
+
+def element_potential(material: Material, factors: Factors, x: Tensor) -> Tensor:
+    """Dissipation potential (...) [W] of an element in the state x (..., 61)."""
     depth, tau, lame_lambda, lame_mu = factors.values.unbind(-1)
     centre, *gauss = places(x)
     if isinstance(material, Hyperelastic):
-        energy, potential = finite(material, lame_lambda + 2 / 3 * lame_mu, lame_mu, centre, gauss)
-    else:
-        energy, potential = (
-            linear(lame_lambda, lame_mu, centre, gauss, kind) for kind in ("gradient", "rate")
-        )
-    return torch.stack((depth * energy, depth * tau * potential), -1)
+        bulk = lame_lambda + 2 / 3 * lame_mu
+        return depth * tau * finite_potential(bulk, lame_mu, centre, gauss)
+    return depth * tau * linear(lame_lambda, lame_mu, centre, gauss, "rate")
 
 
 def linear(
@@ -109,24 +121,29 @@ def linear(
     return total
 
 
-def finite(
-    material: Hyperelastic, bulk: Tensor, shear: Tensor, centre: Place, gauss: list[Place]
-) -> tuple[Tensor, Tensor]:
-    """Energy per depth at finite strain, and dissipation potential per depth and retardation time:
-    quadratic in the rates of J_0, of J - J_0, and of (C J^(-2/3) - 1) / 2, C = F^T F."""
-    J_0, J_0_rate = volume(centre)
-    energy, potential = (
-        centre.area * material.dilatation(J_0),
-        0.5 * bulk * centre.area * J_0_rate**2,
-    )
+def finite_energy(
+    material: Hyperelastic, shear: Tensor, centre: Place, gauss: list[Place]
+) -> Tensor:
+    """Energy per depth at finite strain."""
+    J_0, _ = volume(centre)
+    total = centre.area * material.dilatation(J_0)
+    for place in gauss:
+        (xx, xy, yx, yy), (J, _) = place.gradient, volume(place)
+        zero, one = torch.zeros_like(J), torch.ones_like(J)
+        rows = (1 + xx, xy, zero), (yx, 1 + yy, zero), (zero, zero, one)
+        W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
+        total = total + place.area * (W + WITHIN * shear * (J - J_0) ** 2)
+    return total
+
+
+def finite_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: list[Place]) -> Tensor:
+    """Dissipation potential per depth and retardation time at finite strain: quadratic in the rates
+    of J_0, of J - J_0, and of (C J^(-2/3) - 1) / 2, C = F^T F."""
+    _, J_0_rate = volume(centre)
+    total = 0.5 * bulk * centre.area * J_0_rate**2
     for place in gauss:
         (xx, xy, yx, yy), G = place.gradient, place.rate
-        F = 1 + xx, xy, yx, 1 + yy
-        J, J_rate = volume(place)
-        zero, one = torch.zeros_like(J), torch.ones_like(J)
-        rows = (F[0], F[1], zero), (F[2], F[3], zero), (zero, zero, one)
-        W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
-        energy = energy + place.area * (W + WITHIN * shear * (J - J_0) ** 2)
+        F, (J, J_rate) = (1 + xx, xy, yx, 1 + yy), volume(place)
         C = F[0] ** 2 + F[2] ** 2, F[1] ** 2 + F[3] ** 2, F[0] * F[1] + F[2] * F[3]
         half = (  # of the rate of C
             F[0] * G[0] + F[2] * G[2],
@@ -137,8 +154,8 @@ def finite(
         e_xx, e_yy, e_xy = (isochoric * (one - part * c) for one, c in zip(half, C))
         e_zz = -isochoric * part
         square = e_xx**2 + e_yy**2 + e_zz**2 + 2 * e_xy**2
-        potential = potential + place.area * shear * (square + WITHIN * (J_rate - J_0_rate) ** 2)
-    return energy, potential
+        total = total + place.area * shear * (square + WITHIN * (J_rate - J_0_rate) ** 2)
+    return total
 
 
 def volume(place: Place) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,7 @@ from torchsoft.physics.contact import (
     turned,
 )
 from torchsoft.physics.graph import Evaluation, Graph
-from torchsoft.physics.pads import Pad, free_rates, nodal
+from torchsoft.physics.pads import SAMPLES, Pad, free_rates, nodal
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.state import State
 
@@ -38,7 +38,7 @@ def stored(
     for name, pad in rig.pads.items():
         part = state.pads[name]
         if pad.nodal:
-            energies[f"strain_{name}"], _ = pad.energies(part, torch.zeros_like(part))
+            energies[f"strain_{name}"] = pad.strain_energy(part)
         else:
             fractions, _ = pad.chain()
             if len(fractions) == 1:
@@ -92,9 +92,8 @@ def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]
     for name, pad in rig.pads.items():
         port = graph.ports[f"pad_{name}"]
         if pad.nodal:
-            _, powers[f"pad_{name}"] = pad.energies(
-                state.pads[name], port.transformer.flow(graph.flows)
-            )
+            rate = port.transformer.flow(graph.flows)
+            powers[f"pad_{name}"] = pad.dissipation(state.pads[name], rate)
         else:
             fractions, times = pad.chain()
             rate = (
@@ -121,9 +120,6 @@ def supplied(graph: Evaluation) -> dict[str, Tensor]:
 
 SEPARATED, STICKING, SLIPPING = 0, 1, 2
 """States of a contact point."""
-
-SAMPLES = 64
-"""States whose nodal rates are found side by side."""
 
 
 @torch.no_grad()

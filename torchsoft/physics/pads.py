@@ -14,10 +14,16 @@ import numpy as np
 import torch
 from scipy.special import ndtr
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import tensor, whole
-from torchsoft.physics.elements import Factors, element_constants, element_potentials
+from torchsoft.physics.elements import (
+    Factors,
+    element_constants,
+    element_energy,
+    element_potential,
+)
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import (
@@ -29,6 +35,9 @@ from torchsoft.physics.mesh import (
 )
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Length, Quantity, Ratio, quantities
+
+SAMPLES = 64
+"""States whose elements are evaluated side by side."""
 
 
 @lru_cache(maxsize=16)
@@ -226,13 +235,12 @@ class Pad(nn.Module):
         values = torch.where(held, 0.0, f).flatten(-2)
         return total.index_add(-1, dofs.flatten(), values).unflatten(-1, (-1, 2))
 
-    def potentials(self, u: Tensor, rate: Tensor) -> Tensor:
-        """Energy [J] and dissipation potential [W] (..., elements, 2) of a nodal pad's elements,
-        with displacements and rates (..., elements, 8) at their corners."""
+    def element_inputs(self, u: Tensor, rate: Tensor) -> tuple[Material, Factors, Tensor]:
+        """Arguments of the laws of a nodal pad's elements, with displacements and rates (...,
+        elements, 8) at their corners."""
         constants = torch.from_numpy(self.constants).expand(*u.shape[:-1], -1)
-        return element_potentials(
-            self.material, factors_of(self.factors()), torch.cat((u, rate, constants), -1)
-        )
+        inputs = torch.cat((u, rate, constants), -1)
+        return self.material, factors_of(self.factors()), inputs
 
     def element_forces(self, u: Tensor, rate: Tensor | None = None) -> Tensor:
         """Forces (..., elements, 8) [N] on the corners of a nodal pad's elements, by default at
@@ -244,12 +252,12 @@ class Pad(nn.Module):
                 u = u.detach().requires_grad_()
             if not (recorded and still.requires_grad):
                 still = still.detach().requires_grad_()
-            energy, potential = self.potentials(u, still).unbind(-1)
-            (force,) = torch.autograd.grad(
-                energy.sum(), u, create_graph=recorded, retain_graph=True
-            )
+            given = self.element_inputs(u, still)
+            energy = element_energy(*given).sum()
+            (force,) = torch.autograd.grad(energy, u, create_graph=recorded, retain_graph=True)
             if rate is not None:
-                (viscous,) = torch.autograd.grad(potential.sum(), still, create_graph=recorded)
+                potential = element_potential(*given).sum()
+                (viscous,) = torch.autograd.grad(potential, still, create_graph=recorded)
                 force = force + viscous
         return force
 
@@ -259,10 +267,22 @@ class Pad(nn.Module):
         u, rate = torch.broadcast_tensors(u, rate)
         return self.from_corners(self.element_forces(self.at_corners(u), self.at_corners(rate)))
 
-    def energies(self, u: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Strain energy [J] and power that is dissipated [W] of a nodal pad, (...) each."""
-        both = self.potentials(self.at_corners(u), self.at_corners(rate)).sum(-2)
-        return both[..., 0], 2 * both[..., 1]
+    def strain_energy(self, u: Tensor) -> Tensor:
+        """Energy (...) [J] of a nodal pad at displacements u (..., nodes, 2) [m]. Its graph is made
+        when it is asked for, some samples at a time: that of a long run would not fit."""
+
+        def own(u: Tensor) -> Tensor:
+            at = self.at_corners(u)
+            return element_energy(*self.element_inputs(at, torch.zeros_like(at))).sum(-1)
+
+        parts = u.reshape(-1, *u.shape[-2:]).split(SAMPLES)
+        energy = [checkpoint(own, part, use_reentrant=False) for part in parts]
+        return torch.cat(energy).reshape(u.shape[:-2])
+
+    def dissipation(self, u: Tensor, rate: Tensor) -> Tensor:
+        """Power (...) [W] that a nodal pad takes out."""
+        given = self.element_inputs(self.at_corners(u), self.at_corners(rate))
+        return 2 * element_potential(*given).sum(-1)
 
     @property
     def nodal(self) -> bool:

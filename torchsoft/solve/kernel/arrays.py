@@ -313,7 +313,6 @@ SCRATCH: dict[str, dict[str, str]] = {
         "groups 8 16 lanes": "element_J",
         "groups 16 lanes": "element_at",
         "9 lanes": "element",
-        "element_inputs": "element_alone",
         # of every nodal pad held: its dofs' rates per unit force on the touched nodes, row by row
         "responses": "responses",
         "state": "k",
@@ -345,11 +344,12 @@ SCRATCH: dict[str, dict[str, str]] = {
         "points rows": "out",
         "rows": "weights",
         "6": "by",
-        "8": "element",
+        "8 lanes": "element",
         "4 state": "state",
     },
     "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
         "most": "weights",
+        "8 lanes": "element",
         "parameters": "gradient",
         "most columns": "change",
         "free columns": "r V",

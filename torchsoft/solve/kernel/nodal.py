@@ -419,14 +419,6 @@ def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: 
 
 
 @compiled
-def single(w: Any, e: int) -> None:
-    """Inputs of the law of element e, out of its group, into w.element_alone."""
-    x = w.element_x[e // LANES]
-    for i in range(w.element_alone.size):
-        w.element_alone[i] = x[i, e % LANES]
-
-
-@compiled
 def element_push(
     s: Any, w: Any, z: Any, pad: int, e: int, du: Array, dv: Array, dp: Array, rates: bool,
     out: Array,
@@ -450,11 +442,11 @@ def element_push(
                 if rates:
                     add(J[c, CORNERS + d, lane], dv[i0 + dof], out[i0 + row])
         if moved:
-            single(w, e)
-            weights, gradient = z.weights, z.gradient[: own.stop - own.start]
+            weights, gradient = z.element, z.gradient[: own.stop - own.start]
             weights[:], gradient[:] = 0.0, 0.0
-            weights[c] = 1.0
-            call_pullback(s.nodal_pullback[pad], w.element_alone, s.p[own], weights, gradient)
+            weights[c, lane] = 1.0
+            x = w.element_x[e // LANES]
+            call_pullback(s.nodal_pullback[pad], x, s.p[own], weights, gradient)
             for j in range(gradient.size):
                 add(gradient[j], dp[own.start + j], out[i0 + row])
 
@@ -582,29 +574,31 @@ def push_felt(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, d
 
 
 @compiled
-def element_pull(
-    s: Any, w: Any, pad: int, e: int, bar: Array, u_bar: Array, rate_bar: Array, p_bar: Array
-) -> None:
-    """Add to the cotangents of displacements and rates (dofs,) and of the parameters those of the
-    forces of element e, `bar` (8,)."""
-    own, J, lane = element_parameters(s, pad), w.element_J[e // LANES], e % LANES
-    i0 = s.nodal_dof_start[pad]
-    single(w, e)
-    call_pullback(s.nodal_pullback[pad], w.element_alone, s.p[own], bar, p_bar[own])
-    for d in range(CORNERS):
-        dof = s.nodal_dof[e, d]
-        if dof >= 0:
-            for c in range(CORNERS):
-                u_bar[dof] += J[c, d, lane] * bar[c]
-                rate_bar[i0 + dof] += J[c, CORNERS + d, lane] * bar[c]
-
-
-@compiled
-def gather(s: Any, pad: int, e: int, factor: float, values: Array, out: Array) -> None:
-    """`factor` times the values of the dofs at the corners (8,), zero where they are bonded."""
-    for c in range(CORNERS):
-        dof = s.nodal_dof[e, c]
-        out[c] = factor * values[s.nodal_dof_start[pad] + dof] if dof >= 0 else 0.0
+def pull_elements(
+    s: Any, w: Any, z: Any, pad: int, factor: float, forces_bar: Array, u_bar: Array,
+    rate_bar: Array, p_bar: Array,
+) -> None:  # fmt: skip
+    """Add to the cotangents of displacements (dofs,), of rates (all dofs,) and of the parameters
+    those of the elements' forces, `factor` forces_bar (all dofs,)."""
+    own, i0, bar = element_parameters(s, pad), s.nodal_dof_start[pad], z.element
+    low, high = groups(s, pad)
+    for g in range(low, high):
+        J, dofs = w.element_J[g], s.nodal_dof[g * LANES : (g + 1) * LANES]
+        for c in range(CORNERS):
+            for lane in range(LANES):
+                dof = dofs[lane, c]
+                bar[c, lane] = factor * forces_bar[i0 + dof] if dof >= 0 else 0.0
+        call_pullback(s.nodal_pullback[pad], w.element_x[g], s.p[own], bar, p_bar[own])
+        for d in range(CORNERS):
+            for lane in range(LANES):
+                dof = dofs[lane, d]
+                if dof >= 0:
+                    by_u = by_rate = 0.0
+                    for c in range(CORNERS):
+                        by_u += J[c, d, lane] * bar[c, lane]
+                        by_rate += J[c, CORNERS + d, lane] * bar[c, lane]
+                    u_bar[dof] += by_u
+                    rate_bar[i0 + dof] += by_rate
 
 
 @compiled
@@ -618,9 +612,7 @@ def pull_felt(
     for i in range(first, last, 2):
         bar[i] = wrench[0] + x - s.nodal_X[i + 1] * wrench[2]
         bar[i + 1] = wrench[1] + z_axis + s.nodal_X[i] * wrench[2]
-    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        gather(s, pad, e, 1.0, bar, z.element)
-        element_pull(s, w, pad, e, z.element, y_bar[U : U + last - first], z.rate_of, p_bar)
+    pull_elements(s, w, z, pad, 1.0, bar, y_bar[U : U + last - first], z.rate_of, p_bar)
 
 
 @compiled
@@ -679,10 +671,8 @@ def pull_state(
             own[first + s.nodal_surface[2 * node + r]] += z.rate[node, r]
             y_bar[U + s.nodal_surface[2 * node + r]] += z.u[node, r]
     solve_back(s, w, pad, own[first:last])  # now the multiplier of the pad's equation
-    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        gather(s, pad, e, -1.0, own, z.element)
-        # the rates' cotangents are spent: what comes to them here is not read
-        element_pull(s, w, pad, e, z.element, y_bar[U : U + last - first], z.rate_of, p_bar)
+    # the rates' cotangents are spent: what comes to them here is not read
+    pull_elements(s, w, z, pad, -1.0, own, y_bar[U : U + last - first], z.rate_of, p_bar)
     if not inertial(s, pad):
         return
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
