@@ -8,6 +8,7 @@ from torchsoft.cli.results import add_command, add_out, say, try_folder
 
 if TYPE_CHECKING:
     from torchsoft.materials.deck import Deck
+    from torchsoft.materials.energies import EnergyFit
     from torchsoft.materials.fit import Fit
     from torchsoft.materials.modulus import Modulus
 
@@ -19,7 +20,8 @@ order: over time `t` with one of `strain`, `stretch`, `elongation` and one of `s
 nominal and along the one direction of the test; or `t` with `modulus` or `compliance` alone, of a
 strain or a stress put on at t = 0 and held; a frequency sweep `frequency` with `storage_modulus`
 and `loss_modulus`, or `storage_shear_modulus` and `loss_shear_modulus`, or `tan_delta` as the
-second; a pull without `t`, of which --range says the strains that its modulus is of. Or a deck,
+second; a pull without `t`, of which --range says the strains that its modulus is of, or --energy
+the strain energy that it is to have, with --also for further tables. Or a deck,
 FILE.inp, with *VISCOELASTIC, TIME=PRONY. The whole history counts: ramps need not be cut off.
 
 A relaxation test and a sweep give a relaxation series (prony), a creep test a generalised Kelvin
@@ -42,11 +44,27 @@ def add_commands(commands: Any) -> None:
     add_out(one, "material")
     one.add_argument(
         "--test",
-        choices=("relaxation", "creep", "tension", "compression", "sweep"),
-        help="what was put on: strain, or stress, a pull or a compression, frequencies (by the "
-        "columns, and by what was held)",
+        choices=("relaxation", "creep", "sweep", *PULLS),
+        help="what was put on: strain, or stress, frequencies (by the columns, and by what was "
+        "held), a pull, a compression, a pull of held width, one in two directions, a shear",
     )
-    one.add_argument("--terms", type=int, help="terms of the series (as many as the data call for)")
+    one.add_argument(
+        "--energy", choices=ENERGIES,
+        help="strain energy of finite strains that is fitted to a pull, a compression or a shear",
+    )  # fmt: skip
+    one.add_argument(
+        "--also", action="append", default=[], metavar="TEST=FILE",
+        help="a further table of the same columns for the energy, as shear=FILE.csv; again for "
+        "others",
+    )  # fmt: skip
+    one.add_argument(
+        "--true", action="store_true",
+        help="stresses are per cross-section as it is, not as it was before the test",
+    )  # fmt: skip
+    one.add_argument(
+        "--terms", type=int,
+        help="terms of the series (as many as the data call for), or of ogden (one)",
+    )  # fmt: skip
     for name, meaning in SIZES.items():
         one.add_argument(f"--{name}", type=float, help=meaning)
     one.add_argument(
@@ -102,7 +120,7 @@ def fit_material(options: argparse.Namespace) -> int:
     assumed = {
         name: value
         for name, value in values.items()
-        if name not in found.table() and (name != "tau" or found.kind == "kelvin_voigt")
+        if name not in found.table() and (name != "tau" or found.kind in TIMELESS)
     }
     for name, value in given.items():
         if value is not None and name not in assumed:
@@ -115,7 +133,15 @@ def fit_material(options: argparse.Namespace) -> int:
     return 0
 
 
-OPTIONS = ("test", "terms", *SIZES, "range", "column", "ignore", "unit", "name", *ASSUMED)
+PULLS = ("tension", "compression", "planar", "biaxial", "shear")
+ENERGIES = ("neo_hookean", "mooney_rivlin", "yeoh", "ogden")
+TIMELESS = ("kelvin_voigt", *ENERGIES)
+"""Kinds of materials whose tests tell no time."""
+
+OPTIONS = (
+    "test", "energy", "also", "true", "terms", *SIZES, "range", "column", "ignore", "unit", "name",
+    *ASSUMED,
+)  # fmt: skip
 """Options that say how a file is read."""
 
 
@@ -124,7 +150,7 @@ def deck(options: argparse.Namespace) -> "Deck":
     from torchsoft.materials.deck import read_deck
     from torchsoft.materials.measured import PRESSURE
 
-    for name in ("test", "terms", *SIZES, "range", "column", "ignore"):
+    for name in ("test", "energy", "also", "true", "terms", *SIZES, "range", "column", "ignore"):
         if getattr(options, name):
             raise ValueError(f"{options.file}: a deck needs no --{name}")
     if options.unit is None:
@@ -134,7 +160,7 @@ def deck(options: argparse.Namespace) -> "Deck":
     return read_deck(options.file, unit=PRESSURE[options.unit], name=options.name)
 
 
-def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus":
+def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus | EnergyFit":
     """The material of a test. Raises `ValueError`."""
     from torchsoft.materials.fit import fit
     from torchsoft.materials.measured import Pull, read
@@ -146,21 +172,41 @@ def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus":
     pairs = [one.partition("=")[::2] for one in options.column]
     if not all(name and heading for name, heading in pairs):
         raise ValueError("--column must be NAME=HEADING, as force=Standardkraft")
-    test = read(
-        options.file,
-        test=options.test,
-        length=options.length,
-        area=options.area,
-        nu=nu,
-        strains=None if options.range is None else tuple(options.range),
-        headings={heading: name for name, heading in pairs},
-        ignore=options.ignore,
-    )
+    given: dict[str, Any] = {
+        "length": options.length, "area": options.area, "nu": nu,
+        "strains": None if options.range is None else tuple(options.range),
+        "headings": {heading: name for name, heading in pairs}, "ignore": options.ignore,
+        "true": options.true, "whole": options.energy is not None,
+    }  # fmt: skip
+    test = read(options.file, test=options.test, **given)
+    if options.energy is not None:
+        return energy(options, test, given)
+    if options.also:
+        raise ValueError("--also is of energies: say which, --energy yeoh")
     if not isinstance(test, Pull):
         return fit(test, terms=options.terms)
     if options.terms is not None:
         raise ValueError(f"{options.file}: a pull gives a modulus, and no --terms")
     return modulus(test)
+
+
+def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "EnergyFit":
+    """The strain energy of a table and of those of --also. Raises `ValueError`."""
+    from torchsoft.materials.energies import fit_energy
+    from torchsoft.materials.measured import Pull, read
+
+    if not isinstance(test, Pull):
+        raise ValueError(
+            f"{options.file}: an energy is of a pull, a compression or a shear; say --test tension"
+        )
+    pulls = [test]
+    for name, file in (one.partition("=")[::2] for one in options.also):
+        if name not in PULLS or not file:
+            raise ValueError(f"--also must be TEST=FILE, with a test of {', '.join(PULLS)}")
+        other = read(file, test=name, **given)
+        assert isinstance(other, Pull)
+        pulls.append(other)
+    return fit_energy(pulls, options.energy, nu=given["nu"], terms=options.terms)
 
 
 def list_presets(options: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ tension or of shear; a pull needs no `t`.
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,15 @@ from torchsoft.physics.material import INSTANT
 
 Array = NDArray[np.float64]
 
-Test = Literal["relaxation", "creep", "tension", "compression", "sweep"]
+PullTest = Literal["tension", "compression", "planar", "biaxial", "shear"]
+"""Tests of a modulus or a strain energy: along one direction, along one with the width held, along
+two, and simple shear, whose strain is its amount."""
+
+PULLS = get_args(PullTest)
+
+Test = Literal["relaxation", "creep", "sweep"] | PullTest
 """The controlled quantity over time: strain, so that the stress relaxes; or stress, so that the
-strain creeps; a pull or a compression for a modulus; or a sweep over frequencies."""
+strain creeps; a sweep over frequencies; or a pull."""
 
 PRESSURE = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "psi": 6894.757293168}
 SWEPT = {"storage_modulus": "loss_modulus", "storage_shear_modulus": "loss_shear_modulus"}
@@ -176,11 +182,11 @@ class Spectrum:
 @dataclass(frozen=True)
 class Pull:
     """A pull or a compression up to its largest strain: strain (n,) [1] and nominal stress (n,)
-    [Pa] in the direction of the load, the strains between which the modulus is asked for, and how
-    many rows after the largest strain are left out."""
+    [Pa] in the direction of the load, the strains between which they are taken, and how many rows
+    after the largest strain are left out."""
 
     path: Path
-    test: Literal["tension", "compression"]
+    test: PullTest
     strain: Array
     stress: Array
     strains: tuple[float, float]
@@ -197,11 +203,14 @@ def read(
     strains: tuple[float, float] | None = None,
     headings: Mapping[str, str] | None = None,
     ignore: Collection[str] = (),
+    whole: bool = False,
+    true: bool = False,
 ) -> Measured | Spectrum | Pull:
     """The test in a table. `length` [m] is the gauge length, which elongations are divided by,
     `area` [m2] the cross-section before the test, for forces, `nu` Poisson's ratio, for moduli of
-    shear, `strains` [1] the range of a pull. `headings` are columns of other names, `ignore` those
-    to leave out.
+    shear, `strains` [1] the range of a pull, all of it if the pull counts `whole`; `true` says that
+    stresses are per area as it is, not as it was. `headings` are columns of other names, `ignore`
+    those to leave out.
 
     Without `test` a table with `frequency` is a sweep, one without `t` a pull, and one over time
     controls what it holds over the second half. Raises `ValueError` naming file, row and column,
@@ -246,8 +255,10 @@ def read(
         raise ValueError(
             f"{path}: strain and stress are opposite; is one of them positive in compression?"
         )
-    if test in ("tension", "compression"):
-        return pulled(path, test, strain, stress, strains)
+    if true and test != "shear":
+        stress = stress / (1 + strain)
+    if test in PULLS:
+        return pulled(path, test, strain, stress, strains, whole)
     if "t" not in values:
         raise ValueError(
             f"{path} has no column `t`: over time it would be a relaxation or a creep test; for a "
@@ -302,10 +313,11 @@ def sweep(path: Path, values: Mapping[str, Array], nu: float | None) -> Spectrum
 
 def pulled(
     path: Path,
-    test: Literal["tension", "compression"],
+    test: PullTest,
     strain: Array,
     stress: Array,
     strains: tuple[float, float] | None,
+    whole: bool = False,
 ) -> Pull:
     """A pull up to its largest strain. Raises `ValueError` without a range that the rows cover, for
     loads in the other direction, and where the strain goes back."""
@@ -314,6 +326,8 @@ def pulled(
     if test == "tension" and sign < 0:
         raise ValueError(f"{path}: the strain is negative: a compression test?")
     up, load = sign * strain[: largest + 1], sign * stress[: largest + 1]
+    if strains is None and whole:
+        strains = float(up.min()), float(up[-1])
     if strains is None:
         raise ValueError(
             f"{path}: a modulus is of a range of strains, which must be given; strains go from "

@@ -51,6 +51,10 @@ def modulus(pull: Pull) -> Modulus:
         raise ValueError(f"{pull.path}: the stress does not grow with the strain in this range")
     curve = np.polyder(np.polyfit(x, y, 2))
     ends = (float(np.polyval(curve, x[0])), float(np.polyval(curve, x[-1])))
+    if pull.test not in ("tension", "compression"):
+        raise ValueError(
+            f"{pull.path}: the modulus of a {pull.test} test is not E; say --energy neo_hookean"
+        )
     return Modulus(pull, {"E": float(E)}, {"E": sd}, fitted, ends, tuple(notices(pull, E, ends)))
 
 

@@ -1,13 +1,15 @@
 """Rubbers from the literature. Every coefficient is `published`, with where, or `assumed`.
 
 None of these sources gives retardation times: one Kelvin-Voigt time is assumed, and ought to be
-fitted to a relaxation or creep test, or identified.
+fitted to a relaxation or creep test, or identified. Those at finite strain are Ogden's energy of
+one term, fitted here (`material fit --energy ogden --range 0 1`) to the pulls of a database.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from torchsoft.physics.hyperelastic import Ogden
 from torchsoft.physics.material import KelvinVoigt
 
 GENT = (
@@ -21,6 +23,12 @@ LINDLEY = (
 JOHNSTON = (
     "I. D. Johnston et al., Mechanical characterization of bulk Sylgard 184 for microfluidics and "
     "microengineering, J. Micromech. Microeng. 24 (2014) 035017"
+)
+MARECHAL = (
+    "pulls to failure of ASTM D412 dumb-bells in the Soft Robotics Materials Database (L. Marechal, "
+    "P. Balland, L. Lindenroth, F. Petrou, C. Kontovounisios, F. Bello, Toward a common framework "
+    "and database of materials for soft robotics, Soft Robotics 8 (2021) 284-297; data under ODbL), "
+    "fitted here to stretches from 1 to 2"
 )
 SMOOTH_ON = "Smooth-On Inc., Dragon Skin series, technical bulletin"
 
@@ -55,22 +63,24 @@ def from_shore_a(hardness: float) -> float:
 
 @dataclass(frozen=True)
 class Preset:
-    """A Kelvin-Voigt rubber with its coefficients E, nu, rho and tau by name."""
+    """A rubber of one retardation time with its coefficients by name: E, or Ogden's mu and alpha,
+    nu, rho and tau."""
 
     name: str
     coefficients: Mapping[str, Coefficient]
 
-    def material(self, depth: float) -> KelvinVoigt:
+    def material(self, depth: float) -> KelvinVoigt | Ogden:
         """Pads of it, so deep [m] out of the plane."""
-        return KelvinVoigt(
-            **{name: one.value for name, one in self.coefficients.items()}, depth=depth
-        )
+        values = {name: one.value for name, one in self.coefficients.items()}
+        if "E" in values:
+            return KelvinVoigt(**values, depth=depth)
+        return Ogden([values.pop("mu")], [values.pop("alpha")], **values, depth=depth)
 
     def described(self) -> str:
         """Every coefficient with its unit, its source and where that is."""
-        units = {"E": "Pa", "nu": "1", "rho": "kg/m3", "tau": "s"}
+        units = {"E": "Pa", "mu": "Pa", "alpha": "1", "nu": "1", "rho": "kg/m3", "tau": "s"}
         rows = [
-            f"  {k:<4}{c.value:<9.4g} {units[k]:<6} {c.source}: {c.origin}"
+            f"  {k:<6}{c.value:<9.4g} {units[k]:<6} {c.source}: {c.origin}"
             for k, c in self.coefficients.items()
         ]
         return "\n".join([self.name, *rows])
@@ -78,10 +88,26 @@ class Preset:
 
 def preset(name: str, E: float, origin: str) -> Preset:
     """A rubber of a published modulus [Pa]; the rest is assumed."""
+    return completed(name, {"E": Coefficient(E, "published", origin)})
+
+
+def stretched(name: str, mu: float, alpha: float, residual: float) -> Preset:
+    """A silicone at finite strain, by Ogden's energy of one term, with what is left of the stress
+    [1]."""
+    origin = f"{MARECHAL}, with a residual of {residual:.1%} of the largest stress"
+    own = {
+        "mu": Coefficient(mu, "published", origin),
+        "alpha": Coefficient(alpha, "published", origin),
+    }
+    return completed(f"{name}, finite strain", own)
+
+
+def completed(name: str, own: Mapping[str, Coefficient]) -> Preset:
+    """A rubber whose other numbers are assumed."""
     return Preset(
         name,
         {
-            "E": Coefficient(E, "published", origin),
+            **own,
             "nu": Coefficient(0.49, "assumed", "nearly incompressible, as rubber is"),
             "rho": Coefficient(RHO, "assumed", "of silicone; counts for inertial pads only"),
             "tau": Coefficient(TAU, "assumed", "fit it to a test, or identify it"),
@@ -126,6 +152,11 @@ PRESETS: Mapping[str, Preset] = {
         natural_rubber(40, 1.50e6),
         natural_rubber(50, 2.20e6),
         natural_rubber(60, 4.45e6),
+        stretched("Dragon Skin 10 Medium", 40.2e3, 3.25, 0.0066),
+        stretched("Dragon Skin 20", 112e3, 3.29, 0.009),
+        stretched("Dragon Skin 30", 168e3, 3.06, 0.0029),
+        stretched("Ecoflex 00-30", 14.5e3, 2.42, 0.0126),
+        stretched("Ecoflex 00-50", 19.8e3, 2.49, 0.0155),
     )
 }
 """Presets by name."""

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from torchsoft.files import finite, save_text, write_json
 from torchsoft.materials.deck import Deck
+from torchsoft.materials.energies import EnergyFit, stretches
 from torchsoft.materials.fit import Fit
 from torchsoft.materials.measured import Spectrum
 from torchsoft.materials.modulus import Modulus
@@ -26,6 +27,12 @@ UNITS = {
     "E": "Pa",
     "moduli": "Pa",
     "J": "1",
+    "C10": "Pa",
+    "C01": "Pa",
+    "C20": "Pa",
+    "C30": "Pa",
+    "mu": "Pa",
+    "alpha": "1",
     "tau": "s",
     "tau_instant": "s",
     "nu": "1",
@@ -37,7 +44,7 @@ FILES = ("material.toml", "summary.json", "fit.png")
 """Files that are written."""
 
 
-Found = Fit | Modulus | Deck
+Found = Fit | Modulus | EnergyFit | Deck
 """A material that a file tells."""
 
 
@@ -55,6 +62,9 @@ def source(found: Found) -> tuple[Path, str]:
     """File, and kind of test."""
     if isinstance(found, Deck):
         return found.path, "deck"
+    if isinstance(found, EnergyFit):
+        tests = dict.fromkeys(pull.test for pull in found.pulls)
+        return found.measured.path, f"{' and '.join(tests)} test"
     return found.measured.path, f"{found.measured.test} test"
 
 
@@ -106,6 +116,15 @@ def method(found: Found) -> dict[str, object]:
             "strains": list(found.measured.strains), "slopes_at_ends": list(found.ends),
             "residual_rms": found.rms, "residual_of": "of the largest",
         }  # fmt: skip
+    if isinstance(found, EnergyFit):
+        return {
+            "method": "least squares of the nominal stress of an incompressible specimen",
+            "tables": [
+                {"file": p.path.name, "test": p.test, "rows": len(p.strain),
+                 "strains": list(p.strains)} for p in found.pulls
+            ],
+            "residual_rms": found.rms, "residual_of": "of the largest",
+        }  # fmt: skip
     m = found.measured
     return {
         "method": "nonnegative least squares on a logarithmic grid of times, then least squares in "
@@ -122,7 +141,7 @@ def method(found: Found) -> dict[str, object]:
 
 def printed(found: Found) -> str:
     """The coefficients with 95 % intervals, and the notices."""
-    units = {"E": "Pa", "t": "s", "J": "1", "n": "1"}
+    units = {"E": "Pa", "t": "s", "J": "1", "n": "1", "C": "Pa", "m": "Pa", "a": "1"}
     path, test = source(found)
     if isinstance(found, Deck):
         head, sd = f"material {found.name}, {found.kind} of {found.terms} terms", {}
@@ -130,12 +149,14 @@ def printed(found: Found) -> str:
         low, high = found.measured.strains
         head = f"strains from {low:g} to {high:g}, residual {found.rms:.2%} of the largest"
         sd = found.sd
+    elif isinstance(found, EnergyFit):
+        head, sd = f"{found.kind}, residual {found.rms:.2%} of the largest", found.sd
     else:
         head = f"{found.kind} of {found.terms} terms, residual {found.rms:.2%} {found.residual_of}"
         sd = found.sd
     rows = [
-        f"{name:<7}{value:<12.5g}{units[name[0]]:<3}"
-        + (f"+- {196 * sd[name] / value:.2g} %" if name in sd else "")
+        f"{name:<8}{value:<12.5g}{units[name[0]]:<3}"
+        + (f"+- {196 * sd[name] / abs(value):.2g} %" if name in sd else "")
         for name, value in found.values.items()
     ]
     notes = (f"note: {notice}" for notice in found.notices)
@@ -146,7 +167,36 @@ def drawn(found: Found) -> Figure:
     """The figure of a material."""
     if isinstance(found, Deck):
         return series(found)
+    if isinstance(found, EnergyFit):
+        return energy(found)
     return line_of(found) if isinstance(found, Modulus) else fitted(found)
+
+
+@rc_context(STYLE)
+def energy(found: EnergyFit) -> Figure:
+    """Nominal stress over stretch of every table with the energy's, and their differences."""
+    figure = new_figure(f"{found.measured.path.name}: {found.kind}", 9, 5.4)
+    data, left = figure.subplots(2, 1, height_ratios=(3, 1.4), sharex=True)
+    for number, (pull, curve) in enumerate(zip(found.pulls, found.fitted)):
+        x, own = stretches(pull), f"C{number}"
+        x = 1 + x if pull.test == "shear" else x
+        label = f"{pull.test}, {len(x)} rows"
+        data.plot(x, MPA * pull.stress, ".", color=own, ms=4, label=label)
+        data.plot(x, MPA * curve, color=own)
+        left.plot(x, MPA * (pull.stress - curve), ".", color=own, ms=4)
+    data.set(
+        ylabel="nominal stress [MPa]",
+        title=f"a) stress; the lines are of W, residual {found.rms:.2%} of the largest",
+    )
+    data.legend()
+    left.axhline(0.0, color=OTHER)
+    sheared = any(pull.test == "shear" for pull in found.pulls)
+    left.set(
+        ylabel="residual [MPa]", title="b) measured less fitted",
+        xlabel="stretch [1]" + (", or 1 + the amount of shear" if sheared else ""),
+    )  # fmt: skip
+    figure.align_ylabels()
+    return figure
 
 
 @rc_context(STYLE)
