@@ -29,7 +29,8 @@ chain, a pull a modulus (kelvin_voigt). Says what the rows do not tell. Writes m
 the names of the constructor's arguments, summary.json and fit.png."""
 
 PRESETS = """\
-Rubbers from the literature, every coefficient marked `published`, with where, or `assumed`."""
+Rubbers from the literature, every coefficient marked `published`, with where, `fitted` to published
+tests, or `assumed`."""
 
 
 def add_commands(commands: Any) -> None:

@@ -1,4 +1,5 @@
-"""Rubbers from the literature. Every coefficient is `published`, with where, or `assumed`.
+"""Rubbers from the literature. Every coefficient is `published`, with where, `fitted` here to
+published tests, or `assumed`.
 
 None of these sources gives retardation times: one Kelvin-Voigt time is assumed, and ought to be
 fitted to a relaxation or creep test, or identified. Those at finite strain are Ogden's energy of
@@ -25,10 +26,9 @@ JOHNSTON = (
     "microengineering, J. Micromech. Microeng. 24 (2014) 035017"
 )
 MARECHAL = (
-    "pulls to failure of ASTM D412 dumb-bells in the Soft Robotics Materials Database (L. Marechal, "
-    "P. Balland, L. Lindenroth, F. Petrou, C. Kontovounisios, F. Bello, Toward a common framework "
-    "and database of materials for soft robotics, Soft Robotics 8 (2021) 284-297; data under ODbL), "
-    "fitted here to stretches from 1 to 2"
+    "pulls to failure of ASTM D412 dumb-bells, Soft Robotics Materials Database (L. Marechal et "
+    "al., Toward a common framework and database of materials for soft robotics, Soft Robotics 8 "
+    "(2021) 284-297; data under ODbL)"
 )
 SMOOTH_ON = "Smooth-On Inc., Dragon Skin series, technical bulletin"
 
@@ -41,10 +41,11 @@ the scale it is not one."""
 
 
 class Coefficient(NamedTuple):
-    """A number of a preset [SI], whether it is published, and where, or why it was assumed."""
+    """A number of a preset [SI], whether it is published, and where, fitted here to published data,
+    or why it was assumed."""
 
     value: float
-    source: Literal["published", "assumed"]
+    source: Literal["published", "fitted", "assumed"]
     origin: str
 
 
@@ -94,11 +95,9 @@ def preset(name: str, E: float, origin: str) -> Preset:
 def stretched(name: str, mu: float, alpha: float, residual: float) -> Preset:
     """A silicone at finite strain, by Ogden's energy of one term, with what is left of the stress
     [1]."""
-    origin = f"{MARECHAL}, with a residual of {residual:.1%} of the largest stress"
-    own = {
-        "mu": Coefficient(mu, "published", origin),
-        "alpha": Coefficient(alpha, "published", origin),
-    }
+    origin = f"to stretches from 1 to 2, {residual:.1%} of the largest stress left, of {MARECHAL}"
+    values = {"mu": mu, "alpha": alpha}
+    own = {symbol: Coefficient(value, "fitted", origin) for symbol, value in values.items()}
     return completed(f"{name}, finite strain", own)
 
 

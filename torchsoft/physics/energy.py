@@ -10,17 +10,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torchsoft.physics.balance import Balance, solved
 from torchsoft.physics.contact import (
     PointLaw,
-    cross,
     interface_law,
     moving_frame,
     point_place,
-    turned,
 )
 from torchsoft.physics.graph import Evaluation, Graph
-from torchsoft.physics.pads import SAMPLES, Pad, free_rates, nodal
+from torchsoft.physics.pads import free_rates, nodal
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.state import State
 
@@ -123,11 +120,13 @@ SEPARATED, STICKING, SLIPPING = 0, 1, 2
 
 
 @torch.no_grad()
-def contact_states(rig: Graph, state: State, force: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """State of every point by contact, int8 (..., points); `force` as a run records it (...,
-    points, 2) [N].
+def contact_states(
+    rig: Graph, state: State, force: Mapping[str, Tensor], rates: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """State of every point by contact, int8 (..., points); `force` (..., points, 2) [N] and the
+    `rates` of nodal pads (..., nodes, 2) [m/s] as a run records them.
 
-    The recorded forces say how fast massless pads give way, so that nothing is solved for. A point
+    The recorded forces say how fast condensed pads give way, so that nothing is solved for. A point
     without normal force is separated; one whose slip dissipates power slips.
     """
     out = {}
@@ -135,7 +134,7 @@ def contact_states(rig: Graph, state: State, force: Mapping[str, Tensor]) -> dic
         own = rig.contacts_of(name)
         touched = {key: force[key][..., 0].flatten(0, -2).any(0).nonzero()[:, 0] for key in own}
         u = rig.displacement(name, state)
-        rate = _rates(rig, name, touched, state, u, force)
+        rate = rates[name] if pad.nodal else _rates(rig, name, touched, state, u, force)
         for key, which in touched.items():
             law, shape = rig.contacts[key].law, rig.shape_of(key)
             spread = pad.spread[which]
@@ -150,14 +149,8 @@ def _rates(
     rig: Graph, name: str, touched: Mapping[str, Tensor], state: State, u: Tensor,
     force: Mapping[str, Tensor],
 ) -> Tensor:  # fmt: skip
-    """Rates (..., nodes, 2) [m/s] of the displacements u of a pad's nodes, in its base's frame."""
+    """Rates (..., nodes, 2) [m/s] of the displacements u of a condensed pad's nodes."""
     pad = rig.pads[name]
-    if pad.inertial:
-        pose, velocity = rig.base_motion(name, state)
-        angle = pose[..., 2, None]
-        arm = turned(pad.positions + u, angle)
-        carried = velocity[..., None, :2] + velocity[..., None, 2:] * cross(arm)
-        return turned(state.rates[name] - carried, -angle)
     f = torch.zeros_like(u)
     for key, which in touched.items():
         spread = pad.spread[which]
@@ -166,22 +159,5 @@ def _rates(
         frame = moving_frame(rig.shape_of(key), *point_place(x))
         F_N, F_T = force[key][..., which, :].split(1, -1)
         f = f + spread.mT @ (F_N * frame.n + F_T * frame.t)
-    if pad.nodal:
-        return torch.cat([_given_way(pad, *some) for some in _split(u, f)]).reshape(u.shape)
     free, P = free_rates(pad, state.pads[name], 0.0)
     return free + nodal(P, f)
-
-
-def _split(*values: Tensor) -> list[tuple[Tensor, ...]]:
-    """Values (..., nodes, 2), some samples at a time."""
-    return list(zip(*(value.reshape(-1, *value.shape[-2:]).split(SAMPLES) for value in values)))
-
-
-def _given_way(pad: Pad, u: Tensor, f: Tensor) -> Tensor:
-    """Rates (samples, nodes, 2) [m/s] of a massless nodal pad at displacements u under forces f on
-    its nodes."""
-    at = pad.at_corners(u)
-    balance = Balance(pad, lambda rate: pad.element_forces(at, rate))
-    left = f + balance.residual(torch.zeros_like(u))
-    factors = balance.linearised(torch.zeros_like(u))
-    return solved(left.flatten(1), factors).reshape(u.shape)

@@ -53,7 +53,7 @@ def extensions(rig: Rig) -> dict[str, Extension]:
             )  # fmt: skip
     for stem, material in _shared(rig, Material):
         pads = [pad for pad in rig.pads.values() if pad.material is material]
-        if material.slow is None and not any(pad.inertial for pad in pads):
+        if material.slow is None and not any(pad.nodal for pad in pads):
             longest = float(material.chain()[1].detach().max())
             for factor in SLOWER:
                 out[f"{stem}.slow({factor * longest:.3g} s)"] = Extension(

@@ -12,6 +12,7 @@ from torchsoft.cost import Cost, row_bytes, step_time, steps_per_second
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.display import hidden
 from torchsoft.files import make_folder, write_json
+from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.mesh.mesh import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
@@ -178,14 +179,13 @@ def cost(file: RigFile, runs: bool) -> Cost:
         span, s = file.outputs.duration, file.solver
         steps = span / s.step if s.step is not None else span * steps_per_second(s.rtol or RTOL)
         for mesh, table in zip(meshes, file.pads.values()):
+            material = file.materials[table.material].build(file.folder)
+            nodal = table.inertial or isinstance(material, Hyperelastic)
             surface, free, _ = mesh.counts()
             points = table.points * surface
-            seconds += 0.5 * steps * step_time(surface, points, free if table.inertial else 0)
+            seconds += 0.5 * steps * step_time(surface, points, free if nodal else 0)
             memory += (
-                span
-                / file.outputs.interval
-                * row_bytes(free if table.inertial else surface, points)
-                / 2**30
+                span / file.outputs.interval * row_bytes(free if nodal else surface, points) / 2**30
             )
     return Cost(steps, seconds, memory)
 

@@ -25,12 +25,14 @@ class SimulationFailed(RuntimeError):
 class Progress:
     """Results of the stepper so far: rows of the output grid, its steps, and its counters.
 
-    integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them.
+    integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them; rate: of
+    the displacements of nodal pads [m/s].
     """
 
     y: Array
     integrals: Array
     recorded: Array
+    rate: Array
     rows: int = 1
     steps: int = 0
     solves: int = 0

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.energy import stored
+from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
@@ -327,6 +328,7 @@ def gather(
     steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
     return Trajectory(
         t=t, y=y, state=state, channels=measured, force=force, loads=load, recorded=felt,
+        rates=nodal_rates(rig, out.rate[:count]),
         displacement=displacement, energy=energy,
         dissipated={name: integrals[name] for name in names.dissipated},
         supplied={name: integrals[name] for name in names.supplied if name in names.active},
@@ -343,6 +345,13 @@ def gather(
         ),
         units=units(rig), setup=Setup.of(rig), rig=task.rig or rig,
     )  # fmt: skip
+
+
+def nodal_rates(rig: Rig, rate: Array) -> dict[str, Tensor]:
+    """Rates (T, nodes, 2) of the displacements of nodal pads, from those of all of their dofs."""
+    pads = {name: 2 * pad.nodes for name, pad in rig.pads.items() if pad.nodal}
+    parts = torch.from_numpy(rate).split(list(pads.values()), -1)
+    return {name: part.unflatten(-1, (-1, 2)) for name, part in zip(pads, parts)}
 
 
 # Inputs of a run: numbers in any usual form, and a start whose graph may be shared.

@@ -170,7 +170,7 @@ class ImplicitStepper:
             out_tape = out_tape._replace(y=y)
         outputs = Outputs(
             plan.out_step, plan.out_part, at_outputs, y, out.integrals[rows], out.recorded[rows],
-            out_tape,
+            out.rate[rows], out_tape,
         )  # fmt: skip
         most = self.max_iterations if steps else START_ITERATIONS
         limits = Limits(self.tolerance, most, self.window)
@@ -349,11 +349,9 @@ class ImplicitStepper:
 
     def _room(self, rows: int) -> Progress:
         """Room for so many outputs."""
-        y, integrals, recorded = (
-            np.zeros((rows, width))
-            for width in (self.layout.size, len(self.integrals.names), recorded_size(self.system))
-        )
-        return Progress(y, integrals, recorded, origin=self.origin)
+        s, names = self.system, self.integrals.names
+        widths = self.layout.size, len(names), recorded_size(s), int(s.nodal_dof_start[-1])
+        return Progress(*(np.zeros((rows, width)) for width in widths), origin=self.origin)
 
     @property
     def system(self) -> Any:

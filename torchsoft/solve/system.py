@@ -422,12 +422,12 @@ class Rates:
         self.calls += 1
         found = self._solve(t, y, out)
         if not found:  # once more without the last call's guess
-            self._work.u_dot[:] = 0.0
+            self._work.u_dot[:], self._work.rate[:] = 0.0, 0.0
             found = self._solve(t, y, out)
         if self._followed.error is not None:
             raise self._followed.error
         if not found:
-            self._work.u_dot[:] = 0.0
+            self._work.u_dot[:], self._work.rate[:] = 0.0, 0.0
             raise SimulationFailed(
                 f"at t = {t:.6g} s Newton's iteration found no forces for the state", float(t)
             )

@@ -97,6 +97,7 @@ class Trajectory(Shown):
     setup: Setup = field(default_factory=Setup, repr=False)
     rig: Rig | None = field(default=None, repr=False, compare=False)
     recorded: Tensor | None = field(default=None, repr=False)
+    rates: dict[str, Tensor] = field(default_factory=dict, repr=False)
     touch: Touch | None = field(default=None, repr=False)
     known_contact_state: dict[str, Tensor] | None = field(default=None, repr=False, compare=False)
 
@@ -204,7 +205,7 @@ class Trajectory(Shown):
         rig = self.rig
         if rig is not None and rig.description()["parameters"] == self.made_by["parameters"]:
             state = State(*({k: x.detach() for k, x in part.items()} for part in self.state))
-            return contact_states(rig, state, self.force)
+            return contact_states(rig, state, self.force, self.rates)
         touching = {name: force[..., 0] > 0 for name, force in self.force.items()}
         return {name: -there.to(torch.int8) for name, there in touching.items()}
 

@@ -411,8 +411,8 @@ class Outputs(NamedTuple):
     the signals are signals[i].
 
     Its state goes to y, its integrals to integrals, its forces to recorded (as `recorded_size`
-    orders them); tape has one row an output, or none, each a stage of no length there, whose y it
-    shares.
+    orders them), the rates of nodal pads' dofs to rate; tape has one row an output, or none, each a
+    stage of no length there, whose y it shares.
     """
 
     step: Index
@@ -421,6 +421,7 @@ class Outputs(NamedTuple):
     y: Matrix
     integrals: Matrix
     recorded: Matrix
+    rate: Matrix
     tape: Annotated[Any, Tape]
 
 

@@ -224,6 +224,7 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
             return TAPE_FULL, solves
         put(d.at_row, out.integrals[i])
         record(s, w, d.wrenches, out.recorded[i])
+        put(w.rate, out.rate[i])
         put(d.guess_V, w.V)
         put(d.guess, w.u_dot)
         put(d.guess_rate, w.rate)
