@@ -217,7 +217,7 @@ def test_vtk_files_are_read_back(done, tmp_path):
         np.testing.assert_allclose(
             mesh.point_data["displacement"][first : first + count, :2], own @ pad.axes.T, atol=1e-15
         )
-        stress = pad.stress(pad.strain(own))
+        stress = pad.stress(own)
         np.testing.assert_allclose(mesh.cell_data["von_mises"][0][rows], von_mises(stress))
         tensor = mesh.cell_data["stress"][0][rows].reshape(-1, 3, 3)
         np.testing.assert_allclose(np.trace(tensor, axis1=1, axis2=2), stress[:, :3].sum(1))
