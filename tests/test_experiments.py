@@ -363,3 +363,11 @@ def test_law_comparison_smoke(tmp_path):
     *near, far, other = summary["cases"]
     assert [case["answer"] for case in (*near, far, other)] == ["right"] * 2 + ["cannot tell"] * 2
     assert min(case["D"] for case in near) > 7.3 > 1 > max(far["D"], other["D"])
+
+
+def test_finite_strain_smoke(tmp_path):
+    _, numbers = smoke("finite_strain", tmp_path)
+    more = {name: row["more"] for name, row in numbers["layer"].items()}
+    assert 0.2 < more["nu 0.45, 25% of the height"] < more["nu 0.49, 25% of the height"] < 0.5
+    assert 0.77 < numbers["manipulation"]["linear"]["E as stiff [MPa]"] < 0.9
+    assert (tmp_path / "finite_strain.png").exists()

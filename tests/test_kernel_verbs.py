@@ -96,7 +96,7 @@ def test_banded_solves_are_the_dense_ones(n, band):
     b = ANY.normal(size=(n, 3))
     factor, x, back = stored.ravel().copy(), b.ravel().copy(), b[:, 0].copy()
     linear.factor_banded(factor, n, band)
-    linear.solve_banded(factor, n, band, x, 3)
+    linear.solve_banded(factor, n, band, x, 3, 0)
     linear.solve_transposed(factor, n, band, back)
     assert x.reshape(n, 3) == pytest.approx(np.linalg.solve(A, b), rel=1e-10)
     assert back == pytest.approx(np.linalg.solve(A.T, b[:, 0]), rel=1e-10)

@@ -121,16 +121,16 @@ def solve_one_banded(A: Array, n: int, band: int, b: Array) -> None:
 
 
 @compiled
-def solve_banded(A: Array, n: int, band: int, b: Array, m: int) -> None:
-    """Solution of A x = b for the m right-hand sides b (n m,), row by row, in place; A is
-    factorised."""
+def solve_banded(A: Array, n: int, band: int, b: Array, m: int, first: int) -> None:
+    """Solution of A x = b for the m right-hand sides b (n m,), row by row, zero before row `first`,
+    in place; A is factorised."""
     if m == 1:
         solve_one_banded(A, n, band, b)
         return
     width = 2 * band + 1
-    for i in range(n):
+    for i in range(first, n):
         row = b[i * m : (i + 1) * m]
-        for k in range(max(0, i - band), i):
+        for k in range(max(first, i - band), i):
             factor = A[i * width + band + k - i]
             if factor != 0.0:
                 add(-factor, b[k * m : (k + 1) * m], row)

@@ -201,10 +201,10 @@ def factor(s: Any, w: Any, pad: int, a: float) -> None:
 
 
 @compiled
-def solve(s: Any, w: Any, pad: int, b: Array, m: int) -> None:
-    """A^-1 of m right-hand sides b (dofs m,) in place."""
+def solve(s: Any, w: Any, pad: int, b: Array, m: int, first: int) -> None:
+    """A^-1 of m right-hand sides b (dofs m,), zero before dof `first`, in place."""
     n = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad]
-    solve_banded(matrix(s, w, pad), n, s.nodal_band[pad], b, m)
+    solve_banded(matrix(s, w, pad), n, s.nodal_band[pad], b, m, first)
 
 
 @compiled
@@ -238,7 +238,7 @@ def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
     for i in range(last - first):
         change = change_of_speed(s, w, pad, first + i, y, vx if i % 2 == 0 else vy)
         free[i] = -w.internal[first + i] - mass_rate(s, pad, first + i, a) * change
-    solve(s, w, pad, free, 1)
+    solve(s, w, pad, free, 1, 0)
     for i in range(last - first):
         free[i] += w.rate[first + i]
     for node in range(w.low[pad], w.high[pad]):
@@ -273,9 +273,11 @@ def respond(s: Any, w: Any, pad: int, a: float) -> None:
         M = mass_rate(s, pad, first + i, a)
         b[i * m + 2 * n + i % 2] = M
         w.D_left[first + i, i % 2], w.D_left[first + i, 1 - i % 2] = M, 0.0
+    loaded = 0 if moved else last - first
     for j in range(2 * n):
-        b[s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2] * m + j] = 1.0
-    solve(s, w, pad, b, m)
+        dof = s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2]
+        b[dof * m + j], loaded = 1.0, min(loaded, dof)
+    solve(s, w, pad, b, m, loaded)
     if moved:
         B = w.B[pad]
         B[:] = 0.0
@@ -474,7 +476,7 @@ def push(
     b = w.solves[: (last - first) * m]
     for i in range(last - first):
         put(free[first + i], b[i * m : (i + 1) * m])
-    solve(s, w, pad, b, m)
+    solve(s, w, pad, b, m, 0)
     for i in range(last - first):
         put(b[i * m : (i + 1) * m], free[first + i])
     for i in range(w.counts[pad]):
@@ -521,7 +523,7 @@ def push_rates(s: Any, w: Any, z: Any, pad: int, X: Array, m: int) -> None:
         for o in range(2):
             dof = s.nodal_surface[2 * w.touched[nodes + i] + o]
             put(X[2 * i + o, :m], b[dof * m : (dof + 1) * m])
-    solve(s, w, pad, b, m)
+    solve(s, w, pad, b, m, 0)
     for i in range(last - first):
         rate = z.rate_of[first + i]
         put(z.free[first + i], rate)
