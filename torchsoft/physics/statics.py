@@ -112,12 +112,13 @@ def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, i
             )
 
 
-def carried(rig: Graph, name: str, state: State) -> Tensor:
+def carried(rig: Graph, name: str, state: State, known: dict[str, Tensor] | None = None) -> Tensor:
     """A pad's part of the state at rest, by semi-smooth Newton from the undeformed pad: its nodes'
     displacements (..., nodes, 2) [m], or the forces on them (..., branches, nodes, 2) [N].
 
     Batch dimensions of `state` hold copies of one state: one backward pass then gives as many rows
-    of a Jacobian.
+    of a Jacobian. A nodal pad is sought from the displacements that `known` holds of a state
+    nearby, and leaves its own there.
     """
     pad = rig.pads[name]
     own = rig.contacts_of(name)
@@ -125,7 +126,7 @@ def carried(rig: Graph, name: str, state: State) -> Tensor:
     undeformed = torch.zeros(*batch, pad.nodes, 2, dtype=torch.float64)
     found, left = undeformed, 0.0
     if own and pad.nodal:
-        found, left = displaced(rig, name, state, batch)
+        found, left = displaced(rig, name, state, batch, {} if known is None else known)
     elif own:
         law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
         found, left = nodal_forces(
@@ -139,7 +140,9 @@ def carried(rig: Graph, name: str, state: State) -> Tensor:
     return found if pad.nodal else found[..., None, :, :].expand(*batch, pad.branches, -1, -1)
 
 
-def displaced(rig: Graph, name: str, state: State, batch: Sequence[int]) -> tuple[Tensor, float]:
+def displaced(
+    rig: Graph, name: str, state: State, batch: Sequence[int], known: dict[str, Tensor]
+) -> tuple[Tensor, float]:
     """Displacements (*batch, nodes, 2) [m] of a nodal pad in balance with its contacts, in a batch
     of copies of one state, and the largest step that is left."""
     pad, own, first = rig.pads[name], rig.contacts_of(name), (0,) * len(batch)
@@ -151,8 +154,8 @@ def displaced(rig: Graph, name: str, state: State, batch: Sequence[int]) -> tupl
         balances.append(Balance(pad, pad.element_forces, law))
     undeformed, law = torch.zeros(pad.nodes, 2, dtype=torch.float64), balances[0].law
     assert law is not None
-    for parts in ((1.0,), SOFTER):
-        u = undeformed
+    begins = [(known[name], (1.0,))] if name in known else []
+    for u, parts in (*begins, (undeformed, (1.0,)), (undeformed, SOFTER)):
         try:
             for part in parts:
                 softer = Balance(pad, pad.element_forces, lambda u, part=part: part * law(u))
@@ -160,6 +163,7 @@ def displaced(rig: Graph, name: str, state: State, batch: Sequence[int]) -> tupl
         except FloatingPointError:
             continue
         if left <= RESIDUAL:
+            known[name] = u
             copies = math.prod(batch)
             return balances[1].corrected(u.expand(*batch, -1, -1), copies * factors), left
     return undeformed, torch.inf
@@ -250,11 +254,12 @@ def resting(
         batch = q.shape[:-1]
         still = {name: torch.zeros(*batch, 3, dtype=q.dtype) for name in rig.bodies}
         state = State({}, unstretched(rig, batch), poses(q), {}, still)
-        state = state._replace(pads={name: carried(rig, name, state) for name in rig.pads})
+        state = state._replace(pads={name: carried(rig, name, state, known) for name in rig.pads})
         net = net_loads(rig, state, followed.expand(*batch, -1, -1), actuators)
         net |= {name: net[name] + load for name, load in (pushed or {}).items()}
         return torch.cat([net[name][..., axes] for name, axes in sought.items()], -1) / scale
 
+    known: dict[str, Tensor] = {}
     path: list[tuple[float, Tensor]] = []
     while len(path) < ITERATIONS and not stalled(path, stride):
         with torch.enable_grad():

@@ -287,7 +287,8 @@ class ImplicitStepper:
                 new = self.signals([half]).numpy(), self.signals_at_outputs([half]).numpy()
                 pending.append((half, *new, halvings + 1))
             elif status != CONVERGED:
-                raise self._failure(status, float(plan.starts[steps]), float(plan.h[steps]))
+                since, h = float(plan.starts[steps]), float(plan.h[steps])
+                raise self._failure(now.work, status, since, h)
 
     def _by_tolerance(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
@@ -324,7 +325,7 @@ class ImplicitStepper:
                 self._cap *= 2
             elif status != CONVERGED:
                 worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
-                raise self._failure(status, float(clock[0]), float(clock[1]), worst)
+                raise self._failure(now.work, status, float(clock[0]), float(clock[1]), worst)
 
     def _start(self, now: "RunState") -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
@@ -335,7 +336,7 @@ class ImplicitStepper:
         before, here = now.copy(), slice(0, 1)
         _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping)
         if status != CONVERGED:
-            raise self._failure(status, 0.0, INSTANT)
+            raise self._failure(now.work, status, 0.0, INSTANT)
         now.keep(plan, none, signals, before, here, tapes)
 
     def signals(self, todo: Sequence[Plan]) -> Tensor:
@@ -397,8 +398,25 @@ class ImplicitStepper:
             self._cap *= 2
             now.back(before)
 
-    def _failure(self, status: int, since: float, h: float, worst: str = "") -> SimulationFailed:
-        """The failure at a time `since` the origin [s]."""
+    def _lost(self, work: Any) -> str:
+        """A sentence on the first body that is no longer on its pad where the last stage ended;
+        empty if none is."""
+        s = self.system
+        for c, contact in enumerate(self.rig.contacts.values()):
+            pad, body = s.contact_pad[c], f"`{contact.body}` was lost"
+            at, n = s.pad_point_start[pad], work.actives[pad]
+            ends = s.contact_point_start[c], s.contact_point_start[c + 1] - 1
+            if np.isin(work.active[at : at + n], ends).any():
+                return f"{body}: its contact reached the end of the pad `{contact.pad}`"
+            x, y, limit = *work.relative[c, :2], s.contact_limits[c]
+            if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
+                return f"{body}: it left the space over the pad `{contact.pad}`"
+        return ""
+
+    def _failure(
+        self, work: Any, status: int, since: float, h: float, worst: str = ""
+    ) -> SimulationFailed:
+        """The failure at a time `since` the origin [s]; `work` is what the last stage left."""
         time = self.origin + since
         if h == INSTANT:
             most, tried, instead = START_ITERATIONS, "at the start", "another start"
@@ -412,8 +430,7 @@ class ImplicitStepper:
             NEWTON_FAILED: f"Newton's iteration did not converge within {most} iterations {tried}; "
             f"try {instead}, or a larger v_s of the friction law: where friction falls with slip "
             "faster than the pads damp, massless pads have no unique velocity",
-            OFF_THE_PAD: "the body was lost: its contact reached the end of a pad",
-            LOST: "the body was lost: it left the space over a pad",
+            **dict.fromkeys((OFF_THE_PAD, LOST), self._lost(work)),
             REFUSED: f"the tolerances would need steps below {self._shortest:.3g} s for {worst}; "
             "loosen rtol or atol, or look for a jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
