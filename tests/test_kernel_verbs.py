@@ -54,7 +54,12 @@ def called(*arrays: str) -> Any:
 def plain(monkeypatch):
     """Kernels are plain functions where nothing has compiled them; laws are called by ctypes."""
     for module in (contacts, nodal, sources, stage, tangent, adjoint):
-        for name, arrays in (("value", "xpo"), ("linearise", "xpoJ"), ("pullback", "xpwb")):
+        for name, arrays in (
+            ("value", "xpo"),
+            ("linearise", "xpoJ"),
+            ("pullback", "xpwb"),
+            ("push", "xpdo"),
+        ):
             if hasattr(module, f"call_{name}"):
                 monkeypatch.setattr(module, f"call_{name}", called(*arrays))
 

@@ -36,6 +36,7 @@ class Law:
     value: int
     linearise: int
     pullback: int
+    push: int = 0
 
 
 def compile_law(
@@ -81,8 +82,13 @@ def compile_law(
     linear = _count("linear", linear, len(outputs))
     differentiated = _count("differentiated", differentiated, x.numel())
     count = sum(tensor.numel() for tensor in parameters.values())
-    engine = emit.compiled(_functions(graph, outputs, linear, differentiated, count, lanes))
-    addresses = [engine.get_function_address(name) for name in ("value", "linearise", "pullback")]
+    functions = _functions(graph, outputs, linear, differentiated, count, lanes)
+    names = ["value", "linearise", "pullback"]
+    if conjugates is not None:
+        functions.append(_push(graph, outputs[:linear], count, lanes))
+        names.append("push")
+    engine = emit.compiled(functions)
+    addresses = [engine.get_function_address(name) for name in names]
     return Law(count, len(outputs), linear, differentiated, *addresses)
 
 
@@ -99,32 +105,47 @@ def _forces(g: Graph, potentials: list[int], n: int) -> list[int]:
 def _functions(
     g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int, lanes: int
 ) -> list[str]:
-    """IR of the three entry points."""
+    """IR of the entry points that every law has."""
     x = [g.leaf("x", i) for i in range(differentiated)]
-    p = [g.leaf("p", j) for j in range(parameters)]
-    seeds: dict[int, int] = {}
-    for o, node in enumerate(outputs[:linear]):
-        weight = g.leaf("w", o)
-        seeds[node] = g("add", seeds[node], weight) if node in seeds else weight
     J = itertools.chain.from_iterable(jacobian(g, outputs[:linear], x))
-    lookups = [
-        node for node, op in enumerate(g.ops) if op == "lookup"
-    ]  # of parameters: known when it runs of which
-    p_bar = adjoints(g, seeds, {}, dependent(g, p + lookups), p + lookups)
+    p, p_bar = _pulled(g, outputs[:linear], parameters)
     return [
         emit.function(g, "value", ("x", "p", "out"), {"out": outputs}, lanes=lanes),
         emit.function(
             g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}, lanes=lanes
         ),
-        emit.function(
-            g,
-            "pullback",
-            ("x", "p", "w", "p_bar"),
-            {},
-            {"p_bar": zip(p + lookups, p_bar)},
-            lanes,
-        ),
+        emit.function(g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p, p_bar)}, lanes),
     ]
+
+
+def _pulled(g: Graph, outputs: list[int], parameters: int) -> tuple[list[int], list[int]]:
+    """The parameters, with look-ups of them, and their cotangents under weights of the outputs."""
+    p = [g.leaf("p", j) for j in range(parameters)]
+    seeds: dict[int, int] = {}
+    for o, node in enumerate(outputs):
+        weight = g.leaf("w", o)
+        seeds[node] = g("add", seeds[node], weight) if node in seeds else weight
+    lookups = [
+        node for node, op in enumerate(g.ops) if op == "lookup"
+    ]  # of parameters: known when it runs of which
+    return p + lookups, adjoints(g, seeds, {}, dependent(g, p + lookups), p + lookups)
+
+
+def _push(g: Graph, outputs: list[int], parameters: int, lanes: int) -> str:
+    """IR of the push: the pullback is linear in its weights, and its derivative by them transposed
+    is the push."""
+    p, p_bar = _pulled(g, outputs, parameters)
+    if len(p) > parameters:
+        raise UnknownOperation(
+            "The law looks up parameters by a value, which an energy cannot; write it with others."
+        )
+    seeds: dict[int, int] = {}
+    for j, node in enumerate(p_bar):
+        direction = g.leaf("d", j)
+        seeds[node] = g("add", seeds[node], direction) if node in seeds else direction
+    w = [g.leaf("w", o) for o in range(len(outputs))]
+    along = adjoints(g, seeds, {}, dependent(g, w), w)
+    return emit.function(g, "push", ("x", "p", "d", "out"), {"out": along}, lanes=lanes)
 
 
 def _count(name: str, count: int | None, available: int) -> int:

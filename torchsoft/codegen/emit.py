@@ -143,14 +143,14 @@ class _Body:
         g, op, v = self.g, self.g.ops[node], f"%v{node}"
         if op in LEAVES:
             at = g.args[node][0]
-            if op != "p" and self.lanes > 1:
+            if op in ("x", "w") and self.lanes > 1:
                 yield f"%a{node} = getelementptr double, {POINTER} %{op}, i64 {at * self.lanes}"
                 yield f"{v} = load {self.number}, {POINTER} %a{node}, align 8"
                 return
             yield from _address(g, node, op, f"%a{node}", operands)
             one = v if self.lanes == 1 else f"{v}.0"
             yield f"{one} = load double, {POINTER} %a{node}"
-            if self.lanes > 1:  # of a parameter, in every lane
+            if self.lanes > 1:  # the same in every lane
                 yield f"{v}.1 = insertelement {self.number} undef, double {one}, i32 0"
                 yield (
                     f"{v} = shufflevector {self.number} {v}.1, {self.number} undef, "

@@ -8,7 +8,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-LEAVES = ("x", "p", "w")  # the inputs, the parameters, and the output weights of a pullback
+LEAVES = ("x", "p", "w", "d")  # inputs, parameters, output weights, a direction of parameters
 COMPARISONS = {
     "lt": operator.lt,
     "le": operator.le,
@@ -69,7 +69,8 @@ class Graph:
         return self._node(op, args, (op, *args), op in COMPARISONS or op in LOGIC, finite)
 
     def leaf(self, kind: str, index: int) -> int:
-        """Entry `index` of the inputs "x", the parameters "p" or the output weights "w"."""
+        """Entry `index` of the inputs "x", the parameters "p", the output weights "w" of a pullback
+        or a direction "d" of the parameters."""
         return self._node(kind, (index,), (kind, index), False, True)
 
     def constant(self, value: float | bool) -> int:

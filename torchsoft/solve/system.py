@@ -249,6 +249,7 @@ class Compiled:
                                       for pad in rig.pads.values()], band=band,
             band_start=np.cumsum([0, *(n * (2 * b + 1) for n, b in zip(dofs, band))])[:-1],
             value=address("value"), linearise=address("linearise"), pullback=address("pullback"),
+            push=address("push"),
             p_first=starts, p_last=ends,
             X=joined(lambda pad: pad.positions.numpy().ravel()),
             area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2)),

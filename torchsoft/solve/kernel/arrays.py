@@ -128,6 +128,7 @@ class Nodal(NamedTuple):
     value: Index
     linearise: Index
     pullback: Index
+    push: Index
     p_first: Index
     p_last: Index
     X: Array
@@ -350,7 +351,7 @@ SCRATCH: dict[str, dict[str, str]] = {
     "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
         "most": "weights",
         "8 lanes": "element",
-        "parameters": "gradient",
+        "parameters": "gradient direction",
         "most columns": "change",
         "free columns": "r V",
         "nodes 2 columns": "u v own_rate",

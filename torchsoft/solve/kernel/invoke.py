@@ -53,6 +53,12 @@ def _pullback(typingctx, address, x, p, w, p_bar):
     return _call(address, x, p, w, p_bar)
 
 
+def _push(typingctx, address, x, p, d, out):
+    """Derivative out[o] of the law at `address` along the direction d of its parameters."""
+    return _call(address, x, p, d, out)
+
+
 call_value: Any = intrinsic(_value)
 call_linearise: Any = intrinsic(_linearise)
 call_pullback: Any = intrinsic(_pullback)
+call_push: Any = intrinsic(_push)

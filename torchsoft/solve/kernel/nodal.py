@@ -13,7 +13,12 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, inlined
 from torchsoft.solve.kernel.arrays import CORNERS, LANES
-from torchsoft.solve.kernel.invoke import call_linearise, call_pullback, call_value
+from torchsoft.solve.kernel.invoke import (
+    call_linearise,
+    call_pullback,
+    call_push,
+    call_value,
+)
 from torchsoft.solve.kernel.linear import (
     add,
     dot,
@@ -421,36 +426,36 @@ def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: 
 
 
 @compiled
-def element_push(
-    s: Any, w: Any, z: Any, pad: int, e: int, du: Array, dv: Array, dp: Array, rates: bool,
-    out: Array,
-) -> None:  # fmt: skip
-    """Add the tangents of element e's forces to `out` (dofs, m): by displacements du (dofs, m), by
-    the parameters, and with `rates` by rates dv (dofs, m)."""
-    own, J, lane = element_parameters(s, pad), w.element_J[e // LANES], e % LANES
-    i0 = s.nodal_dof_start[pad]
-    moved = False
-    for j in range(own.start, own.stop):
-        for k in range(dp.shape[1]):
-            moved |= dp[j, k] != 0.0
-    for c in range(CORNERS):
-        row = s.nodal_dof[e, c]
-        if row < 0:
-            continue
-        for d in range(CORNERS):
-            dof = s.nodal_dof[e, d]
-            if dof >= 0:
-                add(J[c, d, lane], du[dof], out[i0 + row])
-                if rates:
-                    add(J[c, CORNERS + d, lane], dv[i0 + dof], out[i0 + row])
-        if moved:
-            weights, gradient = z.element, z.gradient[: own.stop - own.start]
-            weights[:], gradient[:] = 0.0, 0.0
-            weights[c, lane] = 1.0
-            x = w.element_x[e // LANES]
-            call_pullback(s.nodal_pullback[pad], x, s.p[own], weights, gradient)
-            for j in range(gradient.size):
-                add(gradient[j], dp[own.start + j], out[i0 + row])
+def push_elements(
+    s: Any, w: Any, z: Any, pad: int, du: Array, dv: Array, dp: Array, rates: bool, out: Array
+) -> None:
+    """Add the tangents of the elements' forces to `out` (all dofs, m): by displacements du (dofs,
+    m), by the parameters, and with `rates` by rates dv (all dofs, m)."""
+    own, i0, m = element_parameters(s, pad), s.nodal_dof_start[pad], dp.shape[1]
+    d, low_high = z.direction[: own.stop - own.start], groups(s, pad)
+    for g in range(low_high[0], low_high[1]):
+        J, dofs = w.element_J[g], s.nodal_dof[g * LANES : (g + 1) * LANES]
+        for lane in range(LANES):
+            for c in range(CORNERS):
+                row = dofs[lane, c]
+                for e in range(CORNERS if row >= 0 else 0):
+                    dof = dofs[lane, e]
+                    if dof >= 0:
+                        add(J[c, e, lane], du[dof], out[i0 + row])
+                        if rates:
+                            add(J[c, CORNERS + e, lane], dv[i0 + dof], out[i0 + row])
+    for k in range(m):
+        moved = False
+        for j in range(d.size):
+            d[j] = dp[own.start + j, k]
+            moved |= d[j] != 0.0
+        for g in range(low_high[0], low_high[1] if moved else low_high[0]):
+            call_push(s.nodal_push[pad], w.element_x[g], s.p[own], d, z.element)
+            for lane in range(LANES):
+                for c in range(CORNERS):
+                    row = s.nodal_dof[g * LANES + lane, c]
+                    if row >= 0:
+                        out[i0 + row, k] += z.element[c, lane]
 
 
 @compiled
@@ -464,8 +469,7 @@ def push(
     vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
     du, at = dy[U : U + last - first], s.nodal_density_at[pad]
     free[first:last] = 0.0
-    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_push(s, w, z, pad, e, du, free, dp, False, free)
+    push_elements(s, w, z, pad, du, free, dp, False, free)
     for i in range(first, last):
         for k in range(m):
             free[i, k] = -free[i, k]
@@ -558,8 +562,7 @@ def push_felt(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, d
     load = 2 * s.point_contact.size + 3 * s.pad_base.size + base
     out[first:last] = 0.0
     du = dy[U : U + last - first]
-    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        element_push(s, w, z, pad, e, du, z.rate_of, dp, True, out)
+    push_elements(s, w, z, pad, du, z.rate_of, dp, True, out)
     for k in range(m):
         x = z_axis = moment = 0.0
         for i in range(first, last, 2):
