@@ -320,7 +320,13 @@ RIGS: dict[str, Callable[[], Start]] = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=RIGS)
+SLOW = "Ogden pads", "Mooney-Rivlin pads on turning bases", "neo-Hookean pads with inertia"
+PARAMS = [
+    pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in RIGS
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=PARAMS)
 def start(request):
     return RIGS[request.param]()
 

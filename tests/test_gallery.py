@@ -52,6 +52,14 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "train_a_policy": lambda n: n["loss"].item() < 0.05,
     "learn_to_turn": lambda n: max(n["trained"]) < 0.1 < max(n["untrained"]),
     "reduced_model": lambda n: n["score"](n["reduced"], n["other"]).worst < 0.01,
+    "finite_strain": lambda n: (
+        1.03
+        < float(
+            n["runs"]["neo_hookean"].force["U"][-1, :, 0].sum()
+            / n["runs"]["kelvin_voigt"].force["U"][-1, :, 0].sum()
+        )
+        < 1.15
+    ),
     "energy": lambda n: n["run"].energy_residual_rel < 1e-4,
 }
 

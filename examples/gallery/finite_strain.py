@@ -2,8 +2,8 @@
 Rubber at real strains
 ======================
 
-A layer of rubber that is pressed by a sixth of its height is stiffer than linear theory has it. The
-same grasp with linear pads and with neo-Hookean ones, and how fast the difference grows.
+When are linear pads too soft? A layer of rubber that is pressed by a sixth of its height is stiffer
+than linear theory has it: the same grasp with linear pads and with neo-Hookean ones.
 """
 
 import matplotlib.pyplot as plt

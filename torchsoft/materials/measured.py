@@ -26,7 +26,7 @@ PullTest = Literal["tension", "compression", "planar", "biaxial", "shear"]
 """Tests of a modulus or a strain energy: along one direction, along one with the width held, along
 two, and simple shear, whose strain is its amount."""
 
-PULLS = get_args(PullTest)
+PULLS: tuple[PullTest, ...] = get_args(PullTest)
 
 Test = Literal["relaxation", "creep", "sweep"] | PullTest
 """The controlled quantity over time: strain, so that the stress relaxes; or stress, so that the
@@ -257,8 +257,9 @@ def read(
         )
     if true and test != "shear":
         stress = stress / (1 + strain)
-    if test in PULLS:
-        return pulled(path, test, strain, stress, strains, whole)
+    pull: PullTest | None = next((one for one in PULLS if one == test), None)
+    if pull is not None:
+        return pulled(path, pull, strain, stress, strains, whole)
     if "t" not in values:
         raise ValueError(
             f"{path} has no column `t`: over time it would be a relaxation or a creep test; for a "
@@ -266,7 +267,8 @@ def read(
         )
     if strains is not None:
         raise ValueError(f"{path}: a range of strains is of a tension or a compression test")
-    return Measured(path, test or held(path, strain, stress), values["t"], strain, stress)
+    own = test if test in ("relaxation", "creep") else held(path, strain, stress)
+    return Measured(path, own, values["t"], strain, stress)
 
 
 def held(path: Path, strain: Array, stress: Array) -> Literal["relaxation", "creep"]:

@@ -28,7 +28,7 @@ ALIKE = 1e-6
 """Largest relative difference between the moduli that a material states and those of its energy,
 and largest stress of the undeformed material over its shear modulus."""
 
-SERIES, SMALL = 12, 0.02
+SERIES, SMALL = 8, 0.005
 """Terms of the series for sums of powers of two stretches, and up to what difference between them
 it is taken: their closed form has no derivative where they are equal."""
 
@@ -266,11 +266,10 @@ def described(material: Material) -> dict[str, Any] | None:
     kind = next((name for name, own in KINDS.items() if type(material) is own), None)
     if kind is None:
         return None
+    numbers: dict[str, Any] = {}
     if isinstance(material, Ogden):
         columns = zip(*material.series())
-        numbers = dict(zip(("mu", "alpha"), ([x.item() for x in column] for column in columns)))
-    else:
-        numbers = {}
+        numbers |= zip(("mu", "alpha"), ([x.item() for x in column] for column in columns))
     for name in signature(KINDS[kind]).parameters:
         if name not in numbers:
             numbers[name] = getattr(material, name).item()

@@ -71,10 +71,10 @@ class PadSetup:
         """A pad as it is now."""
         material = pad.material
         finite = isinstance(material, Hyperelastic)
+        E, nu, depth = (getattr(material, x).item() for x in ("E", "nu", "depth"))
         return cls(
             pad.mesh, pad.axes.numpy(), pad.origin.numpy(), pad.base, pad.inertial, pad.points,
-            *(getattr(material, x).item() for x in ("E", "nu", "depth")),
-            finite, described(material) if finite else None,
+            E, nu, depth, finite, described(material) if finite else None,
         )  # fmt: skip
 
     @property

@@ -355,7 +355,7 @@ def element_law(name: str, material: Material, factors: Tensor) -> tuple[Law, di
     Raises `UnknownOperation` for an energy that cannot be compiled, with the pad's name.
     """
     own = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
-    parameters = {f"material.{key}": value for key, value in own.items()}
+    parameters: dict[str, Tensor] = {f"material.{key}": value for key, value in own.items()}
     parameters["factors.values"] = factors
     size = 2 * CORNERS + CONSTANTS
     try:

@@ -352,7 +352,8 @@ class ImplicitStepper:
         """Room for so many outputs."""
         s, names = self.system, self.integrals.names
         widths = self.layout.size, len(names), recorded_size(s), int(s.nodal_dof_start[-1])
-        return Progress(*(np.zeros((rows, width)) for width in widths), origin=self.origin)
+        y, integrals, recorded, rate = (np.zeros((rows, width)) for width in widths)
+        return Progress(y, integrals, recorded, rate, origin=self.origin)
 
     @property
     def system(self) -> Any:
@@ -403,14 +404,14 @@ class ImplicitStepper:
         empty if none is."""
         s = self.system
         for c, contact in enumerate(self.rig.contacts.values()):
-            pad, body = s.contact_pad[c], f"`{contact.body}` was lost"
+            pad, body = s.contact_pad[c], contact.body
             at, n = s.pad_point_start[pad], work.actives[pad]
             ends = s.contact_point_start[c], s.contact_point_start[c + 1] - 1
             if np.isin(work.active[at : at + n], ends).any():
-                return f"{body}: its contact reached the end of the pad `{contact.pad}`"
+                return f"`{body}` was lost: its contact reached the end of the pad `{contact.pad}`"
             x, y, limit = *work.relative[c, :2], s.contact_limits[c]
             if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
-                return f"{body}: it left the space over the pad `{contact.pad}`"
+                return f"`{body}` was lost: it left the space over the pad `{contact.pad}`"
         return ""
 
     def _failure(
