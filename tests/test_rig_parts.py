@@ -592,4 +592,4 @@ def test_a_run_that_ends_where_it_begins_has_its_summary(folder, tmp_path):
     running.run(rig(folder, pads={"upper": {"origin": (5.0, 0.0)}}), tmp_path)
     numbers = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert numbers["simulated_s"] == 0.0
-    assert "it left the space over a pad" in numbers["stopped"]
+    assert "`disc` was lost: it left the space over the pad `upper`" in numbers["stopped"]

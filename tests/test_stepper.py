@@ -39,7 +39,9 @@ def test_a_disc_rolled_off_the_pad_is_reported():
     model = coarse()
     y0 = grasped(model)
     beyond = towards(model, Profile([0.0, 1.0], [0.06, 0.13]))
-    with pytest.raises(SimulationFailed, match="contact reached the end of a pad") as caught:
+    with pytest.raises(
+        SimulationFailed, match="`disc` was lost: its contact reached the end of the pad"
+    ) as caught:
         simulate(model, times(1.0, 101), y0=y0, reference=beyond)
     run = caught.value.trajectory
     assert len(run.t) == len(run.y) == len(run["x_C"]) < 101
