@@ -66,10 +66,10 @@ def figures(block: Any, found: dict[str, Any], configuration: dict[str, Any]) ->
 
 
 GALLERY = (
-    "first_run", "own_rig", "rig_from_a_file", "shapes", "fingertips", "relaxation", "friction_law",
-    "gradient_check", "sensitivities", "batch", "torchdiffeq_adjoint", "which_motion", "identify",
-    "identify_friction", "plan_a_motion", "train_a_policy", "learn_to_turn",
-    "reduced_model", "energy",
+    "first_run", "own_rig", "rig_from_a_file", "shapes", "fingertips", "relaxation",
+    "finite_strain", "friction_law", "gradient_check", "sensitivities", "batch",
+    "torchdiffeq_adjoint", "which_motion", "identify", "identify_friction", "plan_a_motion",
+    "train_a_policy", "learn_to_turn", "reduced_model", "energy",
 )  # fmt: skip
 """Programs of the gallery, in their order."""
 
