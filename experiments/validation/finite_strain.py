@@ -6,9 +6,9 @@ paper's manipulation with both: angle and force at 10 s, the push that rolling t
 that a fit of linear pads to the force would give, time of a run and of its gradient.
 
 Command: .venv/bin/python experiments/validation/finite_strain.py [--smoke]
-Expected: at the paper's sixth of the height 17 % (nu 0.45) and 24 % (nu 0.49) more force; linear pads
-of E = 0.85 MPa press as hard as neo-Hookean ones of 0.75 MPa; 10 s of the manipulation take some 7 s,
-its gradient as long. About 2 min.
+Expected: at the paper's sixth of the height 17 % (nu 0.45) and 24 % (nu 0.49) more force; linear
+pads of E = 0.85 MPa press as hard as neo-Hookean ones of 0.75 MPa; 10 s of the manipulation take
+some 7 s, its gradient as long. About 2 min.
 """
 
 import time

@@ -1,8 +1,9 @@
-"""Pads: a mesh of a material, bonded to a base, massless (condensed onto its surface) or inertial.
+"""Pads: a mesh of a material, bonded to a base, condensed onto its surface or nodal.
 
-Displacements are in the frame of the base, which turns with it. A massless pad's state are the
-parts z_b (nodes, 2) [N] of its nodal forces that have set in, branch by branch of its material's
-chain; an inertial pad's its displacements and velocities.
+Displacements are in the frame of the base, which turns with it. A condensed pad is linear and
+massless: its state are the parts z_b (nodes, 2) [N] of its nodal forces that have set in, branch by
+branch of its material's chain. A nodal pad, at finite strain or inertial, has the displacements of
+its nodes, and with inertia their velocities.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -207,7 +208,9 @@ class Pad(nn.Module):
 
     def elements(self, name: str) -> tuple[str, ...]:
         """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
-        elements of its chain."""
+        elements of its chain, or of its strain energy W."""
+        if isinstance(self.material, Hyperelastic):
+            return f"C: W_{name}", f"R: R_{name}"
         own = name if self.branches == 1 else f"{name},1..{self.branches}"
         return f"C: [K_{own}]^-1", f"R: [R_{own}]"
 

@@ -30,8 +30,8 @@ class Rig(Shown, Graph):
     `forward(t, y)` follows torchdiffeq: y has shape (..., `layout.size`), float64, any batch
     dimensions. Not smooth where a point touches, where the normal force is cut at zero and where a
     point begins to slip; continuous there with smooth laws. Raises `ValueError` for names that do
-    not fit together, and `NotImplementedError` for an inertial pad whose base turns or whose
-    material has several retardation times.
+    not fit together, and `NotImplementedError` for an inertial pad whose base turns, and for one
+    that is inertial or at finite strain with several retardation times.
     """
 
     short: Mapping[str, str] = {}

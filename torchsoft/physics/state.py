@@ -13,8 +13,8 @@ class State(NamedTuple):
     """One state, batch dimensions leading, every part by the name of its pad, contact or body. SI
     units.
 
-    pads: of massless pads the nodal forces that have set in (..., branches, nodes, 2) [N], of
-    inertial pads the displacements (..., nodes, 2) [m]; stretch: of contacts (..., points); pose,
+    pads: of condensed pads the nodal forces that have set in (..., branches, nodes, 2) [N], of
+    nodal pads the displacements (..., nodes, 2) [m]; stretch: of contacts (..., points); pose,
     velocity: of bodies (..., 3), x, y and theta, those that are fixed or driven included; rates:
     velocities of inertial pads' nodes (..., nodes, 2), absolute; friction: of contacts whose law of
     friction has states of its own (..., states, points).
