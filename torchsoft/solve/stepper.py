@@ -161,6 +161,7 @@ class ImplicitStepper:
         # look for near points afresh, so that a segment made again has the same bits
         now.work.travelled[0] = np.inf
         now.work.low[:] = now.work.high[:] = 0
+        now.work.held[:] = 0.0
         y = out.y[rows]
         tape, out_tape = (
             room("Tape", self.system, self.layout.size, stages=n, cap=self._cap)
