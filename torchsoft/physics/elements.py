@@ -59,29 +59,32 @@ def element_constants(corners: Array) -> Array:
 
 class Place(NamedTuple):
     """An area of an element, and gradients there of the displacements and of their rates, each as
-    (xx, xy, yx, yy), xy that of x along y."""
+    (xx, xy, yx, yy), xy that of x along y; of the Gauss points with these along the last axis."""
 
     area: Tensor
     gradient: tuple[Tensor, Tensor, Tensor, Tensor]
     rate: tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def places(x: Tensor) -> list[Place]:
+def places(x: Tensor) -> tuple[Place, Place]:
     """The centre, for the whole element, and the Gauss points."""
-    u, rate, constants = x[..., :8], x[..., 8:16], x[..., 16:]
+    u, rate = x[..., :8], x[..., 8:16]
+    constants = x[..., 16:].unflatten(-1, (1 + len(GAUSS), 9))
+    gx, gy, area = constants[..., 0:8:2], constants[..., 1:8:2], constants[..., 8]
 
-    def at(number: int) -> Place:
-        own = constants[..., 9 * number : 9 * number + 9]
-        gx, gy = own[..., 0:8:2], own[..., 1:8:2]
+    def gradient(of: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        ux, uy = of[..., None, 0::2], of[..., None, 1::2]
+        xx, xy = (gx * ux).sum(-1), (gy * ux).sum(-1)
+        return xx, xy, (gx * uy).sum(-1), (gy * uy).sum(-1)
 
-        def gradient(of: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            ux, uy = of[..., 0::2], of[..., 1::2]
-            xx, xy = (gx * ux).sum(-1), (gy * ux).sum(-1)
-            return xx, xy, (gx * uy).sum(-1), (gy * uy).sum(-1)
+    of_u, of_rate = gradient(u), gradient(rate)
 
-        return Place(own[..., 8], gradient(u), gradient(rate))
+    def at(which: int | slice) -> Place:
+        xx, xy, yx, yy = (one[..., which] for one in of_u)
+        x, a, b, y = (one[..., which] for one in of_rate)
+        return Place(area[..., which], (xx, xy, yx, yy), (x, a, b, y))
 
-    return [at(number) for number in range(1 + len(GAUSS))]
+    return at(0), at(slice(1, None))
 
 
 def element_potentials(material: Material, factors: Factors, x: Tensor) -> Tensor:
@@ -93,7 +96,7 @@ def element_potentials(material: Material, factors: Factors, x: Tensor) -> Tenso
 def element_energy(material: Material, factors: Factors, x: Tensor) -> Tensor:
     """Energy (...) [J] of an element in the state x (..., 61)."""
     depth, _, lame_lambda, lame_mu = factors.values.unbind(-1)
-    centre, *gauss = places(x)
+    centre, gauss = places(x)
     if isinstance(material, Hyperelastic):
         return depth * finite_energy(material, lame_mu, centre, gauss)
     return depth * linear(lame_lambda, lame_mu, centre, gauss, "gradient")
@@ -102,60 +105,51 @@ def element_energy(material: Material, factors: Factors, x: Tensor) -> Tensor:
 def element_potential(material: Material, factors: Factors, x: Tensor) -> Tensor:
     """Dissipation potential (...) [W] of an element in the state x (..., 61)."""
     depth, tau, lame_lambda, lame_mu = factors.values.unbind(-1)
-    centre, *gauss = places(x)
+    centre, gauss = places(x)
     if isinstance(material, Hyperelastic):
         bulk = lame_lambda + 2 / 3 * lame_mu
         return depth * tau * finite_potential(bulk, lame_mu, centre, gauss)
     return depth * tau * linear(lame_lambda, lame_mu, centre, gauss, "rate")
 
 
-def linear(
-    lame_lambda: Tensor, lame_mu: Tensor, centre: Place, gauss: list[Place], kind: str
-) -> Tensor:
+def linear(lame_lambda: Tensor, lame_mu: Tensor, centre: Place, gauss: Place, kind: str) -> Tensor:
     """Energy per depth at small strains, or the same of their rates."""
-    xx, _, _, yy = getattr(centre, kind)
-    total = 0.5 * lame_lambda * centre.area * (xx + yy) ** 2
-    for place in gauss:
-        xx, xy, yx, yy = getattr(place, kind)
-        total = total + lame_mu * place.area * (xx**2 + yy**2 + 0.5 * (xy + yx) ** 2)
-    return total
+    x, _, _, y = getattr(centre, kind)
+    xx, xy, yx, yy = getattr(gauss, kind)
+    shear = lame_mu * gauss.area * (xx**2 + yy**2 + 0.5 * (xy + yx) ** 2)
+    return 0.5 * lame_lambda * centre.area * (x + y) ** 2 + shear.sum(-1)
 
 
-def finite_energy(
-    material: Hyperelastic, shear: Tensor, centre: Place, gauss: list[Place]
-) -> Tensor:
+def finite_energy(material: Hyperelastic, shear: Tensor, centre: Place, gauss: Place) -> Tensor:
     """Energy per depth at finite strain."""
-    J_0, _ = volume(centre)
-    total = centre.area * material.dilatation(J_0)
-    for place in gauss:
-        (xx, xy, yx, yy), (J, _) = place.gradient, volume(place)
-        zero, one = torch.zeros_like(J), torch.ones_like(J)
-        rows = (1 + xx, xy, zero), (yx, 1 + yy, zero), (zero, zero, one)
-        W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
-        total = total + place.area * (W + WITHIN * shear * (J - J_0) ** 2)
-    return total
+    (J_0, _), (J, _) = volume(centre), volume(gauss)
+    xx, xy, yx, yy = gauss.gradient
+    zero, one = torch.zeros_like(J), torch.ones_like(J)
+    rows = (1 + xx, xy, zero), (yx, 1 + yy, zero), (zero, zero, one)
+    W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
+    W = W + WITHIN * shear * (J - J_0[..., None]) ** 2
+    return centre.area * material.dilatation(J_0) + (gauss.area * W).sum(-1)
 
 
-def finite_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: list[Place]) -> Tensor:
+def finite_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: Place) -> Tensor:
     """Dissipation potential per depth and retardation time at finite strain: quadratic in the rates
     of J_0, of J - J_0, and of (C J^(-2/3) - 1) / 2, C = F^T F."""
-    _, J_0_rate = volume(centre)
-    total = 0.5 * bulk * centre.area * J_0_rate**2
-    for place in gauss:
-        (xx, xy, yx, yy), G = place.gradient, place.rate
-        F, (J, J_rate) = (1 + xx, xy, yx, 1 + yy), volume(place)
-        C = F[0] ** 2 + F[2] ** 2, F[1] ** 2 + F[3] ** 2, F[0] * F[1] + F[2] * F[3]
-        half = (  # of the rate of C
-            F[0] * G[0] + F[2] * G[2],
-            F[1] * G[1] + F[3] * G[3],
-            0.5 * (F[0] * G[1] + F[1] * G[0] + F[2] * G[3] + F[3] * G[2]),
-        )
-        isochoric, part = power(J, -2 / 3), J_rate / (3 * J)
-        e_xx, e_yy, e_xy = (isochoric * (one - part * c) for one, c in zip(half, C))
-        e_zz = -isochoric * part
-        square = e_xx**2 + e_yy**2 + e_zz**2 + 2 * e_xy**2
-        total = total + place.area * shear * (square + WITHIN * (J_rate - J_0_rate) ** 2)
-    return total
+    (_, J_0_rate), (J, J_rate) = volume(centre), volume(gauss)
+    (xx, xy, yx, yy), G = gauss.gradient, gauss.rate
+    F = 1 + xx, xy, yx, 1 + yy
+    C = F[0] ** 2 + F[2] ** 2, F[1] ** 2 + F[3] ** 2, F[0] * F[1] + F[2] * F[3]
+    half = (  # of the rate of C
+        F[0] * G[0] + F[2] * G[2],
+        F[1] * G[1] + F[3] * G[3],
+        0.5 * (F[0] * G[1] + F[1] * G[0] + F[2] * G[3] + F[3] * G[2]),
+    )
+    isochoric, part = power(J, -2 / 3), J_rate / (3 * J)
+    e_xx, e_yy, e_xy = (isochoric * (one - part * c) for one, c in zip(half, C))
+    e_zz = -isochoric * part
+    square = e_xx**2 + e_yy**2 + e_zz**2 + 2 * e_xy**2
+    within = WITHIN * (J_rate - J_0_rate[..., None]) ** 2
+    distortion = (gauss.area * shear * (square + within)).sum(-1)
+    return 0.5 * bulk * centre.area * J_0_rate**2 + distortion
 
 
 def volume(place: Place) -> tuple[Tensor, Tensor]:
