@@ -180,10 +180,11 @@ def cost(file: RigFile, runs: bool) -> Cost:
         steps = span / s.step if s.step is not None else span * steps_per_second(s.rtol or RTOL)
         for mesh, table in zip(meshes, file.pads.values()):
             material = file.materials[table.material].build(file.folder)
-            nodal = table.inertial or isinstance(material, Hyperelastic)
+            finite = isinstance(material, Hyperelastic)
+            nodal = table.inertial or finite
             surface, free, _ = mesh.counts()
             points = table.points * surface
-            seconds += 0.5 * steps * step_time(surface, points, free if nodal else 0)
+            seconds += 0.5 * steps * step_time(surface, points, free if nodal else 0, finite)
             memory += (
                 span / file.outputs.interval * row_bytes(free if nodal else surface, points) / 2**30
             )
