@@ -24,12 +24,12 @@ from torchsoft import (
 )
 from torchsoft.codegen import compile_law
 from torchsoft.physics import elements
-from torchsoft.physics.elements import Factors, element_constants, element_potentials
+from torchsoft.physics.elements import element_constants, element_potentials
 from torchsoft.physics.hyperelastic import again, described, invariants
 from torchsoft.physics.setup import PadSetup
 from torchsoft.physics.statics import net_loads, settled, unstretched
 from torchsoft.solve.kernel.arrays import LANES
-from torchsoft.solve.laws import as_law
+from torchsoft.solve.laws import Factors, as_law, element
 
 REST = {"nu": 0.45, "rho": 1100.0, "tau": 0.01, "depth": 0.044}
 MATERIALS = {
@@ -47,9 +47,9 @@ def material(request):
     return MATERIALS[request.param]()
 
 
-def factors(material, tau: float = 0.01) -> Factors:
+def factors(material, tau: float = 0.01) -> Tensor:
     lame = material.bulk - 2 / 3 * material.shear, material.shear
-    return Factors(torch.stack((material.depth, f64(tau)[0], *lame)).detach())
+    return torch.stack((material.depth, f64(tau)[0], *lame)).detach()
 
 
 def random(size: float, seed: int = 0, n: int = 8) -> Tensor:
@@ -58,8 +58,8 @@ def random(size: float, seed: int = 0, n: int = 8) -> Tensor:
 
 
 def law_of(material, lanes: int = 1):
-    own = factors(material)
-    function, parameters = as_law(element_potentials, {"material": material, "factors": own})
+    own = Factors(factors(material))
+    function, parameters = as_law(element, {"material": material, "factors": own})
     x = torch.cat((random(1e-4), random(1e-4, 1), CONSTANTS))
     law = compile_law(
         function, x, parameters, linear=8, differentiated=16, conjugates=8, lanes=lanes

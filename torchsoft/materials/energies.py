@@ -123,15 +123,16 @@ def fit_energy(
         raise ValueError(f"{rows} rows do not tell {count} coefficients; take fewer terms")
     x = [stretches(pull) for pull in pulls]
     sizes = [float(np.abs(pull.stress).max()) for pull in pulls]
-    units = scales(kind, pulls[0], count)
+    units = scales(kind, pulls[0], count, nu)
+
+    def material(z: Array) -> Hyperelastic:
+        table = arguments(kind, (z * units).tolist())
+        return made(kind, table, nu=nu, rho=1e3, tau=1.0, depth=1.0)
 
     def stresses(z: Array) -> list[Array]:
-        table = arguments(kind, (z * units).tolist())
-        if kind == "neo_hookean":
-            table["E"] *= 1 + nu
-        material = made(kind, table, nu=nu, rho=1e3, tau=1.0, depth=1.0)
+        own = material(z)
         signs = [-1.0 if pull.test == "compression" else 1.0 for pull in pulls]
-        return [s * nominal_stress(material, p.test, at) for s, p, at in zip(signs, pulls, x)]
+        return [s * nominal_stress(own, p.test, at) for s, p, at in zip(signs, pulls, x)]
 
     def residuals(z: Array) -> Array:
         parts = zip(stresses(z), pulls, sizes)
@@ -149,27 +150,24 @@ def fit_energy(
     _, s, V = np.linalg.svd(best.jac, full_matrices=False)
     spread = ((V.T / np.maximum(s, 1e-300)) ** 2).sum(1)
     sd = units * np.sqrt(spread * 2 * best.cost / max(rows - count, 1))
-    values = best.x * units
-    if kind == "neo_hookean":
-        values, sd = values * (1 + nu), sd * (1 + nu)
     half = range(1, count // 2 + 1)
     names = (
         [f"{symbol}_{k}" for symbol in NAMES[kind] for k in half]
         if kind == "ogden"
         else list(NAMES[kind])
     )
-    own = dict(zip(names, values.tolist())), dict(zip(names, sd.tolist()))
-    material = made(kind, arguments(kind, values.tolist()), nu=nu, rho=1e3, tau=1.0, depth=1.0)
-    said = tuple(notices(pulls, material, *own))
+    own = dict(zip(names, (best.x * units).tolist())), dict(zip(names, sd.tolist()))
+    said = tuple(notices(pulls, material(best.x), *own))
     return EnergyFit(tuple(pulls), kind, *own, tuple(stresses(best.x)), said)
 
 
-def scales(kind: str, pull: Pull, count: int) -> Array:
-    """Units of the coefficients: the pull's modulus [Pa], and 1 for exponents."""
+def scales(kind: str, pull: Pull, count: int, nu: float) -> Array:
+    """Units of the coefficients: the pull's modulus [Pa], for E what it is at Poisson's ratio nu,
+    and 1 for exponents."""
     modulus = np.full(count, float(pull.strain @ pull.stress / (pull.strain @ pull.strain)))
     if kind == "ogden":
         modulus[count // 2 :] = 1.0
-    return modulus
+    return modulus * (1 + nu) if kind == "neo_hookean" else modulus
 
 
 def beginnings(kind: str, count: int) -> list[Array]:

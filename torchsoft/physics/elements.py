@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchsoft.physics.hyperelastic import Hyperelastic, power
 from torchsoft.physics.material import Material
@@ -34,15 +34,6 @@ CORNERS = 8
 
 CONSTANTS = 9 * (1 + len(GAUSS))
 """Number of an element's constants."""
-
-
-class Factors(nn.Module):
-    """Numbers (..., 4) of a pad's elements besides the material's energy: depth [m], retardation
-    time tau [s], and the Lame moduli lambda and mu [Pa] of small strains."""
-
-    def __init__(self, values: Tensor) -> None:
-        super().__init__()
-        self.values = nn.Parameter(values)
 
 
 def element_constants(corners: Array) -> Array:
@@ -87,24 +78,26 @@ def places(x: Tensor) -> tuple[Place, Place]:
     return at(0), at(slice(1, None))
 
 
-def element_potentials(material: Material, factors: Factors, x: Tensor) -> Tensor:
-    """Energy [J] and dissipation potential [W] (..., 2) of an element in the state x (..., 61)."""
+def element_potentials(material: Material, factors: Tensor, x: Tensor) -> Tensor:
+    """Energy [J] and dissipation potential [W] (..., 2) of an element in the state x (..., 61);
+    `factors` (..., 4) are the pad's depth [m], retardation time tau [s], and the Lame moduli lambda
+    and mu [Pa] of small strains."""
     parts = element_energy(material, factors, x), element_potential(material, factors, x)
     return torch.stack(parts, -1)
 
 
-def element_energy(material: Material, factors: Factors, x: Tensor) -> Tensor:
+def element_energy(material: Material, factors: Tensor, x: Tensor) -> Tensor:
     """Energy (...) [J] of an element in the state x (..., 61)."""
-    depth, _, lame_lambda, lame_mu = factors.values.unbind(-1)
+    depth, _, lame_lambda, lame_mu = factors.unbind(-1)
     centre, gauss = places(x)
     if isinstance(material, Hyperelastic):
         return depth * finite_energy(material, lame_mu, centre, gauss)
     return depth * linear(lame_lambda, lame_mu, centre, gauss, "gradient")
 
 
-def element_potential(material: Material, factors: Factors, x: Tensor) -> Tensor:
+def element_potential(material: Material, factors: Tensor, x: Tensor) -> Tensor:
     """Dissipation potential (...) [W] of an element in the state x (..., 61)."""
-    depth, tau, lame_lambda, lame_mu = factors.values.unbind(-1)
+    depth, tau, lame_lambda, lame_mu = factors.unbind(-1)
     centre, gauss = places(x)
     if isinstance(material, Hyperelastic):
         bulk = lame_lambda + 2 / 3 * lame_mu

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from torchsoft.physics.material import LINEAR, TERMS, KelvinVoigt, Material, terms
+from torchsoft.physics.material import LINEAR, TERMS, KelvinVoigt, Material, OneTime, terms
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Density, Depth, Modulus, PoissonRatio, Quantity, Retardation
 
@@ -33,7 +33,7 @@ SERIES, SMALL = 8, 0.005
 it is taken: their closed form has no derivative where they are equal."""
 
 
-class Hyperelastic(Material):
+class Hyperelastic(OneTime):
     """Interface of a material at finite strain, W(F) = `distortion`(F) + `dilatation`(det F); E and
     nu are the moduli of small strains.
 
@@ -42,19 +42,6 @@ class Hyperelastic(Material):
     should stand in `dilatation`, which elements take at their centre: elsewhere it makes nearly
     incompressible elements too stiff.
     """
-
-    def __init__(
-        self, E: Modulus | None, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth
-    ) -> None:
-        super().__init__(E, nu, rho, depth)
-        self.tau = parameter(tau)
-
-    def chain(self) -> tuple[Tensor, Tensor]:
-        return torch.ones_like(self.tau)[None], self.tau[None]
-
-    @property
-    def branches(self) -> int:
-        return 1
 
     def distortion(self, F: Tensor) -> Tensor:
         """Strain energy (...) [J/m3] of the distortion by F (..., 3, 3), in plane strain: F_zz = 1,

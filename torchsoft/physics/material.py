@@ -100,11 +100,11 @@ class Material(nn.Module):
         return ""
 
 
-class KelvinVoigt(Material):
-    """One retardation time tau [s]: R = tau K, the paper's constant R field."""
+class OneTime(Material):
+    """Interface of a material with one retardation time tau [s]."""
 
     def __init__(
-        self, E: Modulus, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth
+        self, E: Modulus | None, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth
     ) -> None:
         super().__init__(E, nu, rho, depth)
         self.tau = parameter(tau)
@@ -115,6 +115,15 @@ class KelvinVoigt(Material):
     @property
     def branches(self) -> int:
         return 1
+
+
+class KelvinVoigt(OneTime):
+    """One retardation time tau [s]: R = tau K, the paper's constant R field."""
+
+    def __init__(
+        self, E: Modulus, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth
+    ) -> None:
+        super().__init__(E, nu, rho, tau, depth)
 
 
 class StandardLinearSolid(Material):

@@ -20,7 +20,6 @@ from torch.utils.checkpoint import checkpoint
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import tensor, whole
 from torchsoft.physics.elements import (
-    Factors,
     element_constants,
     element_energy,
     element_potential,
@@ -220,7 +219,8 @@ class Pad(nn.Module):
         return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
 
     def factors(self) -> Tensor:
-        """Numbers (4,) of the elements besides the material's energy, as `Factors` has them."""
+        """Numbers (4,) of the elements besides the material's energy, as `element_potentials` has
+        them."""
         material, (_, times) = self.material, self.chain()
         depth = material.depth if self.E_ratio is None else self.E_ratio * material.depth
         return torch.stack((depth, times[0], *lame_moduli(material.E, material.nu)))
@@ -238,12 +238,12 @@ class Pad(nn.Module):
         values = torch.where(held, 0.0, f).flatten(-2)
         return total.index_add(-1, dofs.flatten(), values).unflatten(-1, (-1, 2))
 
-    def element_inputs(self, u: Tensor, rate: Tensor) -> tuple[Material, Factors, Tensor]:
+    def element_inputs(self, u: Tensor, rate: Tensor) -> tuple[Material, Tensor, Tensor]:
         """Arguments of the laws of a nodal pad's elements, with displacements and rates (...,
         elements, 8) at their corners."""
         constants = torch.from_numpy(self.constants).expand(*u.shape[:-1], -1)
         inputs = torch.cat((u, rate, constants), -1)
-        return self.material, factors_of(self.factors()), inputs
+        return self.material, self.factors(), inputs
 
     def element_forces(self, u: Tensor, rate: Tensor | None = None) -> Tensor:
         """Forces (..., elements, 8) [N] on the corners of a nodal pad's elements, by default at
@@ -267,7 +267,6 @@ class Pad(nn.Module):
     def internal_force(self, u: Tensor, rate: Tensor) -> Tensor:
         """Forces of a nodal pad (..., nodes, 2) [N] at displacements u (..., nodes, 2) [m] and
         their rates [m/s]."""
-        u, rate = torch.broadcast_tensors(u, rate)
         return self.from_corners(self.element_forces(self.at_corners(u), self.at_corners(rate)))
 
     def strain_energy(self, u: Tensor) -> Tensor:
@@ -306,14 +305,6 @@ class Pad(nn.Module):
     def constants(self) -> Array:
         """Constants of every element (elements, 45) in the base's frame."""
         return element_constants(self.placed(self.mesh.nodes)[self.mesh.elements])
-
-
-def factors_of(values: Tensor) -> Factors:
-    """The factors of elements over a tensor with a graph."""
-    out = Factors(values.detach())
-    del out.values
-    out.values = values  # pyright: ignore[reportAttributeAccessIssue]
-    return out
 
 
 def shape_functions(nodes: Any, shares: Array, count: int) -> Array:

@@ -28,7 +28,7 @@ from torchsoft.physics.contact import (
     relative_motion,
     slip_of,
 )
-from torchsoft.physics.elements import CONSTANTS, CORNERS, Factors, element_potentials
+from torchsoft.physics.elements import CONSTANTS, CORNERS, element_potentials
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.motion import Reference, polynomial
@@ -349,6 +349,19 @@ def weight_law() -> Law:
     return compile_law(law, torch.zeros(0, dtype=torch.float64), {"numbers": numbers})
 
 
+class Factors(nn.Module):
+    """Numbers of a pad's elements besides the material's energy, as a module's parameter."""
+
+    def __init__(self, values: Tensor) -> None:
+        super().__init__()
+        self.values = nn.Parameter(values.detach())
+
+
+def element(material: Material, factors: Factors, x: Tensor) -> Tensor:
+    """Potentials of an element, from the modules that a compiled law is made of."""
+    return element_potentials(material, factors.values, x)
+
+
 def element_law(name: str, material: Material, factors: Tensor) -> tuple[Law, dict[str, Tensor]]:
     """The law of the elements of the pad called `name`, and its parameters.
 
@@ -360,8 +373,8 @@ def element_law(name: str, material: Material, factors: Tensor) -> tuple[Law, di
     size = 2 * CORNERS + CONSTANTS
     try:
         law = compiled_law(
-            parameters, element_potentials, size, CORNERS, 2 * CORNERS, conjugates=CORNERS,
-            lanes=LANES, material=material, factors=Factors(factors.detach()),
+            parameters, element, size, CORNERS, 2 * CORNERS, conjugates=CORNERS,
+            lanes=LANES, material=material, factors=Factors(factors),
         )  # fmt: skip
     except UnknownOperation as error:
         raise UnknownOperation(f"the material of the pad `{name}`: {error}") from error

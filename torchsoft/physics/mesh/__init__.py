@@ -14,14 +14,11 @@ from torchsoft.physics.mesh.mesh import (
     StoredMesh,
     dofs_of,
     lame_moduli,
-    lame_slopes,
     unit_compliance,
-    unit_loads,
 )
 from torchsoft.physics.mesh.quads import QuadMesh
 
 __all__ = [
     "Array", "CurvedPadMesh", "FingertipMesh", "Index", "Mesh", "PadMesh", "QuadMesh",
-    "StoredMesh", "dofs_of", "lame_moduli", "lame_slopes", "unit_compliance",
-    "unit_loads",
+    "StoredMesh", "dofs_of", "lame_moduli", "unit_compliance",
 ]  # fmt: skip

@@ -432,8 +432,8 @@ def push_elements(
     """Add the tangents of the elements' forces to `out` (all dofs, m): by displacements du (dofs,
     m), by the parameters, and with `rates` by rates dv (all dofs, m)."""
     own, i0, m = element_parameters(s, pad), s.nodal_dof_start[pad], dp.shape[1]
-    d, low_high = z.direction[: own.stop - own.start], groups(s, pad)
-    for g in range(low_high[0], low_high[1]):
+    d, (low, high) = z.direction[: own.stop - own.start], groups(s, pad)
+    for g in range(low, high):
         J, dofs = w.element_J[g], s.nodal_dof[g * LANES : (g + 1) * LANES]
         for lane in range(LANES):
             for c in range(CORNERS):
@@ -449,7 +449,7 @@ def push_elements(
         for j in range(d.size):
             d[j] = dp[own.start + j, k]
             moved |= d[j] != 0.0
-        for g in range(low_high[0], low_high[1] if moved else low_high[0]):
+        for g in range(low, high if moved else low):
             call_push(s.nodal_push[pad], w.element_x[g], s.p[own], d, z.element)
             for lane in range(LANES):
                 for c in range(CORNERS):
