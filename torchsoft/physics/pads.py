@@ -138,7 +138,7 @@ class Pad(nn.Module):
     @property
     def branches(self) -> int:
         """Kelvin elements of the chain."""
-        return self.material.branches + (self.material.slow is not None)
+        return self.material.branches + len(self.material.added)
 
     spread: Tensor
     """Shape functions of the nodes in the state at the contact points (points, nodes)."""
