@@ -25,6 +25,7 @@ from torchsoft.sysid import (
     sensitivity,
 )
 from torchsoft.sysid.assumptions import (
+    AMOUNTS,
     PLACE,
     Variation,
     assumptions,
@@ -37,15 +38,14 @@ from torchsoft.sysid.identification import held_by, notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import (
-    AMOUNTS,
     End,
+    assuming,
     Joint,
     difference,
     ended,
     fewest,
     joint_fit,
     refit,
-    varied,
 )
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
@@ -247,7 +247,7 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     base, steps = problem.freeze(runner, x, problem.names, RTOL)
     end = End(x, at, problem.coordinates.free, problem.names, base, steps, RTOL, runner, RTOL)
     law = next(
-        one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction"
+        one for one in assumptions(problem.recordings, set(TRUTH), problem.sensors) if one.name == "Coulomb friction"
     )
     as_stated, again = (
         refit(problem, end, tried, "linear", lambda chi2: None) for tried in ((), [law])
@@ -269,7 +269,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     end = End(x, at, c.free, problem.names, at, steps, RTOL, runner, RTOL)
     suspects = [
         one
-        for one in assumptions(problem.recordings, set(TRUTH))
+        for one in assumptions(problem.recordings, set(TRUTH), problem.sensors)
         if one.name in (MASS, NU, V_S, "mesh")
     ]
     found = joint_fit(problem, end, suspects, 1.1 * len(at.r), "linear", lambda chi2: None)
@@ -325,7 +325,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     where not, no number before a law, and none at all after a law that leaves much less than all
     numbers together."""
     taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
-    taken.append(Variation("law", "law", "", "", vary=lambda r: r))
+    taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
     judge: Any = SimpleNamespace(
@@ -365,8 +365,8 @@ def test_a_number_is_varied_as_far_as_there_is_a_rig():
     """Friction in slip must not exceed that at rest."""
     data = recorded(excitation=BRIEF, file=BASE.override({MU_K: 0.795}))
     problem = Problem([data], SENSORS, {name: Unknown() for name in TRUTH})
-    (one,) = (one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == MU_K)
-    other = varied(problem, problem.names, one)
+    (one,) = (one for one in assumptions(problem.recordings, set(TRUTH), problem.sensors) if one.name == MU_K)
+    other = assuming(problem, [one], free=True)
     sliding = next(a for a in other.coordinates.all if a.name == MU_K)
     reach = AMOUNTS * one.step / one.nominal
     assert sliding.low == pytest.approx((1 - reach) * 0.795)
@@ -377,7 +377,7 @@ def test_a_doubtful_fit_is_repeated_with_what_would_explain_most():
     """And with every law, which either holds or does not."""
     names = [f"number {k}" for k in range(MOST + 5)]
     taken = [Variation(name, "known", "", "", parameter=name) for name in names]
-    taken.append(Variation("law", "law", "", "", vary=lambda r: r))
+    taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     checks = {
         one.name: assumption_test(one, gain=100.0 - k, left=900.0, favoured=1.0)
         for k, one in enumerate(taken)
@@ -460,13 +460,13 @@ def test_every_pad_is_meshed_anew_where_it_was():
 
 def test_what_is_unknown_is_not_taken_for_granted():
     data = brief()
-    names = {one.name for one in assumptions([data], set())}
-    left = {one.name for one in assumptions([data], {RADIUS, "start.disc.x"})}
+    names = {one.name for one in assumptions([data], set(), SENSORS)}
+    left = {one.name for one in assumptions([data], {RADIUS, "start.disc.x"}, SENSORS)}
     assert names - left == {RADIUS, "start of disc.x"}
 
 
 def test_a_variation_that_cannot_be_run_is_said(monkeypatch):
-    one = Variation("mesh", "numerical", "the pads have few elements", "", vary=lambda r: None)
+    one = Variation("mesh", "numerical", "the pads have few elements", "", vary=lambda r, amount, run: None)
     monkeypatch.setattr("torchsoft.sysid.sensitivity.assumptions", lambda *_: [one])
     (said,) = assumption_notices(checked(brief()))
     assert said.startswith("it could not be checked what it does that the pads have few elements")

@@ -4,9 +4,9 @@ stick-slip friction.
 Equations of the paper in brackets. Everything else is generated from these functions: the compiled
 law with its Jacobian and its derivatives in every parameter. Departures from the paper keep forces
 continuous: the normal dashpot carries at most twice what the spring does, so that forces begin at
-zero, and nothing adheres by itself, and the moving frame follows the point on the body nearest to the pad's
-instead of the first one touched. None has a length, a force or a speed of its own: the law is the
-same at every load and size.
+zero, nothing adheres unless it is told to, and the moving frame follows the point on the body
+nearest to the pad's instead of the first one touched. None has a length, a force or a speed of its
+own: the law is the same at every load and size.
 """
 
 from collections.abc import Callable

@@ -54,7 +54,12 @@ from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import ended
-from torchsoft.sysid.residual_tests import judge_residuals, parts, residual_notices
+from torchsoft.sysid.residual_tests import (
+    judge_residuals,
+    parts,
+    residual_notices,
+    systematic,
+)
 from torchsoft.sysid.result import (
     ChannelNoise,
     IdentificationResult,
@@ -64,7 +69,7 @@ from torchsoft.sysid.result import (
 )
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
-from torchsoft.sysid.suspects import assumption_doubts, assumption_notices
+from torchsoft.sysid.suspects import assumption_doubts, assumption_notices, unseen
 from torchsoft.sysid.unknowns import Coordinates
 from torchsoft.tables import SEED, Table, plain
 
@@ -219,9 +224,12 @@ def conclude(
         )
     alarms = residual_notices(verdicts, max(1.0, chi2) ** 0.5 if context.loss == "linear" else 1.0)
     doubts = [sentence for kind, sentence in alarms.items() if kind != "smaller"]
+    explained, hidden = not systematic(verdicts), list[str]()
     if checked is not None:
-        notices += assumption_notices(checked)
-        doubts = assumption_doubts(checked) + doubts
+        against = assumption_doubts(checked)
+        notices += against + assumption_notices(checked)
+        doubts, hidden = against + doubts, unseen(checked)
+        explained = checked.explained or (explained and not checked.favoured)
     notices += alarms.values()
     notices += refusal(coloured) + colour_notices(coloured.found, declared)
     return IdentificationResult(
@@ -238,6 +246,8 @@ def conclude(
         heldout=predicted,
         notices=notices,
         doubts=doubts,
+        explained=explained,
+        unseen=hidden,
         stages=stages,
         cost={
             "simulations": runner.simulations, "jacobians": runner.jacobians,
@@ -296,9 +306,7 @@ def tested_assumptions(
     }
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
-    there = ended(
-        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, end.steps
-    )
+    there = ended(plain, plain.runner(runner), end.x, finer, free, which, end.rtol, end.steps)
     found = check_assumptions(
         plain, there, doubtful=doubtful, explain=context.settings.assumptions == "explained",
         loss=context.loss, progress=progress,

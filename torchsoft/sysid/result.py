@@ -129,7 +129,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
 # The result
 
 
-SCHEMA = "torchsoft-answer-6"
+SCHEMA = "torchsoft-answer-7"
 """Name and version of the file format."""
 
 
@@ -180,6 +180,10 @@ class IdentificationResult(Shown):
     ]  # NRMSE of recordings that were not fitted, by recording and channel
     notices: list[str]
     doubts: list[str]  # the notices that speak against the model
+    # whether residuals are those of a right model, at least under the suspect that is named
+    explained: bool
+    # assumptions that the data would not show to be wrong, though estimates move
+    unseen: list[str]
     stages: list[dict[str, Any]]
     cost: dict[str, Number]
     made_by: dict[str, Any]
@@ -224,12 +228,13 @@ class IdentificationResult(Shown):
                 low, high = one.ci95
                 rows.append((one.label, f"{one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}"))
         rows += [("note", notice) for notice in self.notices]
+        rows += [("unseen", sentence) for sentence in self.unseen]
         return self.headline, rows
 
     @property
     def verdict(self) -> Verdict:
         """Whether the model holds, is in doubt, or does not explain the data."""
-        if not all(one.stated < UNEXPLAINED for one in self.residuals):
+        if not self.explained or not all(one.stated < UNEXPLAINED for one in self.residuals):
             return "does not explain"
         return "doubtful" if self.doubts else "holds"
 
@@ -252,6 +257,10 @@ class IdentificationResult(Shown):
             return text
         worst = max(self.residuals, key=lambda one: one.stated)
         size = f"residuals of {worst.channel} are {worst.stated:.2g} times the stated noise"
+        if worst.stated < UNEXPLAINED:
+            size = f"{len(self.doubts)} notes below say what it leaves"
+            if len(self.doubts) == 1:
+                size = "a note below says what it leaves"
         return (
             f"The model does not explain the data: {size} (χ² = {self.chi2_stated:.3g}), and "
             "intervals may miss the truth"
