@@ -90,7 +90,9 @@ def test_the_friction_of_a_contact_differs_from_its_law():
     model, other = deepcopy(MODEL), deepcopy(MODEL)
     extend(model, ["contacts.U.friction_ratio", POWER])
     law, mine = model.contacts["L"].law, model.contacts["U"].law
-    assert law.K_n is mine.K_n and law.power is mine.power and law.friction is mine.friction
+    assert law.K_n is mine.K_n
+    assert law.power is mine.power
+    assert law.friction is mine.friction
     with torch.no_grad():
         model.parameter("contacts.U.friction_ratio").fill_(1.2)
         for name in ("mu_s", "mu_k"):

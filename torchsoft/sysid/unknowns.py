@@ -156,7 +156,8 @@ class Sensor(Table):
         for kind in NUISANCES:
             nominal, reach = float(kind == "gain"), float(getattr(self, kind))
             if nominal + reach > nominal:
-                out[kind] = nominal - reach, nominal, nominal + reach
+                least = 0.0 if kind == "lag" else nominal - reach
+                out[kind] = least, nominal, nominal + reach
         return out
 
 
