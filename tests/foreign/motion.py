@@ -7,7 +7,7 @@ from scipy.optimize import root
 
 from foreign.numbers import Numbers
 from foreign.pad import Array, compliance
-from foreign.step import march
+from foreign.step import TAKEN_IN, march
 
 COLUMNS = (
     "x_C",
@@ -45,7 +45,8 @@ def lying(p: Numbers, C: Array, X: Array, share: Array) -> tuple[float, Array]:
     def forces(y: float, u: Array) -> Array:
         d = X[0, near] + u - (p.x_C0, y)
         far = np.linalg.norm(d, axis=-1)
-        return (share[near] * p.K_n * np.maximum(0.0, p.radius - far) / far)[:, None] * d
+        g = np.maximum(0.0, p.radius - far)
+        return (share[near] * (p.K_n * g - p.adhesion * g / (g + TAKEN_IN)) / far)[:, None] * d
 
     def residual(z: Array) -> Array:
         u = z[1:].reshape(-1, 2)
@@ -61,6 +62,30 @@ def lying(p: Numbers, C: Array, X: Array, share: Array) -> tuple[float, Array]:
     return float(found.x[0]), (C @ f.ravel()).reshape(-1, 2)
 
 
+def pads(p: Numbers) -> tuple[Array, Array, Array]:
+    """Of both pads, the lower one first: nodes of the surfaces (2, nodes, 2) [m] from where their
+    bases are, compliances (2, 2 nodes, 2 nodes) [m/N], and the spacings (nodes,) that each node
+    stands for."""
+    length, height = p.length * p.longer, p.height * p.thicker
+    C_L = compliance(p._replace(length=length, height=height))
+    C_U = compliance(p._replace(length=length, height=height * p.thicker_U))
+    mirror = np.tile([1.0, -1.0], len(C_L) // 2)
+    C = np.stack((C_L, mirror[:, None] * C_U * mirror / p.upper))
+    x = np.linspace(0.0, length, p.across + 1)
+    lower, upper = np.full_like(x, p.height), np.full_like(x, -p.cm_height - p.height)
+    X = np.stack((np.stack((x, lower), -1), np.stack((x - p.length / 2, upper), -1)))
+    for k, tilt in enumerate((p.tilt_L, p.tilt_U)):
+        if tilt != 0.0:
+            middle = X[k].mean(0)
+            R = np.array([[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]])
+            X[k] = middle + (X[k] - middle) @ R.T
+            turn = np.kron(np.eye(len(x)), R)
+            C[k] = turn @ C[k] @ turn.T
+    share = np.full(len(x), length / p.across / p.spacing)
+    share[[0, -1]] /= 2
+    return X, C, share
+
+
 def simulate(p: Numbers, t: Array, signals: Array, every: int = 1) -> Run:
     """A run on equal steps t (steps + 1,) [s], with rows every so many of them.
 
@@ -68,14 +93,7 @@ def simulate(p: Numbers, t: Array, signals: Array, every: int = 1) -> Run:
     x_d and y_d, the disc where it lies at rest without friction. Raises `RuntimeError` where a step
     cannot be solved.
     """
-    C_L = compliance(p)
-    mirror = np.tile([1.0, -1.0], len(C_L) // 2)
-    C = np.stack((C_L, mirror[:, None] * C_L * mirror / p.upper))
-    x = np.linspace(0.0, p.length, p.across + 1)
-    lower, upper = np.full_like(x, p.height), np.full_like(x, -p.cm_height - p.height)
-    X = np.stack((np.stack((x, lower), -1), np.stack((x - p.length / 2, upper), -1)))
-    share = np.full(len(x), p.length / p.across / p.spacing)
-    share[[0, -1]] /= 2
+    X, C, share = pads(p)
     y, under = lying(p, C[0], X, share)
     q, v = np.array([p.x_C0, y, 0.0, *signals[0, :2, 0]]), np.zeros(5)
     u = np.stack((under, np.zeros_like(under)))

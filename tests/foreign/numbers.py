@@ -15,6 +15,20 @@ class Numbers(NamedTuple):
     compliance sets in over `slow_tau`; the horizontal guide of the bracket has a dry `friction`,
     smooth below the speed `creep`; `inertia` is the disc's over that of a uniform one; gravity is
     turned by a `tilt`.
+
+    `upper_friction` is the friction of the upper contact over that of the lower one. The disc's
+    centre of mass lies at (`com_x`, `com_y`) [m] in the body's frame, whose origin, the contour's
+    centre, is what x_C and y_C are of; `inertia` is about the centre of mass. A node that touches
+    is drawn by an `adhesion` [N]; friction goes by what presses it, without that. The pads are
+    `thicker` and `longer` by factors, the upper one `thicker_U` besides; their surfaces and their
+    left ends stay where they are. `tilt_L` and `tilt_U` [rad] turn each pad about the middle of its
+    surface. While a node sticks for a time t, mu_s grows by `ageing` ln(1 + t / `ageing_time`),
+    which is lost by a slip of `renewed` [m]. A part `fast` of the pads' compliance sets in at once.
+
+    A controller's command is held for `hold` [s], then late by `delay` [s], then limited to
+    `F_x_most` and `F_y_most` [N], then it reaches the bracket by a first-order `lag` [s]; F_x and
+    F_y are what reaches it. From the begin to the end of a run E falls by the part `softening` and
+    friction by the part `wear`.
     """
 
     K_n: float = 1.2e5
@@ -54,3 +68,23 @@ class Numbers(NamedTuple):
     creep: float = 1e-3
     inertia: float = 1.0
     tilt: float = 0.0
+    upper_friction: float = 1.0
+    com_x: float = 0.0
+    com_y: float = 0.0
+    adhesion: float = 0.0
+    thicker: float = 1.0
+    thicker_U: float = 1.0
+    longer: float = 1.0
+    tilt_L: float = 0.0
+    tilt_U: float = 0.0
+    ageing: float = 0.0
+    ageing_time: float = 0.01
+    renewed: float = 1e-6
+    fast: float = 0.0
+    hold: float = 0.0
+    delay: float = 0.0
+    F_x_most: float = float("inf")
+    F_y_most: float = float("inf")
+    lag: float = 0.0
+    softening: float = 0.0
+    wear: float = 0.0

@@ -14,7 +14,13 @@ iterations, and its shortest part."""
 
 CREEP, TAKEN_IN = 1e-5, 1e-6
 """Speed [m/s] below which the literal law's friction does not have its whole size, and depth [m]
-over which it is taken in at touch-down: jumps cannot be solved for."""
+over which it, and adhesion, are taken in at touch-down: jumps cannot be solved for."""
+
+AT_ONCE = 1e-6
+"""Retardation time [s] of the compliance that sets in at once: far below a step."""
+
+SAMPLED_AT = 0.4
+"""Part of its period after which a controller that holds takes a sample."""
 
 
 @njit(cache=True, nogil=True)
@@ -24,7 +30,21 @@ def relaxed(p, h, s):
 
 
 @njit(cache=True, nogil=True)
-def node(p, h, rx, ry, omega, dx, dy, s, slipping):
+def friction(p, k, age, worn):
+    """mu_s and mu_k of a node on pad k that has stuck for the time `age` [s], where wear has left
+    the part `worn` of them."""
+    of_pad = worn * (p.upper_friction if k == 1 else 1.0)
+    return of_pad * (p.mu_s + p.ageing * np.log(1 + age / p.ageing_time)), of_pad * p.mu_k
+
+
+@njit(cache=True, nogil=True)
+def aged(p, h, age, slip):
+    """How long a node has stuck [s] at the end of a step in which it slips at a speed [m/s]."""
+    return (age + h) / (1 + h * slip / p.renewed)
+
+
+@njit(cache=True, nogil=True)
+def node(p, h, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k):
     """One node at the end of a step, for speeds rx, ry of the node against the disc's centre and
     the spin.
 
@@ -47,34 +67,45 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping):
     if p.literal:
         stretch = s + h * v
         e = p.K_t * stretch + p.R_t * v
-        slips, rate = abs(e) > p.mu_s * F_N, 0.0
+        slips, rate = abs(e) > mu_s * F_N, 0.0
         if slipping:
-            e, rate = p.mu_k * F_N * v / np.sqrt(v * v + CREEP * CREEP), abs(v)
+            e, rate = mu_k * F_N * v / np.sqrt(v * v + CREEP * CREEP), abs(v)
         e *= g / (g + TAKEN_IN)
     else:
         R = p.R_t + h * p.K_t
         trial = p.K_t * s + R * v
         a, free = R, abs(trial)
-        b, c = a * p.v_s - (free - p.mu_k * F_N), p.v_s * max(0.0, free - p.mu_s * F_N)
+        b, c = a * p.v_s - (free - mu_k * F_N), p.v_s * max(0.0, free - mu_s * F_N)
         rate = 2 * c / (b + np.sqrt(b * b + 4 * a * c)) if c > 0.0 and b > 0.0 else 0.0
         if c > 0.0 and b <= 0.0:
             rate = (np.sqrt(b * b + 4 * a * c) - b) / (2 * a)
         stretch = s + h * (v - np.sign(trial) * rate)
         e = p.K_t * stretch + p.R_t * (stretch - s) / h
         slips = False
+    F_N -= p.adhesion * g / (g + TAKEN_IN)
     return F_N * nx - e * ny, F_N * ny + e * nx, -far * e, stretch, slips, rate
 
 
 @njit(cache=True, nogil=True)
-def linearise(p, h, rx, ry, omega, dx, dy, s, slipping, share, f, slope):
+def about_centre_of_mass(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k):
+    """Force of a node on the pad, and its torque on the disc about the centre of mass; theta is
+    the disc's angle at the beginning."""
+    fx, fy, torque = node(p, h, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k)[:3]
+    if p.com_x != 0.0 or p.com_y != 0.0:
+        cx, cy = centre_of_mass(p, theta + h * omega)
+        torque += cx * fy - cy * fx
+    return fx, fy, torque
+
+
+@njit(cache=True, nogil=True)
+def linearise(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k, share, f, slope):
     """Force (fx, fy, torque) of a node that stands for `share` spacings of surface, and its slopes
     (3, 3) by rx, ry, omega."""
-    at = node(p, h, rx, ry, omega, dx, dy, s, slipping)[:3]
+    at = about_centre_of_mass(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k)
     for b in range(3):
         by = DIFFERENCE if b < 2 else DIFFERENCE / p.radius
-        moved = node(
-            p, h, rx + by * (b == 0), ry + by * (b == 1), omega + by * (b == 2), dx, dy, s, slipping
-        )[:3]
+        vx, vy, spin = rx + by * (b == 0), ry + by * (b == 1), omega + by * (b == 2)
+        moved = about_centre_of_mass(p, h, theta, vx, vy, spin, dx, dy, s, slipping, mu_s, mu_k)
         for a in range(3):
             f[a] = share * at[a]
             slope[a, b] = share * (moved[a] - at[a]) / by
@@ -82,13 +113,47 @@ def linearise(p, h, rx, ry, omega, dx, dy, s, slipping, share, f, slope):
 
 @njit(cache=True, nogil=True)
 def control(p, q, w, z, h):
-    """Forces of the two loops on the bracket for velocities z at the end of a step, with their
-    slopes by the velocities that they measure. q are the poses (x_C, y_C, theta, x_Br, y_Br) before
+    """Forces that the two loops ask for, for velocities z at the end of a step, with their slopes
+    by the velocities that they measure. q are the poses (x_C, y_C, theta, x_Br, y_Br) before
     it, w (signals, 2) the reference after it."""
     i = 0 if p.senses_disc else 3
     F_x = p.K_x * (w[0, 0] - q[i] - h * z[i]) + p.R_x * (w[0, 1] - z[i])
     F_y = p.K_y * (w[1, 0] - q[4] - h * z[4]) + p.R_y * (w[1, 1] - z[4]) + w[2, 0]
     return F_x, F_y, p.K_x * h + p.R_x, p.K_y * h + p.R_y
+
+
+@njit(cache=True, nogil=True)
+def reaches(p, h, a, asked, slope, past, before):
+    """Force of loop a that reaches the bracket at the end of a step, and its slope.
+
+    `asked` is what the controller asks for then, past (steps, 2) what it asked for at the ends of
+    the steps before, the latest first, and before (2,) what reached the bracket last.
+    """
+    late = int(p.delay / h + 1e-6)
+    part = max(0.0, p.delay / h - late)
+    if late == 0:
+        force, slope = (1 - part) * asked + part * past[0, a], (1 - part) * slope
+    else:
+        force, slope = (1 - part) * past[late - 1, a] + part * past[late, a], 0.0
+    most = p.F_x_most if a == 0 else p.F_y_most
+    if abs(force) > most:
+        force, slope = np.sign(force) * most, 0.0
+    if p.lag > 0.0:
+        force = (p.lag * before[a] + h * force) / (p.lag + h)
+        slope *= h / (p.lag + h)
+    return force, slope
+
+
+@njit(cache=True, nogil=True)
+def drive(p, h, q, w, z, ahead, held, past, before):
+    """Forces of both loops that reach the bracket, with their slopes; `ahead` is the time [s] from
+    the poses q to what is asked for, held (2,) what a controller that holds asks for."""
+    x, y, by_x, by_y = control(p, q, w, z, ahead)
+    if p.hold > 0.0:
+        x, y, by_x, by_y = held[0], held[1], 0.0, 0.0
+    F_x, by_x = reaches(p, h, 0, x, by_x, past, before)
+    F_y, by_y = reaches(p, h, 1, y, by_y, past, before)
+    return F_x, F_y, by_x, by_y
 
 
 @njit(cache=True, nogil=True)
@@ -119,7 +184,16 @@ def resistance(p, v):
 
 
 @njit(cache=True, nogil=True)
-def balance(p, h, C, which, d, shares, q, v, u, u_slow, s, slipping, w, z, r, J):
+def centre_of_mass(p, theta):
+    """From the contour's centre to the centre of mass, (2,) [m]."""
+    return (
+        p.com_x * np.cos(theta) - p.com_y * np.sin(theta),
+        p.com_x * np.sin(theta) + p.com_y * np.cos(theta),
+    )
+
+
+@njit(cache=True, nogil=True)
+def balance(p, h, C, which, d, shares, q, v, parts, s, slipping, ages, now, loops, w, z, r, J):
     """What is left over of all equations, r (n,), and its derivatives J (n, n), for the velocities
     z at the end of the step.
 
@@ -137,30 +211,43 @@ def balance(p, h, C, which, d, shares, q, v, u, u_slow, s, slipping, w, z, r, J)
             h / p.bracket_mass,
         ]
     )
-    F_x, F_y, by_x, by_y = control(p, q, w, z, h)
+    u, u_slow, u_fast = parts
+    soft, worn = now
+    held, past, before = loops
+    F_x, F_y, by_x, by_y = drive(p, h, q, w, z, h, held, past, before)
     for a in range(5):
         r[a] = z[a] - v[a]
+    if p.com_x != 0.0 or p.com_y != 0.0:
+        cx, cy = centre_of_mass(p, q[2])
+        ex, ey = centre_of_mass(p, q[2] + h * z[2])
+        r[0] += v[2] * cy - z[2] * ey
+        r[1] += z[2] * ex - v[2] * cx
+        J[0, 2] -= ey + h * z[2] * ex
+        J[1, 2] += ex - h * z[2] * ey
     r[0] -= h * p.gravity * np.sin(p.tilt)
     r[1] += h * p.gravity * np.cos(p.tilt)
-    held, by_held = resistance(p, z[3])
-    r[3] -= gain[3] * (F_x + held)
-    J[3, 3] -= gain[3] * by_held
+    against, by_against = resistance(p, z[3])
+    r[3] -= gain[3] * (F_x + against)
+    J[3, 3] -= gain[3] * by_against
     r[4] -= gain[4] * F_y
     J[3, 0 if p.senses_disc else 3] += gain[3] * by_x
     J[4, 4] += gain[4] * by_y
     for j in range(len(which)):
         for a in range(2):
-            late = u_slow[which[j, 0], which[j, 1], a]
-            fast = u[which[j, 0], which[j, 1], a] - late
-            r[5 + 2 * j + a] = z[5 + 2 * j + a] + fast / (p.tau + h) + late / (p.slow_tau + h)
-    give = (1 - p.slow) / (p.tau + h) + p.slow / (p.slow_tau + h)
+            late, early = u_slow[which[j, 0], which[j, 1], a], u_fast[which[j, 0], which[j, 1], a]
+            rest = u[which[j, 0], which[j, 1], a] - late - early
+            r[5 + 2 * j + a] = z[5 + 2 * j + a] + rest / (p.tau + h) + late / (p.slow_tau + h)
+            r[5 + 2 * j + a] += early / (AT_ONCE + h)
+    give = (1 - p.slow - p.fast) / (p.tau + h) + p.slow / (p.slow_tau + h) + p.fast / (AT_ONCE + h)
     f, slope = np.empty(3), np.empty((3, 3))
     for j in range(len(which)):
         k, i = which[j]
         rx, ry = z[5 + 2 * j] + k * z[3] - z[0], z[6 + 2 * j] + k * z[4] - z[1]
+        mu_s, mu_k = friction(p, k, ages[k, i], worn)
         linearise(
-            p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], shares[j], f, slope
-        )
+            p, h, q[2], rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], mu_s, mu_k,
+            shares[j], f, slope,
+        )  # fmt: skip
         for a in range(2):
             load(r, J, a, gain[a], f[a], slope[a], j, k)
             if k == 1:
@@ -170,7 +257,7 @@ def balance(p, h, C, which, d, shares, q, v, u, u_slow, s, slipping, w, z, r, J)
             if which[other, 0] == k:
                 for a in range(2):
                     for b in range(2):
-                        moves = C[k, 2 * which[other, 1] + a, 2 * i + b] * give
+                        moves = C[k, 2 * which[other, 1] + a, 2 * i + b] * give * soft
                         load(r, J, 5 + 2 * other + a, -moves, f[b], slope[b], j, k)
 
 
@@ -197,12 +284,14 @@ def largest(p, x):
 
 
 @njit(cache=True, nogil=True)
-def step(p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, w, margin):
+def step(p, h, C, X, share, q, v, parts, u_dot, s, slipping, ages, now, loops, w, margin):
     """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...)
-    displacements u (nodes, 2) with the slow part of them and their rates, stretches s and the
-    literal law's flags. Returns whether it was solved, the fastest slip, and how many nodes touch.
-    Newton's change is halved where it would leave more over than there was."""
-    which, d, shares = near_nodes(p, X, share, q, u, margin)
+    displacements (nodes, 2), the slow and the fast part of them, and their rates, stretches s, the
+    literal law's flags and how long nodes have stuck. `now` are the pads' compliance over that of
+    the begin, and what wear has left of friction; `loops` are what `drive` takes at its end.
+    Returns whether it was solved, the fastest slip, and how many nodes touch. Newton's change is
+    halved where it would leave more over than there was."""
+    which, d, shares = near_nodes(p, X, share, q, parts[0], margin)
     n = 5 + 2 * len(which)
     z, r, J, scale, change, before = (
         np.empty(n),
@@ -216,7 +305,7 @@ def step(p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, w, margin):
     for j in range(len(which)):
         z[5 + 2 * j : 7 + 2 * j] = u_dot[which[j, 0], which[j, 1]]
     for _ in range(MOST):
-        balance(p, h, C, which, d, shares, q, v, u, u_slow, s, slipping, w, z, r, J)
+        balance(p, h, C, which, d, shares, q, v, parts, s, slipping, ages, now, loops, w, z, r, J)
         left = largest(p, r)
         if left > before and scale > SHORTEST:
             scale *= 0.5
@@ -227,18 +316,23 @@ def step(p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, w, margin):
         for a in range(n):
             z[a] -= change[a]
         if largest(p, change) < SOLVED:
-            return finish(p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d)
+            return finish(
+                p, h, C, X, shares, q, v, parts, u_dot, s, slipping, ages, now, z, which, d
+            )
     return False, 0.0, 0
 
 
 @njit(cache=True, nogil=True)
-def finish(p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d):
+def finish(p, h, C, X, shares, q, v, parts, u_dot, s, slipping, ages, now, z, which, d):
     """Takes the velocities z over, unless a node touches the disc that was not looked at."""
+    u, u_slow, u_fast = parts
+    soft, worn = now
     forces, m, fastest, touching = np.empty((len(which), 2)), len(which), 0.0, 0
-    stretches, flags, looked = (
+    stretches, flags, looked, older = (
         np.empty(s.shape),
         np.zeros(s.shape, np.bool_),
         np.zeros(s.shape, np.bool_),
+        np.zeros(s.shape),
     )
     for k in range(2):
         for i in range(s.shape[1]):
@@ -246,11 +340,15 @@ def finish(p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d)
     for j in range(m):
         k, i = which[j]
         rx, ry = z[5 + 2 * j] + k * z[3] - z[0], z[6 + 2 * j] + k * z[4] - z[1]
-        law = node(p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i])
+        mu_s, mu_k = friction(p, k, ages[k, i], worn)
+        law = node(p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], mu_s, mu_k)
         forces[j, 0], forces[j, 1] = shares[j] * law[0], shares[j] * law[1]
         stretches[k, i], flags[k, i], looked[k, i] = law[3], law[4], True
-        fastest, touching = max(fastest, law[5]), touching + (law[0] != 0.0 or law[1] != 0.0)
-    rates, late = np.empty(u.shape), np.empty(u.shape)
+        touches = law[0] != 0.0 or law[1] != 0.0
+        fastest, touching = max(fastest, law[5]), touching + touches
+        if touches:
+            older[k, i] = aged(p, h, ages[k, i], law[5])
+    rates, late, early = np.empty(u.shape), np.empty(u.shape), np.empty(u.shape)
     for k in range(2):
         for i in range(s.shape[1]):
             far = 0.0
@@ -260,9 +358,12 @@ def finish(p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d)
                     if which[j, 0] == k:
                         for b in range(2):
                             total += C[k, 2 * i + a, 2 * which[j, 1] + b] * forces[j, b]
+                total *= soft
                 late[k, i, a] = (p.slow * total - u_slow[k, i, a]) / (p.slow_tau + h)
-                fast = (1 - p.slow) * total - (u[k, i, a] - u_slow[k, i, a])
-                rates[k, i, a] = fast / (p.tau + h) + late[k, i, a]
+                early[k, i, a] = (p.fast * total - u_fast[k, i, a]) / (AT_ONCE + h)
+                rest = u[k, i, a] - u_slow[k, i, a] - u_fast[k, i, a]
+                main = (1 - p.slow - p.fast) * total - rest
+                rates[k, i, a] = main / (p.tau + h) + late[k, i, a] + early[k, i, a]
                 speed = rates[k, i, a] + k * z[3 + a] - z[a]
                 far += (X[k, i, a] + u[k, i, a] + k * q[3 + a] - q[a] + h * speed) ** 2
             if not looked[k, i] and far < p.radius**2:
@@ -270,9 +371,11 @@ def finish(p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d)
     for k in range(2):
         for i in range(s.shape[1]):
             u_dot[k, i], s[k, i], slipping[k, i] = rates[k, i], stretches[k, i], flags[k, i]
+            ages[k, i] = older[k, i]
             for a in range(2):
                 u[k, i, a] += h * rates[k, i, a]
                 u_slow[k, i, a] += h * late[k, i, a]
+                u_fast[k, i, a] += h * early[k, i, a]
     for a in range(5):
         q[a] += h * z[a]
         v[a] = z[a]
@@ -286,23 +389,41 @@ def march(p, h, C, X, share, q, v, u, signals, every):
     the step that could not be solved, or -1."""
     steps, count = len(signals) - 1, X.shape[1]
     u_dot, s, slipping = np.zeros(u.shape), np.zeros((2, count)), np.zeros((2, count), np.bool_)
-    rows, fastest, u_slow = np.zeros((steps // every + 1, 14)), 0.0, p.slow * u
+    rows, fastest, ages = np.zeros((steps // every + 1, 14)), 0.0, np.zeros((2, count))
+    parts = u, p.slow * u, p.fast * u
+    held, past, before = np.empty(2), np.empty((int(p.delay / h) + 2, 2)), np.empty(2)
+    loops, samples = (held, past, before), 0
     for i in range(steps + 1):
         touching = 0
         if i > 0:
+            now = 1 / (1 - p.softening * i / steps), 1 - p.wear * i / steps
             solved, margin = False, MARGIN
             for _ in range(4):
                 solved, slip, touching = step(
-                    p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, signals[i], margin
-                )
+                    p, h, C, X, share, q, v, parts, u_dot, s, slipping, ages, now, loops,
+                    signals[i], margin,
+                )  # fmt: skip
                 if solved:
                     break
                 margin *= 4
             if not solved:
                 return rows, i
             fastest = max(fastest, slip)
+        asked_x, asked_y, _, _ = control(p, q, signals[i], v, 0.0)
+        if i == 0:
+            held[0], held[1] = asked_x, asked_y
+            past[:] = held
+            before[0], before[1] = asked_x, asked_y
+        F_x, F_y, _, _ = drive(p, h, q, signals[i], v, 0.0, held, past, before)
+        before[0], before[1] = F_x, F_y
+        if p.hold > 0.0 and int(i * h / p.hold + 1 - SAMPLED_AT + 1e-6) > samples:
+            samples += 1
+            held[0], held[1] = asked_x, asked_y
+        past[1:] = past[:-1].copy()
+        past[0, 0], past[0, 1] = asked_x, asked_y
+        if p.hold > 0.0:
+            past[0] = held
         if i % every == 0:
-            F_x, F_y, _, _ = control(p, q, signals[i], v, 0.0)
             row = rows[i // every]
             row[:5], row[5:10], row[10], row[11], row[12], row[13] = (
                 q,
