@@ -287,7 +287,7 @@ def of_places(recording: Recording, unknown: Collection[str]) -> Iterator[Variat
 
 
 def of_pads(recording: Recording) -> Iterator[Variation]:
-    """Sizes and tilts of pads, of which blocks have exact ones."""
+    """Sizes of blocks, places and angles of pads."""
     pads = recording.rig.pads
     blocks = [name for name, pad in pads.items() if type(pad.mesh) is PadMesh]
     groups = [blocks] if len(blocks) > 1 else []
@@ -296,12 +296,17 @@ def of_pads(recording: Recording) -> Iterator[Variation]:
         for extent in ("height", "length"):
             yield Variation(
                 f"{extent} of {who}", "known", f"the {extent} of {who} is as stated",
-                "it were more", 100 * KNOWN, "%",
+                "it were more, faces being where they are", 100 * KNOWN, "%",
                 vary=lambda r, part, run, names=names, extent=extent: resized(
                     r, names, extent, 1e-2 * part
                 ),
             )  # fmt: skip
     for name in pads:
+        yield Variation(
+            f"place of the pad {name}", "known", f"the face of the pad {name} is where it should",
+            "it were nearer to what touches it", 1e6 * PLACE, "um",
+            vary=lambda r, um, run, name=name: lifted(r, name, 1e-6 * um),
+        )  # fmt: skip
         yield Variation(
             f"tilt of the pad {name}", "known", f"the pad {name} lies at the angle stated",
             "it were turned anticlockwise", 1e3 * TILT, "mrad",
@@ -495,23 +500,31 @@ def resized(
     recording: Recording, names: Collection[str], extent: str, part: float
 ) -> Recording | None:
     """Change the height or the length of blocks by a relative amount, about the middle of their
-    bases; None where the start is a state of the pads as they were."""
+    faces, which stay where they are; None where the start is a state of the pads as they were."""
 
     def other(pad: Pad) -> Pad:
-        assert isinstance(pad.mesh, PadMesh)
-        size = (1 + part) * getattr(pad.mesh, extent)
-        mesh = replace(pad.mesh, **{extent: size})
-        return pad.reshaped(mesh, pad.placed(0.5 * np.array([pad.mesh.length - mesh.length, 0.0])))
+        old = pad.mesh
+        assert isinstance(old, PadMesh)
+        mesh = replace(old, **{extent: (1 + part) * getattr(old, extent)})
+        corner = np.array([0.5 * (old.length - mesh.length), old.height - mesh.height])
+        return pad.reshaped(mesh, pad.placed(corner))
 
     return with_pads(recording, names, other)
 
 
+def lifted(recording: Recording, name: str, by: float) -> Recording | None:
+    """Move a pad along its normal, towards what touches it, by a distance [m]; None where the start
+    is a state of the pads as they were."""
+    up = np.array([0.0, by])
+    return with_pads(recording, [name], lambda pad: pad.reshaped(pad.mesh, pad.placed(up)))
+
+
 def tilted(recording: Recording, name: str, angle: float) -> Recording | None:
-    """Turn a pad about the middle of its base by an angle [rad]; None where the start is a state of
+    """Turn a pad about the middle of its face by an angle [rad]; None where the start is a state of
     the pads as they were."""
 
     def other(pad: Pad) -> Pad:
-        middle = pad.placed(pad.mesh.nodes[pad.mesh.bonded].mean(0))
+        middle = pad.placed(pad.mesh.nodes[pad.mesh.face].mean(0))
         c, s = np.cos(angle), np.sin(angle)
         arm = np.array([[c, -s], [s, c]]) @ (pad.origin.numpy() - middle)
         return pad.reshaped(pad.mesh, middle + arm, angle)

@@ -131,29 +131,34 @@ Column = tuple[Variation, Array | None, str]
 """A variation with the change of the residuals (m,) by its amount, or None and the reason."""
 
 
-def exact_columns(problem: Problem, end: End, taken: Sequence[Variation]) -> list[Column]:
-    """Columns of parameters, of extensions of the rigs, of faults of sensors and of other readings:
-    all from one run for each recording. Empty where it fails."""
+def exact_columns(
+    problem: Problem, end: End, taken: Sequence[Variation]
+) -> tuple[list[Column], Array | None]:
+    """Columns of parameters, of extensions of the rigs, of faults of sensors and of other readings,
+    and the Jacobian (m, n) of the free coordinates on the same steps: all from one run for each
+    recording. Empty where it fails."""
     mine, out = [one for one in taken if one.vary is None], list[Column]()
     if not mine or end.base.failed:
-        return []
+        return out, None
     try:
         wide = assuming(problem, mine, free=False)
     except ValueError:
         out = [(one, None, why) for one in mine if (why := impossible(problem, one))]
         mine = [one for one in mine if not impossible(problem, one)]
         wide = assuming(problem, mine, free=False)
-    labels = wide.coordinates.labels
-    x = wide.coordinates.begun(dict(zip(problem.coordinates.labels, end.x)))
-    free = np.isin(labels, [one.label for one in mine])
+    c = wide.coordinates
+    x = c.begun(dict(zip(problem.coordinates.labels, end.x)))
+    own = [c.labels.index(one.label) for one in problem.coordinates.within(end.free)]
+    free = np.isin(c.labels, [one.label for one in mine])
+    free[own] = True
     at = wide.residuals(wide.runner(end.runner), x, end.which, end.steps, free)
     if at.failed:
-        return []
+        return [], None
     for one in mine:
-        i = labels.index(one.label)
+        i = c.labels.index(one.label)
         size = one.amount if one.read is not None else one.step
-        out.append((one, at.J[:, i] * (size / wide.coordinates.all[i].slope(x[i])), ""))
-    return out
+        out.append((one, at.J[:, i] * (size / c.all[i].slope(x[i])), ""))
+    return out, at.J[:, own]
 
 
 def impossible(problem: Problem, one: Variation) -> str:

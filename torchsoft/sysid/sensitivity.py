@@ -227,14 +227,16 @@ def check_assumptions(
     c = problem.coordinates
     faults = [f"{one.kind} of {one.name}" for one in c.all if one.kind in FAULTS]
     taken = assumptions(recordings, {*c.names, *faults}, problem.sensors)
-    judge, checks, columns = Judge(problem, end, loss != "linear"), dict[str, AssumptionTest](), []
+    checks, columns = dict[str, AssumptionTest](), list[Array]()
     untried = [one.name for one in taken if one.vary is not None]
+    # such as of pads that creep longer than the lead of a run
+    with warnings.catch_warnings(action="ignore"):
+        exact, J = exact_columns(problem, end, taken)
+    judge = Judge(problem, end, end.at.J[:, end.free] if J is None else J, loss != "linear")
     try:
-        # such as of pads that creep longer than the lead of a run
-        with warnings.catch_warnings(action="ignore"):
-            for one, d, reason in exact_columns(problem, end, taken):
-                if d is None or d.any():
-                    checks[one.name] = judge.first_order(one, d, reason)
+        for one, d, reason in exact:
+            if d is None or d.any():
+                checks[one.name] = judge.first_order(one, d, reason)
         for one in taken:
             if one.vary is None:
                 continue
@@ -368,9 +370,10 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
 class Judge:
     """Tests of variations at the end of a fit."""
 
-    def __init__(self, problem: Problem, end: End, robust: bool = False) -> None:
+    def __init__(self, problem: Problem, end: End, J: Array, robust: bool = False) -> None:
+        """J (m, n) is the Jacobian of the free coordinates on the steps of the variations."""
         self.problem, self.robust = problem, robust
-        self.end, self.r, self.J = end, end.at.r, end.at.J[:, end.free]
+        self.end, self.r, self.J = end, end.at.r, J
         self.Q, _ = np.linalg.qr(self.J)
         self.sd = standard_deviations(self.J)
         self.coordinates = problem.coordinates.within(end.free)
