@@ -21,7 +21,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -187,18 +187,29 @@ Samples = dict[str, tuple[Array, Array]]
 """Times (k,) [s] and values (k,) by channel."""
 
 
-def sampled(made: Made, seed: int, delay: Mapping[str, float], colour: float) -> Samples:
+def pink(count: int, rng: np.random.Generator) -> Array:
+    """Noise (count,) of deviation 1 whose power falls with the frequency, down to one period a
+    recording."""
+    spectrum = np.fft.rfft(rng.standard_normal(count))
+    spectrum /= np.maximum(np.arange(len(spectrum)), 1.0) ** 0.5
+    noise = np.fft.irfft(spectrum, count)
+    return noise / noise.std()
+
+
+def sampled(
+    made: Made, seed: int, delay: Mapping[str, float], colour: float | Literal["pink"]
+) -> Samples:
     """What the sensors `RIG` give at `RATE` from t = 0 on, some of them late by a `delay` [s] (a
     multiple of `KEPT`).
 
-    Their noise has their own deviation and the first autocorrelation `colour`; it is the same for
-    the same seed.
+    Their noise has their own deviation and the first autocorrelation `colour`, or is pink; it is
+    the same for the same seed.
     """
     rng, out = np.random.default_rng(seed), {}
     every, first = round(1 / RATE / KEPT), int(np.searchsorted(made.t, -0.5 * KEPT))
     for channel, sensor in RIG.items():
         at = np.arange(first, len(made.t), every)
-        noise = coloured(len(at), colour, rng)
+        noise = pink(len(at), rng) if colour == "pink" else coloured(len(at), colour, rng)
         exact = made.channels[CALLED.get(channel, channel)][
             at - round(delay.get(channel, 0.0) / KEPT)
         ]
@@ -224,7 +235,7 @@ class Case:
     differs: Mapping[str, Any] = field(default_factory=dict)
     delay: Mapping[str, float] = field(default_factory=dict)
     offset: Mapping[str, float] = field(default_factory=dict)
-    colour: float = 0.0
+    colour: float | Literal["pink"] = 0.0
     flipped: tuple[str, ...] = ()
     noted: Mapping[str, Any] = field(default_factory=dict)
     no_feed_forward: bool = False

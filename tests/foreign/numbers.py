@@ -78,7 +78,7 @@ class Numbers(NamedTuple):
     tilt_L: float = 0.0
     tilt_U: float = 0.0
     ageing: float = 0.0
-    ageing_time: float = 0.01
+    ageing_time: float = 1e-3
     renewed: float = 1e-6
     fast: float = 0.0
     hold: float = 0.0
