@@ -228,7 +228,8 @@ def conclude(
     if checked is not None:
         against = assumption_doubts(checked)
         notices += against + assumption_notices(checked)
-        doubts, hidden = against + doubts, unseen(checked)
+        doubts = against + doubts
+        hidden = unseen(checked) if explained and not checked.favoured else []
         explained = checked.explained or (explained and not checked.favoured)
     notices += alarms.values()
     notices += refusal(coloured) + colour_notices(coloured.found, declared)
