@@ -48,7 +48,8 @@ def thrown() -> Recording:
     """A disc in free flight, which spins; the pad is far below."""
     mesh = PadMesh(length=20e-3, height=4e-3, elements_x=4, elements_y=2)
     rig = Rig(
-        bodies={"disc": Body(0.4, Circle(19e-3))}, pads={"floor": Pad(mesh, KelvinVoigt(**RUBBER, tau=0.01))},
+        bodies={"disc": Body(0.4, Circle(19e-3))},
+        pads={"floor": Pad(mesh, KelvinVoigt(**RUBBER, tau=0.01))},
         contacts={"floor": Contact("floor", "disc", dry(), may_leave=True)}, reference=Reference(),
     )  # fmt: skip
     y0 = rig.state(disc={"x": 0.01, "y": 2.0, "v_x": 0.3, "v_y": 1.0, "omega": 20.0})

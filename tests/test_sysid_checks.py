@@ -34,7 +34,7 @@ from torchsoft.sysid.assumptions import (
     remeshed,
 )
 from torchsoft.sysid.estimate import Quantity
-from torchsoft.sysid.identification import held_by, notices_on
+from torchsoft.sysid.identification import notices_on, ordering_constraints
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import (
@@ -338,7 +338,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
-        little=100.0,
+        explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
         fit=lambda one, again, stated, linear: replace(
@@ -620,7 +620,7 @@ def test_an_interval_wider_than_its_value_determines_nothing(value, sd, seen):
 def test_a_known_number_that_holds_an_unknown_one_is_named():
     """mu_s ends at the mu_k that is taken for known."""
     problem = Problem([recorded()], SENSORS, {"contact.mu_s": Unknown()})
-    held = held_by(problem)
+    held = ordering_constraints(problem)
     assert held == {MU_S: (MU_K, 0.7)}
     one: Any = SimpleNamespace(
         identifiable=True, at_bound=True, label="mu_s", name=MU_S, last=0.70007, step_bias_sd=0.0

@@ -158,8 +158,8 @@ def _pad_ratio(rig: Rig, name: str, ratio: str) -> nn.Parameter:
 
 
 def _branch(rig: Rig, stem: str, time: float) -> nn.Parameter:
-    branch = Branch(0.0, time)
-    _part(rig, Material, stem).added.append(branch)
+    branches: nn.ModuleList = _part(rig, Material, stem).added  # pyright: ignore[reportAssignmentType]
+    branches.append(branch := Branch(0.0, time))
     return branch.fraction
 
 

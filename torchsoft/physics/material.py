@@ -5,7 +5,7 @@ of J_b z_b: C the static compliance of the relaxed material, J_b the fractions o
 part of the nodal forces that has set in, tau_b z_b' + z_b = f.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -56,6 +56,7 @@ class Material(nn.Module):
     [m], and a chain, to which branches may be `added`."""
 
     E: Tensor
+    added: Sequence[Branch]
 
     def __init__(self, E: Modulus | None, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         """E is None where a material makes it of other numbers."""
@@ -63,7 +64,7 @@ class Material(nn.Module):
         if E is not None:
             self.E = parameter(E)
         self.nu, self.rho, self.depth = (parameter(value) for value in (nu, rho, depth))
-        self.added = nn.ModuleList()
+        self.add_module("added", nn.ModuleList())
 
     def chain(self) -> tuple[Tensor, Tensor]:
         """Fractions J [1], which sum to one, and retardation times tau [s] > 0, shape (branches,)

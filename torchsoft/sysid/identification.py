@@ -213,7 +213,7 @@ def conclude(
             notices += guesses(problem, x, context.heldout)
     sd = np.sqrt(np.diag(C_free))
     notices += notices_on(
-        found, held_by(problem), end.at_rest or bool(end.rough), rtol, end.bias is None
+        found, ordering_constraints(problem), end.at_rest or bool(end.rough), rtol, end.bias is None
     )
     notices += rough_notices(c, end.rough)
     if end.jacobian_error > JACOBIAN_ERROR and not end.rough:
@@ -338,7 +338,7 @@ NEXT_TO = 1e-2
 """Relative distance of an estimate at a bound from the known number that is the bound."""
 
 
-def held_by(problem: Problem) -> dict[str, tuple[str, float]]:
+def ordering_constraints(problem: Problem) -> dict[str, tuple[str, float]]:
     """Known numbers that unknown ones may not pass, such as mu_k of mu_s: name and value by the
     name of the unknown."""
     out, unknown = dict[str, tuple[str, float]](), problem.coordinates.names

@@ -143,7 +143,7 @@ def exact_columns(
     try:
         wide = assuming(problem, mine, free=False)
     except ValueError:
-        out = [(one, None, why) for one in mine if (why := impossible(problem, one))]
+        out += [(one, None, why) for one in mine if (why := impossible(problem, one))]
         mine = [one for one in mine if not impossible(problem, one)]
         wide = assuming(problem, mine, free=False)
     c = wide.coordinates

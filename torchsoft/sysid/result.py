@@ -294,7 +294,7 @@ class IdentificationResult(Shown):
         one = self.recorded(recording)
         rig = deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()
         set_parameters(rig, one.identified)
-        self._told(one)
+        self._warn_unidentifiable(one)
         return rig
 
     def applied_to(self, rig: Rig, recording: str | None = None) -> Rig:
@@ -320,7 +320,7 @@ class IdentificationResult(Shown):
             )
         rig = deepcopy(rig)
         set_parameters(rig, one.identified)
-        self._told(one)
+        self._warn_unidentifiable(one)
         return rig
 
     def draws(
@@ -335,7 +335,7 @@ class IdentificationResult(Shown):
         """
         whole("count", count, 1)
         one = self.recorded(recording)
-        determined = self._told(one)
+        determined = self._warn_unidentifiable(one)
         mine = [(i, c) for i, c in enumerate(self.coordinates)
                 if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
         free = [i for i, c in mine if c.name in determined]
@@ -354,7 +354,7 @@ class IdentificationResult(Shown):
                 values[c.name] = values[c.name] * values.get(c.ratio_to, known_one)
         return values
 
-    def _told(self, one: RecordedRig) -> set[str]:
+    def _warn_unidentifiable(self, one: RecordedRig) -> set[str]:
         """Names of the identifiable parameters. Warns of the others, including those of a held-out
         recording."""
         mine = [

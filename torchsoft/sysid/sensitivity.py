@@ -283,8 +283,8 @@ def new_fits(
 
         if end.far:
             bar.set_description("new fit with all suspects unknown at once")
-            joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
-        explains = joint is not None and joint.left <= judge.little
+            joint = joint_fit(problem, end, candidates, judge.explained_chi2, loss, notify)
+        explains = joint is not None and joint.left <= judge.explained_chi2
         bounded = dict[str, float]()
         if joint is not None:  # where it leaves much, no number of it explains the data alone
             gains |= {name: explains * judge.square * part for name, part in joint.parts.items()}
@@ -384,7 +384,7 @@ class Judge:
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
         misfit = self.misfit(self.square)
-        self.little = self.square - NEARLY * misfit if misfit > 0.0 else 0.0
+        self.explained_chi2 = self.square - NEARLY * misfit if misfit > 0.0 else 0.0
         """Sum of squares below which next to nothing is left above the noise."""
 
     def misfit(self, left: float) -> float:
@@ -402,7 +402,7 @@ class Judge:
 
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""
-        return self.explained([one]) or (one.refitted and one.left < self.little)
+        return self.explained([one]) or (one.refitted and one.left < self.explained_chi2)
 
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
