@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ from torchsoft import files
 from torchsoft.cli import main
 from torchsoft.rigs import RigFile
 from torchsoft.solve import stepper
-from torchsoft.sysid import Unreachable
+from torchsoft.sysid import Unreachable, runs
 from torchsoft.sysid.measured import load, unreachable
 from torchsoft.sysid.prediction import FailedRun
+from torchsoft.sysid.runs import Job
 
 OPTIONS = ("--out", "--workers", "--rtol", "--checkpoint", "--yes", "--no-progress")
 
@@ -278,7 +280,15 @@ def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder, capsys)
 
 
 @pytest.mark.slow
-def test_competing_laws_are_compared(folder, capsys):
+def test_competing_laws_are_compared(folder, capsys, monkeypatch):
+    """The law of the file is compared by the runs of its identification."""
+    made, inner = list[str](), runs.simulated
+
+    def simulated(recording: Any, begun: Any, job: Job, start: Any) -> Any:
+        made.append(f"{recording.fingerprint} {job}")
+        return inner(recording, begun, job, start)
+
+    monkeypatch.setattr(runs, "simulated", simulated)
     law = '{kind = "coulomb", mu_s = 0.8, mu_k = 0.7}'
     laws = f"[compare.coulomb]\nsettings.laws.steel_on_rubber.friction = {law}\n"
     (folder / "rig.toml").write_text(f"{CONFIG}{laws}")
@@ -286,6 +296,7 @@ def test_competing_laws_are_compared(folder, capsys):
     text, _ = capsys.readouterr()
     answer = json.loads((folder / "out" / "comparison.json").read_text())
     assert sorted(one["name"] for one in answer["laws"]) == ["as stated", "coulomb"]
+    assert len(made) == len(set(made))
     assert answer["verdict"] in text
     assert sorted(path.name for path in (folder / "out").iterdir()) == [
         "answer.json",

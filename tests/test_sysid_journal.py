@@ -182,3 +182,16 @@ def test_frozen_steps_are_named_to_the_bit(tmp_path):
     assert same(journal(tmp_path).recall(job._replace(steps=Frozen(knots.copy()))), PREDICTION)
     assert journal(tmp_path).recall(job._replace(steps=Frozen(np.nextafter(knots, 1.0)))) is None
     assert journal(tmp_path).recall(job._replace(steps=1e-3)) is None
+
+
+def test_runs_of_varied_recordings_count_where_they_were_asked_for(monkeypatch):
+    """The runs of tests and of new fits are a part of what an identification costs."""
+    monkeypatch.setattr(runs, "simulated", lambda *_: PREDICTION)
+    one = {"beginning": "", "fingerprint": "a", "duration": 1.0, "begin": lambda: None}
+    recordings: Any = [SimpleNamespace(**one)]
+    parent = Runner(recordings)
+    child = parent.of(recordings).of(recordings)
+    child.run([Job(0, {"pad.E": 1.0}, (), 1e-3), Job(0, {"pad.E": 1.0}, ("pad.E",), 1e-3)])
+    parent.run([Job(0, {"pad.E": 2.0}, (), 1e-3)])
+    assert (child.simulations, child.jacobians) == (1, 1)
+    assert (parent.simulations, parent.jacobians) == (2, 1)

@@ -18,7 +18,7 @@ from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid import Problem, Recording, Sensor, Unknown, identify, record
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prechecks import (
     accepted,
@@ -242,6 +242,12 @@ def test_gains_that_are_unknown_still_leave_a_sign_and_a_set_point_to_the_run(
     ):
         problem = Problem([one], SENSORS, {name: Unknown() for name in GAINS})
         assert [f.code for f in precheck(problem, Runner(problem.recordings))] == [code]
+
+
+def test_recordings_are_checked_where_assumptions_are_trusted(recordings):
+    flipped = changed(recordings["rolling"], effort_y=scaled(-1))
+    with pytest.raises(ValueError, match="effort_y looks as if its sign were opposite"):
+        identify(Problem([flipped], SENSORS, {E: Unknown()}), rtol=1e-3, assumptions="trusted")
 
 
 def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_named(

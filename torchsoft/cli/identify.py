@@ -125,8 +125,8 @@ def identify(options: argparse.Namespace) -> int:
             if not result.made_by["untried"]:  # interrupted, nobody waits for pictures
                 written.append(options.out / "report.html")
                 report(result, case.problem, written[-1], checkpoint=unfinished)
+                verdict = compared(case, fit, options, unfinished) if case.laws else ""
                 forget(unfinished)
-                verdict = compared(case, fit, options) if case.laws else ""
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
     except KeyboardInterrupt:
@@ -147,20 +147,22 @@ def identify(options: argparse.Namespace) -> int:
     return 130 if result.made_by["untried"] else 0
 
 
-def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
-    """Fit the competing laws and write the comparison; returns its table and verdict."""
+def compared(case: Any, fit: Any, options: argparse.Namespace, unfinished: Path) -> str:
+    """Fit the competing laws, that of the file with the runs of its identification, which are in
+    the folder `unfinished`, and write the comparison; returns its table and verdict."""
     from torchsoft.sysid.compare import compare
+    from torchsoft.sysid.measured import STATED
     from torchsoft.sysid.runs import forget
 
-    unfinished: Path = options.checkpoint or options.out / "unfinished"
     folder = unfinished.with_name(f"{unfinished.name}-laws")
+    folders = {name: folder / name for name in case.laws if name != STATED}
     answer = compare(
         case.laws, heldout=case.config.heldout, rtol=fit.rtol, starts=fit.starts,
-        workers=fit.workers, checkpoint=folder, progress=options.progress,
+        workers=fit.workers, checkpoint={STATED: unfinished, **folders}, progress=options.progress,
     )  # fmt: skip
     answer.save(options.out / "comparison.json")
-    for name in case.laws:
-        forget(folder / name)
+    for one in folders.values():
+        forget(one)
     if folder.is_dir() and not any(folder.iterdir()):
         folder.rmdir()
     return f"{answer.table()}\n{answer.verdict}\nwritten to {options.out / 'comparison.json'}"

@@ -398,7 +398,7 @@ CLOSE = 1e-3
 def compare(
     laws: Mapping[str, Problem], *, heldout: Sequence[str] = (),
     plans: Mapping[str, Sequence[Stage]] | None = None, rtol: float = RTOL, starts: int = 1,
-    workers: int = 1, checkpoint: str | Path | None = None,
+    workers: int = 1, checkpoint: str | Path | Mapping[str, str | Path] | None = None,
     progress: bool = False,
 ) -> Comparison:  # fmt: skip
     """Fit every law to the same recordings, and say which one made them, or that the data cannot
@@ -413,21 +413,23 @@ def compare(
     that nobody declared.
 
     Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers`
-    and the folder `checkpoint` are those of `identify`. Every law but the best is fitted once more
-    from where the best one ended, as far as they share coordinates, and the better end is kept: no
-    law is to lose by its start.
+    and the folder `checkpoint` are those of `identify`; a mapping has a folder for each law, which
+    may be that of an identification of it: what that has run is not run again. Every law but the
+    best is fitted once more from where the best one ended, as far as they share coordinates, and
+    the better end is kept: no law is to lose by its start.
 
     Raises `ValueError` for laws that were not given the same data, and for a law that cannot follow
     the data.
     """
     check_alike(laws, heldout)
     which = [name for name in next(iter(laws.values())).names if name not in heldout]
-    folder = Path(checkpoint) if checkpoint is not None else None
+    folders = dict(checkpoint) if isinstance(checkpoint, Mapping) else {}
+    if checkpoint is not None and not isinstance(checkpoint, Mapping):
+        folders = {name: Path(checkpoint) / name for name in laws}
     evidence, runners = dict[str, Evidence](), dict[str, Runner]()
     for name, problem in laws.items():
-        runners[name] = Runner(
-            problem.recordings, workers, folder / name if folder is not None else None
-        )
+        own = folders.get(name)
+        runners[name] = Runner(problem.recordings, workers, Path(own) if own is not None else None)
         try:
             law = fitted(
                 name, problem, runners[name], which, (plans or {}).get(name), rtol, starts, progress

@@ -441,7 +441,7 @@ def identify(
     misfit, a notice names the candidates, and `explain` tries them. Before the fit recordings are
     held against what such a rig can do at all: signs, units, delays, zeros, set-points, the body
     that a loop senses; `acknowledged` names findings that are no mistakes. With `assumptions` =
-    "trusted" both are left out.
+    "trusted" the tests at the end are left out, but not the checks of the recordings.
 
     Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or
     cannot be what they are taken for, `Unreachable` where the model cannot follow the data.
@@ -464,11 +464,7 @@ def identify(
     runner = Runner(
         problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None
     )
-    findings = (
-        accepted(precheck(problem, runner, fitted), acknowledged)
-        if assumptions != "trusted"
-        else []
-    )
+    findings = accepted(precheck(problem, runner, fitted), acknowledged)
     for look in findings if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
     try:

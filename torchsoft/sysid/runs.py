@@ -215,12 +215,16 @@ class Runner:
         self._idle: list[list[RunContext]] = [
             [] for _ in self.recordings
         ]  # models that no thread is using
+        self._parent: Runner | None = None
 
     def of(
         self, recordings: Sequence[Recording], variations: Mapping[str, Vary] | None = None
     ) -> "Runner":
-        """A runner for other recordings, with the same number of threads and the same folder."""
-        return Runner(recordings, self.workers, self.folder, variations)
+        """A runner for other recordings, with the same number of threads and the same folder; what
+        it runs counts here too."""
+        out = Runner(recordings, self.workers, self.folder, variations)
+        out._parent = self
+        return out
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
@@ -312,6 +316,8 @@ class Runner:
             self.jacobians += 1
         else:
             self.simulations += 1
+        if self._parent is not None:
+            self._parent._count(job, remembered)
 
 
 EARLY = 2e-3
