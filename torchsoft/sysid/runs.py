@@ -264,7 +264,7 @@ class Runner:
         plain = job._replace(varied=())
 
         def run(one: Recording, job: Job = plain, fine: bool = False) -> Any:
-            job = job._replace(steps=since(job.steps, one))
+            job = job._replace(steps=since(job.steps, one.begins))
             made = simulated(one, one.begin(), job, grid=between(one, job) if fine else None)
             if isinstance(made, FailedRun):
                 raise SimulationFailed(made.reason, made.time)
@@ -324,13 +324,11 @@ EARLY = 2e-3
 """Steps [s] before frozen ones, where the run of a varied recording begins earlier."""
 
 
-def since(steps: Steps, recording: Recording) -> Steps:
-    """The same steps for a run that begins at another time."""
-    if not isinstance(steps, Frozen):
+def since(steps: Steps, begin: float) -> Steps:
+    """The same steps for a run that begins at another time [s]."""
+    if not isinstance(steps, Frozen) or begin == steps.knots[0]:
         return steps
-    begin, knots = float(recording.times[0] - recording.start.lead), steps.knots
-    if begin == knots[0]:
-        return steps
+    knots = steps.knots
     early = np.arange(begin, knots[0], EARLY) if begin < knots[0] else np.array([begin])
     return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
 
