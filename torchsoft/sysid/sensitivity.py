@@ -26,6 +26,7 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import (
     NEARLY,
     End,
+    Joint,
     Refit,
     difference,
     exact_columns,
@@ -49,7 +50,7 @@ LAGS = 10
 BY_CHANCE = 2.0
 """Largest statistic of Box and Pierce, over its expectation, that counts as chance."""
 
-MOST = 24
+MOST = 18
 """Most suspects with which a fit is repeated, besides laws and constants of the computation."""
 
 RIVAL = 0.3
@@ -299,12 +300,12 @@ def new_fits(
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, (), loss, notify)
         bar.update()
-        enough = 0.0
+        enough, ends = 0.0, dict[str, tuple[list[Variation], Refit]]()
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
             if gain < enough:
-                return
+                break
             if name in bounded and least < bounded[name]:
                 continue
             bar.set_description(plain(f"new fit with another {name} ({number} of {len(order)})"))
@@ -316,13 +317,27 @@ def new_fits(
                     for one, changed in zip(some, tried)
                 ]
                 if all(one.refitted for one in found):
-                    checks[name] = judge.together(name, found)
+                    checks[name], ends[name] = judge.together(name, found), (tried, other)
                     least = min(least, judge.misfit(found[0].left))
             bar.update()
             if len(some) == 1:
                 yield some[0]
             if name in checks and judge.nearly(checks[name]):
                 enough = max(enough, RIVAL * gain)
+        best = max(
+            (name for name in ends if checks[name].suspected),
+            key=lambda name: (checks[name].passed, checks[name].gain), default="",
+        )  # fmt: skip
+        if best and as_stated is not None and not checks[best].passed and end.rtol > end.finest:
+            bar.set_description(plain(f"new fit with another {best}, by finer steps"))
+            tried, coarse = ends[best]
+            at = Joint(dict(zip(coarse.problem.coordinates.labels, coarse.fit.x)), 0.0, {})
+            fine = end._replace(rtol=end.finest)
+            other = refit(problem, fine, tried, loss, notify, at)
+            if other is not None:
+                linear = [replace(checks[one.name], refitted=False) for one in tried]
+                found = [judge.fit(one, other, as_stated, c) for one, c in zip(tried, linear)]
+                checks[best] = judge.together(best, found)
 
 
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
