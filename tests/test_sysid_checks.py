@@ -88,6 +88,9 @@ def brief() -> Recording:
     return recorded(excitation=BRIEF)
 
 
+ALARM = Verdict("motion", "roll", "x", 1e-9, 0.4, "x of `roll` (40% of it, most like its rate)")
+
+
 def notices(found: Checked) -> list[str]:
     """All that is said of the assumptions."""
     return assumption_doubts(found) + assumption_notices(found)
@@ -367,7 +370,8 @@ def test_near_rivals_to_first_order_are_left_to_new_fits(same, second, near):
         for one, gain, odds in zip(taken, (300.0, second, 5.0), (1.0, 0.0, 0.0))
     }
     assert [one.name for one in rivals(taken, checks)] == near
-    said = notices(same._replace(checks=[*checks.values()], candidates=tuple(near)))
+    alarms = {"as_stated": (ALARM,)}
+    said = notices(same._replace(checks=[*checks.values()], candidates=tuple(near), **alarms))
     assert said[0].startswith("the data contradict that a is 1") != bool(near)
     assert ("one of 2 assumptions" in said[0] and "b (by 250): `explain`" in said[0]) == bool(near)
 
@@ -412,13 +416,12 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same):
         )
         for name, gain in (("a", 300.0), ("b", 299.0), ("c", 200.0))
     ]  # fmt: skip
-    alarm = Verdict("motion", "roll", "x", 1e-9, 0.4, "x of `roll` (40% of it, most like its rate)")
     judge: Any = SimpleNamespace(
         dof=990,
         besides=lambda best, every: ((), np.zeros(3), np.zeros((3, 1))),
         alarms=lambda r, J: [],
     )
-    found = compared(same._replace(checks=tests), judge)
+    found = compared(same._replace(checks=tests, as_stated=(ALARM,)), judge)
     odds = {one.name: one.odds for one in found.checks}
     assert odds["a"] == pytest.approx(1 / (1 + np.exp(-0.5)), rel=1e-3)
     assert odds["a"] + odds["b"] == pytest.approx(1.0)
@@ -426,13 +429,29 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same):
     (said,) = notices(found)
     assert said.startswith("the data contradict that a is 1: the sum of squares falls by 300")
     assert "cannot tell it (odds 0.62) from: b with b = 1.05 (+5 %, +- 0.5), odds 0.38" in said
-    judge.alarms = lambda r, J: [alarm]
-    (said,) = notices(compared(same._replace(checks=tests), judge))
+    judge.alarms = lambda r, J: [ALARM]
+    (said,) = notices(compared(same._replace(checks=tests, as_stated=(ALARM,)), judge))
     assert said == (
         "the misfit stands for something that is none of the assumptions tested: with the nearest "
         "one, a, the sum of squares falls by 300 in a new fit with a = 1.05 (+5 %, +- 0.5), but "
         "residuals follow the motion in x of `roll` (40% of it, most like its rate)"
     )
+
+
+def test_a_suspect_is_no_cause_where_residuals_pass_without_it(same):
+    (one,) = (one for one in same.checks if one.name == RADIUS)
+    found = replace(
+        one, suspected=True, passed=True, odds=1.0, gain=31.0, favoured=2.0, favoured_sd=0.4,
+        value=0.0198,
+    )  # fmt: skip
+    checked = same._replace(checks=[found])
+    (said,) = notices(checked)
+    assert said == (
+        f"something is not as stated: the sum of squares would fall by 31 with {RADIUS} = 0.0198 "
+        "(+2 %, +- 0.4), which is more than chance. Residuals pass every test without it, so that "
+        "nothing confirms the cause"
+    )
+    assert not checked.explained
 
 
 def test_a_suspect_under_which_something_is_left_loses_to_one_that_passes(same):
@@ -450,7 +469,7 @@ def test_a_suspect_under_which_something_is_left_loses_to_one_that_passes(same):
         besides=lambda best, every: ((), np.zeros(3), np.zeros((3, 1))),
         alarms=lambda r, J: [],
     )
-    found = compared(same._replace(checks=tests), judge)
+    found = compared(same._replace(checks=tests, as_stated=(ALARM,)), judge)
     assert [one.odds for one in found.checks] == [0.0, 1.0]
     (said,) = notices(found)
     assert said.startswith("the data contradict that b is 1")

@@ -179,6 +179,8 @@ class Checked(NamedTuple):
     alarms: tuple[Verdict, ...] = ()
     """Alarms of the residuals under the likeliest suspect and the effects besides, or of the fit
     without a suspect."""
+    as_stated: tuple[Verdict, ...] = ()
+    """Alarms of the residuals of the fit itself."""
     sd: Mapping[str, float] = MappingProxyType({})
     """Standard deviations of the free coordinates, by label."""
 
@@ -191,8 +193,9 @@ class Checked(NamedTuple):
 
     @property
     def explained(self) -> bool:
-        """Whether nothing is left under the likeliest suspect and the effects besides."""
-        return bool(self.favoured) and not self.alarms
+        """Whether nothing is left under the likeliest suspect and the effects besides, and without
+        them something is."""
+        return bool(self.favoured and self.as_stated) and not self.alarms
 
     @property
     def wider(self) -> dict[str, float]:
@@ -261,7 +264,10 @@ def check_assumptions(
     rows = np.stack(columns, 1) if columns else np.zeros((len(end.at.r), 0))
     names = tuple(one.name for one in candidates)
     sd = dict(zip(judge.labels, judge.sd.tolist()))
-    done = Checked([*checks.values()], rows, judge.J, tuple(untried), names, sd=sd)
+    done = Checked(
+        [*checks.values()], rows, judge.J, tuple(untried), names,
+        as_stated=tuple(judge.alarms(judge.r, judge.J)), sd=sd,
+    )  # fmt: skip
     return compared(done, judge)
 
 
@@ -366,7 +372,7 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
     out = list(checked.checks)
     favoured = [one for one in out if one.suspected]
     if not favoured:
-        return checked._replace(alarms=tuple(judge.alarms(judge.r, judge.J)))
+        return checked._replace(alarms=checked.as_stated)
     some = [one for one in favoured if one.passed] or favoured
     rest = max(1.0, min(one.left for one in some) / judge.dof)
     amplitudes = [

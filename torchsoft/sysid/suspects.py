@@ -51,6 +51,14 @@ def assumption_doubts(checked: Checked) -> list[str]:
             f"another {c.gain:.0f}{c.found}"
             for c in checked.besides
         ]
+    if favoured and not checked.as_stated:
+        near = [f"{c.name}{c.found}" for c in favoured if c.odds > LIKELY][:NAMED]
+        return [
+            f"something is not as stated: the sum of squares {favoured[0].falls}"
+            f"{favoured[0].found}, which is more than chance. Residuals pass every test without "
+            "it, so that nothing confirms the cause"
+            + (f"; as likely are {'; '.join(near[1:])}" if near[1:] else "")
+        ]
     looks = "; ".join(SHORT[one.test].format(one.words) for one in checked.alarms[:WORST])
     if favoured:
         best = favoured[0]
