@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from closed_forms import ClosedForm
 from conftest import COARSE, PAPER, RIG, excited, stroked, waves
 
 from torchsoft.rigs.excite import CATALOGUE, GRIP, Excitation
@@ -36,6 +37,7 @@ from torchsoft.sysid.fit import (
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.plan import (
     SCANNED,
+    PlanEnd,
     default_plan,
     jacobian_error,
     run_plan,
@@ -142,6 +144,26 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes, shak
     content = json.loads(answer.to_json())
     assert content["made_by"]["recordings"].keys() == {"strokes", "shake"}
     assert content["cost"]["jacobians"] > 0
+
+
+@pytest.mark.parametrize(("level", "stalls"), [(30.0, True), (3.0, False)])
+def test_a_fit_without_headway_ends_where_it_is_and_says_so(level, stalls):
+    """A model that cannot follow, and residuals too rough for steps to be of use; not one that is
+    near the noise."""
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.array([level, x[0] + 2.0 * np.abs(np.sin(40 * x[0])), 0.3 * x[1]])
+
+    problem, x = ClosedForm(residuals, 2), np.array([2.0, 3.0])
+    common: dict[str, Any] = {"which": (), "free": np.array([True, True]), "steps": {}}
+    fit = gauss_newton(problem, None, x, tolerance=1e-9, **common)
+    assert fit.stalled == stalls
+    assert fit.evaluations == (8 if stalls else 30)
+    assert not fit.converged
+    assert fit.chi2 == pytest.approx(float(np.mean(residuals(fit.x) ** 2)))
+    end = PlanEnd(fit, Stage("all", (), (), 1e-3), [])
+    assert bool(end.notices) == stalls
+    assert not stalls or "the fit made no headway: over 6 evaluations" in end.notices[0]
 
 
 def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):

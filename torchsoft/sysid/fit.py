@@ -213,6 +213,11 @@ SETTLED = 0.2
 """Largest remaining move of a coordinate, in standard deviations, at which a fit has ended."""
 
 
+HEADWAY, LITTLE, FAR_OFF = 6, 0.01, 25.0
+"""Number of evaluations over which chi2 must fall by more than a part for a fit to go on, that
+part, and the chi2 up to which any fall counts."""
+
+
 class Unreachable(RuntimeError):
     """The model cannot follow a recording at the start of a fit; `failed` has reason and time by
     recording, `findings` the doubts about the recordings themselves."""
@@ -226,7 +231,8 @@ class Unreachable(RuntimeError):
 
 class Fit(NamedTuple):
     """End of a fit on `steps`: coordinates x (n,), chi2 (mean squared residual), evaluations,
-    convergence, and the residuals there with their Jacobian."""
+    convergence, the residuals there with their Jacobian, and whether it was `stalled`, far above
+    the noise."""
 
     x: Array
     chi2: float
@@ -234,6 +240,32 @@ class Fit(NamedTuple):
     converged: bool
     steps: StepsByName
     at: Residuals
+    stalled: bool = False
+
+    @property
+    def notices(self) -> list[str]:
+        """A sentence on a fit that was stalled."""
+        if not self.stalled:
+            return []
+        return [
+            f"the fit made no headway: over {HEADWAY} evaluations chi2 fell by less than "
+            f"{LITTLE:.0%}, to {self.chi2:.3g}, which is far above the noise, and there it ended: "
+            "the model lacks something that these data show"
+        ]
+
+
+class Stalled(Exception):
+    """A fit makes no headway."""
+
+
+def no_headway(chi2: Sequence[float]) -> bool:
+    """Whether chi2 by evaluation has fallen by too little, and is still far above the noise."""
+    best = np.minimum.accumulate(chi2)
+    return (
+        len(best) > HEADWAY
+        and best[-1] > FAR_OFF
+        and bool(best[-1] > (1 - LITTLE) * best[-1 - HEADWAY])
+    )
 
 
 def gauss_newton(
@@ -245,7 +277,8 @@ def gauss_newton(
     priors) on the coordinates that are `free`.
 
     `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated
-    shortens the step. `first` holds residuals and Jacobian at x, if they are known. Raises
+    shortens the step. With the linear loss a fit that makes no headway far above the noise ends
+    early, as `Fit.stalled`. `first` holds residuals and Jacobian at x, if they are known. Raises
     `Unreachable` where the start cannot be simulated.
     """
     low, high = problem.coordinates.bounds
@@ -255,6 +288,7 @@ def gauss_newton(
     seen = (
         {zero.tobytes(): first} if first is not None and (begin == x).all() else {}
     )  # the best and the latest
+    chi2 = [float(np.mean(one.r**2)) for one in seen.values()]
 
     def moved(z: Array) -> Array:
         trial = begin.copy()
@@ -268,18 +302,27 @@ def gauss_newton(
             for old in seen.keys() - {best}:
                 del seen[old]
             seen[key] = problem.residuals(runner, moved(z), which, steps, free)
-            notify(float(np.mean(seen[key].r ** 2)))
+            chi2.append(float(np.mean(seen[key].r ** 2)))
+            notify(chi2[-1])
+            if loss == "linear" and no_headway(chi2):
+                raise Stalled
         return seen[key]
 
     if failed := at(zero).failed:
         raise Unreachable(failed)
     solve: Any = least_squares
-    out = solve(
-        lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free],
-        bounds=(low[free] - begin[free], high[free] - begin[free]),
-        loss=robust_loss_except_priors(loss, len(problem.coordinates.priors)), f_scale=REACH[loss],
-        max_nfev=evaluations, ftol=tolerance, xtol=tolerance, gtol=1e-12,
-    )  # fmt: skip
+    try:
+        out = solve(
+            lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free],
+            bounds=(low[free] - begin[free], high[free] - begin[free]),
+            loss=robust_loss_except_priors(loss, len(problem.coordinates.priors)),
+            f_scale=REACH[loss], max_nfev=evaluations, ftol=tolerance, xtol=tolerance,
+            gtol=1e-12,
+        )  # fmt: skip
+    except Stalled:
+        key = min(seen, key=lambda k: float(seen[k].r @ seen[k].r))
+        x = moved(np.frombuffer(key))
+        return Fit(x, min(chi2), len(chi2), False, steps, seen[key], stalled=True)
     return Fit(
         moved(out.x), float(np.mean(out.fun**2)), int(out.nfev), out.status > 0, steps, at(out.x)
     )

@@ -206,12 +206,13 @@ class PlanEnd(NamedTuple):
 
     @property
     def notices(self) -> list[str]:
-        """A sentence where a finer stage could not begin."""
+        """Sentences where the last stage made no headway, and where a finer one could not begin."""
         if self.failure is None:
-            return []
+            return self.fit.notices
         return [
+            *self.fit.notices,
             f"the fit ended by rtol = {self.stage.rtol:g}: by a finer tolerance {self.failure}; "
-            "the model may lack something that drives its parameters to where it has no solution"
+            "the model may lack something that drives its parameters to where it has no solution",
         ]
 
 
@@ -446,13 +447,15 @@ def settle(
     def along(start: Residuals, steps: StepsByName) -> bool:
         """Fit on other steps from residuals on them, with new Jacobians where the last one does not
         suffice; returns whether the coordinates changed."""
-        nonlocal x, at
+        nonlocal x, at, rounds, left
         common: dict[str, Any] = {"which": which, "free": free, "steps": steps, "notify": notify}
         end = chord(problem, runner, x, start._replace(J=at.J), **common)
         if not end.converged:
             end = gauss_newton(
                 problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common
             )
+        if end.stalled:
+            rounds = left = 0
         if further := bool((end.x != x).any()):
             fits.append((rtol, end, clock.perf_counter()))
             x, at = end.x, end.at
