@@ -50,7 +50,7 @@ LAGS = 10
 BY_CHANCE = 2.0
 """Largest statistic of Box and Pierce, over its expectation, that counts as chance."""
 
-MOST = 18
+MOST = 12
 """Most suspects with which a fit is repeated, besides laws and constants of the computation."""
 
 RIVAL = 0.3
