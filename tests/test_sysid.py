@@ -166,6 +166,19 @@ def test_a_fit_without_headway_ends_where_it_is_and_says_so(level, stalls):
     assert not stalls or "the fit made no headway: over 6 evaluations" in end.notices[0]
 
 
+def test_a_fit_far_above_the_noise_is_not_refined(strokes):
+    """Half a millimetre of a wave in a reading of 10 um: finer steps would be to no purpose."""
+    t, y = strokes.samples["x_C"]
+    wavy = replace(strokes, samples=strokes.samples | {"x_C": (t, y + 5e-4 * np.sin(50 * t))})
+    answer = identify(Problem([wavy], SENSORS, {E: Unknown(nominal=7e5)}), rtol=1e-3, **TRUSTED)
+    assert answer.chi2_stated > 25
+    assert {stage["rtol"] for stage in answer.stages} == {1e-3}
+    assert {stage["name"] for stage in answer.stages} <= {
+        "strokes: first look", "everything", "with the noise that was found",
+    }  # fmt: skip
+    assert any("steps were checked and not made finer" in one for one in answer.notices)
+
+
 def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
     problem = Problem(
         [strokes], SENSORS, {E: Unknown(nominal=1.0e6), TAU: Unknown()} | rest_known()

@@ -28,6 +28,7 @@ from torchsoft.sysid.colour import (
 )
 from torchsoft.sysid.estimate import contributions, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.fit import (
+    FAR_OFF,
     Fit,
     Loss,
     Notify,
@@ -137,14 +138,14 @@ def conclude(
     the clock [s]."""
     c = coloured.problem.coordinates
     free, stages = np.isin(c.labels, stage.free), list(stages)
+    hopeless = context.loss == "linear" and coloured.before[1].chi2 > FAR_OFF
+    tightenings = 0 if hopeless else context.tightenings
 
     def at_rest() -> Settled:
         """Continue the fit with its noise until its steps do not matter."""
         start, by = clock.perf_counter(), stage.rtol
         with progress_bar("check of the steps", progress) as notify:
-            end = settle(
-                coloured.problem, runner, stage, coloured.fit, free, context.tightenings, notify
-            )
+            end = settle(coloured.problem, runner, stage, coloured.fit, free, tightenings, notify)
         for rtol, one, at in end.fits:
             name = "steps chosen anew" if rtol == by else "tighter tolerance"
             stages.append(stage_entry(name, stage, rtol, one, start, at))
@@ -213,10 +214,16 @@ def conclude(
             notices += guesses(problem, x, context.heldout)
     sd = np.sqrt(np.diag(C_free))
     notices += notices_on(
-        found, ordering_constraints(problem), end.at_rest or bool(end.rough), rtol, end.bias is None
-    )
+        found, ordering_constraints(problem), end.at_rest or bool(end.rough) or hopeless, rtol,
+        end.bias is None,
+    )  # fmt: skip
+    if hopeless:
+        notices.append(
+            f"steps were checked and not made finer, since chi2 = {coloured.before[1].chi2:.3g} is "
+            "far above the noise"
+        )
     notices += rough_notices(c, end.rough)
-    if end.jacobian_error > JACOBIAN_ERROR and not end.rough:
+    if end.jacobian_error > JACOBIAN_ERROR and not end.rough and not hopeless:
         notices.append(
             f"the tolerance rtol = {rtol:g} is too coarse for derivatives: their error is "
             f"{end.jacobian_error:.2g} of the noise, and estimates scatter more than their "
