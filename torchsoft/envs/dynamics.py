@@ -169,7 +169,11 @@ class Dynamics:
         """The moment at the time `begin`, after the rig's own motion, without disturbance. The
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
-        self._stepper = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver).stepper
+        with torch.enable_grad():  # a step may be differentiated, whatever is done here
+            task = prepare(
+                self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver
+            )
+        self._stepper = task.stepper
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         rows = attached([self._run(t, self._y0, own).solved])[0]
         there = -1 if self.start else 0

@@ -26,13 +26,14 @@ class Progress:
     """Results of the stepper so far: rows of the output grid, its steps, and its counters.
 
     integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them; rate: of
-    the displacements of nodal pads [m/s].
+    the displacements of nodal pads [m/s]; signals: values and rates, fixed coordinates last.
     """
 
     y: Array
     integrals: Array
     recorded: Array
     rate: Array
+    signals: Array
     rows: int = 1
     steps: int = 0
     solves: int = 0
@@ -86,10 +87,11 @@ class Integrals:
 
 @dataclass
 class RunState:
-    """A run in progress: the state, Newton's scratch, the last step, the integrals, and where its
-    results go."""
+    """A run in progress: the state, the rig's arrays, Newton's scratch, the last step, the
+    integrals, and where its results go."""
 
     y: Array
+    system: Any
     work: Any
     step: Any
     integrals: Array

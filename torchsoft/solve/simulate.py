@@ -3,7 +3,7 @@
 
 import time as clock
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -29,7 +29,6 @@ from torchsoft.solve.gradients import (
     march,
     without_gradient,
 )
-from torchsoft.solve.laws import snapshot
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.steps import check_times
@@ -119,9 +118,10 @@ def prepare(
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
-    touch: Sequence[str] = (),
+    touch: Sequence[str] = (), values: Mapping[int, Tensor] | None = None,
 ) -> Task:  # fmt: skip
-    """Checks the arguments of `simulate`; raises its `ValueError`s."""
+    """Checks the arguments of `simulate`, and takes `values` in the place of some parameters, by
+    their id; raises its `ValueError`s."""
     t = tensor("t", t)
     start = tensor("y0", y0)
     knots, dy0 = (
@@ -135,17 +135,17 @@ def prepare(
         raise ValueError(f"{' and '.join(given)} each say which steps to take; give one of them")
     if rtol is None:
         rtol = RTOL if atol is None else 10 * positive("atol", atol)
-    now, followed = rig, reference
-    if isinstance(rig, Rig) and isinstance(reference, Reference | None):
-        now, followed = snapshot(rig, reference)
     stepper = ImplicitStepper(
-        now,
-        followed,
+        rig,
+        reference,
         step=step,
         rtol=rtol,
         atol=0.1 * positive("rtol", rtol) if atol is None else atol,
         knots=knots,
         tolerance=tolerance,
+        values=values,
+        differentiable=gradient == "forward"
+        or (gradient == "discrete" and torch.is_grad_enabled()),
     )
     check_times(t, step)
     stepper.check_start(start)

@@ -1,6 +1,6 @@
 """The implicit stepper: the compiled kernels fed from a rig, chunk by chunk."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from typing import Any
 
@@ -29,12 +29,11 @@ from torchsoft.solve.kernel.arrays import (
     Outputs,
     Run,
     Tape,
-    recorded_size,
     room,
 )
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.progress import Integrals, Progress, RunState, Segment, SimulationFailed
+from torchsoft.solve.progress import Progress, RunState, Segment, SimulationFailed
 from torchsoft.solve.steps import (
     CHUNK,
     LONGEST,
@@ -43,10 +42,7 @@ from torchsoft.solve.steps import (
     check_knots,
     check_times,
     equal_steps,
-    error_parts,
     given_steps,
-    own_units,
-    part_name,
 )
 from torchsoft.solve.system import Compiled
 
@@ -97,15 +93,15 @@ class ImplicitStepper:
         rtol: float = 1e-3, atol: float = 1e-4, knots: Tensor | None = None,
         tolerance: float = 1e-9, max_iterations: int = 40, window: float = 2e-3,
         longest: float = LONGEST, landing: bool = False,
+        values: Mapping[int, Tensor] | None = None, differentiable: bool = True,
     ) -> None:  # fmt: skip
         if not isinstance(rig, Rig):
             raise ValueError(
                 "`rig` must be a Rig, but is "
                 f"{rig if isinstance(rig, type) else type(rig).__name__}"
             )
-        followed = rig.reference if reference is None else reference
-        if not isinstance(followed, Reference):
-            raise ValueError(f"`reference` must be a Reference, but is {type(followed).__name__}")
+        if not isinstance(reference, Reference | None):
+            raise ValueError(f"`reference` must be a Reference, but is {type(reference).__name__}")
         self.step = None if step is None else positive("step", step)
         self.rtol, self.atol = positive("rtol", rtol), positive("atol", atol)
         if self.rtol >= 1:
@@ -117,15 +113,15 @@ class ImplicitStepper:
         self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
         self.knots = None if knots is None else check_knots(knots)
-        self.rig, self.reference = rig, followed
-        self.compiled = Compiled(rig)
-        if self.tolerance < (least := SMALLEST_TOLERANCE * own_units(rig)["force"]):
+        self.compiled = Compiled(rig, reference, values=values, differentiable=differentiable)
+        self.rig, self.reference = self.compiled.rig, self.compiled.reference
+        if self.tolerance < (least := SMALLEST_TOLERANCE * self.compiled.units["force"]):
             raise ValueError(
                 f"`tolerance` must be at least {least:.3g} N, but is {tolerance:g} N, "
                 "which rounding hides"
             )
-        self.layout, self.integrals = self.compiled.layout, Integrals(rig)
-        self._since(0.0)
+        self.layout, self.integrals = self.compiled.layout, self.compiled.model.integrals
+        self.origin = 0.0
         self._cap, self._shortest = 64, SHORTEST
 
     def along(self, knots: Array) -> "ImplicitStepper":
@@ -137,17 +133,12 @@ class ImplicitStepper:
     def following(self, reference: Reference) -> "ImplicitStepper":
         """The same on another reference; the rig stays as it was read."""
         other = copy(self)
-        other.reference = reference
-        other._since(0.0)
+        other.reference, other.origin = reference, 0.0
         return other
-
-    def _since(self, origin: float) -> None:
-        """Count time from `origin` [s]."""
-        self.origin, self._followed = origin, self.reference.since(origin)
 
     def signals_at(self, times: Tensor) -> Tensor:
         """The signals at times (...) [s] since the origin (..., signals, 2)."""
-        return self.compiled.signals(times, self._followed)
+        return self.compiled.signals(times, self.reference.since(self.origin))
 
     def _call(
         self, now: "RunState", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
@@ -164,7 +155,7 @@ class ImplicitStepper:
         now.work.held[:] = 0.0
         y = out.y[rows]
         tape, out_tape = (
-            room("Tape", self.system, self.layout.size, stages=n, cap=self._cap)
+            room("Tape", now.system, self.layout.size, stages=n, cap=self._cap)
             for n in ((2 * steps, len(y) if now.outputs_too else 0) if taping else (0, 0))
         )
         if taping and now.outputs_too:
@@ -176,7 +167,7 @@ class ImplicitStepper:
         most = self.max_iterations if steps else START_ITERATIONS
         limits = Limits(self.tolerance, most, self.window)
         run = Run(
-            self.system, now.work, now.step, follow, errors, limits, outputs, tape, given,
+            now.system, now.work, now.step, follow, errors, limits, outputs, tape, given,
             now.y, k, clock, stops, times, row, self.rtol, self.longest,
             self._shortest, now.integrals, plan.starts, plan.h,
             signals.reshape(steps, 2, *signals.shape[1:]), counts,
@@ -220,25 +211,26 @@ class ImplicitStepper:
         """
         self.check_start(y0)
         check_times(t, self.step)
-        self._since(float(t[0]))
+        self.origin = float(t[0])
         self._shortest = min(SHORTEST, PART * float(t[-1] - t[0]))
-        s, names = self.system, self.integrals.names
-        out = self._room(len(t))
-        work = room("Work", s, self.layout.size, columns=1)
-        step = room("Step", s, self.layout.size, integrals=len(names))
-        y, integrals = y0.numpy().copy(), np.zeros(len(names))
-        set_velocities(s, work, y)
-        state = RunState(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
-        self._start(state)
-        set_velocities(s, work, y)
-        yield from (
-            self._by_tolerance(t, state)
-            if self.step is None and self.knots is None
-            else self._as_given(t, state)
-        )
+        model, out = self.compiled.model, self._room(len(t))
+        place = model.take(self.compiled.numbers)
+        try:
+            y, integrals = y0.numpy().copy(), np.zeros(len(self.integrals.names))
+            set_velocities(place.system, place.work, y)
+            state = RunState(y, *place, integrals, out, segments, tape_bytes, outputs_too)
+            yield from (
+                self._by_tolerance(t, state)
+                if self.step is None and self.knots is None
+                else self._as_given(t, state)
+            )
+        finally:
+            model.give(place)
 
     def _as_given(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take the steps of a plan."""
+        now.out.signals[0] = self.signals_at(torch.zeros(1, dtype=torch.float64)).numpy()
+        self._start(now)
         todo = list(
             given_steps(t, self.knots)
             if self.knots is not None
@@ -262,6 +254,7 @@ class ImplicitStepper:
                 plan, follow, at_rows, now, here, now.taping
             )
             here = slice(out.rows, out.rows + rows_done)
+            out.signals[here] = at_rows[:rows_done]
             now.keep(
                 plan.part(0, steps), follow[: 2 * steps], at_rows[:rows_done], before, here, tapes
             )
@@ -289,29 +282,33 @@ class ImplicitStepper:
                 pending.append((half, *new, halvings + 1))
             elif status != CONVERGED:
                 since, h = float(plan.starts[steps]), float(plan.h[steps])
-                raise self._failure(now.work, status, since, h)
+                raise self._failure(now, status, since, h)
 
     def _by_tolerance(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
-        times, out = np.ascontiguousarray(t.numpy() - self.origin), now.out
-        followed = Followed(self.signals_at, self.rig, self._followed)
+        times, out, model = (
+            np.ascontiguousarray(t.numpy() - self.origin),
+            now.out,
+            self.compiled.model,
+        )
+        followed = self.compiled.followed(self.reference, self.origin)
+        self._start(now, followed)
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > times[0]) & (stops <= times[-1])]
-        errors = error_parts(self.rig, now.y, self.atol)
+        errors = model.errors.of(now.y, self.atol, self.compiled.units)
         clock, k = np.array([times[0], min(FIRST, times[-1] - times[0]), 1.0]), now.step.K[0].copy()
-        count = self.compiled.signal_count
+        count, at_rows = self.compiled.signal_count, out.signals
         row_step, row_part = np.zeros(len(t), np.int64), np.zeros(len(t))
         while out.rows < len(t):
             plan = Plan(np.zeros(CHUNK), np.zeros(CHUNK), row_step, row_part)
-            flat, at_rows = np.zeros((2 * CHUNK, count, 2)), np.zeros((len(t), count, 2))
+            flat = np.zeros((2 * CHUNK, count, 2))
             before = now.copy()
             (steps, done, status, solves, refused, failed, which), tapes = self._call(
                 now, plan, flat, at_rows, slice(None),
                 taping=now.taping, given=False, follow=followed.arrays, errors=errors, k=k,
                 clock=clock, stops=stops, times=times, row=out.rows,
             )  # fmt: skip
-            if followed.error is not None:
-                raise followed.error
+            followed.check()
             here = slice(out.rows, out.rows + done)
             plan = Plan(
                 plan.starts[:steps], plan.h[:steps], row_step[here].copy(), row_part[here].copy()
@@ -325,20 +322,26 @@ class ImplicitStepper:
             if status == TAPE_FULL:
                 self._cap *= 2
             elif status != CONVERGED:
-                worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
-                raise self._failure(now.work, status, float(clock[0]), float(clock[1]), worst)
+                worst = model.errors.names[which] if which >= 0 else "the state"
+                raise self._failure(now, status, float(clock[0]), float(clock[1]), worst)
 
-    def _start(self, now: "RunState") -> None:
-        """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
-        `SimulationFailed`."""
-        signals = self.signals_at(torch.zeros(1, dtype=torch.float64)).numpy()
+    def _start(self, now: "RunState", followed: Followed | None = None) -> None:
+        """Nodal forces, moments and loads at the start, the first row, and the rates there; the
+        signals are those in the first row, or are found by the kernel. Raises `SimulationFailed`
+        and, for signals that are none, `ValueError`."""
+        signals = now.out.signals[:1]
         none = np.zeros((0, *signals.shape[1:]))
         plan = Plan(np.zeros(1), np.zeros(0), np.zeros(1, np.int64), np.zeros(1))
         before, here = now.copy(), slice(0, 1)
-        _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping)
+        _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping, followed)
+        if followed is not None:
+            followed.check()
+            if not np.isfinite(signals).all():
+                self.signals_at(torch.zeros(1, dtype=torch.float64))
         if status != CONVERGED:
-            raise self._failure(now.work, status, 0.0, INSTANT)
+            raise self._failure(now, status, 0.0, INSTANT)
         now.keep(plan, none, signals, before, here, tapes)
+        set_velocities(now.system, now.work, now.y)
 
     def signals(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all stages of some plans (stages, signals, 2)."""
@@ -351,10 +354,10 @@ class ImplicitStepper:
 
     def _room(self, rows: int) -> Progress:
         """Room for so many outputs."""
-        s, names = self.system, self.integrals.names
-        widths = self.layout.size, len(names), recorded_size(s), int(s.nodal_dof_start[-1])
+        widths = self.compiled.model.widths
         y, integrals, recorded, rate = (np.zeros((rows, width)) for width in widths)
-        return Progress(y, integrals, recorded, rate, origin=self.origin)
+        signals = np.zeros((rows, self.compiled.signal_count, 2))
+        return Progress(y, integrals, recorded, rate, signals, origin=self.origin)
 
     @property
     def system(self) -> Any:
@@ -371,6 +374,7 @@ class ImplicitStepper:
         work.V[:], work.u_dot[:], work.rate[:] = segment.V, segment.u_dot, segment.rate
         again = RunState(
             segment.y.copy(),
+            s,
             work,
             room("Step", s, self.layout.size, integrals=names),
             np.zeros(names),
@@ -386,24 +390,26 @@ class ImplicitStepper:
 
     def _run(
         self, plan: Plan, signals: Array, at_outputs: Array, now: "RunState", rows: slice,
-        taping: bool,
+        taping: bool, followed: Followed | None = None,
     ) -> tuple[int, int, int, int, tuple[Any, Any] | None]:  # fmt: skip
-        """One compiled call of given steps; with `taping` once more with longer tapes if more
-        points touch than they have room for."""
-        before = now.copy()
+        """One compiled call of given steps, or of a start with the signals `followed`; with
+        `taping` once more with longer tapes if more points touch than they have room for."""
+        before, own = now.copy(), dict[str, Any]()
+        if followed is not None:
+            own = {"given": False, "follow": followed.arrays, "times": np.zeros(1)}
         while True:
             (done, rows_done, status, solves, *_), tapes = self._call(
-                now, plan, signals, at_outputs, rows, taping=taping
+                now, plan, signals, at_outputs, rows, taping=taping, **own
             )
             if status != TAPE_FULL:
                 return done, rows_done, status, solves, tapes
             self._cap *= 2
             now.back(before)
 
-    def _lost(self, work: Any) -> str:
+    def _lost(self, now: "RunState") -> str:
         """A sentence on the first body that is no longer on its pad where the last stage ended;
         empty if none is."""
-        s = self.system
+        s, work = now.system, now.work
         for c, contact in enumerate(self.rig.contacts.values()):
             pad, body = s.contact_pad[c], contact.body
             at, n = s.pad_point_start[pad], work.actives[pad]
@@ -416,9 +422,9 @@ class ImplicitStepper:
         return ""
 
     def _failure(
-        self, work: Any, status: int, since: float, h: float, worst: str = ""
+        self, now: "RunState", status: int, since: float, h: float, worst: str = ""
     ) -> SimulationFailed:
-        """The failure at a time `since` the origin [s]; `work` is what the last stage left."""
+        """The failure at a time `since` the origin [s], of what the last stage left."""
         time = self.origin + since
         if h == INSTANT:
             most, tried, instead = START_ITERATIONS, "at the start", "another start"
@@ -432,7 +438,7 @@ class ImplicitStepper:
             NEWTON_FAILED: f"Newton's iteration did not converge within {most} iterations {tried}; "
             f"try {instead}, or a larger v_s of the friction law: where friction falls with slip "
             "faster than the pads damp, massless pads have no unique velocity",
-            **dict.fromkeys((OFF_THE_PAD, LOST), self._lost(work)),
+            **dict.fromkeys((OFF_THE_PAD, LOST), self._lost(now)),
             REFUSED: f"the tolerances would need steps below {self._shortest:.3g} s for {worst}; "
             "loosen rtol or atol, or look for a jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",

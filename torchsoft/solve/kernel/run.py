@@ -138,6 +138,8 @@ def run(r: Any) -> None:
             put(y, d.y)
             put(r.integrals, d.integrals)
             put(w.travelled, d.travelled)
+            if not given:
+                follow(r.f, t_out[0], t_out[0], out.signals)
         else:
             now = h[steps]
             if not given:
