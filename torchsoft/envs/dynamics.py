@@ -170,9 +170,7 @@ class Dynamics:
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
         with torch.enable_grad():  # a step may be differentiated, whatever is done here
-            task = prepare(
-                self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver
-            )
+            task = prepare(self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver)
         self._stepper = task.stepper
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         rows = attached([self._run(t, self._y0, own).solved])[0]

@@ -150,6 +150,9 @@ class Model:
         parts = self._bodies, self._make_sources(), self._pads, self._make_condensed()
         self._parts = *parts, self._make_nodal(), *self._make_contacts()
         self.index = torch.tensor(self._index, dtype=torch.int64)
+        self.nodal = {name: 2 * pad.nodes for name, pad in rig.pads.items() if pad.nodal}
+        points = [2 * count for count in rig.point_counts.values()]
+        self.felt = [*points, 3 * len(rig.pads), 3 * len(rig.bodies) + 3]
         self._chains = [
             (at, n) for at, n in zip(self._parts[3].chain_at, self._parts[3].branches) if n
         ]
@@ -304,9 +307,9 @@ class Model:
             if structure_of(actuator) is None and (wrong := actuator_fault(name, actuator)):
                 warnings.warn(wrong, stacklevel=2)
             starts.append(self._add(*parameters.values()))
-        for body in rig.weighted.values():
+        for name in rig.weighted:
             laws.append(weight_law())
-            starts.append(self._add(body.mass, rig.gravity))
+            starts.append(self._add(self._made["weight", name]))
         every, others = rig.actuators.values(), [[]] * len(rig.weighted)
         signal_start, signal = _ragged(
             [[rig.signals.index(name) for name in one.reads] for one in every] + others
@@ -431,6 +434,10 @@ def prepared_shapes(rig: Rig) -> dict[str, Shape]:
 def computed(rig: Rig, shapes: Mapping[str, Shape]) -> dict[tuple[str, str], Tensor]:
     """Numbers that the kernels read and that are made of parameters, by kind and part."""
     out = {("masses", name): torch.stack(body.masses) for name, body in rig.bodies.items()}
+    out |= {
+        ("weight", name): torch.stack((body.mass, rig.gravity))
+        for name, body in rig.weighted.items()
+    }
     for name, pad in rig.pads.items():
         material = pad.material
         if pad.nodal:

@@ -4,6 +4,7 @@
 import time as clock
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -14,10 +15,10 @@ from tqdm import tqdm
 from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.energy import stored
-from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
+from torchsoft.physics.state import State
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts, instability
 from torchsoft.solve.gradients import (
@@ -32,7 +33,6 @@ from torchsoft.solve.gradients import (
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.steps import check_times
-from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Stats, Touch, Trajectory, channels, units
 
 Route = Literal["none", "discrete", "forward"]
@@ -305,53 +305,85 @@ def gather(
     slopes: tuple[Tensor, Tensor] | None = None,
 ) -> Trajectory:  # fmt: skip
     """The trajectory of the rows that the stepper has finished, which carry the gradient, if any is
-    wanted."""
+    wanted. What else belongs to it is made when it is asked for; at once where code of users makes
+    it, which may do otherwise later."""
     stepper, count, touch = task.stepper, out.rows, Touch(task.stepper.rig)
-    rig, names, t = stepper.rig, stepper.integrals, task.t[:count]
+    model, names = stepper.compiled.model, stepper.integrals
     y, felt = (part[:count] for part in rows)
     integrals = dict(zip(names.names, torch.from_numpy(out.integrals[:count]).unbind(-1)))
-    sizes = [2 * count for count in rig.point_counts.values()]
-    with torch.set_grad_enabled(y.requires_grad), independent():
-        *forces, wrenches, loads = felt.split(
-            [*sizes, 3 * len(rig.pads), 3 * len(rig.bodies) + 3], -1
-        )
-        signals = rig.follow(t, stepper.reference)
-        state = rig.unpack(y, signals)
-        moments = dict(zip(rig.pads, wrenches[:, 2::3].unbind(-1)))
-        measured = channels(rig, state, signals, moments)
-        displacement = {name: rig.displacement(name, state) for name in rig.pads}
-        energy = stored(rig, state, displacement)
+    if y.requires_grad:
         integrals = {name: without_gradient(name, x, y) for name, x in integrals.items()}
-        force = {name: part.unflatten(-1, (-1, 2)) for name, part in zip(rig.contacts, forces)}
-        load = dict(zip(rig.bodies, loads.unflatten(-1, (-1, 3)).unbind(1)))
+    *forces, wrenches, loads = felt.split(model.felt, -1)
     given = "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
     steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
-    return Trajectory(
-        t=t, y=y, state=state, channels=measured, force=force, loads=load, recorded=felt,
-        rates=nodal_rates(rig, out.rate[:count]),
-        displacement=displacement, energy=energy,
+    rates = torch.from_numpy(out.rate[:count]).split([*model.nodal.values()], -1)
+    made = Trajectory.later(
+        _Rest(stepper, task.t[:count], y, wrenches, steps),
+        t=task.t[:count], y=y, recorded=felt,
+        force={name: x.unflatten(-1, (-1, 2)) for name, x in zip(model.rig.contacts, forces)},
+        loads=dict(zip(model.rig.bodies, loads.unflatten(-1, (-1, 3)).unbind(1))),
+        rates={name: x.unflatten(-1, (-1, 2)) for name, x in zip(model.nodal, rates)},
         dissipated={name: integrals[name] for name in names.dissipated},
         supplied={name: integrals[name] for name in names.supplied if name in names.active},
         injected=integrals["injected"],
         stats=Stats(out.steps, out.solves, out.failed, out.refused, wall),
-        knots=torch.from_numpy(out.knots), layout=rig.layout, touch=touch,
-        made_by={"torchsoft": VERSION, "method": METHOD, **rig.description(), "steps": steps},
-        wrt=task.wrt,
+        knots=torch.from_numpy(out.knots), layout=model.layout, touch=touch, wrt=task.wrt,
         sensitivities=None if slopes is None else slopes[0][:count],
-        touch_sensitivities={}
-        if slopes is None
-        else dict(
+        touch_sensitivities={} if slopes is None else dict(
             zip(task.touch, touch.slopes(task.touch, slopes[1][:count], felt).unbind(1))
         ),
-        units=units(rig), setup=Setup.of(rig), rig=task.rig or rig,
+        rig=task.rig or stepper.rig,
     )  # fmt: skip
+    if not model.shared or stepper.reference.plain(model.signals) is None:
+        made.complete()
+    return made
 
 
-def nodal_rates(rig: Rig, rate: Array) -> dict[str, Tensor]:
-    """Rates (T, nodes, 2) of the displacements of nodal pads, from those of all of their dofs."""
-    pads = {name: 2 * pad.nodes for name, pad in rig.pads.items() if pad.nodal}
-    parts = torch.from_numpy(rate).split(list(pads.values()), -1)
-    return {name: part.unflatten(-1, (-1, 2)) for name, part in zip(pads, parts)}
+class _Rest:
+    """What a trajectory has beside the rows of a run, made of them and of the rig of the run."""
+
+    def __init__(
+        self, stepper: ImplicitStepper, t: Tensor, y: Tensor, wrenches: Tensor,
+        steps: dict[str, Any],
+    ) -> None:  # fmt: skip
+        self._rig, self._reference, self._t, self._y = stepper.rig, stepper.reference, t, y
+        self._motion, self._wrenches, self._steps = stepper.followed, wrenches, steps
+
+    @cached_property
+    def _followed(self) -> Tensor:
+        """The signals at the outputs, with their graph where there is one."""
+        known = None if self._y.requires_grad else self._motion.at(self._t)
+        return self._rig.follow(self._t, self._reference) if known is None else known
+
+    @cached_property
+    def state(self) -> State:
+        return self._rig.unpack(self._y, self._followed)
+
+    @cached_property
+    def channels(self) -> dict[str, Tensor]:
+        moments = dict(zip(self._rig.pads, self._wrenches[:, 2::3].unbind(-1)))
+        return channels(self._rig, self.state, self._followed, moments)
+
+    @cached_property
+    def displacement(self) -> dict[str, Tensor]:
+        return {name: self._rig.displacement(name, self.state) for name in self._rig.pads}
+
+    @cached_property
+    def energy(self) -> dict[str, Tensor]:
+        return stored(self._rig, self.state, self.displacement)
+
+    @cached_property
+    def made_by(self) -> dict[str, Any]:
+        made = {"torchsoft": VERSION, "method": METHOD}
+        return {**made, **self._rig.description(), "steps": self._steps}
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        return units(self._rig)
+
+    @cached_property
+    def setup(self) -> Setup:
+        return Setup.of(self._rig)
 
 
 # Inputs of a run: numbers in any usual form, and a start whose graph may be shared.

@@ -212,6 +212,7 @@ class ImplicitStepper:
         self.check_start(y0)
         check_times(t, self.step)
         self.origin = float(t[0])
+        self.followed = self.compiled.followed(self.reference, self.origin)
         self._shortest = min(SHORTEST, PART * float(t[-1] - t[0]))
         model, out = self.compiled.model, self._room(len(t))
         place = model.take(self.compiled.numbers)
@@ -254,7 +255,6 @@ class ImplicitStepper:
                 plan, follow, at_rows, now, here, now.taping
             )
             here = slice(out.rows, out.rows + rows_done)
-            out.signals[here] = at_rows[:rows_done]
             now.keep(
                 plan.part(0, steps), follow[: 2 * steps], at_rows[:rows_done], before, here, tapes
             )
@@ -291,7 +291,7 @@ class ImplicitStepper:
             now.out,
             self.compiled.model,
         )
-        followed = self.compiled.followed(self.reference, self.origin)
+        followed = self.followed
         self._start(now, followed)
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > times[0]) & (stops <= times[-1])]

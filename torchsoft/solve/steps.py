@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchsoft.physics.motion import Reference
+from torchsoft.physics.motion import Reference, evaluate
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
@@ -274,6 +274,8 @@ class Followed:
         self.error: BaseException | None = None
         chosen = reference.plain(names)
         self._callback: Any = None
+        self._pieces: Any = None
+        self._count = len(names)
         if chosen is None:
             self.arrays = NO_SIGNALS._replace(address=self._call(signals), room=np.zeros(1))
             self.stops = np.zeros(0)
@@ -281,8 +283,22 @@ class Followed:
         with torch.no_grad():
             pieces = [tuple(x.numpy() for x in one.pieces()) for one in chosen]
             stops = [one.stops.numpy() for one in chosen]
-        self.arrays = packed([(at - origin, span, c) for at, span, c in pieces], fixed)
+        self._pieces = packed(pieces, fixed)
+        self.arrays = self._pieces._replace(at=self._pieces.at - origin)
         self.stops = np.unique(np.concatenate([np.zeros(0), *stops])) - origin
+
+    def at(self, t: Tensor) -> Tensor | None:
+        """Values and rates (..., signals, 2) at t (...) [s] of the reference's pieces, None where
+        it has none."""
+        if self._pieces is None:
+            return None
+        rows, p = list[Tensor](), self._pieces
+        for i in range(self._count):
+            here, width = slice(p.start[i], p.start[i + 1]), p.points[i]
+            parts = p.at[here], p.span[here], p.control[here, :width].copy()
+            at, span, control = map(torch.from_numpy, parts)
+            rows.append(torch.stack(evaluate((at, span, control), t), -1))
+        return torch.stack(rows, -2) if rows else t.new_zeros((*t.shape, 0, 2))
 
     def check(self) -> None:
         """Raises what a signal raised."""

@@ -137,9 +137,12 @@ def taken(
         mine = {key: value.clone() for key, value in mine.items()}
         flat = [mine[id(x)].reshape(-1) for x in tensors]
         return torch.cat([torch.zeros(0, dtype=torch.float64), *flat]), mine
+    if given and not any(x.ndim for x in given):  # scalars, as most parameters are
+        theta = torch.stack([*given])
+        return theta, dict(zip(map(id, tensors), theta.unbind()))
     flat = [x.reshape(-1) for x in given]
     theta = torch.cat([torch.zeros(0, dtype=torch.float64), *flat])
-    parts = theta.split([len(x) for x in flat]) if flat else ()
+    parts = theta.split([len(x) for x in flat])
     return theta, {id(x): part.view(value.shape) for x, value, part in zip(tensors, given, parts)}
 
 
