@@ -26,6 +26,7 @@ from torchsoft.physics.contact import (
     interface_law,
     relative_motion,
     slip_of,
+    stored_law,
 )
 from torchsoft.physics.elements import CONSTANTS, CORNERS, element_potentials
 from torchsoft.physics.hyperelastic import Hyperelastic
@@ -44,6 +45,7 @@ class LawSet(NamedTuple):
     distance: Law
     interface: Law
     free: Law
+    stored: Law
     parameters: dict[str, Tensor]
     states: int
 
@@ -256,6 +258,7 @@ def contact_laws(law: Any, shape: Any) -> LawSet:
             shape=shape,
         ),
         compiled_law(parameters, free_law, states + 2, states, states, law=law),
+        compiled_law(parameters, stored_law, 3, 0, 0, law=law),
         parameters,
         states,
     )  # fmt: skip

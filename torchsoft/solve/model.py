@@ -159,11 +159,23 @@ class Model:
         sizes = [one.shape.size() for one in rig.bodies.values() if one.shape is not None]
         self.smallest = min(sizes, default=np.inf)
         none = self.system(np.zeros(len(self._index)))
+        self.no_tape = room("Tape", none, self.layout.size, stages=0, cap=0)
         self.widths = (
             self.layout.size, len(self.integrals.names), recorded_size(none),
             int(none.nodal_dof_start[-1]),
         )  # fmt: skip
         del self._made, self._places, self._shapes, self._known, self._index
+
+    def bounds(self, p: Array, y: Array) -> dict[str, float]:
+        """Bounds of the displacements of condensed pads [m] in states y (T, size)."""
+        own, out = self._parts[3], dict[str, float]()
+        for i, (name, pad) in enumerate(self.rig.pads.items()):
+            if not pad.nodal:
+                at, n = own.chain_at[i], own.branches[i]
+                z = np.abs(y[:, self.layout.slices["pads", name]]).reshape(len(y), n, -1)
+                most = float((z.sum(-1) @ p[at : at + n]).max())
+                out[name] = float(own.reach[i] * p[at + 2 * n]) * most
+        return out
 
     def system(self, p: Array) -> Any:
         """The rig's arrays with the vector of parameters p."""
@@ -376,7 +388,8 @@ class Model:
             linearise=[one.interface.linearise for one in laws],
             pullback=[one.interface.pullback for one in laws],
             free_linearise=[one.free.linearise for one in laws],
-            free_pullback=[one.free.pullback for one in laws], p_start=[*starts, len(self._index)],
+            free_pullback=[one.free.pullback for one in laws],
+            stored=[one.stored.value for one in laws], p_start=[*starts, len(self._index)],
             point_start=np.cumsum([0, *counts]), size=[shape.size() for shape in shapes],
             limits=limits, relative=motion_law().value,
             relative_linearise=motion_law().linearise,

@@ -26,7 +26,8 @@ class Progress:
     """Results of the stepper so far: rows of the output grid, its steps, and its counters.
 
     integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them; rate: of
-    the displacements of nodal pads [m/s]; signals: values and rates, fixed coordinates last.
+    the displacements of nodal pads [m/s]; signals: values and rates, fixed coordinates last;
+    stored: energy [J], nan with nodal pads.
     """
 
     y: Array
@@ -34,6 +35,7 @@ class Progress:
     recorded: Array
     rate: Array
     signals: Array
+    stored: Array
     rows: int = 1
     steps: int = 0
     solves: int = 0

@@ -30,6 +30,7 @@ from torchsoft.solve.gradients import (
     march,
     without_gradient,
 )
+from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.steps import check_times
@@ -318,7 +319,7 @@ def gather(
     steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
     rates = torch.from_numpy(out.rate[:count]).split([*model.nodal.values()], -1)
     made = Trajectory.later(
-        _Rest(stepper, task.t[:count], y, wrenches, steps),
+        _Rest(stepper, task.t[:count], y, wrenches, out.stored[:count], steps),
         t=task.t[:count], y=y, recorded=felt,
         force={name: x.unflatten(-1, (-1, 2)) for name, x in zip(model.rig.contacts, forces)},
         loads=dict(zip(model.rig.bodies, loads.unflatten(-1, (-1, 3)).unbind(1))),
@@ -334,7 +335,7 @@ def gather(
         ),
         rig=task.rig or stepper.rig,
     )  # fmt: skip
-    if not model.shared or stepper.reference.plain(model.signals) is None:
+    if not model.shared or not stepper.followed.known:
         made.complete()
     return made
 
@@ -343,11 +344,18 @@ class _Rest:
     """What a trajectory has beside the rows of a run, made of them and of the rig of the run."""
 
     def __init__(
-        self, stepper: ImplicitStepper, t: Tensor, y: Tensor, wrenches: Tensor,
+        self, stepper: ImplicitStepper, t: Tensor, y: Tensor, wrenches: Tensor, stored: Array,
         steps: dict[str, Any],
     ) -> None:  # fmt: skip
         self._rig, self._reference, self._t, self._y = stepper.rig, stepper.reference, t, y
-        self._motion, self._wrenches, self._steps = stepper.followed, wrenches, steps
+        self._motion, self._wrenches, self.steps = stepper.followed, wrenches, steps
+        self._compiled = stepper.compiled
+        self.stored = None if stepper.compiled.model.nodal else stored
+
+    @cached_property
+    def bounds(self) -> dict[str, float]:
+        """Bounds of the displacements of condensed pads [m]."""
+        return self._compiled.model.bounds(self._compiled.numbers, self._y.detach().numpy())
 
     @cached_property
     def _followed(self) -> Tensor:
@@ -375,7 +383,7 @@ class _Rest:
     @cached_property
     def made_by(self) -> dict[str, Any]:
         made = {"torchsoft": VERSION, "method": METHOD}
-        return {**made, **self._rig.description(), "steps": self._steps}
+        return {**made, **self._rig.description(), "steps": self.steps}
 
     @cached_property
     def units(self) -> dict[str, str]:

@@ -122,6 +122,7 @@ class ImplicitStepper:
             )
         self.layout, self.integrals = self.compiled.layout, self.compiled.model.integrals
         self.origin = 0.0
+        self._motion: Followed | None = None
         self._cap, self._shortest = 64, SHORTEST
 
     def along(self, knots: Array) -> "ImplicitStepper":
@@ -133,7 +134,14 @@ class ImplicitStepper:
     def following(self, reference: Reference) -> "ImplicitStepper":
         """The same on another reference; the rig stays as it was read."""
         other = copy(self)
-        other.reference, other.origin = reference, 0.0
+        other.reference, other._motion, other.origin = reference, None, 0.0
+        return other
+
+    def moving(self, motion: Followed) -> "ImplicitStepper":
+        """The same with signals as the kernels take them, from where they count time; no derivative
+        can be taken by them."""
+        other = copy(self)
+        other._motion = motion
         return other
 
     def signals_at(self, times: Tensor) -> Tensor:
@@ -154,20 +162,24 @@ class ImplicitStepper:
         now.work.low[:] = now.work.high[:] = 0
         now.work.held[:] = 0.0
         y = out.y[rows]
-        tape, out_tape = (
-            room("Tape", now.system, self.layout.size, stages=n, cap=self._cap)
-            for n in ((2 * steps, len(y) if now.outputs_too else 0) if taping else (0, 0))
-        )
-        if taping and now.outputs_too:
-            out_tape = out_tape._replace(y=y)
+        tape = out_tape = self.compiled.model.no_tape
+        if taping:
+            tape, out_tape = (
+                room("Tape", now.system, self.layout.size, stages=n, cap=self._cap)
+                for n in (2 * steps, len(y) if now.outputs_too else 0)
+            )
+            if now.outputs_too:
+                out_tape = out_tape._replace(y=y)
         outputs = Outputs(
             plan.out_step, plan.out_part, at_outputs, y, out.integrals[rows], out.recorded[rows],
-            out.rate[rows], out_tape,
+            out.rate[rows], out.stored[rows], out_tape,
         )  # fmt: skip
-        most = self.max_iterations if steps else START_ITERATIONS
-        limits = Limits(self.tolerance, most, self.window)
+        limits, start = (
+            Limits(self.tolerance, most, self.window)
+            for most in (self.max_iterations, START_ITERATIONS)
+        )
         run = Run(
-            now.system, now.work, now.step, follow, errors, limits, outputs, tape, given,
+            now.system, now.work, now.step, follow, errors, limits, start, outputs, tape, given,
             now.y, k, clock, stops, times, row, self.rtol, self.longest,
             self._shortest, now.integrals, plan.starts, plan.h,
             signals.reshape(steps, 2, *signals.shape[1:]), counts,
@@ -175,6 +187,11 @@ class ImplicitStepper:
         with released_turn():
             call("run", run)
         return counts.tolist(), (tape, out_tape) if taping else None
+
+    def signals_now(self, t: Tensor) -> Tensor:
+        """The signals at t [s] of the last run, without fixed coordinates (..., signals, 2)."""
+        known = self.followed.at(t) if self._motion is not None else None
+        return self.rig.follow(t, self.reference) if known is None else known
 
     @property
     def signals_at_start(self) -> Tensor:
@@ -212,7 +229,7 @@ class ImplicitStepper:
         self.check_start(y0)
         check_times(t, self.step)
         self.origin = float(t[0])
-        self.followed = self.compiled.followed(self.reference, self.origin)
+        self.followed = self._motion or self.compiled.followed(self.reference, self.origin)
         self._shortest = min(SHORTEST, PART * float(t[-1] - t[0]))
         model, out = self.compiled.model, self._room(len(t))
         place = model.take(self.compiled.numbers)
@@ -292,7 +309,10 @@ class ImplicitStepper:
             self.compiled.model,
         )
         followed = self.followed
-        self._start(now, followed)
+        if now.segments is None:
+            out.rows = 0  # the start is the first row of the first call
+        else:
+            self._start(now, followed)
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > times[0]) & (stops <= times[-1])]
         errors = model.errors.of(now.y, self.atol, self.compiled.units)
@@ -309,6 +329,10 @@ class ImplicitStepper:
                 clock=clock, stops=stops, times=times, row=out.rows,
             )  # fmt: skip
             followed.check()
+            if out.rows == 0:
+                self._check_signals(at_rows[0])
+                if done == 0:
+                    raise self._failure(now, status, 0.0, INSTANT)
             here = slice(out.rows, out.rows + done)
             plan = Plan(
                 plan.starts[:steps], plan.h[:steps], row_step[here].copy(), row_part[here].copy()
@@ -336,12 +360,16 @@ class ImplicitStepper:
         _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping, followed)
         if followed is not None:
             followed.check()
-            if not np.isfinite(signals).all():
-                self.signals_at(torch.zeros(1, dtype=torch.float64))
+            self._check_signals(signals)
         if status != CONVERGED:
             raise self._failure(now, status, 0.0, INSTANT)
         now.keep(plan, none, signals, before, here, tapes)
         set_velocities(now.system, now.work, now.y)
+
+    def _check_signals(self, start: Array) -> None:
+        """Raises `ValueError` for signals that are not finite at the start."""
+        if not np.isfinite(start).all():
+            self.signals_at(torch.zeros(1, dtype=torch.float64))
 
     def signals(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all stages of some plans (stages, signals, 2)."""
@@ -357,7 +385,7 @@ class ImplicitStepper:
         widths = self.compiled.model.widths
         y, integrals, recorded, rate = (np.zeros((rows, width)) for width in widths)
         signals = np.zeros((rows, self.compiled.signal_count, 2))
-        return Progress(y, integrals, recorded, rate, signals, origin=self.origin)
+        return Progress(y, integrals, recorded, rate, signals, np.zeros(rows), origin=self.origin)
 
     @property
     def system(self) -> Any:

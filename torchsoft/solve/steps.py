@@ -3,6 +3,7 @@
 import ctypes
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.kernel.arrays import NO_SIGNALS, Errors, Signals
-from torchsoft.solve.kernel.table import Array
+from torchsoft.solve.kernel.table import Array, Index
 
 # The steps of a run: equal ones between output times, or those that tolerances chose, and where
 # the outputs lie in them.
@@ -90,13 +91,16 @@ def check_times(t: Tensor, step: float | None = None) -> None:
         raise ValueError(
             "`t` must not require a gradient, since none is computed by the times; use t.detach()"
         )
-    if not bool(torch.isfinite(t).all()) or not bool((t.diff() > 0).all()):
-        bad = int((~(t.diff() > 0)).nonzero()[0, 0]) if bool(torch.isfinite(t).all()) else 0
+    times = t.numpy()
+    apart, finite = np.diff(times), bool(np.isfinite(times).all())
+    if not finite or not (apart > 0).all():
+        bad = int(np.flatnonzero(~(apart > 0))[0]) if finite else 0
         raise ValueError(
             f"`t` must increase strictly and be finite, but t[{bad}:{bad + 2}] = "
-            f"{t[bad : bad + 2].tolist()}"
+            f"{times[bad : bad + 2].tolist()}"
         )
-    if (count := float(t[-1] - t[0]) / (LONGEST if step is None else step)) > MOST_STEPS:
+    first, last = float(times[0]), float(times[-1])
+    if (count := (last - first) / (LONGEST if step is None else step)) > MOST_STEPS:
         raise ValueError(
             f"`t` and `step` ask for {count:.3g} steps, but at most {MOST_STEPS:.3g} can be taken "
             "in one run; take less time"
@@ -106,14 +110,14 @@ def check_times(t: Tensor, step: float | None = None) -> None:
                 else " or longer steps"
             )
         )
-    rounding = 16 * torch.finfo(torch.float64).eps
-    finest = max(SHORTEST, rounding * float(t.abs().max()))
-    if float(t.diff().min()) < finest:
+    rounding = 16 * np.finfo(np.float64).eps
+    finest = max(SHORTEST, rounding * max(abs(first), abs(last)))
+    if apart.min() < finest:
         raise ValueError(
             f"`t` must be further apart than {finest:.1g} s, the float64 resolution at "
             "these times; count them from the beginning of the run"
         )
-    finest = max(SHORTEST, rounding * float(t[-1] - t[0]))
+    finest = max(SHORTEST, rounding * (last - first))
     if step is not None and step < finest:
         raise ValueError(
             f"`step` must be longer than {finest:.1g} s, the float64 resolution at the end of "
@@ -283,9 +287,24 @@ class Followed:
         with torch.no_grad():
             pieces = [tuple(x.numpy() for x in one.pieces()) for one in chosen]
             stops = [one.stops.numpy() for one in chosen]
-        self._pieces = packed(pieces, fixed)
+        self._stops, self._pieces = stops, packed(pieces, fixed)
+        self._count_from(origin)
+
+    def _count_from(self, origin: float) -> None:
         self.arrays = self._pieces._replace(at=self._pieces.at - origin)
-        self.stops = np.unique(np.concatenate([np.zeros(0), *stops])) - origin
+        self.stops = np.unique(np.concatenate([np.zeros(0), *self._stops])) - origin
+
+    def on_lines(self, which: Index, first: float, last: float, values: Array) -> "Followed":
+        """The same from `first` to `last` [s], where time counts from, with some signals on lines
+        between two values each (lines, 2), as they were on single lines before."""
+        out, p, rows = copy(self), self._pieces, self._pieces.start[which]
+        at, span, control = p.at.copy(), p.span.copy(), p.control.copy()
+        at[rows], span[rows], control[rows, :2] = first, last - first, values
+        out._pieces = p._replace(at=at, span=span, control=control)
+        others = [x for i, x in enumerate(self._stops) if i not in which]
+        out._stops = [np.array([first, last]), *others]
+        out._count_from(first)
+        return out
 
     def at(self, t: Tensor) -> Tensor | None:
         """Values and rates (..., signals, 2) at t (...) [s] of the reference's pieces, None where
@@ -299,6 +318,11 @@ class Followed:
             at, span, control = map(torch.from_numpy, parts)
             rows.append(torch.stack(evaluate((at, span, control), t), -1))
         return torch.stack(rows, -2) if rows else t.new_zeros((*t.shape, 0, 2))
+
+    @property
+    def known(self) -> bool:
+        """Whether the reference is made of pieces."""
+        return self._pieces is not None
 
     def check(self) -> None:
         """Raises what a signal raised."""

@@ -50,6 +50,7 @@ class Compiled:
         check_place()
         structure, values = Structure(rig), values or {}
         given = [values.get(id(x), x) for x in structure.parameters]
+        differentiable = differentiable or not structure.known  # whose gradients are judged
         followed = rig.reference if reference is None else reference
         if not ordinary(given):
             self._refuse(Copies(structure).made(given)[0], rig.reference)

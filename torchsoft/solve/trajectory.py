@@ -306,6 +306,27 @@ class Trajectory(Shown):
         return read(path)
 
 
+# What a run is judged by, from what it has of itself where that is known before its fields.
+
+
+def stored_energy(run: Trajectory) -> Array:
+    """All stored energy of a run (T,) [J]."""
+    known = getattr(vars(run).get("_rest"), "stored", None)
+    return sum(part.detach().numpy() for part in run.energy.values()) if known is None else known
+
+
+def steps_of(run: Trajectory) -> dict[str, Any]:
+    """How the steps of a run were chosen."""
+    known = getattr(vars(run).get("_rest"), "steps", None)
+    return run.made_by["steps"] if known is None else known
+
+
+def displaced(run: Trajectory, pad: str, enough: float) -> float:
+    """Largest displacement [m] of a pad's nodes, or a bound of it that is below `enough`."""
+    bound = getattr(vars(run).get("_rest"), "bounds", {}).get(pad, np.inf)
+    return bound if bound < enough else float(run.displacement[pad].detach().norm(dim=-1).max())
+
+
 def channels(
     rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
