@@ -15,7 +15,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, condensed, standing
 from torchsoft.solve.steps import UNITS, own_units
-from torchsoft.solve.trajectory import Trajectory, displaced, steps_of, stored_energy
+from torchsoft.solve.trajectory import Ledger, Trajectory, displaced
 
 # Checks of a finished run: whether its energies balance, and whether its pads are pressed beyond
 # the theory.
@@ -57,26 +57,21 @@ def strained(strain: float, time: float) -> str:
     )
 
 
-def energy_scale(run: Trajectory) -> float:
+def energy_scale(ledger: Ledger) -> float:
     """Energy [J] by which a run's ledger is judged: stored at the start, and injected since."""
-    return max(float(stored_energy(run)[0]) + float(run.injected[-1].detach()), NEGLIGIBLE)
+    return max(float(ledger.stored[0]) + ledger.injected, NEGLIGIBLE)
 
 
-def missing_energy(run: Trajectory) -> float:
+def missing_energy(ledger: Ledger) -> float:
     """Part of `energy_scale` that a run's ledger lacks, or has too much, at the most."""
-    stored = stored_energy(run)
-    left = stored - stored[0]
-    for part in run.supplied.values():
-        left = left - part.detach().numpy()
-    for part in run.dissipated.values():
-        left = left + part.detach().numpy()
-    return float(np.abs(left).max()) / energy_scale(run)
+    left = ledger.stored - ledger.stored[0] - ledger.supplied + ledger.dissipated.sum(1)
+    return float(np.abs(left).max()) / energy_scale(ledger)
 
 
 def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     """Run warnings: sentences on the faults of a finished run with a ledger, by their subject."""
-    run, found = trajectory, {}
-    scale, part = energy_scale(run), missing_energy(run)
+    run, ledger, found = trajectory, Ledger.of(trajectory), dict[str, str]()
+    scale, part = energy_scale(ledger), missing_energy(ledger)
     if not part <= RESIDUAL:
         longest = float(run.knots.diff().max())
         better = 0.4 * longest * min(1.0, RESIDUAL / part)
@@ -85,14 +80,14 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
             f"and injected since is missing or too much, with steps of {longest:.3g} s; try steps "
             f"of {better:.2g} s"
         )
-    for name, work in run.dissipated.items():
-        back = -float(np.diff(work.detach().numpy(), prepend=work[0].item()).min())
+    falls = -np.diff(ledger.dissipated, axis=0).min(0, initial=0.0)
+    for name, back in zip(ledger.names, falls):
         if back > SUPPLIED * scale:
             found[f"dissipated {name}"] = (
                 f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "
                 "check its law"
             )
-    if run.stats.failed_steps and "knots" in steps_of(run):
+    if run.stats.failed_steps and "knots" in ledger.steps:
         found["knots"] = (
             "Newton did not converge in some steps between the given `knots`, which were halved "
             "(`stats.failed_steps`): the run is not one of the same steps; its own `knots` are "
@@ -101,23 +96,23 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     for name in rig.contacts:
         if bounded := softened(run, rig, name):
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"
-    unit = 0.0
-    squares = [(force.detach().numpy() ** 2).sum(-1).max() for force in run.force.values()]
-    most, atol = float(np.sqrt(max(squares, default=0.0))), steps_of(run).get("atol", 0.0)
+    most, atol = ledger.force, ledger.steps.get("atol", 0.0)
     if 0 < RESOLVED * most < atol * UNITS["force"]:
         unit = own_units(rig)["force"]
-    if 0 < RESOLVED * most < (off := atol * unit):
-        better = 0.1 * RESOLVED * most
-        remedy = (
-            f"atol = {better / unit:.1g}" if better >= NEWTON else "units that make them larger"
-        )
-        found["atol"] = (
-            f"contact forces reach {most:.2g} N, and `atol` lets a step be off by {off:.2g} N: "
-            f"take {remedy}"
-        )
+        if RESOLVED * most < (off := atol * unit):
+            better = 0.1 * RESOLVED * most
+            remedy = (
+                f"atol = {better / unit:.1g}" if better >= NEWTON else "units that make them larger"
+            )
+            found["atol"] = (
+                f"contact forces reach {most:.2g} N, and `atol` lets a step be off by {off:.2g} N: "
+                f"take {remedy}"
+            )
     for name, pad in rig.pads.items():
         limit, height = COMPRESSED * pad.mesh.height, pad.mesh.height
-        if not (deepest := displaced(run, name, limit)) <= limit:
+        if 2 * ledger.displaced.get(name, np.inf) < limit:  # other nodes give way by less
+            continue
+        if not (deepest := displaced(run, name)) <= limit:
             found[f"pad {name}"] = (
                 f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond "
                 "linear elasticity"

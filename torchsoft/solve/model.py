@@ -65,7 +65,7 @@ from torchsoft.solve.laws import (
 )
 from torchsoft.solve.progress import Integrals
 from torchsoft.solve.steps import ErrorParts
-from torchsoft.solve.structure import Copies, Structure, structure_of
+from torchsoft.solve.structure import Copies, Structure, lasting, structure_of
 
 NOMINAL = 1e-3
 """Stage length a h [s] at which slip laws of users are tried."""
@@ -73,6 +73,9 @@ NOMINAL = 1e-3
 HELD = 3e-4
 """Strain up to which the derivatives of an element's forces are held while it changes, in Newton's
 method."""
+
+NEGLIGIBLE = 1e-9
+"""Nodal force [N] below which a node counts as unloaded."""
 
 KEPT = 8
 """Models that are kept."""
@@ -104,17 +107,22 @@ class Model:
         self.derived = derived(modules)
         self.judged = [i for i, one in enumerate(modules) if hasattr(one, "well_posed")]
         self.shared = structure.known
-        self._structure, self._geometric = structure, geometric(modules, structure)
+        self._key, self._geometric = lasting(structure.key), geometric(modules, structure)
         self._geometry = self._geometry_of(values)
         self._read(values)
         self._idle: list[Room] = []
+        self.last: tuple[Array, Tensor, dict[str, float]] | None = None
 
     def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
         return b"".join([values[i].detach().numpy().tobytes() for i in self._geometric])
 
+    def alike(self, values: Sequence[Tensor]) -> bool:
+        """Whether a rig of the same structure with these parameters has the same geometry."""
+        return self._geometry == self._geometry_of(values)
+
     def serves(self, structure: Structure, values: Sequence[Tensor]) -> bool:
         """Whether this is the model of a rig with these parameters."""
-        return structure.key == self._structure.key and self._geometry == self._geometry_of(values)
+        return structure.key == self._key and self.alike(values)
 
     def within(self, modules: Sequence[Any], theta: Array) -> bool:
         """Whether the values of a rig's parameters, theta, are physical; its own checks are to say
@@ -136,6 +144,8 @@ class Model:
     def _read(self, values: Sequence[Tensor]) -> None:
         rig = self.rig
         self.layout, self.integrals, self.signals = rig.layout, Integrals(rig), rig.signals
+        slices = self.layout.slices
+        self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
         self.fixed, self.errors = len(rig.fixed_values), ErrorParts(rig)
         self._known: dict[tuple[int, int], LawSet] = {}
         self._shapes, self._index = prepared_shapes(rig), list[int]()
@@ -166,15 +176,21 @@ class Model:
         )  # fmt: skip
         del self._made, self._places, self._shapes, self._known, self._index
 
-    def bounds(self, p: Array, y: Array) -> dict[str, float]:
-        """Bounds of the displacements of condensed pads [m] in states y (T, size)."""
+    def displaced(self, p: Array, y: Array) -> dict[str, float]:
+        """Largest displacements of the loaded nodes of condensed pads [m] in states y (T, size)."""
         own, out = self._parts[3], dict[str, float]()
-        for i, (name, pad) in enumerate(self.rig.pads.items()):
-            if not pad.nodal:
-                at, n = own.chain_at[i], own.branches[i]
-                z = np.abs(y[:, self.layout.slices["pads", name]]).reshape(len(y), n, -1)
-                most = float((z.sum(-1) @ p[at : at + n]).max())
-                out[name] = float(own.reach[i] * p[at + 2 * n]) * most
+        for name, here in self.condensed.items():
+            i = [*self.rig.pads].index(name)
+            at, n = own.chain_at[i], own.branches[i]
+            z = y[:, here]
+            size = z.shape[1] // n
+            zeta = np.einsum("b,tbs->ts", p[at : at + n], z.reshape(len(y), n, size))
+            loaded = np.abs(zeta).max(0) > NEGLIGIBLE
+            dofs = np.flatnonzero(loaded.reshape(-1, 2).any(1))
+            dofs = (2 * dofs[:, None] + np.arange(2)).ravel()
+            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(size, size)
+            u = p[at + 2 * n] * (zeta[:, dofs] @ C[dofs[:, None], dofs])
+            out[name] = float(np.sqrt((u.reshape(len(y), -1, 2) ** 2).sum(-1).max(initial=0.0)))
         return out
 
     def system(self, p: Array) -> Any:

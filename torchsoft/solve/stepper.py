@@ -44,7 +44,7 @@ from torchsoft.solve.steps import (
     equal_steps,
     given_steps,
 )
-from torchsoft.solve.system import Compiled
+from torchsoft.solve.system import Compiled, Reading
 
 HALVINGS = 6
 """Most halvings of a step that Newton does not solve before the run fails."""
@@ -93,7 +93,8 @@ class ImplicitStepper:
         rtol: float = 1e-3, atol: float = 1e-4, knots: Tensor | None = None,
         tolerance: float = 1e-9, max_iterations: int = 40, window: float = 2e-3,
         longest: float = LONGEST, landing: bool = False,
-        values: Mapping[int, Tensor] | None = None, differentiable: bool = True,
+        reading: Reading | None = None, values: Mapping[int, Tensor] | None = None,
+        differentiable: bool = True,
     ) -> None:  # fmt: skip
         if not isinstance(rig, Rig):
             raise ValueError(
@@ -113,7 +114,9 @@ class ImplicitStepper:
         self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
         self.knots = None if knots is None else check_knots(knots)
-        self.compiled = Compiled(rig, reference, values=values, differentiable=differentiable)
+        self.compiled = Compiled(
+            rig, reference, reading=reading, values=values, differentiable=differentiable
+        )
         self.rig, self.reference = self.compiled.rig, self.compiled.reference
         if self.tolerance < (least := SMALLEST_TOLERANCE * self.compiled.units["force"]):
             raise ValueError(
@@ -322,7 +325,7 @@ class ImplicitStepper:
         while out.rows < len(t):
             plan = Plan(np.zeros(CHUNK), np.zeros(CHUNK), row_step, row_part)
             flat = np.zeros((2 * CHUNK, count, 2))
-            before = now.copy()
+            before = now.copy() if now.segments is not None else ()
             (steps, done, status, solves, refused, failed, which), tapes = self._call(
                 now, plan, flat, at_rows, slice(None),
                 taping=now.taping, given=False, follow=followed.arrays, errors=errors, k=k,

@@ -263,8 +263,8 @@ QUANTITIES = {
 
 
 class Followed:
-    """The signals of a run as the kernels evaluate them: `arrays`, and `stops` [s], times that no
-    step may pass, both counted from an `origin` [s].
+    """The signals of runs as the kernels evaluate them; `since` has them for one run: `arrays`,
+    and `stops` [s], times that no step may pass.
 
     A reference of pieces (`Profile`, `Sampled`, `Waves`) is evaluated by the kernel, any other one
     by itself, called at every stage as `signals`; its exceptions are kept in `error`. Signals
@@ -272,7 +272,7 @@ class Followed:
     """
 
     def __init__(
-        self, reference: Reference, names: Sequence[str], fixed: Sequence[float], origin: float,
+        self, reference: Reference, names: Sequence[str], fixed: Sequence[float],
         signals: Callable[[Tensor], Tensor],
     ) -> None:  # fmt: skip
         self.error: BaseException | None = None
@@ -287,12 +287,16 @@ class Followed:
         with torch.no_grad():
             pieces = [tuple(x.numpy() for x in one.pieces()) for one in chosen]
             stops = [one.stops.numpy() for one in chosen]
-        self._stops, self._pieces = stops, packed(pieces, fixed)
-        self._count_from(origin)
+        self._stops, self._pieces = [x.copy() for x in stops], packed(pieces, fixed)
 
-    def _count_from(self, origin: float) -> None:
-        self.arrays = self._pieces._replace(at=self._pieces.at - origin)
-        self.stops = np.unique(np.concatenate([np.zeros(0), *self._stops])) - origin
+    def since(self, origin: float) -> "Followed":
+        """The same, for one run whose time counts from `origin` [s]."""
+        if self._pieces is None:
+            return self
+        out, room = copy(self), np.zeros_like(self._pieces.room)
+        out.arrays = self._pieces._replace(at=self._pieces.at - origin, room=room)
+        out.stops = np.unique(np.concatenate([np.zeros(0), *self._stops])) - origin
+        return out
 
     def on_lines(self, which: Index, first: float, last: float, values: Array) -> "Followed":
         """The same from `first` to `last` [s], where time counts from, with some signals on lines
@@ -303,8 +307,7 @@ class Followed:
         out._pieces = p._replace(at=at, span=span, control=control)
         others = [x for i, x in enumerate(self._stops) if i not in which]
         out._stops = [np.array([first, last]), *others]
-        out._count_from(first)
-        return out
+        return out.since(first)
 
     def at(self, t: Tensor) -> Tensor | None:
         """Values and rates (..., signals, 2) at t (...) [s] of the reference's pieces, None where

@@ -10,6 +10,7 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchsoft.physics.graph import Graph
@@ -31,11 +32,34 @@ class Unknown(Exception):
     """Something that does not say all of itself."""
 
 
+class Numbers:
+    """An array, equal to one of the same numbers."""
+
+    def __init__(self, array: NDArray[Any]) -> None:
+        self.array = array
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Numbers) and self.array.dtype == other.array.dtype
+            and np.array_equal(self.array, other.array)
+        )  # fmt: skip
+
+    def __hash__(self) -> int:
+        return hash(self.array.shape)
+
+
+def lasting(value: Any) -> Any:
+    """A key whose arrays nobody else can change."""
+    if isinstance(value, Numbers):
+        return Numbers(value.array.copy())
+    return tuple([lasting(one) for one in value]) if type(value) is tuple else value
+
+
 class Structure:
     """Modules of a part, each once, its parameters' tensors in their order, and a `key` that is
-    equal for equal structures; `known` is False where that is not certain: for code that is neither
-    this package's nor torch's, hooks, other attributes than numbers, text, arrays and functions of
-    this package. Such a part is like no other, and not like itself a moment later."""
+    equal for equal structures, until something changes. `known` is False where that is not certain:
+    for code that is neither this package's nor torch's, hooks, other attributes than numbers, text,
+    arrays and functions of this package. Such a part is like no other, nor like itself later."""
 
     def __init__(self, part: nn.Module) -> None:
         self.modules: list[nn.Module] = []
@@ -105,7 +129,7 @@ def described(value: Any) -> Any:
         except (TypeError, RuntimeError):
             raise Unknown from None
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return value.dtype, value.shape, value.tobytes()
+        return Numbers(value)
     if type(value) in (tuple, list):
         return tuple([described(one) for one in value])
     if type(value) is dict:
@@ -170,9 +194,9 @@ class Copies:
 
 
 def structure_of(part: object) -> Any:
-    """Key of the structure of a part, hashable; None where it is not known."""
+    """Key of the structure of a part, hashable and lasting; None where it is not known."""
     found = Structure(part) if isinstance(part, nn.Module) else None
-    return found.key if found is not None and found.known else None
+    return lasting(found.key) if found is not None and found.known else None
 
 
 def copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:

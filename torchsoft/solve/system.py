@@ -5,8 +5,8 @@ where a derivative is wanted the vector keeps its graph, and so gradients reach 
 values were made of.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from typing import Any
 
@@ -21,7 +21,7 @@ from torchsoft.solve.kernel import arrays
 from torchsoft.solve.kernel.arrays import Limits, room
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.model import computed, model_of, prepared_shapes
+from torchsoft.solve.model import Model, computed, model_of, prepared_shapes
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.steps import Followed, own_units
 from torchsoft.solve.structure import Copies, Structure, copied
@@ -35,6 +35,40 @@ def independent() -> Iterator[None]:
         yield
 
 
+class Reading:
+    """What runs of one rig share that begin together: its structure and its references, as they are
+    now."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.structure, self.model = Structure(rig), None
+        self._motions: dict[Any, tuple[Reference, Followed]] = {}
+        self._owned: dict[int, tuple[Reference, frozenset[int]]] = {}
+
+    def model_of(self, values: Sequence[Tensor]) -> Model:
+        """The model of the rig with these parameters."""
+        if self.model is None or not (self.model.shared and self.model.alike(values)):
+            self.model = model_of(self.structure, values)
+        return self.model
+
+    def touches(self, values: Mapping[int, Tensor], reference: Reference) -> bool:
+        """Whether values take the place of parameters of a reference."""
+        if id(reference) not in self._owned:
+            self._owned[id(reference)] = reference, frozenset(map(id, reference.parameters()))
+        return not self._owned[id(reference)][1].isdisjoint(values)
+
+    def motion(
+        self, reference: Reference, fixed: Sequence[float], make: Callable[[], Followed]
+    ) -> Followed:
+        """A reference as the kernels evaluate it, made once where it consists of pieces."""
+        key = id(reference), *fixed
+        if key not in self._motions:
+            made = make()
+            if not made.known:
+                return made
+            self._motions[key] = reference, made
+        return self._motions[key][1]
+
+
 class Compiled:
     """A rig at one moment, with `values` in the place of some parameters, by their id: `rig`, a
     copy; its `model`; the vector of its parameters, as `numbers` and as `p`, with its graph where
@@ -44,35 +78,48 @@ class Compiled:
     """
 
     def __init__(
-        self, rig: Rig, reference: Reference | None = None, *,
+        self, rig: Rig, reference: Reference | None = None, *, reading: Reading | None = None,
         values: Mapping[int, Tensor] | None = None, differentiable: bool = True,
     ) -> None:  # fmt: skip
         check_place()
-        structure, values = Structure(rig), values or {}
+        self._reading, values = reading or Reading(rig), values or {}
+        structure = self._reading.structure
         given = [values.get(id(x), x) for x in structure.parameters]
         differentiable = differentiable or not structure.known  # whose gradients are judged
         followed = rig.reference if reference is None else reference
         if not ordinary(given):
             self._refuse(Copies(structure).made(given)[0], rig.reference)
-        with torch.inference_mode(False), torch.set_grad_enabled(differentiable), independent():
+        with_graph = torch.inference_mode(False), torch.set_grad_enabled(differentiable)
+        with with_graph[0], with_graph[1], independent() if differentiable else nullcontext():
             theta, mine = taken(structure.parameters, given, differentiable)
             own = [mine[id(x)] for x in structure.parameters]
-            self.model = model = model_of(structure, own)
+            self.model = model = self._reading.model_of(own)
             modules = model.copies.made(own)
             self.rig: Rig = modules[0]
-            with_graph = differentiable or bool(values)
-            self.reference = copy_of(followed, mine, values) if with_graph else followed
+            apart = lambda one: differentiable or (values and self._reading.touches(values, one))
+            self.reference = copy_of(followed, mine, values) if apart(followed) else followed
             self.rig._modules["reference"] = (
-                self.reference if reference is None
-                else copy_of(rig.reference, mine, values) if with_graph
+                self.reference if followed is rig.reference
+                else copy_of(rig.reference, mine, values) if apart(rig.reference)
                 else rig.reference
             )  # fmt: skip
-            if not model.within(modules, theta.detach().numpy()):
-                check_values(self.rig)
-            made = computed(self.rig, prepared_shapes(self.rig)).values()
-            whole = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
-            self.p = whole[model.index]
-        self.numbers: Array = self.p.detach().numpy()
+            self._evaluate(modules, theta)
+        self.layout = model.layout
+
+    def _evaluate(self, modules: Sequence[Any], theta: Tensor) -> None:
+        """Find the vector of parameters; the last one again for the same values without a graph."""
+        model, values = self.model, theta.detach().numpy()
+        if not theta.requires_grad and model.last is not None and model.shared:
+            known, self.p, self.units = model.last
+            if np.array_equal(known, values):
+                self.numbers: Array = self.p.numpy()
+                return
+        if not model.within(modules, values):
+            check_values(self.rig)
+        made = computed(self.rig, prepared_shapes(self.rig)).values()
+        whole = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
+        self.p, self.units = whole[model.index], own_units(self.rig, model.smallest)
+        self.numbers = self.p.detach().numpy()
         if not np.isfinite(self.numbers).all():
             raise ValueError(
                 "the parameters of the rig give numbers that are not finite; some are too large or "
@@ -80,8 +127,8 @@ class Compiled:
             )
         if not model.chained(self.numbers):
             check_values(self.rig)
-        self.layout = model.layout
-        self.units = own_units(self.rig, model.smallest)
+        if not self.p.requires_grad:
+            model.last = values, self.p, self.units
 
     def _refuse(self, rig: Rig, reference: Reference) -> None:
         """Raises the `ValueError` that names a parameter which is no ordinary tensor."""
@@ -102,7 +149,8 @@ class Compiled:
         """A reference as the kernels evaluate it, with time counted from `origin` [s]."""
         fixed = [float(one.detach()) for one in self.rig.fixed_values]
         since = lambda t: self.signals(t, reference.since(origin))
-        return Followed(reference, self.model.signals, fixed, origin, since)
+        make = lambda: Followed(reference, self.model.signals, fixed, since)
+        return self._reading.motion(reference, fixed, make).since(origin)
 
     @independent()
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:

@@ -306,25 +306,39 @@ class Trajectory(Shown):
         return read(path)
 
 
-# What a run is judged by, from what it has of itself where that is known before its fields.
+class Ledger(NamedTuple):
+    """What a run is judged by: all stored energy (T,) [J]; energies dissipated (T, names) and all
+    that is supplied (T,), and injected in all [J]; the largest force on a contact point [N];
+    largest displacements of the loaded nodes of pads [m]; how its steps were chosen."""
+
+    stored: Array
+    names: Sequence[str]
+    dissipated: Array
+    supplied: Array
+    injected: float
+    force: float
+    displaced: dict[str, float]
+    steps: dict[str, Any]
+
+    @classmethod
+    def of(cls, run: Trajectory) -> Ledger:
+        known = getattr(vars(run).get("_rest"), "ledger", None)
+        if known is not None:
+            return known
+        plain = lambda parts: [part.detach().numpy() for part in parts.values()]
+        none = np.zeros(len(run.t))
+        force = max((float(x.detach().norm(dim=-1).max()) for x in run.force.values()), default=0.0)
+        return cls(
+            sum(plain(run.energy), none), [*run.dissipated],
+            np.stack(plain(run.dissipated), 1),
+            sum(plain(run.supplied), none), float(run.injected[-1].detach()), force, {},
+            run.made_by["steps"],
+        )  # fmt: skip
 
 
-def stored_energy(run: Trajectory) -> Array:
-    """All stored energy of a run (T,) [J]."""
-    known = getattr(vars(run).get("_rest"), "stored", None)
-    return sum(part.detach().numpy() for part in run.energy.values()) if known is None else known
-
-
-def steps_of(run: Trajectory) -> dict[str, Any]:
-    """How the steps of a run were chosen."""
-    known = getattr(vars(run).get("_rest"), "steps", None)
-    return run.made_by["steps"] if known is None else known
-
-
-def displaced(run: Trajectory, pad: str, enough: float) -> float:
-    """Largest displacement [m] of a pad's nodes, or a bound of it that is below `enough`."""
-    bound = getattr(vars(run).get("_rest"), "bounds", {}).get(pad, np.inf)
-    return bound if bound < enough else float(run.displacement[pad].detach().norm(dim=-1).max())
+def displaced(run: Trajectory, pad: str) -> float:
+    """Largest displacement of a pad's nodes [m]."""
+    return float(run.displacement[pad].detach().norm(dim=-1).max())
 
 
 def channels(
