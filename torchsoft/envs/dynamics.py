@@ -3,9 +3,9 @@ observation and a reward, all differentiable."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor
@@ -16,9 +16,9 @@ from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.namespace import measurable
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
-from torchsoft.solve.gradients import TAPE_BYTES, attached
+from torchsoft.solve.gradients import TAPE_BYTES, Solved, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
-from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.solve.stepper import ImplicitStepper, Repeated
 from torchsoft.solve.steps import check_knots
 from torchsoft.solve.trajectory import Touch, Trajectory, channels
 
@@ -143,12 +143,12 @@ class Dynamics:
         state = [name for name in spread if name in at]
         felt = [name for name in spread if name in self._touch and self._touch[name].over is None]
         self._other = [name for name in spread if name not in (*state, *felt)]
-        self._state = [at[name] for name in state]
+        self._state = torch.tensor([at[name] for name in state], dtype=torch.int64)
         start, places, weight = self._touch.sums(felt)
         sums = sparse.csr_array((weight, places, start), (len(felt), places.max(initial=0) + 1))
         self._sums = torch.from_numpy(sums.toarray())
         order = [*state, *felt, *self._other]
-        self._order = [order.index(name) for name in spread]
+        self._order = torch.tensor([order.index(name) for name in spread], dtype=torch.int64)
 
     def _set_goal(self) -> None:
         goal, free = self.goal, self.coordinates
@@ -160,7 +160,8 @@ class Dynamics:
                 f"`goal.scale` must have the coordinates of `goal.target`, {', '.join(target)}, "
                 f"but has {', '.join(goal.scale) or 'none'}"
             )
-        self._goal_at = [free[f"{body}.{axis}"] for axis in target]
+        goal_at = [free[f"{body}.{axis}"] for axis in target]
+        self._goal_at = torch.tensor(goal_at, dtype=torch.int64)
         ends = [x if isinstance(x, tuple) else (x, x) for x in target.values()]
         self.targets = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
         scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in target] if goal else []
@@ -172,10 +173,10 @@ class Dynamics:
         `SimulationFailed`."""
         with torch.enable_grad():  # a step may be differentiated, whatever is done here
             task = prepare(self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver)
-        self._stepper = task.stepper
+        self._stepper, self._idle = task.stepper, list[Repeated]()
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         set_by = [*self.actions, *self.disturbances]
-        self._set = np.array([self.rig.signals.index(name) for name in set_by])
+        self._set = [self.rig.signals.index(name) for name in set_by]
         lines = torch.zeros(len(set_by), 2, dtype=torch.float64)
         self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
         rows = attached([self._run(t, self._y0, None).solved])[0]
@@ -283,10 +284,14 @@ class Dynamics:
         disturbances, or by the rig's own motion."""
         if self._stepper is None:
             raise ValueError("the parameters have not been read; call `begin` first")
-        stepper = self._stepper
-        if values is not None and self._motion.known and not torch.is_grad_enabled():
-            ends = float(t[0]), float(t[-1])
-            stepper = stepper.moving(self._motion.on_lines(self._set, *ends, values.numpy()))
+        stepper, plain = self._stepper, self._motion.known and not torch.is_grad_enabled()
+        if values is not None and plain:
+            times = t.numpy()
+            motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
+            stepper = stepper.moving(motion, times[0])
+            given = knots is not None or stepper.step is not None
+            if not given and len(t) == self.samples + 1:
+                return self._again(stepper, t, y)
         elif values is not None:
             stepper = stepper.following(self._following(t[[0, -1]], values))
         else:
@@ -294,6 +299,21 @@ class Dynamics:
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)
+
+    def _again(self, stepper: ImplicitStepper, t: Tensor, y: Tensor) -> RunOutcome:
+        """A run between two control times, in the room of an earlier one."""
+        began, task = perf_counter(), Task(stepper, t, y, "none", (), None, False, ())
+        try:
+            room = self._idle.pop()
+        except IndexError:
+            room = Repeated(stepper, len(t), stepper.followed)
+        out, failure = room.run(stepper, y.numpy(), t.numpy())
+        self._idle.append(room)
+        done = RunOutcome(task, Solved(stepper, y, t, out, None), None, perf_counter() - began)
+        if failure is not None:
+            failure.trajectory = done.trajectory() if out.rows else None
+            raise failure
+        return done
 
 
 def check_names(field: str, given: Iterable[str], known: Iterable[str], listed: str) -> None:

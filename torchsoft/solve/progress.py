@@ -1,6 +1,6 @@
 """State and results of a run of the stepper, chunk by chunk, and its failures."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,16 @@ class Progress:
     starts: list[Array] = field(default_factory=list)
     end: float = 0.0
     origin: float = 0.0
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """Rows of the outputs: states, integrals, forces, rates, signals, energies."""
+        return self.y, self.integrals, self.recorded, self.rate, self.signals, self.stored
+
+    def apart(self) -> "Progress":
+        """The same with rows of its own."""
+        own = ("y", "integrals", "recorded", "rate", "signals", "stored")
+        return replace(self, **{name: getattr(self, name).copy() for name in own})
 
     @property
     def knots(self) -> Array:

@@ -32,7 +32,7 @@ from torchsoft.solve.kernel.arrays import (
     room,
 )
 from torchsoft.solve.kernel.objects import call
-from torchsoft.solve.kernel.table import Array
+from torchsoft.solve.kernel.table import Array, change
 from torchsoft.solve.progress import Progress, RunState, Segment, SimulationFailed
 from torchsoft.solve.steps import (
     CHUNK,
@@ -140,11 +140,12 @@ class ImplicitStepper:
         other.reference, other._motion, other.origin = reference, None, 0.0
         return other
 
-    def moving(self, motion: Followed) -> "ImplicitStepper":
-        """The same with signals as the kernels take them, from where they count time; no derivative
-        can be taken by them."""
+    def moving(self, motion: Followed, origin: float) -> "ImplicitStepper":
+        """The same with signals as the kernels take them, time counting from `origin` [s]; no
+        derivative can be taken by them."""
         other = copy(self)
-        other._motion = motion
+        other._motion = other.followed = motion
+        other.origin = origin
         return other
 
     def signals_at(self, times: Tensor) -> Tensor:
@@ -164,25 +165,19 @@ class ImplicitStepper:
         now.work.travelled[0] = np.inf
         now.work.low[:] = now.work.high[:] = 0
         now.work.held[:] = 0.0
-        y = out.y[rows]
+        here = [part[rows] for part in out.arrays]
         tape = out_tape = self.compiled.model.no_tape
         if taping:
             tape, out_tape = (
                 room("Tape", now.system, self.layout.size, stages=n, cap=self._cap)
-                for n in (2 * steps, len(y) if now.outputs_too else 0)
+                for n in (2 * steps, len(here[0]) if now.outputs_too else 0)
             )
             if now.outputs_too:
-                out_tape = out_tape._replace(y=y)
-        outputs = Outputs(
-            plan.out_step, plan.out_part, at_outputs, y, out.integrals[rows], out.recorded[rows],
-            out.rate[rows], out.stored[rows], out_tape,
-        )  # fmt: skip
-        limits, start = (
-            Limits(self.tolerance, most, self.window)
-            for most in (self.max_iterations, START_ITERATIONS)
-        )
+                out_tape = out_tape._replace(y=here[0])
+        here[4] = at_outputs
         run = Run(
-            now.system, now.work, now.step, follow, errors, limits, start, outputs, tape, given,
+            now.system, now.work, now.step, follow, errors, *self.limits,
+            outputs(plan, here, out_tape), tape, given,
             now.y, k, clock, stops, times, row, self.rtol, self.longest,
             self._shortest, now.integrals, plan.starts, plan.h,
             signals.reshape(steps, 2, *signals.shape[1:]), counts,
@@ -190,6 +185,13 @@ class ImplicitStepper:
         with released_turn():
             call("run", run)
         return counts.tolist(), (tape, out_tape) if taping else None
+
+    @property
+    def limits(self) -> tuple[Limits, Limits]:
+        """Limits of Newton's method, and those at a start."""
+        most = self.max_iterations, START_ITERATIONS
+        limits, start = (Limits(self.tolerance, one, self.window) for one in most)
+        return limits, start
 
     def signals_now(self, t: Tensor) -> Tensor:
         """The signals at t [s] of the last run, without fixed coordinates (..., signals, 2)."""
@@ -326,31 +328,45 @@ class ImplicitStepper:
             plan = Plan(np.zeros(CHUNK), np.zeros(CHUNK), row_step, row_part)
             flat = np.zeros((2 * CHUNK, count, 2))
             before = now.copy() if now.segments is not None else ()
-            (steps, done, status, solves, refused, failed, which), tapes = self._call(
+            counts, tapes = self._call(
                 now, plan, flat, at_rows, slice(None),
                 taping=now.taping, given=False, follow=followed.arrays, errors=errors, k=k,
                 clock=clock, stops=stops, times=times, row=out.rows,
             )  # fmt: skip
             followed.check()
-            if out.rows == 0:
+            row = out.rows
+            failure = self.advanced(out, now, counts, clock)
+            steps, here = counts[0], slice(row, out.rows)
+            if row == 0:
                 self._check_signals(at_rows[0])
-                if done == 0:
-                    raise self._failure(now, status, 0.0, INSTANT)
-            here = slice(out.rows, out.rows + done)
             plan = Plan(
                 plan.starts[:steps], plan.h[:steps], row_step[here].copy(), row_part[here].copy()
             )
             if tapes is not None:
                 tapes = tapes[0], Tape(*(part[here] for part in tapes[1]))
             now.keep(plan, flat[: 2 * steps], at_rows[here], before, here, tapes)
-            out.rows, out.steps, out.solves = here.stop, out.steps + steps, out.solves + solves
-            out.refused, out.failed = out.refused + refused, out.failed + failed
-            yield out
-            if status == TAPE_FULL:
+            if row or out.rows:
+                yield out
+            if failure is not None:
+                raise failure
+            if counts[2] == TAPE_FULL:
                 self._cap *= 2
-            elif status != CONVERGED:
-                worst = model.errors.names[which] if which >= 0 else "the state"
-                raise self._failure(now, status, float(clock[0]), float(clock[1]), worst)
+
+    def advanced(
+        self, out: Progress, now: Any, counts: Sequence[int], clock: Array
+    ) -> SimulationFailed | None:
+        """Note what a call by tolerances has done; why the run ends there, if it does. `now` is
+        what the last stage left."""
+        steps, done, status, solves, refused, failed, which = counts
+        begun = out.rows + done > 0
+        out.rows, out.steps, out.solves = out.rows + done, out.steps + steps, out.solves + solves
+        out.refused, out.failed = out.refused + refused, out.failed + failed
+        if not begun:
+            return self._failure(now, status, 0.0, INSTANT)
+        if status in (CONVERGED, TAPE_FULL):
+            return None
+        worst = self.compiled.model.errors.names[which] if which >= 0 else "the state"
+        return self._failure(now, status, float(clock[0]), float(clock[1]), worst)
 
     def _start(self, now: "RunState", followed: Followed | None = None) -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there; the
@@ -475,6 +491,73 @@ class ImplicitStepper:
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
         }
         return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)
+
+
+class Repeated:
+    """Runs by tolerances of one stepper through so many times, one after the other, in arrays and
+    tables that are made once: without given steps, `landing`, or a derivative. For one thread at a
+    time."""
+
+    def __init__(self, stepper: ImplicitStepper, rows: int, motion: Followed) -> None:
+        model, plan = stepper.compiled.model, Plan(*np.zeros((2, CHUNK)), *np.zeros((2, rows)))
+        self.system, self.work, self.step = model.take(stepper.compiled.numbers)
+        self._out, self._y = stepper._room(rows), np.zeros(model.layout.size)
+        self._integrals, self._k = np.zeros(self._out.integrals.shape[1]), self._y.copy()
+        self._plan = plan = plan._replace(out_step=np.zeros(rows, np.int64))
+        self._clock, self._times, self._counts = START.copy(), np.zeros(rows), np.zeros(7, np.int64)
+        self._stops, self._motion = np.zeros(len(motion.stops) + 1), motion.arrays
+        self._errors = model.errors.of(self._y, stepper.atol, stepper.compiled.units)
+        signals = np.zeros((CHUNK, 2, *self._out.signals.shape[1:]))
+        self._table = Run(
+            self.system, self.work, self.step, self._motion, self._errors, *stepper.limits,
+            outputs(plan, self._out.arrays, model.no_tape), model.no_tape, False, self._y, self._k,
+            self._clock, self._stops, self._times, 0, stepper.rtol, stepper.longest, SHORTEST,
+            self._integrals, plan.starts, plan.h, signals, self._counts,
+        )  # fmt: skip
+
+    def run(
+        self, stepper: ImplicitStepper, y0: Array, t: Array
+    ) -> tuple[Progress, SimulationFailed | None]:
+        """From y0 (size,) through the times t (rows,) [s], along a motion of as many pieces as the
+        first; and why that ended early, if it did."""
+        times, motion, out = t - t[0], stepper.followed, self._out
+        self._y[:], self._times[:], self._integrals[:] = y0, times, 0.0
+        reset(self.system, self.work, self._y)
+        moving = ("at", "span", "control")
+        errors = stepper.compiled.model.errors.of(self._y, stepper.atol, stepper.compiled.units)
+        pairs = [(getattr(self._motion, k), getattr(motion.arrays, k)) for k in moving]
+        for own, given in (*pairs, *zip(self._errors[3:], errors[3:])):
+            own[:] = given
+        stops = motion.stops[(motion.stops > 0.0) & (motion.stops <= times[-1])]
+        self._stops[:] = times[-1]
+        self._stops[: len(stops)] = stops
+        self._clock[:] = 0.0, min(FIRST, times[-1]), 1.0
+        done = Progress(*out.arrays, rows=0, origin=float(t[0]))
+        failure, (starts, h) = None, self._plan[:2]
+        while failure is None and done.rows < len(t):
+            change(self._table, row=done.rows, shortest=min(SHORTEST, PART * times[-1]))
+            with released_turn():
+                call("run", self._table)
+            failure = stepper.advanced(done, self, self._counts.tolist(), self._clock)
+            if steps := int(self._counts[0]):
+                done.starts.append(starts[:steps].copy())
+                done.end = float(starts[steps - 1] + h[steps - 1])
+        return done.apart(), failure
+
+
+def outputs(plan: Plan, rows: Sequence[Array], tape: Any) -> Outputs:
+    """Where the outputs of a plan go: to rows of a `Progress`."""
+    y, integrals, recorded, rate, signals, stored = rows
+    return Outputs(
+        plan.out_step, plan.out_part, signals, y, integrals, recorded, rate, stored, tape
+    )
+
+
+def reset(s: Any, work: Any, y: Array) -> None:
+    """Newton's first guess: the velocities of the state."""
+    for part in (work.V, work.u_dot, work.rate):
+        part.fill(0.0)
+    set_velocities(s, work, y)
 
 
 def stage_times(plan: Plan) -> Tensor:

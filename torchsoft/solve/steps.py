@@ -16,7 +16,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.kernel.arrays import NO_SIGNALS, Errors, Signals
-from torchsoft.solve.kernel.table import Array, Index
+from torchsoft.solve.kernel.table import Array
 
 # The steps of a run: equal ones between output times, or those that tolerances chose, and where
 # the outputs lie in them.
@@ -298,10 +298,12 @@ class Followed:
         out.stops = np.unique(np.concatenate([np.zeros(0), *self._stops])) - origin
         return out
 
-    def on_lines(self, which: Index, first: float, last: float, values: Array) -> "Followed":
+    def on_lines(
+        self, which: Sequence[int], first: float, last: float, values: Array
+    ) -> "Followed":
         """The same from `first` to `last` [s], where time counts from, with some signals on lines
         between two values each (lines, 2), as they were on single lines before."""
-        out, p, rows = copy(self), self._pieces, self._pieces.start[which]
+        out, p, rows = copy(self), self._pieces, self._pieces.start[[*which]]
         at, span, control = p.at.copy(), p.span.copy(), p.control.copy()
         at[rows], span[rows], control[rows, :2] = first, last - first, values
         out._pieces = p._replace(at=at, span=span, control=control)

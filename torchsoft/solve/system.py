@@ -89,18 +89,18 @@ class Compiled:
         followed = rig.reference if reference is None else reference
         if not ordinary(given):
             self._refuse(Copies(structure).made(given)[0], rig.reference)
-        with_graph = torch.inference_mode(False), torch.set_grad_enabled(differentiable)
-        with with_graph[0], with_graph[1], independent() if differentiable else nullcontext():
+        apart = independent() if differentiable else nullcontext()
+        with torch.inference_mode(False), torch.set_grad_enabled(differentiable), apart:
             theta, mine = taken(structure.parameters, given, differentiable)
             own = [mine[id(x)] for x in structure.parameters]
             self.model = model = self._reading.model_of(own)
             modules = model.copies.made(own)
             self.rig: Rig = modules[0]
-            apart = lambda one: differentiable or (values and self._reading.touches(values, one))
-            self.reference = copy_of(followed, mine, values) if apart(followed) else followed
+            change = lambda one: differentiable or (values and self._reading.touches(values, one))
+            self.reference = copy_of(followed, mine, values) if change(followed) else followed
             self.rig._modules["reference"] = (
                 self.reference if followed is rig.reference
-                else copy_of(rig.reference, mine, values) if apart(rig.reference)
+                else copy_of(rig.reference, mine, values) if change(rig.reference)
                 else rig.reference
             )  # fmt: skip
             self._evaluate(modules, theta)
