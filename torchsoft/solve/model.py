@@ -519,13 +519,14 @@ def geometric(modules: Sequence[Any], structure: Structure) -> list[int]:
 
 
 _kept: deque[Model] = deque(maxlen=KEPT)
-_finding = threading.Lock()
+_finding = threading.RLock()
 
 
 def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
     """The model of a rig with these parameters, made where there is none."""
     with _finding:
-        found = next((one for one in _kept if one.serves(structure, values)), None)
+        kept = _kept if structure.known else ()
+        found = next((one for one in kept if one.serves(structure, values)), None)
         if found is None:
             found = Model(structure, values)
         elif found is not _kept[0]:
@@ -533,3 +534,9 @@ def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
         if found.shared and (not _kept or found is not _kept[0]):
             _kept.appendleft(found)
     return found
+
+
+def forget() -> None:
+    """Keep nothing: models are made anew."""
+    with _finding:
+        _kept.clear()
