@@ -308,7 +308,8 @@ class Dynamics:
         except IndexError:
             room = Repeated(stepper, len(t), stepper.followed)
         out, failure = room.run(stepper, y.numpy(), t.numpy())
-        self._idle.append(room)
+        if failure is None:
+            self._idle.append(room)
         done = RunOutcome(task, Solved(stepper, y, t, out, None), None, perf_counter() - began)
         if failure is not None:
             failure.trajectory = done.trajectory() if out.rows else None

@@ -238,17 +238,15 @@ class ImplicitStepper:
         self._shortest = min(SHORTEST, PART * float(t[-1] - t[0]))
         model, out = self.compiled.model, self._room(len(t))
         place = model.take(self.compiled.numbers)
-        try:
-            y, integrals = y0.numpy().copy(), np.zeros(len(self.integrals.names))
-            set_velocities(place.system, place.work, y)
-            state = RunState(y, *place, integrals, out, segments, tape_bytes, outputs_too)
-            yield from (
-                self._by_tolerance(t, state)
-                if self.step is None and self.knots is None
-                else self._as_given(t, state)
-            )
-        finally:
-            model.give(place)
+        y, integrals = y0.numpy().copy(), np.zeros(len(self.integrals.names))
+        set_velocities(place.system, place.work, y)
+        state = RunState(y, *place, integrals, out, segments, tape_bytes, outputs_too)
+        yield from (
+            self._by_tolerance(t, state)
+            if self.step is None and self.knots is None
+            else self._as_given(t, state)
+        )
+        model.give(place)  # not after a failure, which may leave numbers that are none
 
     def _as_given(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take the steps of a plan."""
