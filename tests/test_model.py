@@ -107,10 +107,11 @@ def test_a_batch_reads_the_rig_once_and_gives_what_its_runs_give_alone():
     rig = coarse()
     y0, E = grasped(rig, (0.05, 0.0)), f64(4e5, 9e5, 4e5, 6e5)
     radius = rig.parameter("disc.radius").detach() * f64(1.0, 1.0, 1.001, 1.0)
+    x_d = rig.reference["x_d"].values.detach()
     own = {
         "pad.E": E,
         "disc.radius": radius,
-        "reference.signals.x_d.values": 0.02 + E[:, None] / 1e8,
+        "reference.signals.x_d.values": x_d + 1e-12 * E[:, None],
     }
     batch = simulate_batch(rig, T, y0=y0, parameters=own, rtol=1e-3, threads=2)
     for i, run in enumerate(batch):

@@ -284,13 +284,12 @@ class Dynamics:
         disturbances, or by the rig's own motion."""
         if self._stepper is None:
             raise ValueError("the parameters have not been read; call `begin` first")
-        stepper, plain = self._stepper, self._motion.known and not torch.is_grad_enabled()
-        if values is not None and plain:
+        stepper, given = self._stepper, knots is not None or self._stepper.step is not None
+        if values is not None and self._motion.known and not (given or torch.is_grad_enabled()):
             times = t.numpy()
             motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
             stepper = stepper.moving(motion, times[0])
-            given = knots is not None or stepper.step is not None
-            if not given and len(t) == self.samples + 1:
+            if len(t) == self.samples + 1:
                 return self._again(stepper, t, y)
         elif values is not None:
             stepper = stepper.following(self._following(t[[0, -1]], values))

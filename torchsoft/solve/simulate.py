@@ -314,7 +314,8 @@ def gather(
     stepper, count = task.stepper, out.rows
     model, (y, felt) = stepper.compiled.model, (part[:count] for part in rows)
     rest = _Rest(stepper, task.t[:count], y, felt, out)
-    touch, own = Touch(stepper.rig), {"sensitivities": None, "touch_sensitivities": {}}
+    touch = Touch(stepper.rig)
+    own: dict[str, Any] = {"sensitivities": None, "touch_sensitivities": {}}
     if slopes is not None:
         of_touch = touch.slopes(task.touch, slopes[1][:count], felt).unbind(1)
         own = {"sensitivities": slopes[0][:count]}

@@ -497,11 +497,12 @@ class Repeated:
     time."""
 
     def __init__(self, stepper: ImplicitStepper, rows: int, motion: Followed) -> None:
-        model, plan = stepper.compiled.model, Plan(*np.zeros((2, CHUNK)), *np.zeros((2, rows)))
+        model = stepper.compiled.model
+        numbers, ends = np.zeros((2, CHUNK)), np.zeros(rows, np.int64)
+        self._plan = plan = Plan(numbers[0], numbers[1], ends, np.zeros(rows))
         self.system, self.work, self.step = model.take(stepper.compiled.numbers)
         self._out, self._y = stepper._room(rows), np.zeros(model.layout.size)
         self._integrals, self._k = np.zeros(self._out.integrals.shape[1]), self._y.copy()
-        self._plan = plan = plan._replace(out_step=np.zeros(rows, np.int64))
         self._clock, self._times, self._counts = START.copy(), np.zeros(rows), np.zeros(7, np.int64)
         self._stops, self._motion = np.zeros(len(motion.stops) + 1), motion.arrays
         self._errors = model.errors.of(self._y, stepper.atol, stepper.compiled.units)

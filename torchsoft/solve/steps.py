@@ -285,7 +285,8 @@ class Followed:
             self.stops = np.zeros(0)
             return
         with torch.no_grad():
-            pieces = [tuple(x.numpy() for x in one.pieces()) for one in chosen]
+            found = [one.pieces() for one in chosen]
+            pieces = [(at.numpy(), span.numpy(), c.numpy()) for at, span, c in found]
             stops = [one.stops.numpy() for one in chosen]
         self._stops, self._pieces = [x.copy() for x in stops], packed(pieces, fixed)
 
