@@ -82,8 +82,9 @@ class Compiled:
         values: Mapping[int, Tensor] | None = None, differentiable: bool = True,
     ) -> None:  # fmt: skip
         check_place()
-        self._reading, values = reading or Reading(rig), values or {}
-        structure = self._reading.structure
+        shared, values = reading, values or {}
+        reading = reading or Reading(rig)
+        structure = reading.structure
         given = [values.get(id(x), x) for x in structure.parameters]
         differentiable = differentiable or not structure.known  # whose gradients are judged
         followed = rig.reference if reference is None else reference
@@ -93,10 +94,10 @@ class Compiled:
         with torch.inference_mode(False), torch.set_grad_enabled(differentiable), apart:
             theta, mine = taken(structure.parameters, given, differentiable)
             own = [mine[id(x)] for x in structure.parameters]
-            self.model = model = self._reading.model_of(own)
+            self.model = model = reading.model_of(own)
             modules = model.copies.made(own)
             self.rig: Rig = modules[0]
-            change = lambda one: differentiable or (values and self._reading.touches(values, one))
+            change = lambda one: differentiable or (values and reading.touches(values, one))
             self.reference = copy_of(followed, mine, values) if change(followed) else followed
             self.rig._modules["reference"] = (
                 self.reference if followed is rig.reference
@@ -105,6 +106,7 @@ class Compiled:
             )  # fmt: skip
             self._evaluate(modules, theta)
         self.layout = model.layout
+        self._shared = shared if self.reference is followed else None
 
     def _evaluate(self, modules: Sequence[Any], theta: Tensor) -> None:
         """Find the vector of parameters; the last one again for the same values without a graph."""
@@ -150,7 +152,9 @@ class Compiled:
         fixed = [float(one.detach()) for one in self.rig.fixed_values]
         since = lambda t: self.signals(t, reference.since(origin))
         make = lambda: Followed(reference, self.model.signals, fixed, since)
-        return self._reading.motion(reference, fixed, make).since(origin)
+        shared = self._shared
+        found = make() if shared is None else shared.motion(reference, fixed, make)
+        return found.since(origin)
 
     @independent()
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
