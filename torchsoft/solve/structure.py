@@ -1,7 +1,7 @@
 """Structure of a rig or of a part of it: everything but the values of its parameters.
 
-Two parts of one structure have the same laws, layout and arrays; what is made of a structure serves
-every part that has it, and is made anew for any other.
+Two parts of one structure have the same laws and layout; what is made of a structure serves every
+part that has it, and is made anew for any other.
 """
 
 from collections.abc import Mapping, Sequence
