@@ -27,7 +27,7 @@ FLOWS = {
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour .",
     "solve": """
-        kernel laws steps progress system stepper trajectory gradients formats
+        kernel structure laws steps progress model system stepper trajectory gradients formats
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """

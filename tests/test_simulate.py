@@ -431,7 +431,7 @@ def test_a_law_that_turns_nan_never_converges():
 # ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("when", ["check_values", "integrate"])
+@pytest.mark.parametrize("when", ["computed", "integrate"])
 def test_a_run_has_the_parameters_that_it_began_with(monkeypatch, when):
     """Those that another thread changed meanwhile made results that belong to no value: 38 runs of
     60 with E, 53 with a mass."""
@@ -463,7 +463,7 @@ def test_a_run_has_the_parameters_that_it_began_with(monkeypatch, when):
         make = stepper.ImplicitStepper.integrate
         monkeypatch.setattr(stepper.ImplicitStepper, "integrate", changing(make))
     else:
-        monkeypatch.setattr(system, "check_values", changing(system.check_values))
+        monkeypatch.setattr(system, "computed", changing(system.computed))
     found = result()
     assert len(before) > 10
     assert all(map(torch.equal, found, expected))

@@ -1,6 +1,6 @@
 """Runs side by side: threads, whose compiled kernels hold no lock, and pools of processes.
 
-Python code does hold a lock; a run of a second has some twenty milliseconds of it.
+Python code does hold a lock; a run has about two milliseconds of it.
 """
 
 import multiprocessing

@@ -3,6 +3,7 @@ observation and a reward, all differentiable."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import torch
@@ -15,9 +16,9 @@ from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.namespace import measurable
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
-from torchsoft.solve.gradients import TAPE_BYTES, attached
+from torchsoft.solve.gradients import TAPE_BYTES, Solved, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
-from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.solve.stepper import ImplicitStepper, Repeated
 from torchsoft.solve.steps import check_knots
 from torchsoft.solve.trajectory import Touch, Trajectory, channels
 
@@ -142,12 +143,12 @@ class Dynamics:
         state = [name for name in spread if name in at]
         felt = [name for name in spread if name in self._touch and self._touch[name].over is None]
         self._other = [name for name in spread if name not in (*state, *felt)]
-        self._state = [at[name] for name in state]
+        self._state = torch.tensor([at[name] for name in state], dtype=torch.int64)
         start, places, weight = self._touch.sums(felt)
         sums = sparse.csr_array((weight, places, start), (len(felt), places.max(initial=0) + 1))
         self._sums = torch.from_numpy(sums.toarray())
         order = [*state, *felt, *self._other]
-        self._order = [order.index(name) for name in spread]
+        self._order = torch.tensor([order.index(name) for name in spread], dtype=torch.int64)
 
     def _set_goal(self) -> None:
         goal, free = self.goal, self.coordinates
@@ -159,7 +160,8 @@ class Dynamics:
                 f"`goal.scale` must have the coordinates of `goal.target`, {', '.join(target)}, "
                 f"but has {', '.join(goal.scale) or 'none'}"
             )
-        self._goal_at = [free[f"{body}.{axis}"] for axis in target]
+        goal_at = [free[f"{body}.{axis}"] for axis in target]
+        self._goal_at = torch.tensor(goal_at, dtype=torch.int64)
         ends = [x if isinstance(x, tuple) else (x, x) for x in target.values()]
         self.targets = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
         scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in target] if goal else []
@@ -169,9 +171,15 @@ class Dynamics:
         """The moment at the time `begin`, after the rig's own motion, without disturbance. The
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
-        self._stepper = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver).stepper
+        with torch.enable_grad():  # a step may be differentiated, whatever is done here
+            task = prepare(self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver)
+        self._stepper, self._idle = task.stepper, list[Repeated]()
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
-        rows = attached([self._run(t, self._y0, own).solved])[0]
+        set_by = [*self.actions, *self.disturbances]
+        self._set = [self.rig.signals.index(name) for name in set_by]
+        lines = torch.zeros(len(set_by), 2, dtype=torch.float64)
+        self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
+        rows = attached([self._run(t, self._y0, None).solved])[0]
         there = -1 if self.start else 0
         with torch.no_grad():
             now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
@@ -190,8 +198,7 @@ class Dynamics:
         t = torch.linspace(begin, end, self.samples + 1, dtype=torch.float64)
         before, after = (self._low + self._half * (1 + a) for a in (now.action, action))
         both = torch.stack((before, after), -1)
-        reference = self._following(t[[0, -1]], torch.cat((both, self._disturbed(now))))
-        outcome = self._run(t, now.y, reference, knots)
+        outcome = self._run(t, now.y, torch.cat((both, self._disturbed(now))), knots)
         rows = attached([outcome.solved])[0]
         moment = now._replace(
             y=rows.y[-1], action=action, steps=now.steps + 1, recorded=rows.recorded[-1]
@@ -205,28 +212,31 @@ class Dynamics:
             assert self.goal is not None
             value = 1 / (1 + self.distance(moment).square().sum())
             value = value - self.goal.changes * (action - now.action).square().sum()
-        return Transition(moment, self.observe(moment, reference), value, outcome)
+        return Transition(moment, self._seen(moment, outcome.solved.stepper), value, outcome)
 
     def look(self, now: Moment) -> Trajectory:
         """A short run from a moment, whose first sample is that moment."""
         t = self.start + now.steps * self.interval + torch.tensor([0.0, LOOK]).double()
         held = self._low + self._half * (1 + now.action)
-        held = torch.cat((held, self._disturbed(now)[:, 0]))[:, None]
-        reference = self._following(t[:1], held)
+        held = torch.cat((held, self._disturbed(now)[:, 0]))[:, None].expand(-1, 2)
         with torch.no_grad():
-            return self._run(t, now.y, reference).trajectory()
+            return self._run(t, now.y, held).trajectory()
 
     def distance(self, now: Moment) -> Tensor:
         """Distances of the goal's coordinates from their targets, over their scales."""
         return (now.target - now.y[self._goal_at]) / self._scale
 
-    def observe(self, now: Moment, reference: Reference | None = None) -> Tensor:
-        """The observation (n,) at a moment; `reference` is the motion that led to it, by default
-        the rig's own."""
+    def observe(self, now: Moment) -> Tensor:
+        """The observation (n,) at a moment to which the rig's own motion led."""
+        return self._seen(now, None)
+
+    def _seen(self, now: Moment, stepper: ImplicitStepper | None) -> Tensor:
+        """The observation at a moment to which the motion of a stepper led, or the rig's own."""
         y, rig = now.y, self.rig
         parts = [y[self._state], self._sums @ now.recorded[: self._sums.shape[1]]]
         if self._other:
-            signals = rig.follow(self.start + now.steps * self.interval, reference)
+            t = torch.tensor(self.start + now.steps * self.interval, dtype=torch.float64)
+            signals = rig.follow(t) if stepper is None else stepper.signals_now(t)
             named = channels(rig, rig.unpack(y, signals), signals)
             for name in self._other:
                 touch = name not in named
@@ -261,21 +271,49 @@ class Dynamics:
         return own + torch.where((when == steps) & (steps > 0), peak, 0.0)
 
     def _following(self, times: Tensor, values: Tensor) -> Reference:
-        """The rig's own reference, with linear interpolation of values (signals, T) for signals set
+        """The rig's own reference, with lines between two values each (signals, 2) for signals set
         by actions or disturbances."""
         own = {name: self.rig.reference[name] for name in self.rig.signals}
         lines = [Lines(times, row) for row in values]
         return Reference(**own | dict(zip((*self.actions, *self.disturbances), lines)))
 
     def _run(
-        self, t: Tensor, y: Tensor, reference: Reference, knots: Tensor | None = None
+        self, t: Tensor, y: Tensor, values: Tensor | None, knots: Tensor | None = None
     ) -> RunOutcome:
+        """A run with lines between `values` (signals, 2) for signals set by actions or
+        disturbances, or by the rig's own motion."""
         if self._stepper is None:
             raise ValueError("the parameters have not been read; call `begin` first")
-        stepper = self._stepper.following(reference)
+        stepper, given = self._stepper, knots is not None or self._stepper.step is not None
+        if values is not None and self._motion.known and not (given or torch.is_grad_enabled()):
+            times = t.numpy()
+            motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
+            stepper = stepper.moving(motion, times[0])
+            if len(t) == self.samples + 1:
+                return self._again(stepper, t, y)
+        elif values is not None:
+            stepper = stepper.following(self._following(t[[0, -1]], values))
+        else:
+            stepper = stepper.following(self.rig.reference)
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)
+
+    def _again(self, stepper: ImplicitStepper, t: Tensor, y: Tensor) -> RunOutcome:
+        """A run between two control times, in the room of an earlier one."""
+        began, task = perf_counter(), Task(stepper, t, y, "none", (), None, False, ())
+        try:
+            room = self._idle.pop()
+        except IndexError:
+            room = Repeated(stepper, len(t), stepper.followed)
+        out, failure = room.run(stepper, y.numpy(), t.numpy())
+        if failure is None:
+            self._idle.append(room)
+        done = RunOutcome(task, Solved(stepper, y, t, out, None), None, perf_counter() - began)
+        if failure is not None:
+            failure.trajectory = done.trajectory() if out.rows else None
+            raise failure
+        return done
 
 
 def check_names(field: str, given: Iterable[str], known: Iterable[str], listed: str) -> None:

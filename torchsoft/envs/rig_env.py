@@ -293,7 +293,7 @@ class RigVectorEnv(SyncVectorEnv):
     """Environments whose steps and resets run in `threads` threads, by default one for each core.
     Results do not depend on the number of threads.
 
-    Only one thread at a time computes in Python, which is two thirds of a short step; where that
+    Only one thread at a time computes in Python, which is about half of a short step; where that
     counts, gymnasium's `AsyncVectorEnv` takes processes.
     """
 
@@ -305,7 +305,8 @@ class RigVectorEnv(SyncVectorEnv):
             raise ValueError("`make` must hold one function an environment, but is empty")
         threads = cores() if threads is None else whole("threads", threads, 1)
         super().__init__(make, autoreset_mode=autoreset_mode)
-        self._pool = executor(min(threads, len(make)))
+        self._threads = min(threads, len(make))
+        self._pool = executor(self._threads)
 
     def step(self, actions: Any) -> Any:
         """Step all environments, as gymnasium's `SyncVectorEnv` does."""
@@ -319,7 +320,12 @@ class RigVectorEnv(SyncVectorEnv):
             over = (stepped[2] or stepped[3]) and self.autoreset_mode is AutoresetMode.SAME_STEP
             return _Done(stepped, every[i].reset() if over else None)
 
-        done = dict(parallel_map(work, len(every), turns=True, pool=self._pool))
+        def share(k: int) -> dict[int, _Done]:
+            return {i: work(i) for i in range(k, len(every), self._threads)}
+
+        done: dict[int, _Done] = {}
+        for _, some in parallel_map(share, self._threads, turns=True, pool=self._pool):
+            done |= some
         try:
             self.envs = [done[i] for i in range(len(every))]  # pyright: ignore[reportAttributeAccessIssue]
             return super().step(actions)

@@ -426,6 +426,11 @@ def distance_law(shape: Shape, x: Tensor) -> Tensor:
     return -moving_frame(shape, *point_place(x)).g[None]
 
 
+def stored_law(contact: SoftContact, x: Tensor) -> Tensor:
+    """Energies (2,) [J] of a point's springs, of x = (penetration, stretch, weight)."""
+    return torch.stack(contact.stored(*x.unbind(-1)), -1)
+
+
 def free_law(contact: SoftContact, x: Tensor) -> Tensor:
     """Rates of the states, powers of dashpots and of slip (..., states + 2) away from contact, of x
     = (states at the stage's start, weight, a h)."""

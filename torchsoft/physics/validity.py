@@ -5,7 +5,7 @@ take no more than the effort. Every refusal is one sentence that names the fault
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -77,6 +77,15 @@ def check_array(name: str, x: Any) -> None:
             f"`{name}` has a tangent of torch's forward mode, which runs drop; use "
             "gradient='forward'"
         )
+
+
+def ordinary(tensors: Iterable[Tensor]) -> bool:
+    """Whether all of them are what `check_array` takes, and not made in inference mode."""
+    dual = torch.autograd.forward_ad._current_level >= 0
+    return not dual and all(
+        x.dtype is torch.float64 and x.layout is torch.strided and x.is_cpu
+        and not x.is_inference() and not is_functorch_wrapped_tensor(x) for x in tensors
+    )  # fmt: skip
 
 
 def check_place() -> None:

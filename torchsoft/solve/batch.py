@@ -20,9 +20,9 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import TAPE_BYTES, attached
-from torchsoft.solve.laws import copied
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RunOutcome, prepare, run
+from torchsoft.solve.system import Reading
 from torchsoft.solve.trajectory import Trajectory
 
 
@@ -179,11 +179,17 @@ def simulate_batch(
         min(count, cores() if threads is None else whole("threads", threads, 1)),
     )
     budget = TAPE_BYTES / count
+    readings = {
+        id(rig): Reading(rig)
+        for rig in {id(one["rig"]): one["rig"] for one in runs}.values()
+        if isinstance(rig, Rig)
+    }
 
     def work(i: int) -> RunOutcome | Trajectory | Exception:
         try:
             own = _own(runs[i]["rig"], parameters or {}, i)
-            task = prepare(**runs[i] | {"rig": own}, **options)
+            reading = readings.get(id(runs[i]["rig"]))
+            task = prepare(**runs[i], reading=reading, values=own, **options)
             outcome = run(task, budget, explained=False)
             return outcome.trajectory() if outcome.solved.segments is None else outcome
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
@@ -278,10 +284,8 @@ def _spread(
     ]
 
 
-def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> Rig:
-    """The rig with row i of the parameters in place of its own; everything else is shared."""
-    if not parameters:
-        return rig
+def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> dict[int, Tensor]:
+    """Row i of the parameters, by the id of the rig's own that they take the place of."""
     values: dict[int, Tensor] = {}
     for name, rows in parameters.items():
         old = rig.parameter(name)
@@ -291,4 +295,4 @@ def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> Rig:
                 f"{tuple(rows[i].shape)}"
             )
         values[id(old)] = rows[i].double()
-    return copied(rig, {}, values)  # pyright: ignore[reportReturnType]
+    return values

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,8 +14,8 @@ from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, condensed, standing
-from torchsoft.solve.steps import own_units
-from torchsoft.solve.trajectory import Trajectory
+from torchsoft.solve.steps import UNITS, own_units
+from torchsoft.solve.trajectory import Ledger, Trajectory, displaced
 
 # Checks of a finished run: whether its energies balance, and whether its pads are pressed beyond
 # the theory.
@@ -56,21 +57,21 @@ def strained(strain: float, time: float) -> str:
     )
 
 
-def energy_scale(run: Trajectory) -> float:
+def energy_scale(ledger: Ledger) -> float:
     """Energy [J] by which a run's ledger is judged: stored at the start, and injected since."""
-    stored = sum(float(part[0].detach()) for part in run.energy.values())
-    return max(stored + float(run.injected[-1].detach()), NEGLIGIBLE)
+    return max(float(ledger.stored[0]) + ledger.injected, NEGLIGIBLE)
 
 
-def missing_energy(run: Trajectory) -> float:
+def missing_energy(ledger: Ledger) -> float:
     """Part of `energy_scale` that a run's ledger lacks, or has too much, at the most."""
-    return float(run.energy_residual.detach().abs().max()) / energy_scale(run)
+    left = ledger.stored - ledger.stored[0] - ledger.supplied + ledger.dissipated.sum(1)
+    return float(np.abs(left).max()) / energy_scale(ledger)
 
 
 def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     """Run warnings: sentences on the faults of a finished run with a ledger, by their subject."""
-    run, found = trajectory, {}
-    scale, part = energy_scale(run), missing_energy(run)
+    run, ledger, found = trajectory, Ledger.of(trajectory), dict[str, str]()
+    scale, part = energy_scale(ledger), missing_energy(ledger)
     if not part <= RESIDUAL:
         longest = float(run.knots.diff().max())
         better = 0.4 * longest * min(1.0, RESIDUAL / part)
@@ -79,14 +80,14 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
             f"and injected since is missing or too much, with steps of {longest:.3g} s; try steps "
             f"of {better:.2g} s"
         )
-    for name, work in run.dissipated.items():
-        back = -float(work.detach().diff(prepend=work[:1].detach()).min())
+    falls = -np.diff(ledger.dissipated, axis=0).min(0, initial=0.0)
+    for name, back in zip(ledger.names, falls):
         if back > SUPPLIED * scale:
             found[f"dissipated {name}"] = (
                 f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "
                 "check its law"
             )
-    if run.stats.failed_steps and "knots" in run.made_by["steps"]:
+    if run.stats.failed_steps and "knots" in ledger.steps:
         found["knots"] = (
             "Newton did not converge in some steps between the given `knots`, which were halved "
             "(`stats.failed_steps`): the run is not one of the same steps; its own `knots` are "
@@ -95,20 +96,23 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     for name in rig.contacts:
         if bounded := softened(run, rig, name):
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"
-    steps, unit = run.made_by["steps"], own_units(rig)["force"]
-    most = max((float(f.detach().norm(dim=-1).max()) for f in run.force.values()), default=0.0)
-    if 0 < RESOLVED * most < (off := steps.get("atol", 0.0) * unit):
-        better = 0.1 * RESOLVED * most
-        remedy = (
-            f"atol = {better / unit:.1g}" if better >= NEWTON else "units that make them larger"
-        )
-        found["atol"] = (
-            f"contact forces reach {most:.2g} N, and `atol` lets a step be off by {off:.2g} N: "
-            f"take {remedy}"
-        )
-    for name, u in run.displacement.items():
-        deepest, height = float(u.detach().norm(dim=-1).max()), rig.pads[name].mesh.height
-        if not deepest <= COMPRESSED * height:
+    most, atol = ledger.force, ledger.steps.get("atol", 0.0)
+    if 0 < RESOLVED * most < atol * UNITS["force"]:
+        unit = own_units(rig)["force"]
+        if RESOLVED * most < (off := atol * unit):
+            better = 0.1 * RESOLVED * most
+            remedy = (
+                f"atol = {better / unit:.1g}" if better >= NEWTON else "units that make them larger"
+            )
+            found["atol"] = (
+                f"contact forces reach {most:.2g} N, and `atol` lets a step be off by {off:.2g} N: "
+                f"take {remedy}"
+            )
+    for name, pad in rig.pads.items():
+        limit, height = COMPRESSED * pad.mesh.height, pad.mesh.height
+        if 2 * ledger.displaced.get(name, np.inf) < limit:  # other nodes give way by less
+            continue
+        if not (deepest := displaced(run, name)) <= limit:
             found[f"pad {name}"] = (
                 f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond "
                 "linear elasticity"

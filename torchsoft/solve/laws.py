@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
-from types import FunctionType
 from typing import Any, NamedTuple
 
 import torch
@@ -27,16 +26,16 @@ from torchsoft.physics.contact import (
     interface_law,
     relative_motion,
     slip_of,
+    stored_law,
 )
 from torchsoft.physics.elements import CONSTANTS, CORNERS, element_potentials
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
-from torchsoft.physics.motion import Reference, polynomial
 from torchsoft.physics.parts import Actuator, weight
-from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
 from torchsoft.physics.validity import tried
 from torchsoft.solve.kernel.arrays import LANES, MOTION, WRENCH
+from torchsoft.solve.structure import copied, structure_of
 
 
 class LawSet(NamedTuple):
@@ -46,42 +45,9 @@ class LawSet(NamedTuple):
     distance: Law
     interface: Law
     free: Law
+    stored: Law
     parameters: dict[str, Tensor]
     states: int
-
-
-def copied(
-    module: nn.Module, known: dict[int, nn.Module], values: Mapping[int, Tensor] | None = None
-) -> nn.Module:
-    """The same modules over the same tensors, or with `values` in the place of some parameters, by
-    their id: tracing, and runs side by side, put others in their place, which other threads must
-    not meet."""
-    if id(module) not in known:
-        out = known[id(module)] = module.__class__.__new__(module.__class__)
-        own: dict[str, Any] = {
-            k: (values or {}).get(id(p), p) for k, p in module._parameters.items()
-        }
-        out.__dict__ = module.__dict__ | {"_parameters": own, "_buffers": dict(module._buffers)}
-        out.__dict__["_modules"] = {
-            k: m if m is None else copied(m, known, values) for k, m in module._modules.items()
-        }
-    return known[id(module)]
-
-
-def snapshot(rig: Rig, reference: Reference | None) -> tuple[Rig, Reference | None]:
-    """The rig, and the reference of a run, with copies of their parameters as they are now, through
-    which gradients pass: another thread may change them during the run. Signals that are not this
-    package's are kept as they are."""
-    known: dict[int, nn.Module] = {}
-    given = [one for one in (rig, reference) if one is not None]
-    for one in (rig.reference, reference):
-        for part in (*one.signals.values(), *([one] if one.own_way else [])) if one else ():
-            if part is one or not polynomial(part):
-                known[id(part)] = part
-    with torch.inference_mode(False), torch.enable_grad():
-        values = {id(p): p.clone() for one in given for p in one.parameters()}
-    copies: list[Any] = [copied(one, known, values) for one in given]
-    return copies[0], copies[1] if copies[1:] else None
 
 
 class _Called(nn.Module):
@@ -111,43 +77,6 @@ def as_law(
     return law, dict(called.named_parameters())
 
 
-def structure(module: object) -> Any:
-    """Structure of a module's law, apart from its parameters' values, hashable: two modules of one
-    structure have one law. None where that is not known: code that is neither this package's nor
-    torch's, hooks, other attributes than numbers, text and functions of this package."""
-    if isinstance(module, nn.Module) and type(module).__module__.startswith(
-        ("torchsoft.", "torch.nn.")
-    ):
-        kind = type(module)
-        own = {k: v for k, v in vars(module).items() if not k.startswith("_")}
-        given = {
-            k: v
-            for base in kind.__mro__[::-1]
-            for k, v in vars(base).items()
-            if isinstance(v, int | float)
-        }
-        parts = tuple((k, structure(v)) for k, v in module._modules.items())
-        buffers = tuple(
-            (k, v.dtype, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None
-        )
-        shapes = tuple((k, tuple(v.shape)) for k, v in module._parameters.items() if v is not None)
-        plain = all(
-            _plain(one) for v in own.values() for one in (v if isinstance(v, tuple) else (v,))
-        )
-        hooked = any(v for k, v in vars(module).items() if k.endswith("_hooks"))
-        if plain and not hooked and all(part is not None for _, part in parts):
-            return kind, kind.forward, tuple(sorted((given | own).items())), parts, buffers, shapes
-    return None
-
-
-def _plain(value: object) -> bool:
-    """Whether an attribute says all of itself: a number, text, or a function of this package
-    without a closure."""
-    if isinstance(value, FunctionType):
-        return (value.__module__ or "").startswith("torchsoft.") and value.__closure__ is None
-    return isinstance(value, bool | int | float | str | None)
-
-
 _laws: dict[Any, Law] = {}
 """Compiled laws, by the structure of their modules, else by their traced expressions."""
 
@@ -169,7 +98,7 @@ def compiled_law(
     parameters `names`, of which it may not use all; `points` says that it is the law of a contact
     point, whatever the others do; `conjugates` and `lanes` are those of `compile_law`. Raises
     `UnknownOperation` naming the line of a law that cannot be compiled."""
-    decided = tuple((name, structure(module)) for name, module in modules.items())
+    decided = tuple((name, structure_of(module)) for name, module in modules.items())
     shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
     with _compiling:
         known = all(part is not None for _, part in decided)
@@ -329,6 +258,7 @@ def contact_laws(law: Any, shape: Any) -> LawSet:
             shape=shape,
         ),
         compiled_law(parameters, free_law, states + 2, states, states, law=law),
+        compiled_law(parameters, stored_law, 3, 0, 0, law=law),
         parameters,
         states,
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """State and results of a run of the stepper, chunk by chunk, and its failures."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,13 +26,16 @@ class Progress:
     """Results of the stepper so far: rows of the output grid, its steps, and its counters.
 
     integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them; rate: of
-    the displacements of nodal pads [m/s].
+    the displacements of nodal pads [m/s]; signals: values and rates, fixed coordinates last;
+    stored: energy [J], nan with nodal pads.
     """
 
     y: Array
     integrals: Array
     recorded: Array
     rate: Array
+    signals: Array
+    stored: Array
     rows: int = 1
     steps: int = 0
     solves: int = 0
@@ -41,6 +44,16 @@ class Progress:
     starts: list[Array] = field(default_factory=list)
     end: float = 0.0
     origin: float = 0.0
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """Rows of the outputs: states, integrals, forces, rates, signals, energies."""
+        return self.y, self.integrals, self.recorded, self.rate, self.signals, self.stored
+
+    def apart(self) -> "Progress":
+        """The same with rows of its own."""
+        own = ("y", "integrals", "recorded", "rate", "signals", "stored")
+        return replace(self, **{name: getattr(self, name).copy() for name in own})
 
     @property
     def knots(self) -> Array:
@@ -86,10 +99,11 @@ class Integrals:
 
 @dataclass
 class RunState:
-    """A run in progress: the state, Newton's scratch, the last step, the integrals, and where its
-    results go."""
+    """A run in progress: the state, the rig's arrays, Newton's scratch, the last step, the
+    integrals, and where its results go."""
 
     y: Array
+    system: Any
     work: Any
     step: Any
     integrals: Array

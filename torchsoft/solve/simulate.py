@@ -3,10 +3,12 @@
 
 import time as clock
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -14,10 +16,10 @@ from tqdm import tqdm
 from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.energy import stored
-from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
+from torchsoft.physics.state import State
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts, instability
 from torchsoft.solve.gradients import (
@@ -29,12 +31,11 @@ from torchsoft.solve.gradients import (
     march,
     without_gradient,
 )
-from torchsoft.solve.laws import snapshot
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.steps import check_times
-from torchsoft.solve.system import independent
-from torchsoft.solve.trajectory import Stats, Touch, Trajectory, channels, units
+from torchsoft.solve.system import Reading
+from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory, channels, units
 
 Route = Literal["none", "discrete", "forward"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`."""
@@ -119,9 +120,11 @@ def prepare(
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
-    touch: Sequence[str] = (),
+    touch: Sequence[str] = (), reading: Reading | None = None,
+    values: Mapping[int, Tensor] | None = None,
 ) -> Task:  # fmt: skip
-    """Checks the arguments of `simulate`; raises its `ValueError`s."""
+    """Checks the arguments of `simulate`, and takes `values` in the place of some parameters of
+    the rig of a `reading`, by their id; raises its `ValueError`s."""
     t = tensor("t", t)
     start = tensor("y0", y0)
     knots, dy0 = (
@@ -135,17 +138,18 @@ def prepare(
         raise ValueError(f"{' and '.join(given)} each say which steps to take; give one of them")
     if rtol is None:
         rtol = RTOL if atol is None else 10 * positive("atol", atol)
-    now, followed = rig, reference
-    if isinstance(rig, Rig) and isinstance(reference, Reference | None):
-        now, followed = snapshot(rig, reference)
     stepper = ImplicitStepper(
-        now,
-        followed,
+        rig,
+        reference,
         step=step,
         rtol=rtol,
         atol=0.1 * positive("rtol", rtol) if atol is None else atol,
         knots=knots,
         tolerance=tolerance,
+        reading=reading,
+        values=values,
+        differentiable=gradient == "forward"
+        or (gradient == "discrete" and torch.is_grad_enabled()),
     )
     check_times(t, step)
     stepper.check_start(start)
@@ -305,53 +309,133 @@ def gather(
     slopes: tuple[Tensor, Tensor] | None = None,
 ) -> Trajectory:  # fmt: skip
     """The trajectory of the rows that the stepper has finished, which carry the gradient, if any is
-    wanted."""
-    stepper, count, touch = task.stepper, out.rows, Touch(task.stepper.rig)
-    rig, names, t = stepper.rig, stepper.integrals, task.t[:count]
-    y, felt = (part[:count] for part in rows)
-    integrals = dict(zip(names.names, torch.from_numpy(out.integrals[:count]).unbind(-1)))
-    sizes = [2 * count for count in rig.point_counts.values()]
-    with torch.set_grad_enabled(y.requires_grad), independent():
-        *forces, wrenches, loads = felt.split(
-            [*sizes, 3 * len(rig.pads), 3 * len(rig.bodies) + 3], -1
-        )
-        signals = rig.follow(t, stepper.reference)
-        state = rig.unpack(y, signals)
-        moments = dict(zip(rig.pads, wrenches[:, 2::3].unbind(-1)))
-        measured = channels(rig, state, signals, moments)
-        displacement = {name: rig.displacement(name, state) for name in rig.pads}
-        energy = stored(rig, state, displacement)
-        integrals = {name: without_gradient(name, x, y) for name, x in integrals.items()}
-        force = {name: part.unflatten(-1, (-1, 2)) for name, part in zip(rig.contacts, forces)}
-        load = dict(zip(rig.bodies, loads.unflatten(-1, (-1, 3)).unbind(1)))
-    given = "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
-    steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
-    return Trajectory(
-        t=t, y=y, state=state, channels=measured, force=force, loads=load, recorded=felt,
-        rates=nodal_rates(rig, out.rate[:count]),
-        displacement=displacement, energy=energy,
-        dissipated={name: integrals[name] for name in names.dissipated},
-        supplied={name: integrals[name] for name in names.supplied if name in names.active},
-        injected=integrals["injected"],
+    wanted. What is made of them is made when it is asked for; at once where code of users makes it,
+    which may do otherwise later."""
+    stepper, count = task.stepper, out.rows
+    model, (y, felt) = stepper.compiled.model, (part[:count] for part in rows)
+    rest = _Rest(stepper, task.t[:count], y, felt, out)
+    touch = Touch(stepper.rig)
+    own: dict[str, Any] = {"sensitivities": None, "touch_sensitivities": {}}
+    if slopes is not None:
+        of_touch = touch.slopes(task.touch, slopes[1][:count], felt).unbind(1)
+        own = {"sensitivities": slopes[0][:count]}
+        own["touch_sensitivities"] = dict(zip(task.touch, of_touch))
+    made = Trajectory.later(
+        rest, t=rest.t, y=y, recorded=felt, touch=touch, layout=model.layout, wrt=task.wrt,
         stats=Stats(out.steps, out.solves, out.failed, out.refused, wall),
-        knots=torch.from_numpy(out.knots), layout=rig.layout, touch=touch,
-        made_by={"torchsoft": VERSION, "method": METHOD, **rig.description(), "steps": steps},
-        wrt=task.wrt,
-        sensitivities=None if slopes is None else slopes[0][:count],
-        touch_sensitivities={}
-        if slopes is None
-        else dict(
-            zip(task.touch, touch.slopes(task.touch, slopes[1][:count], felt).unbind(1))
-        ),
-        units=units(rig), setup=Setup.of(rig), rig=task.rig or rig,
+        rig=task.rig or stepper.rig, **own,
     )  # fmt: skip
+    if not model.shared or not stepper.followed.known:
+        made.complete()
+    return made
 
 
-def nodal_rates(rig: Rig, rate: Array) -> dict[str, Tensor]:
-    """Rates (T, nodes, 2) of the displacements of nodal pads, from those of all of their dofs."""
-    pads = {name: 2 * pad.nodes for name, pad in rig.pads.items() if pad.nodal}
-    parts = torch.from_numpy(rate).split(list(pads.values()), -1)
-    return {name: part.unflatten(-1, (-1, 2)) for name, part in zip(pads, parts)}
+class _Rest:
+    """Parts of a trajectory that are made of the rows of a run, and of the rig of the run."""
+
+    def __init__(
+        self, stepper: ImplicitStepper, t: Tensor, y: Tensor, felt: Tensor, out: Progress
+    ) -> None:
+        self._rig, self._reference, self._motion = stepper.rig, stepper.reference, stepper.followed
+        self._compiled, self._out, self.t, self._y = stepper.compiled, out, t, y
+        given = (
+            "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
+        )
+        tolerances = {"rtol": stepper.rtol, "atol": stepper.atol}
+        self._steps = {given: stepper.step} if given else tolerances
+        self._model, self._felt, self._count = stepper.compiled.model, felt, len(y)
+
+    @property
+    def ledger(self) -> Ledger | None:
+        """What the run is judged by; None with nodal pads, whose energies the kernel does not
+        know."""
+        model, out, names = self._model, self._out, self._model.integrals
+        if model.nodal:
+            return None
+        integrals, ends = out.integrals[: self._count], len(names.dissipated)
+        felt = self._felt.detach().numpy()[:, : sum(model.felt[:-2])]
+        force = (felt**2).reshape(self._count, -1, 2).sum(-1).max(initial=0.0)
+        return Ledger(
+            out.stored[: self._count], names.dissipated, integrals[:, :ends],
+            integrals[:, ends:-1].sum(1), float(integrals[-1, -1]), float(np.sqrt(force)),
+            model.displaced(self._compiled.numbers, out.y[: self._count]), self._steps,
+        )  # fmt: skip
+
+    @cached_property
+    def knots(self) -> Tensor:
+        return torch.from_numpy(self._out.knots)
+
+    @cached_property
+    def _parts(self) -> tuple[Tensor, ...]:
+        return self._felt.split(self._model.felt, -1)
+
+    @cached_property
+    def force(self) -> dict[str, Tensor]:
+        return {k: x.unflatten(-1, (-1, 2)) for k, x in zip(self._model.rig.contacts, self._parts)}
+
+    @cached_property
+    def loads(self) -> dict[str, Tensor]:
+        return dict(zip(self._model.rig.bodies, self._parts[-1].unflatten(-1, (-1, 3)).unbind(1)))
+
+    @cached_property
+    def rates(self) -> dict[str, Tensor]:
+        nodal = self._model.nodal
+        parts = torch.from_numpy(self._out.rate[: self._count]).split([*nodal.values()], -1)
+        return {name: x.unflatten(-1, (-1, 2)) for name, x in zip(nodal, parts)}
+
+    def _integrals(self, names: Iterable[str]) -> dict[str, Tensor]:
+        every, rows = self._model.integrals.names, torch.from_numpy(self._out.integrals)
+        found = {name: rows[: self._count, every.index(name)] for name in names}
+        return {name: without_gradient(name, x, self._y) for name, x in found.items()}
+
+    @cached_property
+    def dissipated(self) -> dict[str, Tensor]:
+        return self._integrals(self._model.integrals.dissipated)
+
+    @cached_property
+    def supplied(self) -> dict[str, Tensor]:
+        names = self._model.integrals
+        return self._integrals(name for name in names.supplied if name in names.active)
+
+    @cached_property
+    def injected(self) -> Tensor:
+        return self._integrals(["injected"])["injected"]
+
+    @cached_property
+    def _followed(self) -> Tensor:
+        """The signals at the outputs, with their graph where there is one."""
+        known = None if self._y.requires_grad else self._motion.at(self.t)
+        return self._rig.follow(self.t, self._reference) if known is None else known
+
+    @cached_property
+    def state(self) -> State:
+        return self._rig.unpack(self._y, self._followed)
+
+    @cached_property
+    def channels(self) -> dict[str, Tensor]:
+        moments = dict(zip(self._rig.pads, self._parts[-2][:, 2::3].unbind(-1)))
+        return channels(self._rig, self.state, self._followed, moments)
+
+    @cached_property
+    def displacement(self) -> dict[str, Tensor]:
+        return {name: self._rig.displacement(name, self.state) for name in self._rig.pads}
+
+    @cached_property
+    def energy(self) -> dict[str, Tensor]:
+        return stored(self._rig, self.state, self.displacement)
+
+    @cached_property
+    def made_by(self) -> dict[str, Any]:
+        made = {"torchsoft": VERSION, "method": METHOD}
+        return {**made, **self._rig.description(), "steps": self._steps}
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        return units(self._rig)
+
+    @cached_property
+    def setup(self) -> Setup:
+        return Setup.of(self._rig)
 
 
 # Inputs of a run: numbers in any usual form, and a start whose graph may be shared.

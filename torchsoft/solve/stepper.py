@@ -1,6 +1,6 @@
 """The implicit stepper: the compiled kernels fed from a rig, chunk by chunk."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from typing import Any
 
@@ -29,12 +29,11 @@ from torchsoft.solve.kernel.arrays import (
     Outputs,
     Run,
     Tape,
-    recorded_size,
     room,
 )
 from torchsoft.solve.kernel.objects import call
-from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.progress import Integrals, Progress, RunState, Segment, SimulationFailed
+from torchsoft.solve.kernel.table import Array, change
+from torchsoft.solve.progress import Progress, RunState, Segment, SimulationFailed
 from torchsoft.solve.steps import (
     CHUNK,
     LONGEST,
@@ -43,12 +42,9 @@ from torchsoft.solve.steps import (
     check_knots,
     check_times,
     equal_steps,
-    error_parts,
     given_steps,
-    own_units,
-    part_name,
 )
-from torchsoft.solve.system import Compiled
+from torchsoft.solve.system import Compiled, Reading
 
 HALVINGS = 6
 """Most halvings of a step that Newton does not solve before the run fails."""
@@ -97,15 +93,16 @@ class ImplicitStepper:
         rtol: float = 1e-3, atol: float = 1e-4, knots: Tensor | None = None,
         tolerance: float = 1e-9, max_iterations: int = 40, window: float = 2e-3,
         longest: float = LONGEST, landing: bool = False,
+        reading: Reading | None = None, values: Mapping[int, Tensor] | None = None,
+        differentiable: bool = True,
     ) -> None:  # fmt: skip
         if not isinstance(rig, Rig):
             raise ValueError(
                 "`rig` must be a Rig, but is "
                 f"{rig if isinstance(rig, type) else type(rig).__name__}"
             )
-        followed = rig.reference if reference is None else reference
-        if not isinstance(followed, Reference):
-            raise ValueError(f"`reference` must be a Reference, but is {type(followed).__name__}")
+        if not isinstance(reference, Reference | None):
+            raise ValueError(f"`reference` must be a Reference, but is {type(reference).__name__}")
         self.step = None if step is None else positive("step", step)
         self.rtol, self.atol = positive("rtol", rtol), positive("atol", atol)
         if self.rtol >= 1:
@@ -117,15 +114,18 @@ class ImplicitStepper:
         self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
         self.knots = None if knots is None else check_knots(knots)
-        self.rig, self.reference = rig, followed
-        self.compiled = Compiled(rig)
-        if self.tolerance < (least := SMALLEST_TOLERANCE * own_units(rig)["force"]):
+        self.compiled = Compiled(
+            rig, reference, reading=reading, values=values, differentiable=differentiable
+        )
+        self.rig, self.reference = self.compiled.rig, self.compiled.reference
+        if self.tolerance < (least := SMALLEST_TOLERANCE * self.compiled.units["force"]):
             raise ValueError(
                 f"`tolerance` must be at least {least:.3g} N, but is {tolerance:g} N, "
                 "which rounding hides"
             )
-        self.layout, self.integrals = self.compiled.layout, Integrals(rig)
-        self._since(0.0)
+        self.layout, self.integrals = self.compiled.layout, self.compiled.model.integrals
+        self.origin = 0.0
+        self._motion: Followed | None = None
         self._cap, self._shortest = 64, SHORTEST
 
     def along(self, knots: Array) -> "ImplicitStepper":
@@ -137,17 +137,20 @@ class ImplicitStepper:
     def following(self, reference: Reference) -> "ImplicitStepper":
         """The same on another reference; the rig stays as it was read."""
         other = copy(self)
-        other.reference = reference
-        other._since(0.0)
+        other.reference, other._motion, other.origin = reference, None, 0.0
         return other
 
-    def _since(self, origin: float) -> None:
-        """Count time from `origin` [s]."""
-        self.origin, self._followed = origin, self.reference.since(origin)
+    def moving(self, motion: Followed, origin: float) -> "ImplicitStepper":
+        """The same with signals as the kernels take them, time counting from `origin` [s]; no
+        derivative can be taken by them."""
+        other = copy(self)
+        other._motion = other.followed = motion
+        other.origin = origin
+        return other
 
     def signals_at(self, times: Tensor) -> Tensor:
         """The signals at times (...) [s] since the origin (..., signals, 2)."""
-        return self.compiled.signals(times, self._followed)
+        return self.compiled.signals(times, self.reference.since(self.origin))
 
     def _call(
         self, now: "RunState", plan: Plan, signals: Array, at_outputs: Array, rows: slice,
@@ -162,21 +165,19 @@ class ImplicitStepper:
         now.work.travelled[0] = np.inf
         now.work.low[:] = now.work.high[:] = 0
         now.work.held[:] = 0.0
-        y = out.y[rows]
-        tape, out_tape = (
-            room("Tape", self.system, self.layout.size, stages=n, cap=self._cap)
-            for n in ((2 * steps, len(y) if now.outputs_too else 0) if taping else (0, 0))
-        )
-        if taping and now.outputs_too:
-            out_tape = out_tape._replace(y=y)
-        outputs = Outputs(
-            plan.out_step, plan.out_part, at_outputs, y, out.integrals[rows], out.recorded[rows],
-            out.rate[rows], out_tape,
-        )  # fmt: skip
-        most = self.max_iterations if steps else START_ITERATIONS
-        limits = Limits(self.tolerance, most, self.window)
+        here = [part[rows] for part in out.arrays]
+        tape = out_tape = self.compiled.model.no_tape
+        if taping:
+            tape, out_tape = (
+                room("Tape", now.system, self.layout.size, stages=n, cap=self._cap)
+                for n in (2 * steps, len(here[0]) if now.outputs_too else 0)
+            )
+            if now.outputs_too:
+                out_tape = out_tape._replace(y=here[0])
+        here[4] = at_outputs
         run = Run(
-            self.system, now.work, now.step, follow, errors, limits, outputs, tape, given,
+            now.system, now.work, now.step, follow, errors, *self.limits,
+            outputs(plan, here, out_tape), tape, given,
             now.y, k, clock, stops, times, row, self.rtol, self.longest,
             self._shortest, now.integrals, plan.starts, plan.h,
             signals.reshape(steps, 2, *signals.shape[1:]), counts,
@@ -184,6 +185,18 @@ class ImplicitStepper:
         with released_turn():
             call("run", run)
         return counts.tolist(), (tape, out_tape) if taping else None
+
+    @property
+    def limits(self) -> tuple[Limits, Limits]:
+        """Limits of Newton's method, and those at a start."""
+        most = self.max_iterations, START_ITERATIONS
+        limits, start = (Limits(self.tolerance, one, self.window) for one in most)
+        return limits, start
+
+    def signals_now(self, t: Tensor) -> Tensor:
+        """The signals at t [s] of the last run, without fixed coordinates (..., signals, 2)."""
+        known = self.followed.at(t) if self._motion is not None else None
+        return self.rig.follow(t, self.reference) if known is None else known
 
     @property
     def signals_at_start(self) -> Tensor:
@@ -220,25 +233,25 @@ class ImplicitStepper:
         """
         self.check_start(y0)
         check_times(t, self.step)
-        self._since(float(t[0]))
+        self.origin = float(t[0])
+        self.followed = self._motion or self.compiled.followed(self.reference, self.origin)
         self._shortest = min(SHORTEST, PART * float(t[-1] - t[0]))
-        s, names = self.system, self.integrals.names
-        out = self._room(len(t))
-        work = room("Work", s, self.layout.size, columns=1)
-        step = room("Step", s, self.layout.size, integrals=len(names))
-        y, integrals = y0.numpy().copy(), np.zeros(len(names))
-        set_velocities(s, work, y)
-        state = RunState(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
-        self._start(state)
-        set_velocities(s, work, y)
+        model, out = self.compiled.model, self._room(len(t))
+        place = model.take(self.compiled.numbers)
+        y, integrals = y0.numpy().copy(), np.zeros(len(self.integrals.names))
+        set_velocities(place.system, place.work, y)
+        state = RunState(y, *place, integrals, out, segments, tape_bytes, outputs_too)
         yield from (
             self._by_tolerance(t, state)
             if self.step is None and self.knots is None
             else self._as_given(t, state)
         )
+        model.give(place)  # not after a failure, which may leave numbers that are none
 
     def _as_given(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take the steps of a plan."""
+        now.out.signals[0] = self.signals_at(torch.zeros(1, dtype=torch.float64)).numpy()
+        self._start(now)
         todo = list(
             given_steps(t, self.knots)
             if self.knots is not None
@@ -289,56 +302,91 @@ class ImplicitStepper:
                 pending.append((half, *new, halvings + 1))
             elif status != CONVERGED:
                 since, h = float(plan.starts[steps]), float(plan.h[steps])
-                raise self._failure(now.work, status, since, h)
+                raise self._failure(now, status, since, h)
 
     def _by_tolerance(self, t: Tensor, now: "RunState") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
-        times, out = np.ascontiguousarray(t.numpy() - self.origin), now.out
-        followed = Followed(self.signals_at, self.rig, self._followed)
+        times, out, model = (
+            np.ascontiguousarray(t.numpy() - self.origin),
+            now.out,
+            self.compiled.model,
+        )
+        followed = self.followed
+        if now.segments is None:
+            out.rows = 0  # the start is the first row of the first call
+        else:
+            self._start(now, followed)
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > times[0]) & (stops <= times[-1])]
-        errors = error_parts(self.rig, now.y, self.atol)
+        errors = model.errors.of(now.y, self.atol, self.compiled.units)
         clock, k = np.array([times[0], min(FIRST, times[-1] - times[0]), 1.0]), now.step.K[0].copy()
-        count = self.compiled.signal_count
+        count, at_rows = self.compiled.signal_count, out.signals
         row_step, row_part = np.zeros(len(t), np.int64), np.zeros(len(t))
         while out.rows < len(t):
             plan = Plan(np.zeros(CHUNK), np.zeros(CHUNK), row_step, row_part)
-            flat, at_rows = np.zeros((2 * CHUNK, count, 2)), np.zeros((len(t), count, 2))
-            before = now.copy()
-            (steps, done, status, solves, refused, failed, which), tapes = self._call(
+            flat = np.zeros((2 * CHUNK, count, 2))
+            before = now.copy() if now.segments is not None else ()
+            counts, tapes = self._call(
                 now, plan, flat, at_rows, slice(None),
                 taping=now.taping, given=False, follow=followed.arrays, errors=errors, k=k,
                 clock=clock, stops=stops, times=times, row=out.rows,
             )  # fmt: skip
-            if followed.error is not None:
-                raise followed.error
-            here = slice(out.rows, out.rows + done)
+            followed.check()
+            row = out.rows
+            failure = self.advanced(out, now, counts, clock)
+            steps, here = counts[0], slice(row, out.rows)
+            if row == 0:
+                self._check_signals(at_rows[0])
             plan = Plan(
                 plan.starts[:steps], plan.h[:steps], row_step[here].copy(), row_part[here].copy()
             )
             if tapes is not None:
                 tapes = tapes[0], Tape(*(part[here] for part in tapes[1]))
             now.keep(plan, flat[: 2 * steps], at_rows[here], before, here, tapes)
-            out.rows, out.steps, out.solves = here.stop, out.steps + steps, out.solves + solves
-            out.refused, out.failed = out.refused + refused, out.failed + failed
-            yield out
-            if status == TAPE_FULL:
+            if row or out.rows:
+                yield out
+            if failure is not None:
+                raise failure
+            if counts[2] == TAPE_FULL:
                 self._cap *= 2
-            elif status != CONVERGED:
-                worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
-                raise self._failure(now.work, status, float(clock[0]), float(clock[1]), worst)
 
-    def _start(self, now: "RunState") -> None:
-        """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
-        `SimulationFailed`."""
-        signals = self.signals_at(torch.zeros(1, dtype=torch.float64)).numpy()
+    def advanced(
+        self, out: Progress, now: Any, counts: Sequence[int], clock: Array
+    ) -> SimulationFailed | None:
+        """Note what a call by tolerances has done; why the run ends there, if it does. `now` is
+        what the last stage left."""
+        steps, done, status, solves, refused, failed, which = counts
+        begun = out.rows + done > 0
+        out.rows, out.steps, out.solves = out.rows + done, out.steps + steps, out.solves + solves
+        out.refused, out.failed = out.refused + refused, out.failed + failed
+        if not begun:
+            return self._failure(now, status, 0.0, INSTANT)
+        if status in (CONVERGED, TAPE_FULL):
+            return None
+        worst = self.compiled.model.errors.names[which] if which >= 0 else "the state"
+        return self._failure(now, status, float(clock[0]), float(clock[1]), worst)
+
+    def _start(self, now: "RunState", followed: Followed | None = None) -> None:
+        """Nodal forces, moments and loads at the start, the first row, and the rates there; the
+        signals are those in the first row, or are found by the kernel. Raises `SimulationFailed`
+        and, for signals that are none, `ValueError`."""
+        signals = now.out.signals[:1]
         none = np.zeros((0, *signals.shape[1:]))
         plan = Plan(np.zeros(1), np.zeros(0), np.zeros(1, np.int64), np.zeros(1))
         before, here = now.copy(), slice(0, 1)
-        _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping)
+        _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping, followed)
+        if followed is not None:
+            followed.check()
+            self._check_signals(signals)
         if status != CONVERGED:
-            raise self._failure(now.work, status, 0.0, INSTANT)
+            raise self._failure(now, status, 0.0, INSTANT)
         now.keep(plan, none, signals, before, here, tapes)
+        set_velocities(now.system, now.work, now.y)
+
+    def _check_signals(self, start: Array) -> None:
+        """Raises `ValueError` for signals that are not finite at the start."""
+        if not np.isfinite(start).all():
+            self.signals_at(torch.zeros(1, dtype=torch.float64))
 
     def signals(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all stages of some plans (stages, signals, 2)."""
@@ -351,10 +399,10 @@ class ImplicitStepper:
 
     def _room(self, rows: int) -> Progress:
         """Room for so many outputs."""
-        s, names = self.system, self.integrals.names
-        widths = self.layout.size, len(names), recorded_size(s), int(s.nodal_dof_start[-1])
+        widths = self.compiled.model.widths
         y, integrals, recorded, rate = (np.zeros((rows, width)) for width in widths)
-        return Progress(y, integrals, recorded, rate, origin=self.origin)
+        signals = np.zeros((rows, self.compiled.signal_count, 2))
+        return Progress(y, integrals, recorded, rate, signals, np.zeros(rows), origin=self.origin)
 
     @property
     def system(self) -> Any:
@@ -371,6 +419,7 @@ class ImplicitStepper:
         work.V[:], work.u_dot[:], work.rate[:] = segment.V, segment.u_dot, segment.rate
         again = RunState(
             segment.y.copy(),
+            s,
             work,
             room("Step", s, self.layout.size, integrals=names),
             np.zeros(names),
@@ -386,24 +435,26 @@ class ImplicitStepper:
 
     def _run(
         self, plan: Plan, signals: Array, at_outputs: Array, now: "RunState", rows: slice,
-        taping: bool,
+        taping: bool, followed: Followed | None = None,
     ) -> tuple[int, int, int, int, tuple[Any, Any] | None]:  # fmt: skip
-        """One compiled call of given steps; with `taping` once more with longer tapes if more
-        points touch than they have room for."""
-        before = now.copy()
+        """One compiled call of given steps, or of a start with the signals `followed`; with
+        `taping` once more with longer tapes if more points touch than they have room for."""
+        before, own = now.copy(), dict[str, Any]()
+        if followed is not None:
+            own = {"given": False, "follow": followed.arrays, "times": np.zeros(1)}
         while True:
             (done, rows_done, status, solves, *_), tapes = self._call(
-                now, plan, signals, at_outputs, rows, taping=taping
+                now, plan, signals, at_outputs, rows, taping=taping, **own
             )
             if status != TAPE_FULL:
                 return done, rows_done, status, solves, tapes
             self._cap *= 2
             now.back(before)
 
-    def _lost(self, work: Any) -> str:
+    def _lost(self, now: "RunState") -> str:
         """A sentence on the first body that is no longer on its pad where the last stage ended;
         empty if none is."""
-        s = self.system
+        s, work = now.system, now.work
         for c, contact in enumerate(self.rig.contacts.values()):
             pad, body = s.contact_pad[c], contact.body
             at, n = s.pad_point_start[pad], work.actives[pad]
@@ -416,9 +467,9 @@ class ImplicitStepper:
         return ""
 
     def _failure(
-        self, work: Any, status: int, since: float, h: float, worst: str = ""
+        self, now: "RunState", status: int, since: float, h: float, worst: str = ""
     ) -> SimulationFailed:
-        """The failure at a time `since` the origin [s]; `work` is what the last stage left."""
+        """The failure at a time `since` the origin [s], of what the last stage left."""
         time = self.origin + since
         if h == INSTANT:
             most, tried, instead = START_ITERATIONS, "at the start", "another start"
@@ -432,12 +483,80 @@ class ImplicitStepper:
             NEWTON_FAILED: f"Newton's iteration did not converge within {most} iterations {tried}; "
             f"try {instead}, or a larger v_s of the friction law: where friction falls with slip "
             "faster than the pads damp, massless pads have no unique velocity",
-            **dict.fromkeys((OFF_THE_PAD, LOST), self._lost(work)),
+            **dict.fromkeys((OFF_THE_PAD, LOST), self._lost(now)),
             REFUSED: f"the tolerances would need steps below {self._shortest:.3g} s for {worst}; "
             "loosen rtol or atol, or look for a jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
         }
         return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)
+
+
+class Repeated:
+    """Runs by tolerances of one stepper through so many times, one after the other, in arrays and
+    tables that are made once: without given steps, `landing`, or a derivative. For one thread at a
+    time."""
+
+    def __init__(self, stepper: ImplicitStepper, rows: int, motion: Followed) -> None:
+        model = stepper.compiled.model
+        numbers, ends = np.zeros((2, CHUNK)), np.zeros(rows, np.int64)
+        self._plan = plan = Plan(numbers[0], numbers[1], ends, np.zeros(rows))
+        self.system, self.work, self.step = model.take(stepper.compiled.numbers)
+        self._out, self._y = stepper._room(rows), np.zeros(model.layout.size)
+        self._integrals, self._k = np.zeros(self._out.integrals.shape[1]), self._y.copy()
+        self._clock, self._times, self._counts = START.copy(), np.zeros(rows), np.zeros(7, np.int64)
+        self._stops, self._motion = np.zeros(len(motion.stops) + 1), motion.arrays
+        self._errors = model.errors.of(self._y, stepper.atol, stepper.compiled.units)
+        signals = np.zeros((CHUNK, 2, *self._out.signals.shape[1:]))
+        self._table = Run(
+            self.system, self.work, self.step, self._motion, self._errors, *stepper.limits,
+            outputs(plan, self._out.arrays, model.no_tape), model.no_tape, False, self._y, self._k,
+            self._clock, self._stops, self._times, 0, stepper.rtol, stepper.longest, SHORTEST,
+            self._integrals, plan.starts, plan.h, signals, self._counts,
+        )  # fmt: skip
+
+    def run(
+        self, stepper: ImplicitStepper, y0: Array, t: Array
+    ) -> tuple[Progress, SimulationFailed | None]:
+        """From y0 (size,) through the times t (rows,) [s], along a motion of as many pieces as the
+        first; and why that ended early, if it did."""
+        times, motion, out = t - t[0], stepper.followed, self._out
+        self._y[:], self._times[:], self._integrals[:] = y0, times, 0.0
+        reset(self.system, self.work, self._y)
+        moving = ("at", "span", "control")
+        errors = stepper.compiled.model.errors.of(self._y, stepper.atol, stepper.compiled.units)
+        pairs = [(getattr(self._motion, k), getattr(motion.arrays, k)) for k in moving]
+        for own, given in (*pairs, *zip(self._errors[3:], errors[3:])):
+            own[:] = given
+        stops = motion.stops[(motion.stops > 0.0) & (motion.stops <= times[-1])]
+        self._stops[:] = times[-1]
+        self._stops[: len(stops)] = stops
+        self._clock[:] = 0.0, min(FIRST, times[-1]), 1.0
+        done = Progress(*out.arrays, rows=0, origin=float(t[0]))
+        failure, (starts, h) = None, self._plan[:2]
+        while failure is None and done.rows < len(t):
+            change(self._table, row=done.rows, shortest=min(SHORTEST, PART * times[-1]))
+            with released_turn():
+                call("run", self._table)
+            failure = stepper.advanced(done, self, self._counts.tolist(), self._clock)
+            if steps := int(self._counts[0]):
+                done.starts.append(starts[:steps].copy())
+                done.end = float(starts[steps - 1] + h[steps - 1])
+        return done.apart(), failure
+
+
+def outputs(plan: Plan, rows: Sequence[Array], tape: Any) -> Outputs:
+    """Where the outputs of a plan go: to rows of a `Progress`."""
+    y, integrals, recorded, rate, signals, stored = rows
+    return Outputs(
+        plan.out_step, plan.out_part, signals, y, integrals, recorded, rate, stored, tape
+    )
+
+
+def reset(s: Any, work: Any, y: Array) -> None:
+    """Newton's first guess: the velocities of the state."""
+    for part in (work.V, work.u_dot, work.rate):
+        part.fill(0.0)
+    set_velocities(s, work, y)
 
 
 def stage_times(plan: Plan) -> Tensor:

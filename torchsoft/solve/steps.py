@@ -2,7 +2,8 @@
 
 import ctypes
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchsoft.physics.motion import Reference
+from torchsoft.physics.motion import Reference, evaluate
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
@@ -90,13 +91,16 @@ def check_times(t: Tensor, step: float | None = None) -> None:
         raise ValueError(
             "`t` must not require a gradient, since none is computed by the times; use t.detach()"
         )
-    if not bool(torch.isfinite(t).all()) or not bool((t.diff() > 0).all()):
-        bad = int((~(t.diff() > 0)).nonzero()[0, 0]) if bool(torch.isfinite(t).all()) else 0
+    times = t.numpy()
+    apart, finite = np.diff(times), bool(np.isfinite(times).all())
+    if not finite or not (apart > 0).all():
+        bad = int(np.flatnonzero(~(apart > 0))[0]) if finite else 0
         raise ValueError(
             f"`t` must increase strictly and be finite, but t[{bad}:{bad + 2}] = "
-            f"{t[bad : bad + 2].tolist()}"
+            f"{times[bad : bad + 2].tolist()}"
         )
-    if (count := float(t[-1] - t[0]) / (LONGEST if step is None else step)) > MOST_STEPS:
+    first, last = float(times[0]), float(times[-1])
+    if (count := (last - first) / (LONGEST if step is None else step)) > MOST_STEPS:
         raise ValueError(
             f"`t` and `step` ask for {count:.3g} steps, but at most {MOST_STEPS:.3g} can be taken "
             "in one run; take less time"
@@ -106,14 +110,14 @@ def check_times(t: Tensor, step: float | None = None) -> None:
                 else " or longer steps"
             )
         )
-    rounding = 16 * torch.finfo(torch.float64).eps
-    finest = max(SHORTEST, rounding * float(t.abs().max()))
-    if float(t.diff().min()) < finest:
+    rounding = 16 * np.finfo(np.float64).eps
+    finest = max(SHORTEST, rounding * max(abs(first), abs(last)))
+    if apart.min() < finest:
         raise ValueError(
             f"`t` must be further apart than {finest:.1g} s, the float64 resolution at "
             "these times; count them from the beginning of the run"
         )
-    finest = max(SHORTEST, rounding * float(t[-1] - t[0]))
+    finest = max(SHORTEST, rounding * (last - first))
     if step is not None and step < finest:
         raise ValueError(
             f"`step` must be longer than {finest:.1g} s, the float64 resolution at the end of "
@@ -191,100 +195,145 @@ THIN = 0.1
 """Unit of lengths over the size of the smallest body, at the most."""
 
 
-def own_units(rig: Rig) -> dict[str, float]:
+def own_units(rig: Rig, smallest: float | None = None) -> dict[str, float]:
     """Units of `atol` for a rig: `UNITS`, or what its bodies weigh or would weigh, and a part of
-    the smallest one, where they are less."""
+    the `smallest` one [m], where they are less."""
     free = [one for one in rig.bodies.values() if "free" in one.freedom.values()]
     weight = sum(float(one.mass.detach() * rig.gravity.detach()) for one in free)
-    shapes = [one.shape for one in rig.bodies.values() if one.shape is not None]
-    size = min((one.size() for one in shapes), default=math.inf)
-    most = {"force": weight or math.inf, "length": THIN * size, "angle": math.inf}
+    if smallest is None:
+        shapes = [one.shape for one in rig.bodies.values() if one.shape is not None]
+        smallest = min((one.size() for one in shapes), default=math.inf)
+    most = {"force": weight or math.inf, "length": THIN * smallest, "angle": math.inf}
     return {name: min(unit, most[name]) for name, unit in UNITS.items()}
 
 
-def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
-    """Parts of the state whose error is judged together: each pad's forces, each contact's
+class ErrorParts:
+    """Parts of a rig's state whose error is judged together: each pad's forces, each contact's
     stretches, a state of its law of friction, in units of its start, a body's position, its angle.
     A rate's error counts by the displacement within a step. A position's size is how far it has
-    come from y0."""
-    first, last, rate, unit, size, origin = [], [], [], [], [], np.zeros(len(y0))
-    layout, units = rig.layout, own_units(rig)
-    for (kind, name), here in layout.slices.items():
-        if kind == "friction":
-            one_by_one = torch.arange(here.start, here.stop).unflatten(0, layout.shapes[kind, name])
-            parts = [(int(row[0]), int(row[-1]) + 1, "own") for row in one_by_one]
-        elif kind in ("pads", "stretch", "rates"):
-            forces = kind == "pads" and not rig.pads[name].nodal
-            parts = [(here.start, here.stop, "force" if forces else "length")]
-        else:
-            axes = layout.free[name]
-            turning = "theta" in [COORDINATES[i] for i in axes]
-            split = here.stop - turning
-            parts = [(here.start, split, "length"), (split, here.stop, "angle")]
-        if kind == "pose":
+    come from the start."""
+
+    def __init__(self, rig: Rig) -> None:
+        layout, found = rig.layout, list[tuple[int, int, bool, str, str]]()
+        self._poses = [here for (kind, _), here in layout.slices.items() if kind == "pose"]
+        for (kind, name), here in layout.slices.items():
+            if kind == "friction":
+                one_by_one = torch.arange(here.start, here.stop)
+                one_by_one = one_by_one.unflatten(0, layout.shapes[kind, name])
+                parts = [(int(row[0]), int(row[-1]) + 1, "own") for row in one_by_one]
+            elif kind in ("pads", "stretch", "rates"):
+                forces = kind == "pads" and not rig.pads[name].nodal
+                parts = [(here.start, here.stop, "force" if forces else "length")]
+            else:
+                turning = "theta" in [COORDINATES[i] for i in layout.free[name]]
+                split = here.stop - turning
+                parts = [(here.start, split, "length"), (split, here.stop, "angle")]
+            rate = kind in ("rates", "velocity")
+            found += [
+                (begin, end, rate, dimension, f"{QUANTITIES[kind]} `{name}`")
+                for begin, end, dimension in parts if end > begin
+            ]  # fmt: skip
+        self._ends = [(begin, end) for begin, end, *_ in found]
+        columns = list(zip(*found)) or [()] * 5
+        self._whole = [np.array(numbers, np.int64) for numbers in columns[:3]]
+        self._dimensions, self.names = columns[3:]
+
+    def of(self, y0: Array, atol: float, units: Mapping[str, float]) -> Errors:
+        """The errors of a run from y0, with tolerances of `atol` units."""
+        origin = np.zeros(len(y0))
+        for here in self._poses:
             origin[here] = y0[here]
-        for begin, end, dimension in parts:
-            if end > begin:
-                first.append(begin)
-                last.append(end)
-                rate.append(kind in ("rates", "velocity"))
-                own = np.linalg.norm(y0[begin:end]) if dimension == "own" else 0.0
-                unit.append(own or units.get(dimension, 1.0))
-                size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
-    whole = [np.array(numbers, np.int64) for numbers in (first, last, rate)]
-    return Errors(whole[0], whole[1], whole[2], atol * np.array(unit), np.array(size), origin)
+        off = y0 - origin
+        size = [math.sqrt(off[a:b].dot(off[a:b])) for a, b in self._ends]
+        unit = [units.get(one, 1.0) for one in self._dimensions]
+        for i, one in enumerate(self._dimensions):
+            if one == "own":
+                begin, end = self._ends[i]
+                unit[i] = math.sqrt(y0[begin:end].dot(y0[begin:end])) or 1.0
+        first, last, rate = self._whole
+        return Errors(first, last, rate, atol * np.array(unit), np.array(size), origin)
 
 
-def part_name(rig: Rig, errors: Errors, number: int) -> str:
-    """Quantity of a part's error, in words."""
-    quantities = {
-        "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
-        "pose": "the pose of body", "rates": "the nodal velocities of pad",
-        "velocity": "the velocity of body", "friction": "the states of friction of contact",
-    }  # fmt: skip
-    for (kind, name), here in rig.layout.slices.items():
-        if here.start <= errors.first[number] < here.stop:
-            return f"{quantities[kind]} `{name}`"
-    return "the state"
+QUANTITIES = {
+    "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
+    "pose": "the pose of body", "rates": "the nodal velocities of pad",
+    "velocity": "the velocity of body", "friction": "the states of friction of contact",
+}  # fmt: skip
+"""Quantities of the parts of a state, in words."""
 
 
 class Followed:
-    """The signals of a run as the kernels evaluate them: `arrays`, and `stops` [s], times that no
-    step may pass.
+    """The signals of runs as the kernels evaluate them; `since` has them for one run: `arrays`,
+    and `stops` [s], times that no step may pass.
 
     A reference of pieces (`Profile`, `Sampled`, `Waves`) is evaluated by the kernel, any other one
-    by itself, called at every stage; its exceptions are kept in `error`.
+    by itself, called at every stage as `signals`; its exceptions are kept in `error`. Signals
+    called `names` come first, and then those that stay at the numbers `fixed`.
     """
 
-    def __init__(self, signals: Callable[[Tensor], Tensor], rig: Rig, reference: Reference) -> None:
+    def __init__(
+        self, reference: Reference, names: Sequence[str], fixed: Sequence[float],
+        signals: Callable[[Tensor], Tensor],
+    ) -> None:  # fmt: skip
         self.error: BaseException | None = None
-        chosen = reference.plain(rig.signals)
+        chosen = reference.plain(names)
         self._callback: Any = None
+        self._pieces: Any = None
+        self._count = len(names)
         if chosen is None:
             self.arrays = NO_SIGNALS._replace(address=self._call(signals), room=np.zeros(1))
             self.stops = np.zeros(0)
             return
         with torch.no_grad():
-            pieces = [one.pieces() for one in chosen]
-            one = torch.ones(1, dtype=torch.float64)
-            pieces += [(0.0 * one, one, value.reshape(1, 1)) for value in rig.fixed_values]
-            widest = max((c.shape[1] for *_, c in pieces), default=1)
-            padded = [torch.nn.functional.pad(c, (0, widest - c.shape[1])) for *_, c in pieces]
-            empty = torch.zeros(0, dtype=torch.float64)
-            self.arrays = Signals(
-                np.cumsum([0, *(len(at) for at, *_ in pieces)]).astype(np.int64),
-                np.array([c.shape[1] for *_, c in pieces], np.int64),
-                torch.cat([empty, *(at for at, *_ in pieces)]).numpy(),
-                torch.cat([empty, *(span for _, span, _ in pieces)]).numpy(),
-                torch.cat([torch.zeros(0, widest, dtype=torch.float64), *padded])
-                .contiguous()
-                .numpy(),
-                0,
-                np.zeros(max(widest, 1)),
-            )
-        self.stops = np.unique(
-            np.concatenate([np.zeros(0), *(signal.stops.numpy() for signal in chosen)])
-        )
+            found = [one.pieces() for one in chosen]
+            pieces = [(at.numpy(), span.numpy(), c.numpy()) for at, span, c in found]
+            stops = [one.stops.numpy() for one in chosen]
+        self._stops, self._pieces = [x.copy() for x in stops], packed(pieces, fixed)
+
+    def since(self, origin: float) -> "Followed":
+        """The same, for one run whose time counts from `origin` [s]."""
+        if self._pieces is None:
+            return self
+        out, room = copy(self), np.zeros_like(self._pieces.room)
+        out.arrays = self._pieces._replace(at=self._pieces.at - origin, room=room)
+        out.stops = np.unique(np.concatenate([np.zeros(0), *self._stops])) - origin
+        return out
+
+    def on_lines(
+        self, which: Sequence[int], first: float, last: float, values: Array
+    ) -> "Followed":
+        """The same from `first` to `last` [s], where time counts from, with some signals on lines
+        between two values each (lines, 2), as they were on single lines before."""
+        out, p, rows = copy(self), self._pieces, self._pieces.start[[*which]]
+        at, span, control = p.at.copy(), p.span.copy(), p.control.copy()
+        at[rows], span[rows], control[rows, :2] = first, last - first, values
+        out._pieces = p._replace(at=at, span=span, control=control)
+        others = [x for i, x in enumerate(self._stops) if i not in which]
+        out._stops = [np.array([first, last]), *others]
+        return out.since(first)
+
+    def at(self, t: Tensor) -> Tensor | None:
+        """Values and rates (..., signals, 2) at t (...) [s] of the reference's pieces, None where
+        it has none."""
+        if self._pieces is None:
+            return None
+        rows, p = list[Tensor](), self._pieces
+        for i in range(self._count):
+            here, width = slice(p.start[i], p.start[i + 1]), p.points[i]
+            parts = p.at[here], p.span[here], p.control[here, :width].copy()
+            at, span, control = map(torch.from_numpy, parts)
+            rows.append(torch.stack(evaluate((at, span, control), t), -1))
+        return torch.stack(rows, -2) if rows else t.new_zeros((*t.shape, 0, 2))
+
+    @property
+    def known(self) -> bool:
+        """Whether the reference is made of pieces."""
+        return self._pieces is not None
+
+    def check(self) -> None:
+        """Raises what a signal raised."""
+        if self.error is not None:
+            raise self.error
 
     def _call(self, signals: Callable[[Tensor], Tensor]) -> int:
         """Address of a function that writes the signals at the time x[0] to out."""
@@ -303,3 +352,19 @@ class Followed:
         pointer = ctypes.POINTER(ctypes.c_double)
         self._callback = ctypes.CFUNCTYPE(None, pointer, pointer, pointer)(call)
         return ctypes.cast(self._callback, ctypes.c_void_p).value or 0
+
+
+def packed(pieces: Sequence[tuple[Array, Array, Array]], fixed: Sequence[float]) -> Signals:
+    """Signals of pieces, each with its starts and spans [s] and control points, and then those
+    that are `fixed`."""
+    counts, widths = [len(at) for at, *_ in pieces], [c.shape[1] for *_, c in pieces]
+    total, widest = sum(counts), max(widths, default=1)
+    start = np.cumsum([0, *counts, *[1] * len(fixed)])
+    at, span = np.zeros(start[-1]), np.ones(start[-1])
+    control = np.zeros((start[-1], widest))
+    for first, width, (begins, spans, points) in zip(start, widths, pieces):
+        here = slice(first, first + len(begins))
+        at[here], span[here], control[here, :width] = begins, spans, points
+    control[total:, 0] = fixed
+    points = np.array([*widths, *[1] * len(fixed)], np.int64)
+    return Signals(start, points, at, span, control, 0, np.zeros(max(widest, 1)))

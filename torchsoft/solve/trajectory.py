@@ -32,6 +32,7 @@ from scipy import sparse
 
 from torchsoft.display import enumerated
 from torchsoft.solve.kernel.table import Array, Index
+from torchsoft.solve.system import independent
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,38 @@ class Trajectory(Shown):
     rates: dict[str, Tensor] = field(default_factory=dict, repr=False)
     touch: Touch | None = field(default=None, repr=False)
     known_contact_state: dict[str, Tensor] | None = field(default=None, repr=False, compare=False)
+
+    @classmethod
+    def later(cls, rest: Any, **known: Any) -> Trajectory:
+        """A run of whose fields only some are known yet; `rest` has the others as attributes, which
+        it makes when they are asked for."""
+        run = object.__new__(cls)
+        vars(run).update(known, known_contact_state=None, _rest=rest)
+        return run
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """A field that was not known yet."""
+            own = vars(self)
+            if name not in type(self).__dataclass_fields__ or "_rest" not in own:
+                raise AttributeError(name)
+            with (
+                torch.inference_mode(False),
+                torch.set_grad_enabled(own["y"].requires_grad),
+                independent(),
+            ):
+                return own.setdefault(name, getattr(own["_rest"], name))
+
+    def complete(self) -> None:
+        """Make everything that was not known yet."""
+        for name in type(self).__dataclass_fields__:
+            getattr(self, name)
+        vars(self).pop("_rest", None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.complete()
+        return vars(self)
 
     def __getitem__(self, channel: str) -> Tensor:
         """A channel (T,), by its name or a short one. Raises `KeyError` naming those that are
@@ -271,6 +304,41 @@ class Trajectory(Shown):
         from torchsoft.solve.formats import read
 
         return read(path)
+
+
+class Ledger(NamedTuple):
+    """What a run is judged by: all stored energy (T,) [J]; energies dissipated (T, names) and all
+    that is supplied (T,), and injected in all [J]; the largest force on a contact point [N];
+    largest displacements of the loaded nodes of pads [m]; how its steps were chosen."""
+
+    stored: Array
+    names: Sequence[str]
+    dissipated: Array
+    supplied: Array
+    injected: float
+    force: float
+    displaced: dict[str, float]
+    steps: dict[str, Any]
+
+    @classmethod
+    def of(cls, run: Trajectory) -> Ledger:
+        known = getattr(vars(run).get("_rest"), "ledger", None)
+        if known is not None:
+            return known
+        plain = lambda parts: [part.detach().numpy() for part in parts.values()]
+        none = np.zeros(len(run.t))
+        force = max((float(x.detach().norm(dim=-1).max()) for x in run.force.values()), default=0.0)
+        return cls(
+            sum(plain(run.energy), none), [*run.dissipated],
+            np.stack(plain(run.dissipated), 1),
+            sum(plain(run.supplied), none), float(run.injected[-1].detach()), force, {},
+            run.made_by["steps"],
+        )  # fmt: skip
+
+
+def displaced(run: Trajectory, pad: str) -> float:
+    """Largest displacement of a pad's nodes [m]."""
+    return float(run.displacement[pad].detach().norm(dim=-1).max())
 
 
 def channels(

@@ -155,6 +155,7 @@ class Contacts(NamedTuple):
     pullback: Index
     free_linearise: Index
     free_pullback: Index
+    stored: Index
     p_start: Index
     point_start: Index
     size: Array
@@ -412,8 +413,8 @@ class Outputs(NamedTuple):
     the signals are signals[i].
 
     Its state goes to y, its integrals to integrals, its forces to recorded (as `recorded_size`
-    orders them), the rates of nodal pads' dofs to rate; tape has one row an output, or none, each a
-    stage of no length there, whose y it shares.
+    orders them), the rates of nodal pads' dofs to rate, its energy to stored; tape has one row an
+    output, or none, each a stage of no length there, whose y it shares.
     """
 
     step: Index
@@ -423,6 +424,7 @@ class Outputs(NamedTuple):
     integrals: Matrix
     recorded: Matrix
     rate: Matrix
+    stored: Array
     tape: Annotated[Any, Tape]
 
 
@@ -436,6 +438,7 @@ class Run(NamedTuple):
     f: Signals
     e: Errors
     limits: Limits
+    start: Limits
     out: Outputs
     tape: Annotated[Any, Tape]
     given: int

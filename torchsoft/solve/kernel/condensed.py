@@ -119,6 +119,32 @@ def propose(s: Any, w: Any, pad: int, a: float) -> None:
 
 
 @compiled
+def quadratic(s: Any, pad: int, x: Array, low: int, high: int) -> float:
+    """x C x of a vector of surface dofs that is zero but from `low` to `high`, with the stored
+    compliance C."""
+    total, size, inside = 0.0, size_of(s, pad), x[low:high]
+    for m in range(inside.size):
+        row = row_of(s.condensed_C, s.condensed_C_start[pad], low + m, size)
+        total += inside[m] * dot(inside, row[low:])
+    return total
+
+
+@compiled
+def stored(s: Any, pad: int, y: Array) -> float:
+    """Strain energy of the pad [J] in a state."""
+    size, chain, total = size_of(s, pad), s.condensed_chain_at[pad], 0.0
+    for b in range(s.condensed_branches[pad]):
+        start = s.pad_y_start[pad] + b * size
+        z, low, high = y[start : start + size], 0, size
+        while low < high and abs(z[low]) < NEGLIGIBLE:
+            low += 1
+        while high > low and abs(z[high - 1]) < NEGLIGIBLE:
+            high -= 1
+        total += 0.5 * s.p[chain + b] * quadratic(s, pad, z, low, high)
+    return softness(s, pad) * total
+
+
+@compiled
 def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array) -> float:
     """Rates of the forces that have set in into w.k, and the power [W] that the pad dissipates;
     returns a bound of its nodes' speeds [m/s]."""
@@ -134,10 +160,7 @@ def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array) -> float
             if abs(rate) * a > NEGLIGIBLE_RATE:
                 low, high = min(low, m), m + 1
                 total += J * abs(rate)
-        power, changes = 0.0, k[z + low : z + high]
-        for m in range(changes.size):
-            row = row_of(s.condensed_C, s.condensed_C_start[pad], low + m, size)
-            power += changes[m] * dot(changes, row[low:])
+        power = quadratic(s, pad, k[z : z + size], low, high)
         powers[pad] += J * tau * power * softness(s, pad)
     return total * s.condensed_reach[pad] * softness(s, pad)
 

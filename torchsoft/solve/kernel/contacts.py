@@ -357,6 +357,21 @@ def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: 
 
 
 @compiled
+def stored(s: Any, w: Any, pad: int, y: Array) -> float:
+    """Energy [J] in the springs of a pad's points, in the state y where the last stage ended."""
+    at, i, total, x, out = s.pad_point_start[pad], 0, 0.0, w.decay_x, w.decay
+    for k in range(at, s.pad_point_start[pad + 1]):
+        c, stretch, depth = s.point_contact[k], y[s.point_y_start[k]], 0.0
+        if i < w.actives[pad] and w.active[at + i] == k:
+            i, depth = i + 1, -separation(s, w, k, w.x[k])
+        if depth != 0.0 or stretch != 0.0:
+            x[0], x[1], x[2] = depth, stretch, s.point_weight[k]
+            call_value(s.contact_stored[c], x, s.p[bounds(s.contact_p_start, c)], out)
+            total += out[0] + out[1]
+    return total
+
+
+@compiled
 def loads(s: Any, w: Any) -> None:
     """The contacts' generalised forces on all coordinates into w.load."""
     w.load[:] = 0.0

@@ -7,6 +7,8 @@ its material: `begin` and `displace` a stage, `evaluate` what a trial leaves, ma
 
 from typing import Any
 
+import numpy as np
+
 from torchsoft.solve.kernel import compiled, condensed, nodal
 from torchsoft.solve.kernel.arrays import CONDENSED
 from torchsoft.solve.kernel.contacts import outputs
@@ -110,6 +112,12 @@ def move(s: Any, w: Any, pad: int, part: float) -> None:
             w.u_dot[node, r] = rate + part * (w.u_dot_new[2 * node + r] - rate)
     if s.pad_kind[pad] != CONDENSED:
         nodal.move(s, w, pad, part)
+
+
+@compiled
+def stored(s: Any, pad: int, y: Array) -> float:
+    """Strain energy of a condensed pad [J]; that of a nodal one is not found here, but nan."""
+    return condensed.stored(s, pad, y) if s.pad_kind[pad] == CONDENSED else np.nan
 
 
 @compiled

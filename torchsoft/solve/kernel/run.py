@@ -111,6 +111,14 @@ def next_end(t: float, length: float, stops: Array) -> float:
 
 
 @compiled
+def afresh(w: Any) -> None:
+    """Forget which points are near and what is held, so that what is made again has the same
+    bits."""
+    w.travelled[0] = np.inf
+    w.low[:], w.high[:], w.held[:] = 0, 0, 0.0
+
+
+@compiled
 def run(r: Any) -> None:
     """Take up to h.size steps of the rig's arrays `s`.
 
@@ -121,7 +129,8 @@ def run(r: Any) -> None:
     passes a time of `stops`, whose last is t_out's.
 
     `tape` has two rows a step, or none. y, `integrals` and the guesses in w are advanced in place;
-    after a failure they hold the last good step. With no steps the one output is that of y itself.
+    after a failure they hold the last good step. With no steps the one output is that of y itself;
+    with lengths by tolerances the output 0 is, before any step.
 
     counts receives steps and outputs done, status, linear solves, steps that were refused for their
     error and that Newton did not solve, and the part of the state whose error was largest in the
@@ -130,14 +139,17 @@ def run(r: Any) -> None:
     s, w, d, y, out, given = r.s, r.w, r.d, r.y, r.out, r.given != 0
     clock, counts, h, t_out = r.clock, r.counts, r.h, r.t_out
     steps, row, solves, refused, failed, which = 0, r.row, 0, 0, 0, -1
-    status, begin = CONVERGED, h.size == 0
+    status, begin = CONVERGED, h.size == 0 or (not given and row == 0)
     while (steps < h.size and (given or row < t_out.size)) or begin:
         t, length, end, error, last = clock[0], min(clock[1], r.longest), 0.0, 0.0, row
         if begin:  # the output at the start, where nothing has moved
-            d.K[:], d.powers[:], w.travelled[0], now, last = 0.0, 0.0, np.inf, 0.0, row + 1
+            d.K[:], d.powers[:], now, last = 0.0, 0.0, 0.0, row + 1
+            afresh(w)
             put(y, d.y)
             put(r.integrals, d.integrals)
             put(w.travelled, d.travelled)
+            if not given:
+                follow(r.f, t_out[0], t_out[0], out.signals)
         else:
             now = h[steps]
             if not given:
@@ -163,11 +175,17 @@ def run(r: Any) -> None:
                         follow(r.f, t_out[last], t_out[last], out.signals[last : last + 1])
                     last += 1
         if status == CONVERGED:
-            status, count = write_rows(r, now, row, last)
+            limits = r.start if begin else r.limits
+            status, count = write_rows(r, limits, now, row, last)
             solves += count
+        if begin and status != CONVERGED:
+            break
         if begin:
             put(w.k, d.K[0])
-            begin, row = False, last
+            if not given:
+                put(w.k, r.k)
+                afresh(w)
+            begin, row, solves = False, last, 0
         elif status == CONVERGED:
             if not given:
                 r.starts[steps], h[steps] = t, now

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled, sources
+from torchsoft.solve.kernel import compiled, contacts, pads, sources
 from torchsoft.solve.kernel.arrays import (
     CONVERGED,
     GAMMA,
@@ -24,7 +24,6 @@ from torchsoft.solve.kernel.arrays import (
     TINY,
     WRENCH,
 )
-from torchsoft.solve.kernel.contacts import at_point
 from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.stage import finish, solve_stage
 from torchsoft.solve.kernel.table import Array
@@ -48,8 +47,8 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array, way: float) -> boo
             k = w.active[at + i]
             tape.point[row, slot] = k
             state = tape.state[row, slot]
-            ux, uy = at_point(s, k, w.u)
-            state[2], state[3] = at_point(s, k, w.u_dot)
+            ux, uy = contacts.at_point(s, k, w.u)
+            state[2], state[3] = contacts.at_point(s, k, w.u_dot)
             state[0], state[1] = ux + way * state[2], uy + way * state[3]
             slot += 1
     return True
@@ -85,6 +84,17 @@ def record(s: Any, w: Any, wrenches: Array, out: Array) -> None:
     first = 2 * s.point_contact.size
     put(wrenches, out[first : first + wrenches.size])
     put(w.load, out[first + wrenches.size :])
+
+
+@compiled
+def stored(s: Any, w: Any, y: Array) -> float:
+    """Energy [J] of the rig in the state y where the last stage ended; nan with nodal pads."""
+    total = 0.0
+    for pad in range(s.pad_base.size):
+        total += pads.stored(s, pad, y) + contacts.stored(s, w, pad, y)
+    for i in range(s.body_coordinate.size):
+        total += 0.5 * s.p[s.body_mass_at[i]] * y[s.body_V_start + i] ** 2
+    return total
 
 
 @compiled
@@ -181,7 +191,7 @@ def dense_states(part: float) -> tuple[float, float, float]:
 
 
 @compiled
-def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
+def write_rows(r: Any, limits: Any, h: float, first: int, last: int) -> tuple[int, int]:
     """The outputs from `first` to `last` of the step just taken. At its end they are what the last
     stage found; before it, dense output with the forces that belong to it, which take a stage of no
     length; that is what `out.tape` holds, if it has rows. Returns status and linear solves."""
@@ -215,7 +225,7 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
             gone_by = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
             w.travelled[0] = gone_by if scans == d.travelled[2] else np.inf
             converged, count, _ = solve_near(
-                s, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.wrenches
+                s, w, limits, ys[i], out.signals[i], INSTANT, d.scrap, d.wrenches
             )
             solves += count
             if not converged:
@@ -225,6 +235,7 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
         put(d.at_row, out.integrals[i])
         record(s, w, d.wrenches, out.recorded[i])
         put(w.rate, out.rate[i])
+        out.stored[i] = stored(s, w, ys[i])
         put(d.guess_V, w.V)
         put(d.guess, w.u_dot)
         put(d.guess_rate, w.rate)

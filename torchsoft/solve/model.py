@@ -1,0 +1,542 @@
+"""What the structure and the geometry of a rig decide: its laws compiled, the layout of its state,
+the places of its parameters in one vector, its lists as plain arrays, and room to compute in.
+
+A model is made once for all rigs that are alike in that, and never for one that is not: it is found
+by comparing all that it was made of.
+"""
+
+import threading
+import warnings
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoft.codegen import Law
+from torchsoft.physics.contact import Friction, SoftContact
+from torchsoft.physics.elements import CONSTANTS
+from torchsoft.physics.hyperelastic import Hyperelastic
+from torchsoft.physics.material import Material
+from torchsoft.physics.mesh import dofs_of
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rate_and_state import RateAndState
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import Shape
+from torchsoft.physics.validity import (
+    LARGEST,
+    MISSING,
+    check_groups,
+    check_shape,
+    check_slip,
+    check_values,
+    slip_rates,
+)
+from torchsoft.quantity import quantities, quantity_of
+from torchsoft.solve.kernel.arrays import (
+    CONDENSED,
+    LANES,
+    NODAL,
+    Bodies,
+    Condensed,
+    Contacts,
+    Nodal,
+    Pads,
+    Points,
+    Sources,
+    recorded_size,
+    room,
+    system,
+)
+from torchsoft.solve.kernel.table import Array, Index, layout
+from torchsoft.solve.laws import (
+    LawSet,
+    actuator_fault,
+    actuator_law,
+    contact_laws,
+    element_law,
+    friction_fault,
+    material_fault,
+    motion_law,
+    shape_fault,
+    weight_law,
+)
+from torchsoft.solve.progress import Integrals
+from torchsoft.solve.steps import ErrorParts
+from torchsoft.solve.structure import Copies, Structure, lasting, structure_of
+
+NOMINAL = 1e-3
+"""Stage length a h [s] at which slip laws of users are tried."""
+
+HELD = 3e-4
+"""Strain up to which the derivatives of an element's forces are held while it changes, in Newton's
+method."""
+
+NEGLIGIBLE = 1e-9
+"""Nodal force [N] below which a node counts as unloaded."""
+
+KEPT = 8
+"""Models that are kept."""
+
+
+class Room(NamedTuple):
+    """Arrays that one run at a time works in: a system with a vector of parameters of its own, and
+    the kernels' scratch."""
+
+    system: Any
+    work: Any
+    step: Any
+
+
+class Model:
+    """The model of a copy of a rig with parameters `values`, one for each of its structure.
+
+    Raises the `ValueError`s of a rig that cannot be run, and warns of its laws' faults.
+    """
+
+    def __init__(self, structure: Structure, values: Sequence[Tensor]) -> None:
+        self.copies = Copies(structure)
+        modules = self.copies.made(values)
+        self.rig: Rig = modules[0]
+        self.rig.check_names()
+        check_values(self.rig)
+        check_groups(self.rig)
+        self.low, self.high = ranges(modules, structure)
+        self.derived = derived(modules)
+        self.judged = [i for i, one in enumerate(modules) if hasattr(one, "well_posed")]
+        self.shared = structure.known
+        self._key, self._geometric = lasting(structure.key), geometric(modules, structure)
+        self._geometry = self._geometry_of(values)
+        self._read(values)
+        self._idle: list[Room] = []
+        self.last: tuple[Array, Tensor, dict[str, float]] | None = None
+
+    def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
+        return b"".join([values[i].detach().numpy().tobytes() for i in self._geometric])
+
+    def alike(self, values: Sequence[Tensor]) -> bool:
+        """Whether a rig of the same structure with these parameters has the same geometry."""
+        return self._geometry == self._geometry_of(values)
+
+    def serves(self, structure: Structure, values: Sequence[Tensor]) -> bool:
+        """Whether this is the model of a rig with these parameters."""
+        return structure.key == self._key and self.alike(values)
+
+    def within(self, modules: Sequence[Any], theta: Array) -> bool:
+        """Whether the values of a rig's parameters, theta, are physical; its own checks are to say
+        in words why they are not."""
+        fine = bool(((self.low <= theta) & (theta <= self.high)).all())
+        for number, name, low, high in self.derived if fine else ():
+            value = getattr(modules[number], name)
+            fine = fine and bool(((low <= value) & (value <= high)).all())
+        return fine and not any(modules[i].well_posed() for i in self.judged)
+
+    def chained(self, p: Array) -> bool:
+        """The same of the chains of condensed pads in the kernels' vector."""
+        for at, branches in self._chains:
+            J, tau = p[at : at + branches], p[at + branches : at + 2 * branches]
+            if (J < 0.0).any() or abs(J.sum() - 1.0) > MISSING or (tau <= 0.0).any():
+                return False
+        return True
+
+    def _read(self, values: Sequence[Tensor]) -> None:
+        rig = self.rig
+        self.layout, self.integrals, self.signals = rig.layout, Integrals(rig), rig.signals
+        slices = self.layout.slices
+        self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
+        self.fixed, self.errors = len(rig.fixed_values), ErrorParts(rig)
+        self._known: dict[tuple[int, int], LawSet] = {}
+        self._shapes, self._index = prepared_shapes(rig), list[int]()
+        self._made = computed(rig, self._shapes)
+        self._places: dict[int, int] = {}
+        count = 0
+        for value in (*values, *self._made.values()):
+            self._places.setdefault(id(value), count)
+            count += value.numel()
+        self._bodies = self._make_bodies()
+        self._pads = self._make_pads()
+        parts = self._bodies, self._make_sources(), self._pads, self._make_condensed()
+        self._parts = *parts, self._make_nodal(), *self._make_contacts()
+        self.index = torch.tensor(self._index, dtype=torch.int64)
+        self.nodal = {name: 2 * pad.nodes for name, pad in rig.pads.items() if pad.nodal}
+        points = [2 * count for count in rig.point_counts.values()]
+        self.felt = [*points, 3 * len(rig.pads), 3 * len(rig.bodies) + 3]
+        self._chains = [
+            (at, n) for at, n in zip(self._parts[3].chain_at, self._parts[3].branches) if n
+        ]
+        sizes = [one.shape.size() for one in rig.bodies.values() if one.shape is not None]
+        self.smallest = min(sizes, default=np.inf)
+        none = self.system(np.zeros(len(self._index)))
+        self.no_tape = room("Tape", none, self.layout.size, stages=0, cap=0)
+        self.widths = (
+            self.layout.size, len(self.integrals.names), recorded_size(none),
+            int(none.nodal_dof_start[-1]),
+        )  # fmt: skip
+        del self._made, self._places, self._shapes, self._known, self._index
+
+    def displaced(self, p: Array, y: Array) -> dict[str, float]:
+        """Largest displacements of the loaded nodes of condensed pads [m] in states y (T, size)."""
+        own, out = self._parts[3], dict[str, float]()
+        for name, here in self.condensed.items():
+            i = [*self.rig.pads].index(name)
+            at, n = own.chain_at[i], own.branches[i]
+            z = y[:, here]
+            size = z.shape[1] // n
+            zeta = np.einsum("b,tbs->ts", p[at : at + n], z.reshape(len(y), n, size))
+            loaded = np.abs(zeta).max(0) > NEGLIGIBLE
+            dofs = np.flatnonzero(loaded.reshape(-1, 2).any(1))
+            dofs = (2 * dofs[:, None] + np.arange(2)).ravel()
+            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(size, size)
+            u = p[at + 2 * n] * (zeta[:, dofs] @ C[dofs[:, None], dofs])
+            out[name] = float(np.sqrt((u.reshape(len(y), -1, 2) ** 2).sum(-1).max(initial=0.0)))
+        return out
+
+    def system(self, p: Array) -> Any:
+        """The rig's arrays with the vector of parameters p."""
+        return system(*self._parts, p=p)
+
+    def take(self, p: Array) -> Room:
+        """Room for a run, as good as new, with the numbers p."""
+        try:
+            found = self._idle.pop()
+        except IndexError:
+            own = self.system(p.copy())
+            work, size = room("Work", own, self.layout.size, columns=1), len(self.integrals.names)
+            return Room(own, work, room("Step", own, self.layout.size, integrals=size))
+        found.system.p[:] = p
+        for part in (found.work.V, found.work.u_dot, found.work.rate):
+            part.fill(0.0)
+        return found
+
+    def give(self, used: Room) -> None:
+        """Take a room back."""
+        self._idle.append(used)
+
+    def _add(self, *values: Tensor) -> int:
+        """Append parameters, or what was computed of them, to the kernels' vector; where they
+        begin."""
+        at = len(self._index)
+        for value in values:
+            first = self._places[id(value)]
+            self._index += range(first, first + value.numel())
+        return at
+
+    def _start(self, part: str) -> int:
+        """Index at which a part of the state begins."""
+        return min((s.start for (of, _), s in self.layout.slices.items() if of == part), default=0)
+
+    def _make_bodies(self) -> Bodies:
+        rig = self.rig
+        places = [(name, axis) for name in rig.bodies for axis in COORDINATES]
+        kinds = np.array([rig.bodies[name].freedom[axis] for name, axis in places] + 3 * ["ground"])
+        free, fixed, driven = (kinds == kind for kind in ("free", "fixed", "driven"))
+        signal = np.full(len(kinds), -1)
+        signal[fixed] = len(rig.signals) + np.arange(fixed.sum())
+        for c in np.flatnonzero(driven):
+            signal[c] = rig.signals.index(".".join(places[c]))
+        masses = [self._add(self._made["masses", name]) for name in rig.bodies]
+        masses = np.add.outer(np.array(masses, np.int64), np.arange(3)).ravel()
+        coordinate = np.flatnonzero(free)
+        return filled(
+            Bodies, free=np.where(free, free.cumsum() - 1, -1), signal=signal,
+            coordinate=coordinate, mass_at=masses[coordinate],
+            q_start=self._start("pose"), V_start=self._start("velocity"),
+        )  # fmt: skip
+
+    def _make_pads(self) -> Pads:
+        rig, slices, bodies = self.rig, self.layout.slices, list(self.rig.bodies)
+        pads, sizes = rig.pads.values(), [len(pad.mesh.surface) for pad in rig.pads.values()]
+        base = [3 * (len(bodies) if pad.base is None else bodies.index(pad.base)) for pad in pads]
+        for name, pad in rig.pads.items():
+            if structure_of(pad.material) is None and (wrong := material_fault(name, pad.material)):
+                warnings.warn(wrong, stacklevel=2)
+        columns = np.full((len(pads), len(self._bodies.coordinate)), -1, np.int64)
+        for number, name in enumerate(rig.pads):
+            touched = (3 * bodies.index(rig.contacts[key].body) for key in rig.contacts_of(name))
+            mine = np.isin(self._bodies.coordinate // 3 * 3, [base[number], *touched])
+            columns[number, mine] = np.arange(mine.sum())
+        ends = np.cumsum([0, *rig.point_counts.values()])
+        owners = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
+        return filled(
+            Pads, kind=[NODAL if pad.nodal else CONDENSED for pad in pads], base=base,
+            node_start=np.cumsum([0, *sizes]),
+            point_start=ends[np.searchsorted(owners, np.arange(len(pads) + 1))],
+            y_start=[slices["pads", name].start for name in rig.pads], column=columns,
+            columns=(columns >= 0).sum(1),
+        )  # fmt: skip
+
+    def _make_condensed(self) -> Condensed:
+        """Chains and compliances of the pads that are condensed; a nodal pad has none."""
+        pads, none = list(self.rig.pads.values()), torch.zeros(0, dtype=torch.float64)
+        units = [(none, none) if pad.nodal else pad.unit_compliance() for pad in pads]
+        C, dC = (torch.cat([none, *(unit[k].flatten() for unit in units)]) for k in (0, 1))
+        numbers = [self._made.get(("chain", name)) for name in self.rig.pads]
+        return filled(
+            Condensed,
+            chain_at=[len(self._index) if one is None else self._add(one) for one in numbers],
+            branches=[0 if pad.nodal else pad.branches for pad in pads],
+            C_start=np.cumsum([0, *(len(unit.flatten()) for unit, _ in units)]), C=C, dC=dC,
+            reach=[0.0 if pad.nodal else 1.5 * unit.abs().max()
+                   for pad, (unit, _) in zip(pads, units)],
+        )  # fmt: skip
+
+    def _make_nodal(self) -> Nodal:
+        """Elements of the pads that are not condensed."""
+        rig, slices = self.rig, self.layout.slices
+        pads = [pad if pad.nodal else None for pad in rig.pads.values()]
+        dofs = [0 if pad is None else 2 * pad.nodes for pad in pads]
+        band = [0 if pad is None else 2 * spread(pad.corners // 2) + 1 for pad in pads]
+        elements = [0 if pad is None else -(-len(pad.corners) // LANES) * LANES for pad in pads]
+        laws, starts, ends, density = list[Law | None](), list[int](), list[int](), list[int]()
+        for name, pad in rig.pads.items():
+            law, parameters = None, dict[str, Tensor]()
+            if pad.nodal:
+                law, parameters = element_law(name, pad.material, self._made["factors", name])
+            laws.append(law)
+            starts.append(self._add(*parameters.values()))
+            ends.append(len(self._index))
+            density.append(self._add(self._made["density", name]) if pad.nodal else -1)
+        joined = lambda kind, *shape: np.concatenate(
+            [np.zeros((0, *shape)), *(kind(pad) for pad in pads if pad is not None)]
+        )
+        surface = [
+            np.full(2 * len(pad.mesh.surface), -1)
+            if not pad.nodal
+            else dofs_of(pad.surface.numpy())
+            for pad in rig.pads.values()
+        ]
+        address = lambda name: [0 if law is None else getattr(law, name) for law in laws]
+        return filled(
+            Nodal, dof_start=np.cumsum([0, *dofs]),
+            element_start=np.cumsum([0, *elements]),
+            v_start=[slices["rates", name].start if pad.inertial else -1
+                     for name, pad in rig.pads.items()],
+            density_at=density, hold=[HELD if isinstance(pad.material, Hyperelastic) else np.inf
+                                      for pad in rig.pads.values()], band=band,
+            band_start=np.cumsum([0, *(n * (2 * b + 1) for n, b in zip(dofs, band))])[:-1],
+            value=address("value"), linearise=address("linearise"), pullback=address("pullback"),
+            push=address("push"),
+            p_first=starts, p_last=ends,
+            X=joined(lambda pad: pad.positions.numpy().ravel()),
+            area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2)),
+            dof=joined(lambda pad: lengthened(pad.corners, -1), 8),
+            constants=joined(lambda pad: lengthened(pad.constants, 0.0), CONSTANTS),
+            surface=np.concatenate([np.zeros(0), *surface]),
+        )  # fmt: skip
+
+    def _make_sources(self) -> Sources:
+        """Actuators, and weights of the bodies that move along y."""
+        rig, laws, starts = self.rig, list[Law](), list[int]()
+        for name, actuator in rig.actuators.items():
+            parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
+            laws.append(actuator_law(name, actuator, parameters))
+            if structure_of(actuator) is None and (wrong := actuator_fault(name, actuator)):
+                warnings.warn(wrong, stacklevel=2)
+            starts.append(self._add(*parameters.values()))
+        for name in rig.weighted:
+            laws.append(weight_law())
+            starts.append(self._add(self._made["weight", name]))
+        every, others = rig.actuators.values(), [[]] * len(rig.weighted)
+        signal_start, signal = _ragged(
+            [[rig.signals.index(name) for name in one.reads] for one in every] + others
+        )
+        coordinate_start, coordinate = _ragged(
+            [[rig.coordinate(name) for name in one.measures] for one in every] + others
+        )
+        return filled(
+            Sources, linearise=[law.linearise for law in laws],
+            pullback=[law.pullback for law in laws], p_start=[*starts, len(self._index)],
+            pushed=[rig.coordinate(one.pushes) for one in every]
+            + [rig.coordinate(f"{name}.y") for name in rig.weighted],
+            power=[*range(len(every)), *[len(every)] * len(rig.weighted)],
+            signal_start=signal_start, signal=signal, coordinate_start=coordinate_start,
+            coordinate=coordinate,
+        )  # fmt: skip
+
+    def _laws(self, name: str, law: SoftContact, shape: Shape) -> LawSet:
+        """The laws of a contact, checked where they are not this package's."""
+        key = id(law), id(shape)
+        if key not in self._known:
+            check_shape(self.rig.contacts[name].body, shape)
+            slip = law.friction
+            own = structure_of(law) is None or not isinstance(slip, Friction | RateAndState)
+            stiffness = law.R_t.item() + NOMINAL * law.K_t.item()
+            if own:
+                self.shared = False
+                one = torch.ones(()).double()
+                slip_rates(name, slip, one, one, stiffness)
+            self._known[key] = contact_laws(
+                law, self._shapes.get(self.rig.contacts[name].body, shape)
+            )
+            faults = list[str]()
+            if own:
+                faults += check_slip(name, slip, stiffness), friction_fault(name, slip, stiffness)
+            if structure_of(shape) is None:
+                faults.append(shape_fault(self.rig.contacts[name].body, shape))
+            for wrong in filter(None, faults):
+                warnings.warn(wrong, stacklevel=2)
+        return self._known[key]
+
+    def _make_contacts(self) -> tuple[Contacts, Points]:
+        rig, contacts = self.rig, self.rig.contacts.values()
+        laws, starts, limits = list[LawSet](), list[int](), list[Any]()
+        shapes = [rig.shape_of(name) for name in rig.contacts]
+        for (name, contact), shape in zip(rig.contacts.items(), shapes):
+            laws.append(self._laws(name, contact.law, shape))
+            starts.append(self._add(*laws[-1].parameters.values()))
+            pad = rig.pads[contact.pad]
+            corners = pad.placed(np.stack(np.meshgrid(*pad.mesh.space.T), -1).reshape(-1, 2))
+            box = np.stack((corners.min(0), corners.max(0)), 1).ravel()
+            limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
+        owners = [list(rig.pads).index(contact.pad) for contact in contacts]
+        body = np.array(
+            [3 * list(rig.bodies).index(contact.body) for contact in contacts], np.int64
+        )
+        both = np.stack((body, self._pads.base[owners]), 1)[..., None] + np.arange(3)
+        coordinate = both.reshape(-1, 6)
+        counts = list(rig.point_counts.values())
+        made = filled(
+            Contacts, pad=owners, number=self._bodies.free[coordinate], coordinate=coordinate,
+            states=[one.states for one in laws], distance=[one.distance.value for one in laws],
+            value=[one.interface.value for one in laws],
+            linearise=[one.interface.linearise for one in laws],
+            pullback=[one.interface.pullback for one in laws],
+            free_linearise=[one.free.linearise for one in laws],
+            free_pullback=[one.free.pullback for one in laws],
+            stored=[one.stored.value for one in laws], p_start=[*starts, len(self._index)],
+            point_start=np.cumsum([0, *counts]), size=[shape.size() for shape in shapes],
+            limits=limits, relative=motion_law().value,
+            relative_linearise=motion_law().linearise,
+        )  # fmt: skip
+        pads = [rig.pads[contact.pad] for contact in contacts]
+        joined = lambda parts, *shape: np.concatenate([np.zeros((0, *shape)), *parts])
+        return made, filled(
+            Points, contact=np.repeat(np.arange(len(counts)), counts),
+            X=joined((pad.point_positions for pad in pads), 2),
+            weight=joined(rig.weight(name).detach() for name in rig.contacts),
+            node=joined(
+                (self._pads.node_start[k] + pad.point_nodes for k, pad in zip(owners, pads)), 2
+            ),
+            N=joined((pad.point_shares for pad in pads), 2), y_start=joined(
+                np.arange(*self.layout.slices["stretch", name].indices(self.layout.size))
+                for name in rig.contacts
+            ),
+        )  # fmt: skip
+
+
+def lengthened(rows: Any, value: float) -> Any:
+    """Rows of a pad's elements, with rows of one value up to a multiple of `LANES`."""
+    more = -len(rows) % LANES
+    return np.concatenate((rows, np.full((more, rows.shape[1]), value, rows.dtype)))
+
+
+def spread(corners: Index) -> int:
+    """Largest difference between the nodes of one element, bonded ones (below zero) apart."""
+    free = corners >= 0
+    most = np.where(free, corners, -1).max(1) - np.where(free, corners, corners.max()).min(1)
+    return int(most.max())
+
+
+def filled(part: Any, /, **fields: Any) -> Any:
+    """One of `PARTS` from its fields, as arrays of their declared types."""
+    parts = []
+    for name, dtype, ndim, _ in layout(part):
+        value = np.ascontiguousarray(fields[name], dtype) if ndim else fields[name]
+        parts.append(value if np.ndim(value) == ndim else value.reshape((0,) * ndim))
+    return part(*parts)
+
+
+def _ragged(lists: list[list[int]]) -> tuple[Index, list[int]]:
+    """Ends of concatenated lists, and their numbers."""
+    return np.cumsum([0, *map(len, lists)]), [number for one in lists for number in one]
+
+
+def prepared_shapes(rig: Rig) -> dict[str, Shape]:
+    """Shapes that laws are compiled from where they are others than the bodies' own, by body."""
+    shapes = {name: body.shape for name, body in rig.bodies.items() if body.shape is not None}
+    made = {name: shape.prepared() for name, shape in shapes.items()}
+    return {name: shape for name, shape in made.items() if shape is not shapes[name]}
+
+
+def computed(rig: Rig, shapes: Mapping[str, Shape]) -> dict[tuple[str, str], Tensor]:
+    """Numbers that the kernels read and that are made of parameters, by kind and part."""
+    out = {("masses", name): torch.stack(body.masses) for name, body in rig.bodies.items()}
+    out |= {
+        ("weight", name): torch.stack((body.mass, rig.gravity))
+        for name, body in rig.weighted.items()
+    }
+    for name, pad in rig.pads.items():
+        material = pad.material
+        if pad.nodal:
+            out["factors", name] = pad.factors()
+            out["density", name] = material.rho * material.depth
+        else:
+            own = torch.stack((1 / (pad.E * material.depth), material.nu))
+            out["chain", name] = torch.cat((*pad.chain(), own))
+    for name, shape in shapes.items():
+        out |= {(f"shape of {name}", key): x for key, x in shape.named_parameters()}
+    return out
+
+
+def ranges(modules: Sequence[Any], structure: Structure) -> tuple[Array, Array]:
+    """Least and largest value of every number of a structure's parameters."""
+    ends = list[Array]()
+    for module in modules:
+        for name, value in module._parameters.items():
+            if value is not None:
+                known = quantity_of(module, name)
+                low, high = (-np.inf, np.inf) if known is None else (known.low, known.high)
+                most = np.nextafter(LARGEST, 0.0)
+                ends.append(np.tile([max(low, -most), min(high, most)], (value.numel(), 1)))
+    both = np.concatenate([np.zeros((0, 2)), *ends])
+    return both[:, 0].copy(), both[:, 1].copy()
+
+
+def derived(modules: Sequence[Any]) -> list[tuple[int, str, float, float]]:
+    """Numbers with a range that are made of parameters: of which module, names and ranges."""
+    out = []
+    for i, module in enumerate(modules):
+        for name in quantities(type(module)).keys() - module._parameters.keys():
+            if isinstance(getattr(module, name, None), Tensor):
+                known = quantity_of(module, name)
+                assert known is not None
+                out.append((i, name, known.low, known.high))
+    return out
+
+
+def geometric(modules: Sequence[Any], structure: Structure) -> list[int]:
+    """Which of the parameters the arrays of a model depend on: those of shapes, and Poisson's
+    ratios; all of them where it is not known."""
+    owners = [(m, k) for m in modules for k, x in m._parameters.items() if x is not None]
+    if not structure.known:
+        return [*range(len(owners))]
+    return [
+        i for i, (module, name) in enumerate(owners)
+        if isinstance(module, Shape) or (isinstance(module, Material) and name == "nu")
+    ]  # fmt: skip
+
+
+_kept: deque[Model] = deque(maxlen=KEPT)
+_finding = threading.RLock()
+
+
+def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
+    """The model of a rig with these parameters, made where there is none."""
+    with _finding:
+        kept = _kept if structure.known else ()
+        found = next((one for one in kept if one.serves(structure, values)), None)
+        if found is None:
+            found = Model(structure, values)
+        elif found is not _kept[0]:
+            _kept.remove(found)
+        if found.shared and (not _kept or found is not _kept[0]):
+            _kept.appendleft(found)
+    return found
+
+
+def forget() -> None:
+    """Keep nothing: models are made anew."""
+    with _finding:
+        _kept.clear()

@@ -1,0 +1,213 @@
+"""Structure of a rig or of a part of it: everything but the values of its parameters.
+
+Two parts of one structure have the same laws and layout; what is made of a structure serves every
+part that has it, and is made anew for any other.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache, cached_property
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from torchsoft.physics.graph import Graph
+from torchsoft.physics.mesh import Mesh
+from torchsoft.physics.pads import Taxels
+
+OWN = "torchsoft.", "torch.nn."
+"""Packages whose modules say all of themselves."""
+
+HOOKS = "_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks"
+
+PLAIN = frozenset((bool, int, float, str, type(None)))
+
+IDLE: Mapping[type, frozenset[str]] = {Graph: frozenset(("watch", "tables", "reference"))}
+"""Attributes of modules that decide nothing of a run; the reference is given to it."""
+
+
+class Unknown(Exception):
+    """Something that does not say all of itself."""
+
+
+class Numbers:
+    """An array, equal to one of the same numbers."""
+
+    def __init__(self, array: NDArray[Any]) -> None:
+        self.array = array
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Numbers) and self.array.dtype == other.array.dtype
+            and np.array_equal(self.array, other.array)
+        )  # fmt: skip
+
+    def __hash__(self) -> int:
+        return hash(self.array.shape)
+
+
+def lasting(value: Any) -> Any:
+    """A key whose arrays nobody else can change."""
+    if isinstance(value, Numbers):
+        return Numbers(value.array.copy())
+    return tuple([lasting(one) for one in value]) if type(value) is tuple else value
+
+
+class Structure:
+    """Modules of a part, each once, its parameters' tensors in their order, and a `key` that is
+    equal for equal structures, until something changes. `known` is False where that is not certain:
+    for code that is neither this package's nor torch's, hooks, other attributes than numbers, text,
+    arrays and functions of this package. Such a part is like no other, nor like itself later."""
+
+    def __init__(self, part: nn.Module) -> None:
+        self.modules: list[nn.Module] = []
+        self.children: list[dict[str, int | None]] = []
+        self.parameters: list[Tensor] = []
+        self.known = True
+        self._key: list[Any] = []
+        self._numbers: dict[int, int] = {}
+        self._visit(part)
+        first: dict[int, int] = {}
+        self._key += [first.setdefault(id(x), i) for i, x in enumerate(self.parameters)]
+        self.key = tuple(self._key)
+
+    def _visit(self, module: nn.Module) -> int:
+        if (found := self._numbers.get(id(module))) is not None:
+            return found
+        number = self._numbers[id(module)] = len(self.modules)
+        children: dict[str, int | None] = {}
+        self.modules.append(module)
+        self.children.append(children)
+        own, kind = module.__dict__, type(module)
+        idle, numbers, known = _traits(kind)
+        key = self._key
+        key.append((kind, kind.forward, *[getattr(kind, name) for name in numbers]))
+        if not known or any(own.get(hooks) for hooks in HOOKS):
+            self.known = False
+        try:
+            for name, value in own.items():
+                if name[0] != "_" and name not in idle:
+                    key.append(name)
+                    key.append(value if type(value) in PLAIN else described(value))
+            for name, value in own["_buffers"].items():
+                key.append((name, None if value is None else described(value)))
+        except Unknown:
+            self.known = False
+        for name, value in own["_parameters"].items():
+            key.append(name)
+            key.append(None if value is None else value.shape)
+            if value is not None:
+                self.parameters.append(value)
+        for name, child in own["_modules"].items():
+            if name not in idle:
+                children[name] = None if child is None else self._visit(child)
+        key.append(tuple(children.items()))
+        return number
+
+
+@cache
+def _traits(kind: type) -> tuple[frozenset[str], tuple[str, ...], bool]:
+    """Names of attributes that decide nothing, names of the numbers of a class, and whether its
+    objects say all of themselves."""
+    bases = [base for base in kind.__mro__ if base not in (nn.Module, object)]
+    idle = frozenset().union(*(names for base, names in IDLE.items() if issubclass(kind, base)))
+    cached = {k for base in bases for k, v in vars(base).items() if isinstance(v, cached_property)}
+    numbers = {k: 0 for base in bases for k, v in vars(base).items() if isinstance(v, int | float)}
+    known = kind.__module__.startswith(OWN)
+    return idle | cached, tuple(numbers), known
+
+
+def described(value: Any) -> Any:
+    """A value as it is now, hashable. Raises `Unknown` where nobody can tell."""
+    if type(value) in PLAIN or isinstance(value, Mesh | Taxels):
+        return value
+    if isinstance(value, Tensor):
+        try:
+            value = value.detach().numpy()
+        except (TypeError, RuntimeError):
+            raise Unknown from None
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return Numbers(value)
+    if type(value) in (tuple, list):
+        return tuple([described(one) for one in value])
+    if type(value) is dict:
+        return tuple([(key, described(one)) for key, one in value.items()])
+    if (
+        isinstance(value, FunctionType)
+        and (value.__module__ or "").startswith("torchsoft.")
+        and value.__closure__ is None
+    ):
+        return value
+    raise Unknown
+
+
+class Copies:
+    """Copies of a part, of whose parameters each has its own: of the same structure as the part
+    when this was made, whatever happens to that later."""
+
+    def __init__(self, structure: Structure) -> None:
+        self._kinds = [type(module) for module in structure.modules]
+        self._children, self._own = structure.children, list[dict[str, Any]]()
+        self._parameters = [[*module._parameters] for module in structure.modules]
+        self._there = [
+            [value is not None for value in module._parameters.values()]
+            for module in structure.modules
+        ]
+        self._buffers = list[dict[str, Any]]()
+        for module in structure.modules:
+            apart = "_parameters", "_buffers", "_modules"
+            own = {k: v for k, v in vars(module).items() if k not in apart}
+            for name, value in own.items():
+                if type(value) in (dict, list, np.ndarray):
+                    own[name] = value.copy()
+            self._own.append(own)
+            buffers = module._buffers.items()
+            self._buffers.append({k: v if v is None else v.detach().clone() for k, v in buffers})
+
+    def made(self, values: Sequence[Tensor]) -> list[Any]:
+        """The modules of a copy with these parameters, in the structure's order; the part itself
+        comes first."""
+        out: list[Any] = [kind.__new__(kind) for kind in self._kinds]
+        given = iter(values)
+        parts = zip(
+            out,
+            self._own,
+            self._parameters,
+            self._there,
+            self._buffers,
+            self._children,
+            strict=True,
+        )
+        for module, own, names, there, buffers, children in parts:
+            mine = module.__dict__
+            mine.update(own)
+            mine["_parameters"] = {
+                name: next(given) if here else None for name, here in zip(names, there)
+            }
+            mine["_buffers"] = buffers
+            mine["_modules"] = {
+                name: None if number is None else out[number] for name, number in children.items()
+            }
+        return out
+
+
+def structure_of(part: object) -> Any:
+    """Key of the structure of a part, hashable and lasting; None where it is not known."""
+    found = Structure(part) if isinstance(part, nn.Module) else None
+    return lasting(found.key) if found is not None and found.known else None
+
+
+def copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:
+    """The same modules over the same tensors, beside those in `known`, by their id: tracing puts
+    others in their place, which other threads must not meet."""
+    if id(module) not in known:
+        out = known[id(module)] = module.__class__.__new__(module.__class__)
+        mine = out.__dict__
+        mine.update(module.__dict__)
+        mine["_parameters"], mine["_buffers"] = dict(module._parameters), dict(module._buffers)
+        mine["_modules"] = {
+            k: m if m is None else copied(m, known) for k, m in module._modules.items()
+        }
+    return known[id(module)]
