@@ -31,9 +31,9 @@ FLOWS = {
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
-        initial_state recording unknowns prediction noise runs problem first_samples
+        initial_state recording unknowns prediction noise runs assumptions problem first_samples
         synthetic fit plan prechecks
-        residual_tests colour assumptions refits sensitivity suspects estimate result profile
+        residual_tests colour refits sensitivity suspects estimate result profile
         posterior identification compare
         planner columns configuration measured design figures report .
     """,

@@ -25,6 +25,7 @@ from torchsoft.sysid import (
     sensitivity,
 )
 from torchsoft.sysid.assumptions import (
+    AMOUNTS,
     PLACE,
     Variation,
     assumptions,
@@ -33,20 +34,20 @@ from torchsoft.sysid.assumptions import (
     remeshed,
 )
 from torchsoft.sysid.estimate import Quantity
-from torchsoft.sysid.identification import held_by, notices_on
+from torchsoft.sysid.identification import notices_on, ordering_constraints
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import (
-    AMOUNTS,
     End,
     Joint,
+    assuming,
     difference,
     ended,
     fewest,
     joint_fit,
     refit,
-    varied,
 )
+from torchsoft.sysid.residual_tests import Verdict
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
@@ -59,7 +60,7 @@ from torchsoft.sysid.sensitivity import (
     new_fits,
     rivals,
 )
-from torchsoft.sysid.suspects import assumption_notices
+from torchsoft.sysid.suspects import assumption_doubts, assumption_notices, unseen
 
 BASE = PAPER.override(COARSE)
 E, NU, K_N = "materials.rubber.E", "materials.rubber.nu", "laws.steel_on_rubber.K_n"
@@ -87,6 +88,14 @@ def brief() -> Recording:
     return recorded(excitation=BRIEF)
 
 
+ALARM = Verdict("motion", "roll", "x", 1e-9, 0.4, "x of `roll` (40% of it, most like its rate)")
+
+
+def notices(found: Checked) -> list[str]:
+    """All that is said of the assumptions."""
+    return assumption_doubts(found) + assumption_notices(found)
+
+
 def checked(
     data: Recording,
     doubtful: bool = False,
@@ -110,7 +119,7 @@ def same():
 
 
 def test_nothing_is_said_of_what_is_right(same):
-    assert not assumption_notices(same)
+    assert not notices(same)
     names = {one.name for one in same.checks}
     assert {
         "mesh", "contact points", "mesh phase", "start of disc.x",
@@ -179,10 +188,10 @@ def test_the_cause_is_named_with_its_amount(made, name, favoured, says):
         assert one.value == pytest.approx(
             (1 + one.favoured / 100) * BASE.assemble().parameter(name).item(), rel=1e-9
         )
-        assert f"with {name} = {one.value:.6g} (" in assumption_notices(found)[0]
-    assert f"estimates under it: {E} = " in assumption_notices(found)[0]
+        assert f"with {name} = {one.value:.6g} (" in notices(found)[0]
+    assert f"estimates under it: {E} = " in notices(found)[0]
     assert one.under[E] == pytest.approx(TRUTH[E], rel=0.05)
-    assert assumption_notices(found)[0].startswith(f"the data contradict that {says}")
+    assert notices(found)[0].startswith(f"the data contradict that {says}")
 
 
 def made_by(
@@ -204,7 +213,7 @@ def test_a_finer_mesh_is_asked_for_by_data_that_one_made():
     (mesh,) = (one for one in found.checks if one.name == "mesh")
     assert mesh.suspected
     assert mesh.favoured == pytest.approx(1.0, abs=0.2)
-    assert any("elements" in sentence for sentence in assumption_notices(found))
+    assert any("elements" in sentence for sentence in notices(found))
 
 
 LIGHT = stroked(travel=30e-3, stroke_time=0.15, duration=0.9, depth=1.8e-4)
@@ -235,7 +244,7 @@ def test_what_no_test_explains_has_candidates(
     found = check_assumptions(problem, end, doubtful=True)
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
-    assert any(": `explain` fits again with each of " in text for text in assumption_notices(found))
+    assert any(": `explain` fits again with each of " in text for text in notices(found))
 
 
 @pytest.mark.slow
@@ -247,7 +256,9 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     base, steps = problem.freeze(runner, x, problem.names, RTOL)
     end = End(x, at, problem.coordinates.free, problem.names, base, steps, RTOL, runner, RTOL)
     law = next(
-        one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction"
+        one
+        for one in assumptions(problem.recordings, set(TRUTH), problem.sensors)
+        if one.name == "Coulomb friction"
     )
     as_stated, again = (
         refit(problem, end, tried, "linear", lambda chi2: None) for tried in ((), [law])
@@ -269,7 +280,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     end = End(x, at, c.free, problem.names, at, steps, RTOL, runner, RTOL)
     suspects = [
         one
-        for one in assumptions(problem.recordings, set(TRUTH))
+        for one in assumptions(problem.recordings, set(TRUTH), problem.sensors)
         if one.name in (MASS, NU, V_S, "mesh")
     ]
     found = joint_fit(problem, end, suspects, 1.1 * len(at.r), "linear", lambda chi2: None)
@@ -292,7 +303,7 @@ def test_faults_that_only_together_explain_the_data_are_named_together():
     (one,) = (one for one in found.checks if one.kind == "several")
     assert one.name == "delay theta_C and delay x_C"
     assert one.odds > 0.9
-    notice = assumption_notices(found)[0]
+    notice = notices(found)[0]
     assert "theta_C has no unknown delay and x_C has no unknown delay" in notice
     assert re.search(r" if theta_C came late \(\+(1\.9|2)\S* ms fit best, .*\) and if x_C", notice)
     assert one.under[E] == pytest.approx(TRUTH[E], rel=0.01)
@@ -325,12 +336,12 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     where not, no number before a law, and none at all after a law that leaves much less than all
     numbers together."""
     taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
-    taken.append(Variation("law", "law", "", "", vary=lambda r: r))
+    taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
-        little=100.0,
+        explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
         fit=lambda one, again, stated, linear: replace(
@@ -353,20 +364,28 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
 def test_near_rivals_to_first_order_are_left_to_new_fits(same, second, near):
     taken = [Variation(name, "known", f"{name} is 1", "", parameter=name) for name in "abc"]
     checks = {
-        one.name: assumption_test(one, gain=gain, favoured=1.0, significance=gain, odds=odds)
+        one.name: assumption_test(
+            one, gain=gain, favoured=1.0, significance=gain, odds=odds, passed=True
+        )
         for one, gain, odds in zip(taken, (300.0, second, 5.0), (1.0, 0.0, 0.0))
     }
     assert [one.name for one in rivals(taken, checks)] == near
-    said = assumption_notices(same._replace(checks=[*checks.values()], candidates=tuple(near)))
-    assert (". Nearly as much falls with b (by 250): `explain` compares" in said[0]) == bool(near)
+    alarms = {"as_stated": (ALARM,)}
+    said = notices(same._replace(checks=[*checks.values()], candidates=tuple(near), **alarms))
+    assert said[0].startswith("the data contradict that a is 1") != bool(near)
+    assert ("one of 2 assumptions" in said[0] and "b (by 250): `explain`" in said[0]) == bool(near)
 
 
 def test_a_number_is_varied_as_far_as_there_is_a_rig():
     """Friction in slip must not exceed that at rest."""
     data = recorded(excitation=BRIEF, file=BASE.override({MU_K: 0.795}))
     problem = Problem([data], SENSORS, {name: Unknown() for name in TRUTH})
-    (one,) = (one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == MU_K)
-    other = varied(problem, problem.names, one)
+    (one,) = (
+        one
+        for one in assumptions(problem.recordings, set(TRUTH), problem.sensors)
+        if one.name == MU_K
+    )
+    other = assuming(problem, [one], free=True)
     sliding = next(a for a in other.coordinates.all if a.name == MU_K)
     reach = AMOUNTS * one.step / one.nominal
     assert sliding.low == pytest.approx((1 - reach) * 0.795)
@@ -377,7 +396,7 @@ def test_a_doubtful_fit_is_repeated_with_what_would_explain_most():
     """And with every law, which either holds or does not."""
     names = [f"number {k}" for k in range(MOST + 5)]
     taken = [Variation(name, "known", "", "", parameter=name) for name in names]
-    taken.append(Variation("law", "law", "", "", vary=lambda r: r))
+    taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     checks = {
         one.name: assumption_test(one, gain=100.0 - k, left=900.0, favoured=1.0)
         for k, one in enumerate(taken)
@@ -393,30 +412,91 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same):
         AssumptionTest(
             name, "known", f"{name} is 1", "", 1.0, "%", name, 1.0, 0.01, gain=gain,
             left=1000.0 - gain, favoured=5.0, favoured_sd=0.5, significance=gain, value=1.05,
-            refitted=True,
+            refitted=True, passed=True,
         )
         for name, gain in (("a", 300.0), ("b", 299.0), ("c", 200.0))
     ]  # fmt: skip
     judge: Any = SimpleNamespace(
         dof=990,
-        besides=lambda best, every: ((), np.zeros(3)),
-        remaining=lambda r: {"effort_y": 3.1},
+        besides=lambda best, every: ((), np.zeros(3), np.zeros((3, 1))),
+        alarms=lambda r, J: [],
     )
-    found = compared(same._replace(checks=tests), judge)
+    found = compared(same._replace(checks=tests, as_stated=(ALARM,)), judge)
     odds = {one.name: one.odds for one in found.checks}
     assert odds["a"] == pytest.approx(1 / (1 + np.exp(-0.5)), rel=1e-3)
     assert odds["a"] + odds["b"] == pytest.approx(1.0)
     assert odds["c"] < 1e-20
-    said = assumption_notices(found)
-    assert said[0].startswith("the data contradict that a is 1: the sum of squares falls by 300")
-    assert "cannot tell it (odds 0.62) from: b with b = 1.05 (+5 %, +- 0.5), odds 0.38" in said[0]
-    assert said[1] == "none of 3 suspects explains effort_y: 3.1 times the noise left"
-    first, second = assumption_notices(found._replace(left={"effort_y": 58.0}))
-    assert first == (
-        "no suspect explains these data: the sum of squares falls by 300 in a new fit with a = "
-        "1.05 (+5 %, +- 0.5), which leaves too much to be the cause"
+    (said,) = notices(found)
+    assert said.startswith("the data contradict that a is 1: the sum of squares falls by 300")
+    assert "cannot tell it (odds 0.62) from: b with b = 1.05 (+5 %, +- 0.5), odds 0.38" in said
+    judge.alarms = lambda r, J: [ALARM]
+    (said,) = notices(compared(same._replace(checks=tests, as_stated=(ALARM,)), judge))
+    assert said == (
+        "the misfit stands for something that is none of the assumptions tested: with the nearest "
+        "one, a, the sum of squares falls by 300 in a new fit with a = 1.05 (+5 %, +- 0.5), but "
+        "residuals follow the motion in x of `roll` (40% of it, most like its rate)"
     )
-    assert second == "none of 3 suspects explains effort_y: 58 times the noise left"
+
+
+def test_a_suspect_is_no_cause_where_residuals_pass_without_it(same):
+    (one,) = (one for one in same.checks if one.name == RADIUS)
+    found = replace(
+        one, suspected=True, passed=True, odds=1.0, gain=31.0, favoured=2.0, favoured_sd=0.4,
+        value=0.0198,
+    )  # fmt: skip
+    checked = same._replace(checks=[found])
+    (said,) = notices(checked)
+    assert said == (
+        f"something is not as stated: the sum of squares would fall by 31 with {RADIUS} = 0.0198 "
+        "(+2 %, +- 0.4), which is more than chance. Residuals pass every test without it, so that "
+        "nothing confirms the cause"
+    )
+    assert not checked.explained
+
+
+def test_a_suspect_under_which_something_is_left_loses_to_one_that_passes(same):
+    """However much more the sum of squares falls with it."""
+    tests = [
+        AssumptionTest(
+            name, "known", f"{name} is 1", "", 1.0, "%", name, 1.0, 0.01, gain=gain,
+            left=1000.0 - gain, favoured=5.0, favoured_sd=0.5, significance=gain, value=1.05,
+            refitted=True, passed=passed,
+        )
+        for name, gain, passed in (("a", 300.0, False), ("b", 280.0, True))
+    ]  # fmt: skip
+    judge: Any = SimpleNamespace(
+        dof=990,
+        besides=lambda best, every: ((), np.zeros(3), np.zeros((3, 1))),
+        alarms=lambda r, J: [],
+    )
+    found = compared(same._replace(checks=tests, as_stated=(ALARM,)), judge)
+    assert [one.odds for one in found.checks] == [0.0, 1.0]
+    (said,) = notices(found)
+    assert said.startswith("the data contradict that b is 1")
+    assert "cannot tell it" not in said
+
+
+def test_what_would_not_be_seen_is_said_with_its_size_or_its_price(same):
+    """The worst three of each kind that move an estimate by more than a standard deviation."""
+
+    def one(name: str, move: float, detectable: float, **others: Any) -> AssumptionTest:
+        usual = {"moves": {E: move}, "detectable": detectable}
+        return AssumptionTest(name, "known", "", "", 1.0, "%", **(usual | others))
+
+    tests = [
+        one("a", 2.0, 3.0), one("b", -0.5, 4.0), one("c", 0.1, 5.0), one("d", 1.0, 1.5),
+        one("e", 5.0, 0.5), one("far", 3.0, 1e3), one("seen", 9.0, 3.0, suspected=True),
+    ]  # fmt: skip
+    said = unseen(same._replace(checks=tests, sd={E: 0.004}))
+    assert said == [
+        f"a: 3 % more or less than stated would not be seen, and moves {E} by 6 standard "
+        "deviations",
+        f"e: 0.5 % more or less than stated would not be seen, and moves {E} by 2.5 standard "
+        "deviations",
+        f"b: 4 % more or less than stated would not be seen, and moves {E} by 2 standard "
+        "deviations",
+        f"{E} takes far as exact: 1 % of it is +1.2 % of {E}",
+    ]
 
 
 def test_two_causes_are_both_named():
@@ -428,9 +508,7 @@ def test_two_causes_are_both_named():
     )
     first, *_ = sorted(found.checks, key=lambda one: -one.odds)
     assert {first.name, *(one.name for one in found.besides)} >= {"bias theta_C", "gain effort_y"}
-    assert any(
-        text.startswith("besides, the data contradict") for text in assumption_notices(found)
-    )
+    assert any(text.startswith("besides, the data contradict") for text in notices(found))
 
 
 @pytest.mark.slow
@@ -460,15 +538,17 @@ def test_every_pad_is_meshed_anew_where_it_was():
 
 def test_what_is_unknown_is_not_taken_for_granted():
     data = brief()
-    names = {one.name for one in assumptions([data], set())}
-    left = {one.name for one in assumptions([data], {RADIUS, "start.disc.x"})}
+    names = {one.name for one in assumptions([data], set(), SENSORS)}
+    left = {one.name for one in assumptions([data], {RADIUS, "start.disc.x"}, SENSORS)}
     assert names - left == {RADIUS, "start of disc.x"}
 
 
 def test_a_variation_that_cannot_be_run_is_said(monkeypatch):
-    one = Variation("mesh", "numerical", "the pads have few elements", "", vary=lambda r: None)
+    one = Variation(
+        "mesh", "numerical", "the pads have few elements", "", vary=lambda r, amount, run: None
+    )
     monkeypatch.setattr("torchsoft.sysid.sensitivity.assumptions", lambda *_: [one])
-    (said,) = assumption_notices(checked(brief()))
+    (said,) = notices(checked(brief()))
     assert said.startswith("it could not be checked what it does that the pads have few elements")
 
 
@@ -559,7 +639,7 @@ def test_an_interval_wider_than_its_value_determines_nothing(value, sd, seen):
 def test_a_known_number_that_holds_an_unknown_one_is_named():
     """mu_s ends at the mu_k that is taken for known."""
     problem = Problem([recorded()], SENSORS, {"contact.mu_s": Unknown()})
-    held = held_by(problem)
+    held = ordering_constraints(problem)
     assert held == {MU_S: (MU_K, 0.7)}
     one: Any = SimpleNamespace(
         identifiable=True, at_bound=True, label="mu_s", name=MU_S, last=0.70007, step_bias_sd=0.0

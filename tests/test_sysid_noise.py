@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 from scipy import linalg, optimize, signal, stats
 
-from torchsoft.sysid.fit import EFFICIENCY, REACH, Loss, covariance, fisher, rho, spared
+from torchsoft.sysid.fit import (
+    EFFICIENCY,
+    REACH,
+    Loss,
+    covariance,
+    fisher,
+    rho,
+    robust_loss_except_priors,
+)
 from torchsoft.sysid.noise import (
     Autoregression,
     coefficients,
@@ -173,11 +181,15 @@ def test_losses_are_scipys(loss):
         "ftol": 1e-14,
     }
     one = optimize.least_squares(lambda x: J @ x - y, loss=loss, **options)
-    other = optimize.least_squares(lambda x: J @ x - y, loss=spared(loss, 0), **options)
+    other = optimize.least_squares(
+        lambda x: J @ x - y, loss=robust_loss_except_priors(loss, 0), **options
+    )
     np.testing.assert_allclose(other.x, one.x, rtol=1e-12)
     assert other.cost == pytest.approx(one.cost, rel=1e-12)
     prior = optimize.least_squares(
-        lambda x: np.append(J @ x - y, 50.0 * (x - 2.0)), loss=spared(loss, 2), x0=np.zeros(2)
+        lambda x: np.append(J @ x - y, 50.0 * (x - 2.0)),
+        loss=robust_loss_except_priors(loss, 2),
+        x0=np.zeros(2),
     )
     assert np.abs(prior.x - 2.0).max() < 0.1  # however far off, a prior is no outlier
 
@@ -196,7 +208,7 @@ def test_robust_covariance_is_that_of_many_fits(loss, bad):
         start = np.linalg.lstsq(J, y, rcond=None)[0]
         fit = optimize.least_squares(
             lambda x, y=y: J @ x - y, start if bad == 0 else 0 * start, jac=lambda x: J,
-            loss=spared(loss, 0), f_scale=REACH[loss],
+            loss=robust_loss_except_priors(loss, 0), f_scale=REACH[loss],
         )  # fmt: skip
         ends.append(fit.x)
         plain.append(start)

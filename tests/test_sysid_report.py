@@ -269,7 +269,7 @@ def test_assumptions_that_matter_stand_open_and_others_are_folded(page):
     folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
     said = (
         f"\nthe disc weighs 1 kg\nit were not\n−4.2 sd of {E}\nyes −3.1 ± 1.2 %: the sum of "
-        "squares would fall by 99\n"
+        "squares would fall by 99, but is not the cause\n"
     )
     assert page.text.index(said) < folded
     assert page.text.index("\nslip is smooth\nit were not\nnot checked: a run failed\n") < folded

@@ -26,8 +26,7 @@ from torchsoft.sysid.assumptions import assumptions
 from torchsoft.sysid.columns import wraps
 from torchsoft.sysid.measured import load, vocabulary
 from torchsoft.sysid.prediction import Frozen
-from torchsoft.sysid.refits import since
-from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.runs import Runner, since
 
 RIG = RigFile.path("two_fingers")
 SENSORS = {"x_disc": 10e-6, "y_disc": 10e-6, "x_left": 10e-6, "effort_left_x": 0.05}
@@ -121,11 +120,11 @@ def test_a_recorded_signal_takes_the_place_of_the_files_motion(folder):
 def test_the_time_before_the_first_sample_is_an_assumption(folder):
     """Said otherwise in both directions, on the steps of the fit with others before them."""
     (stated,) = load([folder / "run.csv"], folder / "fit.toml").problem.recordings
-    (other,) = [one for one in assumptions([stated], set()) if one.name == "lead"]
-    made = other.vary(stated)
+    (other,) = [one for one in assumptions([stated], set(), {}) if one.name == "lead"]
+    made = other.vary(stated, 1.0, None)
     assert (stated.start.lead, made.start.lead) == (0.0, 0.2)
-    (back,) = [one for one in assumptions([made], set()) if one.name == "lead"]
-    assert back.vary(made).start.lead == 0.0
+    (back,) = [one for one in assumptions([made], set(), {}) if one.name == "lead"]
+    assert back.vary(made, 1.0, None).start.lead == 0.0
     knots = np.array([0.0, 4e-3, 0.01])
     earlier = since(Frozen(knots), -5e-3).knots
     assert earlier.tolist() == pytest.approx([-5e-3, -3e-3, -1e-3, 0.0, 4e-3, 0.01])

@@ -200,7 +200,7 @@ def halved(
 
 
 FRICTION, CENTRE, HEIGHT = ("friction_ratio",), ("bodies.disc.centre",), ("height of", "thickness")
-LATE = tuple(f"{what} of actuator" for what in ("delay", "lag", "hold"))
+LATE = ("delay of controllers", "delay of the controller")
 """To first order a delay, a lag and half the period of a hold are the same."""
 
 PAIRS = (
@@ -231,7 +231,7 @@ PAIRS = (
     halved((0.5, 0.25), "controllers {} ms late", LATE, lambda size: {"delay": 1e-3 * size}),
     halved((0.5, 0.25), "controllers lag by {} ms", LATE, lambda size: {"lag": 1e-3 * size}),
     halved((1, 0.5), "controllers hold for {} ms", LATE, lambda size: {"hold": 1e-3 * size}),
-    halved((24, 26), "F_x limited to {} N", ("limit of actuator",),
+    halved((24, 26), "F_x limited to {} N", ("limit of the controller x",),
            lambda size: {"F_x_most": size}),
     halved((2, 1), "upper pad tilted by {} mrad", ("tilt of",),
            lambda size: {"tilt_U": 1e-3 * size}),
@@ -241,14 +241,14 @@ PAIRS = (
            lambda size: {"softening": size / 100}),
     halved((5, 2.5), "friction falls by {} %", ("wear", "drift of mu", "friction.drift"),
            lambda size: {"wear": size / 100}),
-    halved((20, 40), "theta through a low-pass of {} Hz", ("lowpass", "lag theta_C"),
+    halved((20, 40), "theta through a low-pass of {} Hz", ("lag theta_C",),
            sensed=lambda size: low_passed("theta", size)),
     halved((2, 1), "{} % of effort_y in effort_x", ("crosstalk",),
            sensed=lambda size: mixed("F_x", "F_y", size / 100)),
-    halved((1.002, 1.001), "camera's scale {}", ("gain x_C", "gain y_C", "scale x_C", "scale y_C"),
+    halved((1.002, 1.001), "camera's scale {}", ("gain x_C", "scale of the camera"),
            sensed=lambda size: scaled(size, "zero")),
     halved((1.002, 1.001), "camera's scale {} about the begin",
-           ("gain x_C", "gain y_C", "scale x_C", "scale y_C"),
+           ("gain x_C", "scale of the camera"),
            sensed=lambda size: scaled(size, "begin")),
 )  # fmt: skip
 

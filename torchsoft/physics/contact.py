@@ -4,9 +4,9 @@ stick-slip friction.
 Equations of the paper in brackets. Everything else is generated from these functions: the compiled
 law with its Jacobian and its derivatives in every parameter. Departures from the paper keep forces
 continuous: the normal dashpot carries at most twice what the spring does, so that forces begin at
-zero, and nothing adheres, and the moving frame follows the point on the body nearest to the pad's
-instead of the first one touched. None has a length, a force or a speed of its own: the law is the
-same at every load and size.
+zero, nothing adheres unless it is told to, and the moving frame follows the point on the body
+nearest to the pad's instead of the first one touched. None has a length, a force or a speed of its
+own: the law is the same at every load and size.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes import Shape, parameter
-from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Stiffness
+from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Ratio, Stiffness
 
 SlipLaw = Callable[..., Any]
 """Slip rate |gamma'| >= 0 [m/s] under a trial effort E >= 0 [N], a normal force F_N [N] and the
@@ -214,12 +214,17 @@ class Coulomb(Friction):
 REFERENCE_DEPTH = 1e-4
 """Penetration g_0 [m] at which the normal spring's force is K_n g_0, whatever its power."""
 
+ADHERING_DEPTH = 1e-6
+"""Penetration [m] at which half of the adhesion acts, which sets in smoothly."""
+
 
 class SoftContact(nn.Module):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
     R_n, R_t [N.s/m], and a friction law. `weight` scales them to the length of surface that a point
     stands for. With a `power` m [1] the normal spring's force is K_n g_0 (g / g_0)^m, g_0 being
-    `REFERENCE_DEPTH`."""
+    `REFERENCE_DEPTH`. An `adhesion` A [N] pulls with A g / (g + `ADHERING_DEPTH`) while the point
+    touches, and adds to the force that friction follows (Derjaguin, Muller and Toporov). Friction
+    is `friction_ratio` [1] times that of its law."""
 
     def __init__(
         self,
@@ -236,12 +241,21 @@ class SoftContact(nn.Module):
             float, Quantity("1", 0.5, 4.0, "power of the normal spring's force; linear without one")
         ]
         | None = None,
+        adhesion: Annotated[
+            float, Quantity("N", 0.0, 1e3, "pull of a point that touches; none without one")
+        ]
+        | None = None,
+        friction_ratio: Annotated[Ratio, "friction over that of the law; 1 without one"]
+        | None = None,
     ) -> None:
         super().__init__()
         self.K_n, self.R_n, self.K_t, self.R_t = (
             parameter(value) for value in (K_n, R_n, K_t, R_t)
         )
-        self.power = None if power is None else parameter(power)
+        self.power, self.adhesion, self.friction_ratio = (
+            None if value is None else parameter(value)
+            for value in (power, adhesion, friction_ratio)
+        )
         if not callable(friction):
             raise ValueError(
                 "`friction` must be a function or a module of (effort, normal force, dashpot), "
@@ -265,12 +279,20 @@ class SoftContact(nn.Module):
             depth > 0, self.K_n * REFERENCE_DEPTH * torch.exp(self.power * torch.log(over)), 0.0
         )
 
+    def pull(self, g: Tensor) -> Tensor:
+        """Adhesive force [N] per reference spacing at penetrations g (...) [m]."""
+        depth = g.clamp(min=0.0)
+        if self.adhesion is None:
+            return torch.zeros_like(depth)
+        return self.adhesion * depth / (depth + ADHERING_DEPTH)
+
     def jumps(self, F_N: float) -> str:
         """Why the slip rate jumps under a normal force F_N [N] per reference spacing: friction
         falls with slip faster than spring and dashpot balance, as far as the law of friction knows.
         Empty if it does not."""
         judge = getattr(self.friction, "jumps", None)
-        reason = judge(F_N, self.R_t, self.K_t) if judge is not None else ""
+        ratio = 1.0 if self.friction_ratio is None else self.friction_ratio.item()
+        reason = judge(ratio * F_N, self.R_t, self.K_t) if judge is not None else ""
         return f"slip is not single-valued at a normal force of {F_N:.3g} N: {reason}" * bool(
             reason
         )
@@ -299,25 +321,34 @@ class SoftContact(nn.Module):
         trial = self.K_t * s + R * slides  # (10), (11): the effort if nothing slipped
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
-        slip, z_dot = slip_of(self.friction, sign * trial, F_N, R, z, stage)
+        held = F_N if self.friction_ratio is None else self.friction_ratio * F_N
+        slip, z_dot = slip_of(self.friction, sign * trial, held, R, z, stage)
         gamma_dot = sign * slip  # (12), (13)
         s_dot = slides - gamma_dot
         e = self.K_t * s + R * s_dot
         F_T = torch.where(spring > 0, e, 0.0)
+        F_N = F_N if self.adhesion is None else F_N - self.pull(g)
         return ContactState(weight * F_N, weight * F_T, s_dot, gamma_dot, weight * e, z_dot)
 
     def dissipated(
         self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float
     ) -> tuple[Tensor, Tensor]:
         """Powers [W] that dashpots and slip take out, shape (...), never negative."""
+        stored = self.spring(g) if self.adhesion is None else self.spring(g) - self.pull(g)
         return (
-            at.F_N - weight * self.spring(g)
+            at.F_N - weight * stored
         ) * g_dot + weight * self.R_t * at.s_dot**2, at.e * at.gamma_dot
 
     def stored(self, g: Tensor, s: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Energies [J] of the normal and the tangential springs, shape (...)."""
-        m = 1.0 if self.power is None else self.power
-        return weight * self.spring(g) * g.clamp(min=0.0) / (m + 1), 0.5 * weight * self.K_t * s**2
+        """Energies [J] of the normal spring, adhesion included, and of the tangential one, shape
+        (...)."""
+        m, depth = 1.0 if self.power is None else self.power, g.clamp(min=0.0)
+        normal = self.spring(g) * depth / (m + 1)
+        if self.adhesion is not None:
+            normal = normal - self.adhesion * (
+                depth - ADHERING_DEPTH * torch.log1p(depth / ADHERING_DEPTH)
+            )
+        return weight * normal, 0.5 * weight * self.K_t * s**2
 
 
 # Laws as the kernels call them. A point's motion is (p, r, theta, u', r', theta'): its place in the

@@ -12,15 +12,16 @@ from typing import NamedTuple, TypeVar
 from torch import nn
 
 from torchsoft.physics.contact import REFERENCE_DEPTH, SoftContact
-from torchsoft.physics.material import Material, SlowBranch
+from torchsoft.physics.material import Branch, Material
 from torchsoft.physics.parts import Actuator, Guide, Tilt
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import parameter
 
 M = TypeVar("M", bound=nn.Module)
 
-SLOWER = (10.0, 100.0)
-"""Retardation times of a slow branch over the longest one of the material."""
+FASTER, SLOWER = 0.01, (10.0, 100.0)
+"""Retardation time of a fast branch over the shortest one of the material, and those of slow
+branches over the longest."""
 
 
 class Extension(NamedTuple):
@@ -52,21 +53,38 @@ def extensions(rig: Rig) -> dict[str, Extension]:
                 partial(_pad_ratio, name=name, ratio=ratio),
             )  # fmt: skip
     for stem, material in _shared(rig, Material):
-        pads = [pad for pad in rig.pads.values() if pad.material is material]
-        if material.slow is None and not any(pad.nodal for pad in pads):
-            longest = float(material.chain()[1].detach().max())
-            for factor in SLOWER:
-                out[f"{stem}.slow({factor * longest:.3g} s)"] = Extension(
-                    0.0, 0.01, 0.0, 0.5, "", f"{stem} has no slower branch",
-                    f"0.01 of the compliance of {stem} set in over {factor * longest:.3g} s",
-                    partial(_slow_branch, stem=stem, time=factor * longest),
-                )  # fmt: skip
+        if any(pad.nodal for pad in rig.pads.values() if pad.material is material):
+            continue
+        own = material.chain()[1].detach()
+        branches = {"fast": [FASTER * float(own.min())]}
+        branches["slow"] = [factor * float(own.max()) for factor in SLOWER]
+        for kind, time in ((kind, time) for kind, times in branches.items() for time in times):
+            out[f"{stem}.{kind}({time:.3g} s)"] = Extension(
+                0.0, 0.01, 0.0, 0.5, "", f"{stem} has no {kind}er branch",
+                f"0.01 of the compliance of {stem} set in over {time:.3g} s",
+                partial(_branch, stem=stem, time=time),
+            )  # fmt: skip
+    laws: list[SoftContact] = []
     for stem, law in _shared(rig, SoftContact):
-        if law.power is None:
-            out[f"{stem}.power"] = Extension(
-                1.0, 0.01, 0.6, 2.5, "", f"the penalty force of {stem} is linear in the depth",
-                f"it grew with the depth to the power 1.01, the same at {REFERENCE_DEPTH:g} m",
-                partial(_power, stem=stem),
+        if any(same_law(law, one) for one in laws):
+            continue
+        laws.append(law)
+        out[f"{stem}.power"] = Extension(
+            1.0, 0.01, 0.6, 2.5, "", f"the penalty force of {stem} is linear in the depth",
+            f"it grew with the depth to the power 1.01, the same at {REFERENCE_DEPTH:g} m",
+            partial(_of_law, stem=stem, name="power", neutral=1.0),
+        )  # fmt: skip
+        out[f"{stem}.adhesion"] = Extension(
+            0.0, 1e-3, 0.0, 1.0, "N", f"{stem} does not adhere",
+            f"a point that touches adhered with 0.001 N per {1e3 * law.node_spacing:g} mm",
+            partial(_of_law, stem=stem, name="adhesion", neutral=0.0),
+        )  # fmt: skip
+        users = [name for name, one in rig.contacts.items() if same_law(one.law, law)]
+        for name in users if len(users) > 1 else ():
+            out[f"contacts.{name}.friction_ratio"] = Extension(
+                1.0, 0.01, 0.2, 5.0, "", f"friction of the contact {name} is that of its law",
+                f"friction of the contact {name} were 1.01 times that of its law",
+                partial(_friction_ratio, name=name),
             )  # fmt: skip
     for coordinate in _guided(rig):
         turns = coordinate.endswith(".theta")
@@ -86,7 +104,8 @@ def extensions(rig: Rig) -> dict[str, Extension]:
             0.0, 1e-3, -0.2, 0.2, "rad", "gravity acts along -y",
             "it were turned by 1 mrad, anticlockwise", partial(_tilt, bodies=tilted),
         )  # fmt: skip
-    return {name: one for name, one in out.items() if name not in rig.names}
+    known = {*rig.names, *(own for own, _ in rig.named_parameters())}
+    return {name: one for name, one in out.items() if name not in known}
 
 
 def extend(rig: Rig, names: Collection[str]) -> None:
@@ -138,16 +157,37 @@ def _pad_ratio(rig: Rig, name: str, ratio: str) -> nn.Parameter:
     return getattr(rig.pads[name], ratio)
 
 
-def _slow_branch(rig: Rig, stem: str, time: float) -> nn.Parameter:
-    material = _part(rig, Material, stem)
-    material.slow = SlowBranch(0.0, time)
-    return material.slow.fraction
+def _branch(rig: Rig, stem: str, time: float) -> nn.Parameter:
+    branches: nn.ModuleList = _part(rig, Material, stem).added  # pyright: ignore[reportAssignmentType]
+    branches.append(branch := Branch(0.0, time))
+    return branch.fraction
 
 
-def _power(rig: Rig, stem: str) -> nn.Parameter:
-    law = _part(rig, SoftContact, stem)
-    law.power = parameter(1.0)
-    return law.power
+def same_law(one: SoftContact, other: SoftContact) -> bool:
+    """Whether two laws have the same numbers, but for the ratio of friction."""
+    return one.K_n is other.K_n
+
+
+def _of_law(rig: Rig, stem: str, name: str, neutral: float) -> nn.Parameter:
+    law, made = _part(rig, SoftContact, stem), parameter(neutral)
+    for contact in rig.contacts.values():
+        if same_law(contact.law, law):
+            setattr(contact.law, name, made)
+    return made
+
+
+def _friction_ratio(rig: Rig, name: str) -> nn.Parameter:
+    """Give a contact a law of its own, of the same parameters and the same friction."""
+    shared = rig.contacts[name].law
+    law = SoftContact(
+        1.0, 0.0, 1.0, 1.0, friction=shared.friction, node_spacing=shared.node_spacing,
+        friction_ratio=1.0,
+    )  # fmt: skip
+    for key, value in shared._parameters.items():
+        setattr(law, key, value)
+    law.friction_ratio = parameter(1.0)
+    rig.contacts[name].law = law
+    return law.friction_ratio
 
 
 def _guide(rig: Rig, coordinate: str, kind: str) -> nn.Parameter:

@@ -5,7 +5,7 @@ of J_b z_b: C the static compliance of the relaxed material, J_b the fractions o
 part of the nodal forces that has set in, tau_b z_b' + z_b = f.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -38,7 +38,7 @@ TOO_MUCH = 1e-12
 """Largest rounding error of fractions that sum to one."""
 
 
-class SlowBranch(nn.Module):
+class Branch(nn.Module):
     """One more Kelvin element of a material: a `fraction` [1] of the relaxed compliance that sets
     in with a retardation `time` [s] of its own."""
 
@@ -53,11 +53,10 @@ class SlowBranch(nn.Module):
 
 class Material(nn.Module):
     """Interface of a pad's material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane depth
-    [m], and a chain, to which a `slow` branch may be added."""
-
-    slow: SlowBranch | None
+    [m], and a chain, to which branches may be `added`."""
 
     E: Tensor
+    added: Sequence[Branch]
 
     def __init__(self, E: Modulus | None, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         """E is None where a material makes it of other numbers."""
@@ -65,7 +64,7 @@ class Material(nn.Module):
         if E is not None:
             self.E = parameter(E)
         self.nu, self.rho, self.depth = (parameter(value) for value in (nu, rho, depth))
-        self.slow = None
+        self.add_module("added", nn.ModuleList())
 
     def chain(self) -> tuple[Tensor, Tensor]:
         """Fractions J [1], which sum to one, and retardation times tau [s] > 0, shape (branches,)
@@ -73,16 +72,17 @@ class Material(nn.Module):
         raise NotImplementedError
 
     def whole_chain(self) -> tuple[Tensor, Tensor]:
-        """The chain with the slow branch, which takes its fraction from every other element."""
+        """The chain with the branches added, each of which takes its fraction from every element
+        before it."""
         J, tau = self.chain()
-        if self.slow is None:
-            return J, tau
-        f, t = self.slow.fraction, self.slow.time
-        return torch.cat((J * (1 - f), f[None])), torch.cat((tau, t[None]))
+        for one in self.added:
+            J = torch.cat((J * (1 - one.fraction), one.fraction[None]))
+            tau = torch.cat((tau, one.time[None]))
+        return J, tau
 
     @property
     def branches(self) -> int:
-        """Elements of the chain, without the slow branch."""
+        """Elements of the chain, without branches added."""
         return len(self.chain()[0].detach())
 
     def creep(self, t: Tensor) -> Tensor:

@@ -232,7 +232,7 @@ class Waves(Profile):
 
 
 class Retimed(Piecewise):
-    """Another signal with its time scaled and shifted: the value at t [s] is that at rate * t +
+    """Another signal with its time scaled and shifted: its value at t [s] comes at rate * t +
     shift."""
 
     def __init__(self, signal: Piecewise, rate: float = 1.0, shift: float = 0.0) -> None:

@@ -115,12 +115,19 @@ class Pad(nn.Module):
         linear = material.linear() if isinstance(material, Hyperelastic) else material
         return self._again(self.mesh, linear, False, self.points)
 
-    def _again(self, mesh: Mesh, material: Material, inertial: bool, points: int) -> "Pad":
-        c, s = self.axes[:, 0].tolist()
+    def reshaped(self, mesh: Mesh, origin: Array, turn: float = 0.0) -> "Pad":
+        """The same pad on another mesh, its origin (2,) [m] elsewhere, and turned further [rad]."""
+        return self._again(mesh, self.material, self.inertial, self.points, origin, turn)
+
+    def _again(
+        self, mesh: Mesh, material: Material, inertial: bool, points: int,
+        origin: Array | None = None, turn: float = 0.0,
+    ) -> "Pad":  # fmt: skip
+        (c, s), at = self.axes[:, 0].tolist(), self.origin.numpy() if origin is None else origin
         pad = Pad(
-            mesh, material, base=self.base,
-            origin=(float(self.origin[0]), float(self.origin[1])), angle=float(np.arctan2(s, c)),
-            mirrored=float(self.axes.det()) < 0, inertial=inertial, points=points,
+            mesh, material, base=self.base, origin=(float(at[0]), float(at[1])),
+            angle=float(np.arctan2(s, c)) + turn, mirrored=float(self.axes.det()) < 0,
+            inertial=inertial, points=points,
         )  # fmt: skip
         pad.E_ratio, pad.tau_ratio = self.E_ratio, self.tau_ratio
         return pad
@@ -138,7 +145,7 @@ class Pad(nn.Module):
     @property
     def branches(self) -> int:
         """Kelvin elements of the chain."""
-        return self.material.branches + (self.material.slow is not None)
+        return self.material.branches + len(self.material.added)
 
     spread: Tensor
     """Shape functions of the nodes in the state at the contact points (points, nodes)."""

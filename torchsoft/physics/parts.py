@@ -182,6 +182,15 @@ class Tilt(nn.Module):
         return self.mass * self.gravity * part + 0.0 * q
 
 
+class Load(nn.Module):
+    """A load [N or N.m] that a signal, the feed-forward, gives."""
+
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
+    ) -> Tensor:
+        return feed_forward + 0.0 * q
+
+
 class Actuator(nn.Module):
     """Measures coordinates, such as "disc.x", and pushes one, such as "bracket.x", by a law.
 

@@ -5,20 +5,28 @@ A variation changes the recordings or their parameters as if one assumption were
 amount.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.extensions import extensions
+from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
+from torchsoft.physics.names import effort_channel, rate_channel
+from torchsoft.physics.pads import Pad
+from torchsoft.physics.parts import COORDINATES, PD, Actuator, Load
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import SETTLE, Standing
-from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.runs import Simulated, Vary
 from torchsoft.sysid.unknowns import Nuisance, Sensor
 from torchsoft.tables import Number
 
@@ -38,12 +46,27 @@ KNOWN = 1e-2
 FORCE = 0.5
 """Variation of feed-forward forces [N]."""
 
+CENTRE, TILT = 1e-4, 1e-3
+"""Variation of a centre of mass [m], and of the angle of a pad [rad]."""
+
+CROSSTALK = 1e-3
+"""Variation of the part of a channel that another reads, and of the scale of an instrument."""
+
 CLOCK, SLOWER = 1e-4, 1e-4
 """Variation of the time of set-points [s], and of the rate of their clock [1]."""
+
+AMOUNTS = 10.0
+"""Range of a number in a repeated fit, in amounts of its variation."""
 
 NEAR, WIDEST = 5.0, 5.0
 """Number of variation amounts, by the test to first order, within which a new fit searches for a
 known parameter, and the largest factor on that range."""
+
+FAULT_BOUNDS = {
+    "bias": 1e4, "delay": 0.02, "gain": 0.5, "drift": 1e4, "clock": 0.05, "lag": 0.05,
+}  # fmt: skip
+"""Range of a sensor's fault: bias and drift [/s] over the noise, delay and lag [s], gain and clock
+[1]."""
 
 
 class Fault(NamedTuple):
@@ -73,6 +96,7 @@ class Fault(NamedTuple):
             shown,
             nominal=float(kind == "gain"),
             step=self.size(sensor, recording),
+            one_sided=kind == "lag",
             fault=(channel, kind),
         )
 
@@ -83,6 +107,7 @@ FAULTS: dict[Nuisance, Fault] = {
     "gain": Fault(1e-3, "1", "were too sensitive"),
     "drift": Fault(0.1, "noise/s", "drifted upwards"),
     "clock": Fault(1e-4, "1", "ran too fast"),
+    "lag": Fault(1e-4, "s", "came through a low-pass"),
 }
 """Faults of sensors that are tested where they are not unknowns."""
 
@@ -112,163 +137,225 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Variation(Assumption):
-    """An assumption with its variation: `vary` gives the varied recording, None where the variation
-    does not apply to it, and `by` does so for any amount [unit]. An `extension` is a parameter that
-    the rig does not have yet; a `fault` belongs to a channel's sensor."""
+    """An assumption with its variation, which is a parameter of the rig, an `extension` of it, a
+    `fault` of a channel's sensor, or a function of an amount [unit]: `vary` gives the varied
+    recording, `read` what is added to a channel's samples (k,)."""
 
-    vary: Callable[[Recording], Recording | None] | None = None
-    by: Callable[[Recording, float], Recording | None] | None = None
+    vary: Vary | None = None
+    read: Callable[[Recording, str, float], Array] | None = None
     extension: bool = False
     fault: tuple[str, Any] | None = None
 
-    def of(self, amount: float) -> "Variation":
-        """The variation by another amount, if it has one; the range of a known parameter becomes
-        wider for a large amount."""
-        by = self.by
-        if self.parameter and not self.extension:
-            wider = min(max(abs(amount / self.amount) / NEAR, 1.0), WIDEST)
-            return replace(self, amount=wider * self.amount, step=wider * self.step)
-        if by is None:
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Range of the amount [unit]; a law or a constant of the computation is varied or not."""
+        if self.kind in ("numerical", "law"):
+            return 0.0, 1.0
+        return -AMOUNTS * self.amount * (not self.one_sided), AMOUNTS * self.amount
+
+    def within(self, amount: float) -> "Variation":
+        """The variation with a range for another amount, wider for a large one."""
+        wider = min(max(abs(amount / self.amount) / NEAR, 1.0), WIDEST)
+        if self.kind in ("numerical", "law") or self.extension or self.fault is not None:
             return self
-        return replace(self, amount=amount, vary=lambda recording: by(recording, amount))
+        return replace(self, amount=wider * self.amount, step=wider * self.step)
 
     @property
     def label(self) -> str:
-        """Label of the coordinate for this assumption, if it were an unknown; empty for a law."""
-        return f"{self.fault[1]} of {self.fault[0]}" if self.fault is not None else self.parameter
+        """Label of the coordinate for this assumption."""
+        if self.fault is not None:
+            return f"{self.fault[1]} of {self.fault[0]}"
+        return self.parameter or self.name
 
 
-def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Variation]:
+def assumptions(
+    recordings: Sequence[Recording], unknown: Collection[str], sensors: Mapping[str, Sensor]
+) -> list[Variation]:
     """All assumptions of the runs of some recordings that can be varied; `unknown` are the
-    identified parameters and coordinates of starts."""
-    first, *others = recordings
-    rig = first.rig
-    pad = next(iter(rig.pads.values()))
-    nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
-    at = f"{points} points an element" if points else "on the nodes"
-    out = [
-        Variation(
-            "mesh",
-            "numerical",
-            f"the pads have {nx} x {ny} elements",
-            f"they had {2 * nx} x {2 * ny}",
-            vary=lambda r: remeshed(r, 2, points),
-        ),
-        Variation(
-            "contact points",
-            "numerical",
-            f"contact is computed {at}",
-            f"it were at {points + 2} points an element",
-            vary=lambda r: remeshed(r, 1, points + 2),
-        ),
-        Variation(
-            "mesh phase",
-            "numerical",
-            "a node lies where the mesh puts it",
-            "nodes lay a quarter of an element on",
-            vary=lambda r: shifted(r, 0.25),
-        ),
-    ]
-    if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
-        out.append(
-            Variation(
-                "set-points",
-                "numerical",
-                "set-points are what a smooth curve through the recorded ones says",
-                "only every second one were known",
-                vary=sparser,
-            )
-        )
-    out += [
-        Variation("clock of the set-points", "known", "set-points and sensors have one clock",
-                  "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r: delayed(r, CLOCK),
-                  by=lambda r, amount: delayed(r, 1e-3 * amount)),
-        Variation("scale of the clock", "known", "clocks of set-points and sensors run alike",
-                  "that of the set-points ran slower", 100 * SLOWER, "%",
-                  vary=lambda r: stretched(r, SLOWER),
-                  by=lambda r, amount: stretched(r, 1e-2 * amount)),
-    ]  # fmt: skip
-    if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
-        out.append(
-            Variation(
-                "feed-forward",
-                "known",
-                "what was fed forward is known",
-                f"it were {FORCE} N more",
-                FORCE,
-                "N",
-                vary=lambda r: raised(r, FORCE),
-                by=raised,
-            )
-        )
-    if isinstance(first.start, Standing):
-        lead, other = first.start.lead, 0.0 if first.start.lead else SETTLE
-        stated = f"bodies were put where they stand {lead:g} s before the first sample (lead)"
-        out.append(
-            Variation("lead", "law", stated, f"it were {other:g} s", vary=partial(led, lead=other))
-        )
-    if any(isinstance(law.friction, SmoothSlip) for law in laws(rig)):
-        out.append(
-            Variation(
-                "Coulomb friction",
-                "law",
-                'slip is smooth (friction "smooth")',
-                "it were Coulomb's",
-                vary=coulomb,
-            )
-        )
-    pushed = {one.pushes for one in rig.actuators.values()}
-    for name, axes in rig.layout.free.items() if isinstance(first.start, Standing) else ():
-        if 0 in axes and f"{name}.x" not in pushed and f"start.{name}.x" not in unknown:
-            stated = f"{name} begins where the start says"
-            otherwise, by = f"it began {1e6 * PLACE:g} um further right", partial(moved, body=name)
-            out.append(
-                Variation(
-                    f"start of {name}.x",
-                    "known",
-                    stated,
-                    otherwise,
-                    1e6 * PLACE,
-                    "um",
-                    vary=by,
-                    by=lambda r, amount, name=name: moved(r, name, 1e-6 * amount),
-                )
-            )
+    identified parameters and coordinates of starts, and labels of faults of the `sensors`."""
+    first = recordings[0]
+    out = [*numerical(first), *of_motion(first), *of_laws(first), *of_places(first, unknown)]
+    out += [*of_pads(first), *of_actuators(first)]
     for name, value in first.parameters.items():
         if name in unknown or value == 0.0 or name.startswith("start.") or "fixed" in name:
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
-        out.append(
-            Variation(
-                name,
-                "known",
-                f"{name} is {value:.6g}",
-                f"{name} were {(1 + part) * value:.6g}",
-                100 * part,
-                "%",
-                parameter=name,
-                nominal=value,
-                step=part * value,
-            )
-        )
-    for name, one in extensions(rig).items():
-        if ".slow(" not in name or all(isinstance(r.start, Standing) for r in (first, *others)):
-            out.append(
-                Variation(
-                    name,
-                    "known",
-                    one.stated,
-                    one.otherwise,
-                    one.amount,
-                    one.unit,
-                    parameter=name,
-                    nominal=one.neutral,
-                    step=one.amount,
-                    one_sided=one.low == one.neutral,
-                    extension=True,
-                )
-            )
-    return out
+        one = Variation(
+            name, "known", f"{name} is {value:.6g}", f"{name} were {(1 + part) * value:.6g}",
+            100 * part, "%", parameter=name, nominal=value, step=part * value,
+        )  # fmt: skip
+        if any(r.parameters.get(name) != value for r in recordings):  # each has its own
+            each = f"{name} is as each recording states it"
+            scaled = partial(_scaled, name=name)
+            one = replace(one, stated=each, otherwise=f"{name} were larger", parameter="",
+                          nominal=float("nan"), step=float("nan"), vary=scaled)  # fmt: skip
+        out.append(one)
+    for name, one in extensions(first.rig).items():
+        if ".slow(" not in name or all(isinstance(r.start, Standing) for r in recordings):
+            more = Variation(
+                name, "known", one.stated, one.otherwise, one.amount, one.unit, parameter=name,
+                nominal=one.neutral, step=one.amount, one_sided=one.low == one.neutral,
+                extension=True,
+            )  # fmt: skip
+            out.append(more)
+    return [*out, *of_sensors(first, unknown, sensors)]
+
+
+def numerical(recording: Recording) -> Iterator[Variation]:
+    """Constants of the computation."""
+    pad = next(iter(recording.rig.pads.values()))
+    nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
+    at = f"{points} points an element" if points else "on the nodes"
+    yield Variation(
+        "mesh", "numerical", f"the pads have {nx} x {ny} elements",
+        f"they had {2 * nx} x {2 * ny}", vary=lambda r, _, run: remeshed(r, 2, points),
+    )  # fmt: skip
+    yield Variation(
+        "contact points", "numerical", f"contact is computed {at}",
+        f"it were at {points + 2} points an element",
+        vary=lambda r, _, run: remeshed(r, 1, points + 2),
+    )  # fmt: skip
+    yield Variation(
+        "mesh phase", "numerical", "a node lies where the mesh puts it",
+        "nodes lay a quarter of an element on", vary=lambda r, _, run: shifted(r, 0.25),
+    )  # fmt: skip
+    if any(isinstance(one, Sampled) for one in recording.rig.reference.signals.values()):
+        yield Variation(
+            "set-points", "numerical",
+            "set-points are what a smooth curve through the recorded ones says",
+            "only every second one were known", vary=lambda r, _, run: sparser(r),
+        )  # fmt: skip
+
+
+def of_motion(recording: Recording) -> Iterator[Variation]:
+    """Clock of the set-points, and what is fed forward."""
+    yield Variation(
+        "clock of the set-points", "known", "set-points and sensors have one clock",
+        "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r, ms, run: delayed(r, 1e-3 * ms),
+    )  # fmt: skip
+    yield Variation(
+        "scale of the clock", "known", "clocks of set-points and sensors run alike",
+        "that of the set-points ran slower", 100 * SLOWER, "%",
+        vary=lambda r, part, run: stretched(r, 1e-2 * part),
+    )  # fmt: skip
+    if any(actuator.feed_forward is not None for actuator in recording.rig.actuators.values()):
+        yield Variation(
+            "feed-forward", "known", "what was fed forward is known", f"it were {FORCE} N more",
+            FORCE, "N", vary=lambda r, force, run: raised(r, force),
+        )  # fmt: skip
+
+
+def of_laws(recording: Recording) -> Iterator[Variation]:
+    """Laws that hold or do not."""
+    if isinstance(recording.start, Standing):
+        lead, other = recording.start.lead, 0.0 if recording.start.lead else SETTLE
+        yield Variation(
+            "lead", "law",
+            f"bodies were put where they stand {lead:g} s before the first sample (lead)",
+            f"it were {other:g} s", vary=lambda r, _, run: led(r, other),
+        )  # fmt: skip
+    if any(isinstance(law.friction, SmoothSlip) for law in laws(recording.rig)):
+        yield Variation(
+            "Coulomb friction", "law", 'slip is smooth (friction "smooth")', "it were Coulomb's",
+            vary=lambda r, _, run: coulomb(r),
+        )  # fmt: skip
+
+
+def of_places(recording: Recording, unknown: Collection[str]) -> Iterator[Variation]:
+    """Where bodies begin, and where their centres of mass are."""
+    rig = recording.rig
+    pushed = {one.pushes for one in rig.actuators.values()}
+    standing = isinstance(recording.start, Standing)
+    for name, axes in rig.layout.free.items():
+        if standing and 0 in axes and not {f"{name}.x", f"start.{name}.x"} & {*pushed, *unknown}:
+            yield Variation(
+                f"start of {name}.x", "known", f"{name} begins where the start says",
+                f"it began {1e6 * PLACE:g} um further right", 1e6 * PLACE, "um",
+                vary=lambda r, um, run, name=name: moved(r, name, 1e-6 * um),
+            )  # fmt: skip
+        if axes != [0, 1, 2] or rig.bodies[name].shape is None:
+            continue
+        for k, axis in enumerate("xy"):
+            yield Variation(
+                f"bodies.{name}.centre_{axis}", "known",
+                f"the centre of mass of {name} is that of its contour",
+                f"it were {1e3 * CENTRE:g} mm off along {axis}", 1e3 * CENTRE, "mm",
+                vary=lambda r, mm, run, name=name, k=k: off_centre(
+                    r, run, name, (1e-3 * mm * (k == 0), 1e-3 * mm * (k == 1))
+                ),
+            )  # fmt: skip
+
+
+def of_pads(recording: Recording) -> Iterator[Variation]:
+    """Sizes of blocks, places and angles of pads."""
+    pads = recording.rig.pads
+    blocks = [name for name, pad in pads.items() if type(pad.mesh) is PadMesh]
+    groups = [blocks] if len(blocks) > 1 else []
+    for names in (*groups, *([name] for name in blocks)):
+        who = "pads" if len(names) > 1 else f"the pad {names[0]}"
+        for extent in ("height", "length"):
+            yield Variation(
+                f"{extent} of {who}", "known", f"the {extent} of {who} is as stated",
+                "it were more, faces being where they are", 100 * KNOWN, "%",
+                vary=lambda r, part, run, names=names, extent=extent: resized(
+                    r, names, extent, 1e-2 * part
+                ),
+            )  # fmt: skip
+    for name in pads:
+        yield Variation(
+            f"place of the pad {name}", "known", f"the face of the pad {name} is where it should",
+            "it were nearer to what touches it", 1e6 * PLACE, "um",
+            vary=lambda r, um, run, name=name: lifted(r, name, 1e-6 * um),
+        )  # fmt: skip
+        yield Variation(
+            f"tilt of the pad {name}", "known", f"the pad {name} lies at the angle stated",
+            "it were turned anticlockwise", 1e3 * TILT, "mrad",
+            vary=lambda r, mrad, run, name=name: tilted(r, name, 1e-3 * mrad),
+        )  # fmt: skip
+
+
+def of_actuators(recording: Recording) -> Iterator[Variation]:
+    """What controllers do besides their law."""
+    loops = [name for name, one in recording.rig.actuators.items() if isinstance(one.law, PD)]
+    for names in (*([loops] if len(loops) > 1 else []), *([name] for name in loops)):
+        who = "controllers" if len(names) > 1 else f"the controller {names[0]}"
+        for kind, one in EFFORTS.items():
+            if kind == "limit" and len(names) > 1:
+                continue
+            yield Variation(
+                f"{kind} of {who}", "known", f"{who} {one.stated[len(names) > 1]}",
+                one.otherwise, one.amount, one.unit, one_sided=True,
+                vary=lambda r, amount, run, names=names, fault=one.effort: pushed(
+                    r, run, names, fault, amount
+                ),
+            )  # fmt: skip
+
+
+def of_sensors(
+    recording: Recording, unknown: Collection[str], sensors: Mapping[str, Sensor]
+) -> Iterator[Variation]:
+    """Faults of single channels, and of those that share an instrument."""
+    units = {channel: recording.units[channel] for channel in sensors if channel in recording.units}
+    for channel, sensor in sensors.items():
+        for kind, fault in FAULTS.items():
+            if channel in units and f"{kind} of {channel}" not in unknown:
+                yield fault.assumption(channel, kind, units[channel], sensor, recording)
+    for channel, unit in units.items():
+        for other in (one for one, its in units.items() if its == unit and one != channel):
+            yield Variation(
+                f"crosstalk {other} to {channel}", "sensor", f"{channel} does not read {other}",
+                f"it read a part of {other}", 100 * CROSSTALK, "%",
+                read=lambda r, at, part, channel=channel, other=other: read_across(
+                    r, at, channel, other, 1e-2 * part
+                ),
+            )  # fmt: skip
+    places = [channel for channel, unit in units.items() if unit == "m"]
+    if len(places) > 1:
+        yield Variation(
+            "scale of the camera", "sensor", f"{', '.join(places)} have one true scale",
+            "they were all too large about their first sample", 100 * CROSSTALK, "%",
+            read=lambda r, at, part: rescaled(r, at, places, 1e-2 * part),
+        )  # fmt: skip
 
 
 def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
@@ -281,15 +368,8 @@ def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
 def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
     """Refine every pad's mesh by the factor `finer`, with other contact points; None where the
     start is a state of this mesh."""
-    if not isinstance(recording.start, Standing):
-        return None
-
-    def change(rig: Rig) -> None:
-        modules: nn.ModuleDict = rig.pads  # pyright: ignore[reportAssignmentType]
-        for name, pad in rig.pads.items():
-            modules[name] = pad.remeshed(finer, points)
-
-    return with_rig(recording, change)
+    every = tuple(recording.rig.pads)
+    return with_pads(recording, every, lambda pad: pad.remeshed(finer, points))
 
 
 def shifted(recording: Recording, part: float) -> Recording:
@@ -322,17 +402,24 @@ def coulomb(recording: Recording) -> Recording:
     """Replace smooth slip by Coulomb friction with the same coefficients."""
 
     def change(rig: Rig) -> None:
+        made = dict[int, Coulomb]()
         for law in laws(rig):
             smooth = law.friction
             if isinstance(smooth, SmoothSlip):
-                law.friction = Coulomb(smooth.mu_s.item(), smooth.mu_k.item())
+                new = Coulomb(smooth.mu_s.item(), smooth.mu_k.item())
+                law.friction = made.setdefault(id(smooth), new)
 
     return with_rig(recording, change)
 
 
+def signals_by_name(rig: Rig) -> dict[str, nn.Module]:
+    """Signals of a rig's reference by name."""
+    return {name.replace(":", "."): one for name, one in rig.reference.signals.items()}
+
+
 def signals_of(recording: Recording) -> dict[str, nn.Module]:
     """Signals of a recording's reference by name."""
-    return {name.replace(":", "."): one for name, one in recording.rig.reference.signals.items()}
+    return signals_by_name(recording.rig)
 
 
 def with_reference(recording: Recording, **signals: nn.Module) -> Recording:
@@ -386,7 +473,7 @@ def stretched(recording: Recording, part: float) -> Recording | None:
 
 
 def raised(recording: Recording, by: float) -> Recording | None:
-    """Add a feed-forward force [N] to every actuator; None where a signal is not piecewise
+    """Add a feed-forward force [N] to every feed-forward; None where a signal is not piecewise
     polynomial."""
     names = {a.feed_forward for a in recording.rig.actuators.values() if a.feed_forward is not None}
     known = {name: recording.rig.reference[name] for name in names}
@@ -397,3 +484,236 @@ def raised(recording: Recording, by: float) -> Recording | None:
         values: Tensor = one.values  # pyright: ignore[reportAssignmentType]
         values.data.add_(by)
     return with_reference(recording, **signals)
+
+
+def _scaled(recording: Recording, part: float, run: Simulated, name: str) -> Recording:
+    """Change a number of the rig by a part [%]."""
+
+    @torch.no_grad()
+    def change(rig: Rig) -> None:
+        rig.parameter(name).mul_(1 + 1e-2 * part)
+
+    return with_rig(recording, change)
+
+
+def resized(
+    recording: Recording, names: Collection[str], extent: str, part: float
+) -> Recording | None:
+    """Change the height or the length of blocks by a relative amount, about the middle of their
+    faces, which stay where they are; None where the start is a state of the pads as they were."""
+
+    def other(pad: Pad) -> Pad:
+        old = pad.mesh
+        assert isinstance(old, PadMesh)
+        mesh = replace(old, **{extent: (1 + part) * getattr(old, extent)})
+        corner = np.array([0.5 * (old.length - mesh.length), old.height - mesh.height])
+        return pad.reshaped(mesh, pad.placed(corner))
+
+    return with_pads(recording, names, other)
+
+
+def lifted(recording: Recording, name: str, by: float) -> Recording | None:
+    """Move a pad along its normal, towards what touches it, by a distance [m]; None where the start
+    is a state of the pads as they were."""
+    up = np.array([0.0, by])
+    return with_pads(recording, [name], lambda pad: pad.reshaped(pad.mesh, pad.placed(up)))
+
+
+def tilted(recording: Recording, name: str, angle: float) -> Recording | None:
+    """Turn a pad about the middle of its face by an angle [rad]; None where the start is a state of
+    the pads as they were."""
+
+    def other(pad: Pad) -> Pad:
+        middle = pad.placed(pad.mesh.nodes[pad.mesh.face].mean(0))
+        c, s = np.cos(angle), np.sin(angle)
+        arm = np.array([[c, -s], [s, c]]) @ (pad.origin.numpy() - middle)
+        return pad.reshaped(pad.mesh, middle + arm, angle)
+
+    return with_pads(recording, [name], other)
+
+
+def with_pads(
+    recording: Recording, names: Collection[str], other: Callable[[Pad], Pad]
+) -> Recording | None:
+    """Replace some pads; None where the start is a state of the pads as they were."""
+    if not isinstance(recording.start, Standing):
+        return None
+
+    def change(rig: Rig) -> None:
+        modules: nn.ModuleDict = rig.pads  # pyright: ignore[reportAssignmentType]
+        for name in names:
+            modules[name] = other(rig.pads[name])
+
+    return with_rig(recording, change)
+
+
+# Forces along a run: what a fault adds to the forces of the rig as it is stated, computed from
+# runs with what it added before
+
+
+APART = 1e-6
+"""Least distance [s] between the knots of such a force and those of the signal that it adds to."""
+
+FIXED_POINT, CLOSE = 6, 3e-3
+"""Most times that such forces are computed, and their relative change at which they are not once
+more. To first order in a fault once is exact."""
+
+
+def settled(now: Array, before: Array | None) -> bool:
+    """Whether forces (..., G) have settled."""
+    return before is not None and float(np.abs(now - before).max()) <= CLOSE * np.abs(now).max()
+
+
+class Effort(NamedTuple):
+    """A fault of controllers: effort (G,) of times t (G,) [s], the effort by the law (G,) and the
+    amount; its variation [unit], and clauses without it, of one controller and of several, and with
+    it."""
+
+    effort: Callable[[Array, Array, float], Array]
+    amount: float
+    unit: str
+    stated: tuple[str, str]
+    otherwise: str
+
+
+def late_effort(t: Array, effort: Array, ms: float) -> Array:
+    """The effort some time [ms] ago."""
+    return CubicSpline(t, effort)(np.maximum(t - 1e-3 * ms, t[0]))
+
+
+def limited_effort(t: Array, effort: Array, part: float) -> Array:
+    """The effort, cut off at a part [%] below its largest size."""
+    most = (1 - 1e-2 * part) * float(np.abs(effort).max())
+    return effort.clip(-most, most)
+
+
+EFFORTS = {
+    "delay": Effort(
+        late_effort, 0.1, "ms", ("pushes without delay", "push without delay"),
+        "it came late, by a lag, a delay or half the period of a hold",
+    ),
+    "limit": Effort(
+        limited_effort, 10.0, "%", ("does not saturate", "do not saturate"),
+        "it were cut off below its largest effort",
+    ),
+}  # fmt: skip
+"""Faults of controllers."""
+
+
+def pushed(
+    recording: Recording, run: Simulated, names: Collection[str],
+    fault: Callable[[Array, Array, float], Array], amount: float,
+) -> Recording:  # fmt: skip
+    """Controllers that push otherwise than by their laws: what is missing is fed forward."""
+    columns = [recording.channels.index(effort_channel(name)) for name in names]
+    made, fed = recording, None
+    for _ in range(FIXED_POINT):
+        at, before = run(made), fed
+        own = at.signals[:, columns].T - (0.0 if before is None else before)
+        fed = np.stack([fault(at.t, one, amount) for one in own]) - own
+        made = with_efforts(recording, at.t, dict(zip(names, fed)))
+        if settled(fed, before):
+            break
+    return made
+
+
+def with_efforts(recording: Recording, t: Array, fed: Mapping[str, Array]) -> Recording:
+    """More feed-forward (G,) [N or N.m] at times t (G,) [s] of some actuators. Raises `ValueError`
+    where one has a feed-forward that is not piecewise polynomial."""
+
+    def change(rig: Rig) -> None:
+        more = dict[str, nn.Module]()
+        for name, force in fed.items():
+            actuator, spline = rig.actuators[name], CubicSpline(t, force)
+            before, actuator.feed_forward = actuator.feed_forward, f"fed_{name}"
+            if before is None:
+                more[actuator.feed_forward] = signal(t, force)
+                continue
+            known = rig.reference[before]
+            if not isinstance(known, Piecewise):
+                raise ValueError(f"the signal `{before}` is not piecewise polynomial")
+            stops = known.stops.numpy()
+            inside = stops[(stops > t[0] + APART) & (stops < t[-1] - APART)]
+            alone = np.abs(t[:, None] - inside).min(1, initial=np.inf) > APART
+            every = np.sort(np.concatenate((t[alone], inside)))
+            value, rate = (x.detach().numpy() for x in known(torch.from_numpy(every)))
+            sums = value + spline(every), rate + spline(every, 1)
+            more[actuator.feed_forward] = signal(every, *sums)
+        rig.reference = Reference(**(signals_by_name(rig) | more))
+
+    return with_rig(recording, change)
+
+
+def signal(t: Array, *columns: Array) -> Sampled:
+    """A signal through values, with rates if they are given, at times t (G,) [s]."""
+    return Sampled(*(torch.from_numpy(np.array(one, dtype=np.float64)) for one in (t, *columns)))
+
+
+def off_centre(
+    recording: Recording, run: Simulated, body: str, centre: tuple[float, float]
+) -> Recording:
+    """A body whose centre of mass is at a place [m] in the frame of its contour; coordinates are
+    those of the contour.
+
+    With c the place turned by the body's angle, its inertia adds -m c'' to the forces on the
+    contour's centre, and its weight and inertia the moment c x m (g - r'' - c'').
+    """
+    made, symbol = recording, recording.rig.symbols[body]
+    mass, gravity = recording.rig.bodies[body].mass.item(), recording.rig.gravity.item()
+    weight, loads = np.array([0.0, -gravity * recording.rig.bodies[body].weighted]), None
+    for _ in range(FIXED_POINT):
+        at, before = run(made), loads
+
+        def channel(name: str) -> Array:
+            return at.signals[:, recording.channels.index(name)]  # noqa: B023
+
+        angle, spin = channel(f"theta_{symbol}"), channel(rate_channel(f"theta_{symbol}"))
+        speeds = [channel(rate_channel(f"{axis}_{symbol}")) for axis in "xy"]
+        faster, *pulls = (CubicSpline(at.t, one)(at.t, 1) for one in (spin, *speeds))
+        c = np.stack([np.cos(angle) * centre[0] - np.sin(angle) * centre[1],
+                      np.sin(angle) * centre[0] + np.cos(angle) * centre[1]], -1)  # fmt: skip
+        across = np.stack((-c[:, 1], c[:, 0]), -1)
+        bent = faster[:, None] * across - spin[:, None] ** 2 * c
+        force = -mass * bent
+        free = mass * (weight - np.stack(pulls, -1) - bent)
+        moment = c[:, 0] * free[:, 1] - c[:, 1] * free[:, 0]
+        loads = np.column_stack((force, moment))
+        made = with_loads(recording, at.t, body, loads)
+        if settled(loads, before):
+            break
+    return made
+
+
+def with_loads(recording: Recording, t: Array, body: str, loads: Array) -> Recording:
+    """A force and a moment (G, 3) [N, N, N.m] at times t (G,) [s] on a body."""
+
+    def change(rig: Rig) -> None:
+        actuators: nn.ModuleDict = rig.actuators  # pyright: ignore[reportAssignmentType]
+        more = dict[str, nn.Module]()
+        for axis, load in zip(COORDINATES, loads.T):
+            name = f"load_{body}_{axis}"
+            more[name] = signal(t, load)
+            actuators[name] = Actuator(
+                f"{body}.{axis}", f"{body}.{axis}", Load(), setpoint=(), feed_forward=name,
+                elements=("Se: load",),
+            )  # fmt: skip
+        rig.reference = Reference(**(signals_by_name(rig) | more))
+
+    return with_rig(recording, change)
+
+
+# Readings of channels
+
+
+def read_across(recording: Recording, at: str, channel: str, other: str, part: float) -> Array:
+    """What a channel's samples lose, if they read a part of another channel."""
+    t, _ = recording.samples[at]
+    if at != channel or other not in recording.samples:
+        return np.zeros(len(t))
+    return -part * np.interp(t, *recording.samples[other])
+
+
+def rescaled(recording: Recording, at: str, channels: Collection[str], part: float) -> Array:
+    """What a channel's samples lose, if they are too large about the first of them."""
+    t, y = recording.samples[at]
+    return -part * (y - y[0]) if at in channels else np.zeros(len(t))

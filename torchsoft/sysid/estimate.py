@@ -184,7 +184,10 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
         axis = one.name.split(".")[2]
         return ("rad" if axis.endswith("theta") else "m") + ("/s" if axis.startswith("v_") else "")
     own = problem.unit(one.name)
-    units = {"bias": own, "drift": f"{own}/s", "delay": "s", "misalignment": "rad", "inertia": "kg"}
+    units = {
+        "bias": own, "drift": f"{own}/s", "delay": "s", "lag": "s", "misalignment": "rad",
+        "inertia": "kg",
+    }  # fmt: skip
     return units.get(one.kind, "1")
 
 

@@ -163,7 +163,7 @@ def rho(loss: Loss, z: Array) -> Array:
             return np.stack((np.arctan(z), 1 / (1 + z**2), -2 * z / (1 + z**2) ** 2))
 
 
-def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
+def robust_loss_except_priors(loss: Loss, priors: int) -> Callable[[Array], Array]:
     """The loss in the form of `least_squares`, linear in the last `priors` rows; its `f_scale` is
     `REACH[loss]`."""
 
@@ -315,8 +315,9 @@ def gauss_newton(
         out = solve(
             lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free],
             bounds=(low[free] - begin[free], high[free] - begin[free]),
-            loss=spared(loss, len(problem.coordinates.priors)), f_scale=REACH[loss],
-            max_nfev=evaluations, ftol=tolerance, xtol=tolerance, gtol=1e-12,
+            loss=robust_loss_except_priors(loss, len(problem.coordinates.priors)),
+            f_scale=REACH[loss], max_nfev=evaluations, ftol=tolerance, xtol=tolerance,
+            gtol=1e-12,
         )  # fmt: skip
     except Stalled:
         key = min(seen, key=lambda k: float(seen[k].r @ seen[k].r))

@@ -55,7 +55,12 @@ from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import ended
-from torchsoft.sysid.residual_tests import judge_residuals, parts, residual_notices
+from torchsoft.sysid.residual_tests import (
+    judge_residuals,
+    parts,
+    residual_notices,
+    systematic,
+)
 from torchsoft.sysid.result import (
     ChannelNoise,
     IdentificationResult,
@@ -65,7 +70,7 @@ from torchsoft.sysid.result import (
 )
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
-from torchsoft.sysid.suspects import assumption_doubts, assumption_notices
+from torchsoft.sysid.suspects import assumption_doubts, assumption_notices, unseen
 from torchsoft.sysid.unknowns import Coordinates
 from torchsoft.tables import SEED, Table, plain
 
@@ -209,7 +214,11 @@ def conclude(
             notices += guesses(problem, x, context.heldout)
     sd = np.sqrt(np.diag(C_free))
     notices += notices_on(
-        found, held_by(problem), end.at_rest or bool(end.rough) or hopeless, rtol, end.bias is None
+        found,
+        ordering_constraints(problem),
+        end.at_rest or bool(end.rough) or hopeless,
+        rtol,
+        end.bias is None,
     )
     if hopeless:
         notices.append(
@@ -225,9 +234,13 @@ def conclude(
         )
     alarms = residual_notices(verdicts, max(1.0, chi2) ** 0.5 if context.loss == "linear" else 1.0)
     doubts = [sentence for kind, sentence in alarms.items() if kind != "smaller"]
+    explained, hidden = not systematic(verdicts), list[str]()
     if checked is not None:
-        notices += assumption_notices(checked)
-        doubts = assumption_doubts(checked) + doubts
+        against = assumption_doubts(checked)
+        notices += against + assumption_notices(checked)
+        doubts = against + doubts
+        hidden = unseen(checked) if explained and not checked.favoured else []
+        explained = checked.explained or (explained and not checked.favoured)
     notices += alarms.values()
     notices += refusal(coloured) + colour_notices(coloured.found, declared)
     return IdentificationResult(
@@ -244,6 +257,8 @@ def conclude(
         heldout=predicted,
         notices=notices,
         doubts=doubts,
+        explained=explained,
+        unseen=hidden,
         stages=stages,
         cost={
             "simulations": runner.simulations, "jacobians": runner.jacobians,
@@ -302,9 +317,7 @@ def tested_assumptions(
     }
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
-    there = ended(
-        plain, runner.of(plain.recordings), end.x, finer, free, which, end.rtol, end.steps
-    )
+    there = ended(plain, plain.runner(runner), end.x, finer, free, which, end.rtol, end.steps)
     found = check_assumptions(
         plain, there, doubtful=doubtful, explain=context.settings.assumptions == "explained",
         loss=context.loss, progress=progress,
@@ -335,7 +348,7 @@ NEXT_TO = 1e-2
 """Relative distance of an estimate at a bound from the known number that is the bound."""
 
 
-def held_by(problem: Problem) -> dict[str, tuple[str, float]]:
+def ordering_constraints(problem: Problem) -> dict[str, tuple[str, float]]:
     """Known numbers that unknown ones may not pass, such as mu_k of mu_s: name and value by the
     name of the unknown."""
     out, unknown = dict[str, tuple[str, float]](), problem.coordinates.names

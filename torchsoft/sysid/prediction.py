@@ -59,6 +59,7 @@ class Readout:
     middle: float
     terms: tuple[Term, ...]
     clock: float = 0.0
+    lag: float = 0.0
 
     def expected(
         self, signals: Signals, times: Array
@@ -69,16 +70,22 @@ class Readout:
         by: dict[Nuisance, Array] = {}
         for term in self.terms:
             j, at = signals.names.index(term.channel), self.own_times(times)
-            spline = CubicSpline(signals.t, signals.values[:, j])
+            spline = CubicSpline(signals.t, lagged(signals.t, signals.values[:, j], self.lag))
             part = spline(at, term.order)
             y, rate = y + term.factor * part, rate + term.factor * spline(at, term.order + 1)
+            if self.lag > 0:
+                near = [
+                    lagged(signals.t, signals.values[:, j], (1 + part) * self.lag)
+                    for part in (-LAG_STEP, LAG_STEP)
+                ]
+                moved = CubicSpline(signals.t, (near[1] - near[0]) / (2 * LAG_STEP * self.lag))
+                by["lag"] = by.get("lag", 0.0) + self.gain * term.factor * moved(at, term.order)
             if term.by is not None:
                 kind, slope = term.by
                 by[kind] = by.get(kind, 0.0) + self.gain * slope * part
             if signals.derivatives is not None and term.factor != 0.0:
-                more = term.factor * CubicSpline(signals.t, signals.derivatives[:, j])(
-                    at, term.order
-                )
+                late = lagged(signals.t, signals.derivatives[:, j], self.lag)
+                more = term.factor * CubicSpline(signals.t, late)(at, term.order)
                 slopes = more if slopes is None else slopes + more
         by |= {
             "gain": y,
@@ -87,6 +94,7 @@ class Readout:
             "delay": -self.gain * rate,
             "clock": self.gain * rate * (self.middle - times),
         }
+        by.setdefault("lag", -self.gain * rate)
         y = self.gain * y + self.bias + self.drift * (times - self.middle)
         return y, None if slopes is None else self.gain * slopes, by
 
@@ -107,7 +115,8 @@ class Readout:
 
     def pulled_back(self, signals: Signals, times: Array, v: Array) -> Array:
         """Weights (G, channels) on the channels, from weights v (k,) on the expected reading."""
-        out, spline = np.zeros(signals.values.shape), CubicSpline(signals.t, np.eye(len(signals.t)))
+        every = lagged(signals.t, np.eye(len(signals.t)), self.lag)
+        out, spline = np.zeros(signals.values.shape), CubicSpline(signals.t, every)
         for term in self.terms:
             if term.factor != 0.0:
                 j = signals.names.index(term.channel)
@@ -119,6 +128,22 @@ class Readout:
     def own_times(self, times: Array) -> Array:
         """Times (k,) [s] of the readings that the sensor stamps with `times`."""
         return times - self.delay - self.clock * (times - self.middle)
+
+
+LAG_STEP = 1e-4
+"""Relative change of a lag by which readings are differentiated."""
+
+
+def lagged(t: Array, y: Array, lag: float) -> Array:
+    """Signals y (G, ...) on lines between the times t (G,) [s] behind a low-pass of first order
+    with the time constant `lag` [s], at rest at the first of them."""
+    if lag == 0.0:
+        return y
+    out, spans = y.copy(), np.diff(t)
+    for k, (h, rise) in enumerate(zip(spans, np.diff(y, axis=0))):
+        behind = lag * rise / h  # of a line that has lasted
+        out[k + 1] = y[k + 1] - behind + np.exp(-h / lag) * (out[k] - y[k] + behind)
+    return out
 
 
 def censored(z: Array) -> tuple[Array, Array]:
@@ -193,7 +218,7 @@ def readout(
         terms.append(Term(pushed(rig, channel), 1, -at["inertia"], ("inertia", -1.0)))
     return Readout(
         channel, sensor.sd, sensor.low, sensor.high, at["gain"], at["bias"], at["drift"],
-        at["delay"], 0.5 * (span[0] + span[1]), tuple(terms), at["clock"],
+        at["delay"], 0.5 * (span[0] + span[1]), tuple(terms), at["clock"], at["lag"],
     )  # fmt: skip
 
 

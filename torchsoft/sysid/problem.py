@@ -1,7 +1,7 @@
 """The least-squares problem: recordings, sensors and unknowns; whitened residuals."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from torchsoft.display import Shown, amount, suggestion
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
 from torchsoft.solve.trajectory import Touch
+from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
     FailedRun,
@@ -23,7 +24,7 @@ from torchsoft.sysid.prediction import (
     set_parameters,
 )
 from torchsoft.sysid.recording import Array, Recording, extended
-from torchsoft.sysid.runs import Job, Runner
+from torchsoft.sysid.runs import Job, Runner, Vary
 from torchsoft.sysid.unknowns import (
     NUISANCES,
     Coordinates,
@@ -79,10 +80,12 @@ def with_extensions(
     return added, out
 
 
-def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
-    """Raises `ValueError` where a bound of an unknown makes the rig impossible."""
+def check_ends(
+    coordinates: Coordinates, recordings: Sequence[Recording], held: Collection[str]
+) -> None:
+    """Raises `ValueError` where a bound of an unknown that is not held makes the rig impossible."""
     for c in coordinates.all:
-        if c.kind != "parameter" or c.ratio_to:
+        if c.kind != "parameter" or c.ratio_to or c.label in held:
             continue
         for recording in recordings:
             if c.name in {*recording.rig.ordered, *recording.rig.ordered.values()}:
@@ -127,13 +130,15 @@ class Problem(Shown):
 
     `recordings` have distinct names; `sensors` are the channels that count, with their noise;
     `unknowns` are the parameters, `extensions` of the rigs included; `noise` is the colour of a
-    channel's noise, white by default. Short names are taken here, and the problem and its results
-    have the full ones. Raises `ValueError` where these do not fit together.
+    channel's noise, white by default. Amounts of `variations` of the recordings are coordinates
+    too; those whose labels are `held` are not free. Short names are taken here, and the problem and
+    its results have the full ones. Raises `ValueError` where these do not fit together.
     """
 
     def __init__(
         self, recordings: Sequence[Recording], sensors: dict[str, Sensor],
         unknowns: dict[str, Unknown], noise: Mapping[str, Autoregression] | None = None,
+        variations: Sequence[Variation] = (), held: Collection[str] = (),
     ) -> None:  # fmt: skip
         names = [recording.name for recording in recordings]
         sampled = {channel for recording in recordings for channel in recording.samples}
@@ -161,14 +166,20 @@ class Problem(Shown):
                     f"{list(sensors)}"
                 )
         recordings, unknowns = with_extensions(recordings, unknowns)
+        unknowns = {
+            name: u.model_copy(update={"fixed": True}) if name in held else u
+            for name, u in unknowns.items()
+        }
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
-        self.coordinates = Coordinates(unknowns, sensors, recordings)
+        self.variations, self.held = {one.name: one for one in variations}, frozenset(held)
+        amounts = {one.name: one.bounds for one in variations}
+        self.coordinates = Coordinates(unknowns, sensors, recordings, amounts, held)
         if not self.coordinates.free.any():
             raise ValueError("there is nothing to identify: no unknown is free")
-        check_ends(self.coordinates, recordings)
+        check_ends(self.coordinates, recordings, held)
         self.interpolated = any(
-            sensor.delay > 0 or sensor.inertia > 0 or sensor.clock > 0
-            for sensor in sensors.values()
+            c.kind in ("delay", "inertia", "clock", "lag") and not c.fixed
+            for c in self.coordinates.all
         )
         self.noise = in_full(rigs, noise or {})
         self._whiteners: dict[tuple[str, str], Any] = {}
@@ -196,7 +207,19 @@ class Problem(Shown):
 
     def with_noise(self, noise: Mapping[str, Autoregression]) -> "Problem":
         """The same problem with other noise, by channel."""
-        return Problem(self.recordings, self.sensors, self.unknowns, noise)
+        return Problem(
+            self.recordings, self.sensors, self.unknowns, noise, [*self.variations.values()],
+            self.held,
+        )  # fmt: skip
+
+    @property
+    def varying(self) -> dict[str, Vary]:
+        """What its jobs' runner needs to know: the variations of runs, by name."""
+        return {name: one.vary for name, one in self.variations.items() if one.vary is not None}
+
+    def runner(self, like: Runner) -> Runner:
+        """A runner for this problem, with the threads and the folder of another."""
+        return like.of(self.recordings, self.varying)
 
     def whitened(self, recording: Recording, channel: str, rows: Array) -> Array:
         """Rows (k,) or (k, n) of a channel's samples, whitened."""
@@ -262,6 +285,10 @@ class Problem(Shown):
         """One run for each recording; with `free`, differentiated by the parameters that depend on
         free coordinates (n,)."""
         c, out = self.coordinates, []
+        varied = tuple(
+            (one.name, amount) for i, one in enumerate(c.all)
+            if one.name in self.varying and (amount := one.to_value(x[i])) != 0.0
+        )  # fmt: skip
         for k, recording in enumerate(self.recordings):
             if recording.name not in which:
                 continue
@@ -275,7 +302,7 @@ class Problem(Shown):
                     (one, self.noise.get(one.channel)) for one in self.readouts(x, k).values()
                 )
             mine = steps[recording.name] if isinstance(steps, Mapping) else steps
-            out.append(Job(k, values, names, mine, self.interpolated, judged))
+            out.append(Job(k, values, names, mine, self.interpolated, judged, varied))
         return out
 
     def residuals(
@@ -287,9 +314,52 @@ class Problem(Shown):
         free: NDArray[np.bool_] | None = None,
     ) -> Residuals:
         """Residuals of some recordings at x (n,), with the Jacobian's columns of `free`
-        coordinates. On frozen steps they are smooth in x."""
+        coordinates, those of variations by differences. On frozen steps they are smooth in x."""
+        at, runs, jobs = self._at(runner, x, which, steps, free)
+        return self._with_differences(runner, at, jobs, runs, x, which, steps, free)
+
+    def _at(
+        self,
+        runner: Runner,
+        x: Array,
+        which: Sequence[str],
+        steps: StepsByName,
+        free: NDArray[np.bool_] | None,
+    ) -> tuple[Residuals, list[Any], list[Job]]:
+        """`residuals` without the columns of variations, with the runs and their jobs."""
         jobs = self.jobs(x, which, steps, free)
-        return self.gather(x, jobs, runner.run(jobs))
+        runs = runner.run(jobs)
+        return self.gather(x, jobs, runs), runs, jobs
+
+    def _with_differences(
+        self,
+        runner: Runner,
+        at: Residuals,
+        jobs: Sequence[Job],
+        runs: Sequence[Any],
+        x: Array,
+        which: Sequence[str],
+        steps: StepsByName,
+        free: NDArray[np.bool_] | None,
+    ) -> Residuals:
+        """Residuals at x with the columns of free variations: each is a run with another amount,
+        or the same `runs` read in another way."""
+        if free is None or at.failed:
+            return at
+        for i in np.flatnonzero(free):
+            one = self.coordinates.all[i]
+            if one.kind != "variation":
+                continue
+            step = self.variations[one.name].amount / (one.high - one.low)
+            moved = x + step * np.eye(len(x))[i]
+            there = self.gather(moved, jobs, runs)
+            if one.name in self.varying:
+                others = self.jobs(moved, which, steps, None)
+                there = self.gather(moved, others, runner.run(others))
+            if there.failed:
+                return there._replace(J=np.full_like(at.J, np.inf))
+            at.J[:, i] = (there.r - at.r) / step
+        return at
 
     def freeze(
         self,
@@ -301,11 +371,12 @@ class Problem(Shown):
     ) -> tuple[Residuals, dict[str, Frozen]]:
         """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; no steps
         where a run fails."""
-        jobs = self.jobs(x, which, rtol, free)
-        runs = runner.run(jobs)
-        at = self.gather(x, jobs, runs)
+        at, runs, jobs = self._at(runner, x, which, rtol, free)
         names = [self.recordings[job.recording].name for job in jobs]
-        return at, {} if at.failed else {name: Frozen(run.knots) for name, run in zip(names, runs)}
+        if at.failed:
+            return at, {}
+        steps = {name: Frozen(run.knots) for name, run in zip(names, runs)}
+        return self._with_differences(runner, at, jobs, runs, x, which, steps, free), steps
 
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
         """Residuals at x (n,) from the results of jobs."""
@@ -354,8 +425,15 @@ class Problem(Shown):
         """Readings of the sensors in a job's recording at x (n,)."""
         recording = self.recordings[job.recording]
         signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
+        amounts = [
+            (one.read, c.to_value(x[i])) for i, c in enumerate(self.coordinates.all)
+            if (one := self.variations.get(c.name)) is not None and one.read is not None
+        ]  # fmt: skip
         for channel, one in self.readouts(x, job.recording).items():
             t, measured = recording.samples[channel]
+            for read, size in amounts:
+                if size != 0.0:
+                    measured = measured + read(recording, channel, size)
             y, slopes, by = one.expected(signals, t)
             yield Reading(channel, t, measured, y, slopes, by, *one.residuals(y, measured))
 

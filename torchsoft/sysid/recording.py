@@ -111,6 +111,11 @@ class Recording:
         return every[np.append(True, np.diff(every) > SAME)]
 
     @property
+    def begins(self) -> float:
+        """Begin of the run [s]."""
+        return float(self.times[0] - self.start.lead)
+
+    @property
     def duration(self) -> float:
         """Time from the first to the last sample [s]."""
         return float(self.times[-1] - self.times[0])
@@ -165,20 +170,20 @@ class Recording:
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
-        begin = self.times[0] - lead
+        begin = self.begins
         early = int(t[0] - begin > SAME)
         return Grid(torch.from_numpy(np.append([begin] * early, t)), early)
 
     @cached_property
     def beginning(self) -> str:
         """Checksum of everything that determines the initial state, besides the unknowns."""
-        signals = self.rig.follow(self.times[0] - self.start.lead).detach().numpy().tobytes()
+        signals = self.rig.follow(self.begins).detach().numpy().tobytes()
         return sha256(identity(self.rig) + signals + repr(self.start).encode()).hexdigest()
 
     @cached_property
     def fingerprint(self) -> str:
         """Checksum of everything that determines a run or a residual of this recording."""
-        t = torch.from_numpy(np.linspace(self.times[0] - self.start.lead, self.times[-1], 2000))
+        t = torch.from_numpy(np.linspace(self.begins, self.times[-1], 2000))
         signals = self.rig.follow(t).detach().numpy().tobytes()
         measured = b"".join(
             k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items())

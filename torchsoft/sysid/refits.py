@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.sysid.assumptions import Variation
+from torchsoft.sysid.assumptions import AMOUNTS, FAULT_BOUNDS, Variation
 from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
 from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, Stage, default_plan, run_plan
 from torchsoft.sysid.prediction import Frozen
@@ -24,9 +24,6 @@ vanishes."""
 FAR = 2.0
 """Misfit per sample above which tests to first order at the end of the fit are void, and repeated
 fits also start where the first fit did."""
-
-AMOUNTS = 10.0
-"""Range of a parameter in a repeated fit, in amounts of its variation."""
 
 HALVINGS = 10
 """Most halvings of that range where the rig is impossible at its end."""
@@ -77,26 +74,16 @@ def ended(
     return End(x, at, free, tuple(which), base, steps, usual, runner, rtol)
 
 
-EARLY = 2e-3
-"""Steps [s] before those of the fit, where the run of a variation begins earlier."""
-
-WRONG = {"bias": 1e4, "delay": 0.02, "gain": 0.5, "drift": 1e4, "clock": 0.05}
-"""Range of a sensor's fault: bias and drift [/s] over the noise, delay [s], gain [1], clock [1]."""
-
-
-def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | str:
-    """The problem with one assumption varied in the recordings `which`, or the reason why there is
-    none. A known parameter, or a fault of a sensor, becomes another unknown."""
-    made, unknowns, sensors = [], dict(problem.unknowns), dict(problem.sensors)
-    for recording in problem.recordings:
-        other = (
-            one.vary(recording) if one.vary is not None and recording.name in which else recording
-        )
-        if other is None:
-            return f"it has no meaning where recording `{recording.name}` begins"
-        made.append(other)
-    try:
-        if one.extension:
+def assuming(problem: Problem, some: Sequence[Variation], free: bool) -> Problem:
+    """The problem with assumptions as more coordinates, `free` or held at what is stated; a law or
+    a constant of the computation is held and, as by `begun`, otherwise. Raises `ValueError` for one
+    that cannot be."""
+    unknowns, sensors, held = dict(problem.unknowns), dict(problem.sensors), set(problem.held)
+    longest = max(1.0, *(recording.duration for recording in problem.recordings))
+    for one in some:
+        if not free or one.kind in ("numerical", "law"):
+            held.add(one.label)
+        if one.extension or (one.parameter and not free and one.nominal > 0):
             unknowns[one.parameter] = Unknown()
         elif one.parameter:
             reach = AMOUNTS * one.step / one.nominal
@@ -104,16 +91,28 @@ def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | 
                 farthest(problem.recordings, one.parameter, one.nominal, part)
                 for part in (-reach, reach)
             )
-            unknowns[one.parameter] = Unknown(nominal=one.nominal, low=low, high=high)
-        if one.fault is not None:
+            scale = "log" if low > 0 else "linear"
+            unknowns[one.parameter] = Unknown(nominal=one.nominal, low=low, high=high, scale=scale)
+        elif one.fault is not None:
             channel, kind = one.fault
-            scale = sensors[channel].noise if kind in ("bias", "drift") else 1.0
-            if kind == "clock":
-                scale = 1.0 / max(1.0, *(recording.duration for recording in made))
-            sensors[channel] = sensors[channel].model_copy(update={kind: WRONG[kind] * scale})
-        return Problem(made, sensors, unknowns, problem.noise)
-    except ValueError as error:  # an unknown that the varied rig has not, or that cannot be one
-        return str(error)
+            scales = {"bias": sensors[channel].noise, "drift": sensors[channel].noise,
+                      "clock": 1.0 / longest}  # fmt: skip
+            most = FAULT_BOUNDS[kind] * scales.get(kind, 1.0)
+            sensors[channel] = sensors[channel].model_copy(update={kind: most})
+    more = [*problem.variations.values(), *(one for one in some if one.vary or one.read)]
+    return Problem(problem.recordings, sensors, unknowns, problem.noise, more, held)
+
+
+def begun(problem: Problem, some: Sequence[Variation], at: Mapping[str, float]) -> Array:
+    """Coordinates (n,) of a problem under assumptions from those `at`, by label: laws and constants
+    of the computation are otherwise, numbers as stated."""
+    c = problem.coordinates
+    x = c.begun(at)
+    for one in some:
+        if one.kind in ("numerical", "law"):
+            i = c.labels.index(one.label)
+            x[i] = c.all[i].to_x(1.0)
+    return x
 
 
 def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
@@ -128,32 +127,62 @@ def farthest(recordings: Sequence[Recording], name: str, value: float, part: flo
     raise ValueError(f"{name} = {value:g} can hardly be varied")
 
 
+Column = tuple[Variation, Array | None, str]
+"""A variation with the change of the residuals (m,) by its amount, or None and the reason."""
+
+
+def exact_columns(
+    problem: Problem, end: End, taken: Sequence[Variation]
+) -> tuple[list[Column], Array | None]:
+    """Columns of parameters, of extensions of the rigs, of faults of sensors and of other readings,
+    and the Jacobian (m, n) of the free coordinates on the same steps: all from one run for each
+    recording. Empty where it fails."""
+    mine, out = [one for one in taken if one.vary is None], list[Column]()
+    if not mine or end.base.failed:
+        return out, None
+    try:
+        wide = assuming(problem, mine, free=False)
+    except ValueError:
+        out += [(one, None, why) for one in mine if (why := impossible(problem, one))]
+        mine = [one for one in mine if not impossible(problem, one)]
+        wide = assuming(problem, mine, free=False)
+    c = wide.coordinates
+    x = c.begun(dict(zip(problem.coordinates.labels, end.x)))
+    own = [c.labels.index(one.label) for one in problem.coordinates.within(end.free)]
+    free = np.isin(c.labels, [one.label for one in mine])
+    free[own] = True
+    at = wide.residuals(wide.runner(end.runner), x, end.which, end.steps, free)
+    if at.failed:
+        return [], None
+    for one in mine:
+        i = c.labels.index(one.label)
+        size = one.amount if one.read is not None else one.step
+        out.append((one, at.J[:, i] * (size / c.all[i].slope(x[i])), ""))
+    return out, at.J[:, own]
+
+
+def impossible(problem: Problem, one: Variation) -> str:
+    """Why an assumption cannot be a coordinate; empty if it can."""
+    try:
+        assuming(problem, [one], free=False)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
 def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
-    """Change of the residuals (m,) by a variation, on the same steps, or None and the reason."""
+    """Change of the residuals (m,) by a variation of runs, on the same steps, or None and the
+    reason."""
     if end.base.failed:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
-    other = varied(problem, end.which, one)
-    if isinstance(other, str):
-        return None, other
-    runner = end.runner.of(other.recordings)
-    steps = {
-        r.name: since(end.steps[r.name], float(r.times[0] - r.start.lead))
-        for r in other.recordings
-        if r.name in end.steps
-    }
-    got = other.residuals(runner, end.x, end.which, steps)
+    other = assuming(problem, [one], free=False)
+    c = other.coordinates
+    x, i = c.begun(dict(zip(problem.coordinates.labels, end.x))), c.labels.index(one.label)
+    x[i] = c.all[i].to_x(one.amount)
+    got = other.residuals(other.runner(end.runner), x, end.which, end.steps)
     if got.failed:
-        return None, f"a run failed: {got.reason}"
+        return None, got.reason
     return got.r - end.base.r, ""
-
-
-def since(steps: Frozen, begin: float) -> Frozen:
-    """The same steps for a run that begins at another time [s]."""
-    knots = steps.knots
-    if begin == knots[0]:
-        return steps
-    early = np.arange(begin, knots[0], EARLY) if begin < knots[0] else np.array([begin])
-    return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
 
 
 class Joint(NamedTuple):
@@ -182,9 +211,9 @@ def joint_fit(
     """
     other, tried = problem, list[Variation]()
     for one in suspects:
-        added = varied(other, end.which, one) if one.label else ""
-        if isinstance(added, Problem):
-            other, tried = added, [*tried, one]
+        with suppress(ValueError):
+            if one.parameter or one.fault is not None:
+                other, tried = assuming(other, [one], free=True), [*tried, one]
     if not tried:
         return None
     c, free = other.coordinates, freed(problem, other, end)
@@ -194,7 +223,7 @@ def joint_fit(
         for rtol in (LOOSE, end.rtol)
     ]
     at, fits = dict(zip(problem.coordinates.labels, end.x)), list[Fit]()
-    runner = end.runner.of(other.recordings)
+    runner = other.runner(end.runner)
     for x in (c.begun(at), c.start):
         with suppress(Unreachable):
             fits.append(run_plan(other, runner, plan, x, loss=loss, notify=notify).fit)
@@ -244,9 +273,10 @@ def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
 
 
 def freed(problem: Problem, other: Problem, end: End) -> NDArray[np.bool_]:
-    """Mask of the free coordinates of a varied problem: those of the fit, and its own."""
-    fitted = dict(zip(problem.coordinates.labels, end.free))
-    return np.array([bool(fitted.get(label, True)) for label in other.coordinates.labels])
+    """Mask of the free coordinates of a problem under assumptions: those of the fit, and its
+    own."""
+    fitted, c = dict(zip(problem.coordinates.labels, end.free)), other.coordinates
+    return np.array([bool(fitted.get(label, own)) for label, own in zip(c.labels, c.free)])
 
 
 class Refit(NamedTuple):
@@ -272,21 +302,19 @@ def refit(
     their whole range. Without a joint fit, and with a misfit above `FAR`, variations other than of
     a sensor also start where the first fit did, and the better end counts.
     """
-    other = problem
-    for one in tried:
-        added = varied(other, end.which, one)
-        if isinstance(added, str):
-            return None
-        other = added
+    try:
+        other = assuming(problem, tried, free=True)
+    except ValueError:
+        return None
     c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
     if joint is not None:
         at |= {label: joint.at[label] for label in c.labels if label in joint.at}
-    x = c.begun(at)
+    x = begun(other, tried, at)
     free = freed(problem, other, end)
     stuck = [one for one in c.within(free & c.at_bound(x)) if one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
     labels = tuple(one.label for one in c.within(free))
-    runner = end.runner.of(other.recordings)
+    runner = other.runner(end.runner)
 
     def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
         """The fit of the last stage, nothing where one fails."""
@@ -299,7 +327,7 @@ def refit(
         with suppress(Unreachable):
             plan = default_plan(other, runner, end.rtol, end.which)
             if set(plan[-1].free) == set(labels):
-                fits += carried_out(plan, c.start)
+                fits += carried_out(plan, begun(other, tried, {}))
     if not tried and not fits:  # it stays where it ended
         chi2 = float(np.mean(end.base.r**2))
         fits = [Fit(end.x, chi2, 0, False, end.steps, end.base._replace(J=end.at.J))]

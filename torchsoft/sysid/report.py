@@ -161,12 +161,15 @@ def assumptions(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
             amount = f" {signed(one.favoured)} ± {grouped(one.favoured_sd, 2)} {by}".rstrip()
         asks: Cell = f"no:{amount}" if amount else "they cannot tell"
         if one.suspected:
-            asks = "weak", f"yes{amount}: the sum of squares {one.falls}"
+            cause = "" if one.passed else ", but is not the cause"
+            asks = "weak", f"yes{amount}: the sum of squares {one.falls}{cause}"
         if one.unchecked:
             asks = "weak", f"not checked: {one.unchecked}"
         moved = ("", f"{signed(move)} sd of {label}" if label else "")
         matters = one.suspected or abs(move) > MOVED or one.unchecked
-        (moving if matters else harmless).append([one.stated, one.otherwise, moved, asks])
+        seen = f"{grouped(one.detectable, 2)} {one.unit}".rstrip() if measured else ""
+        seen = seen if np.isfinite(one.detectable) else ""
+        (moving if matters else harmless).append([one.stated, one.otherwise, moved, asks, seen])
     return {"moving": moving, "harmless": harmless}
 
 

@@ -166,6 +166,17 @@ class Verdict:
         return self.adjusted < LEVEL
 
 
+def systematic(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """The alarms that a wrong model causes, the clearest first: residuals that are too large,
+    coloured, follow the motion, or belong together."""
+    kinds = ("white", "motion", "channels")
+    found = [
+        one for one in verdicts
+        if one.alarming and (one.test in kinds or (one.test == "level" and one.size > 1))
+    ]  # fmt: skip
+    return sorted(found, key=lambda one: one.p)
+
+
 def judge_residuals(
     parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
 ) -> list[Verdict]:

@@ -129,7 +129,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
 # The result
 
 
-SCHEMA = "torchsoft-answer-6"
+SCHEMA = "torchsoft-answer-7"
 """Name and version of the file format."""
 
 
@@ -180,6 +180,10 @@ class IdentificationResult(Shown):
     ]  # NRMSE of recordings that were not fitted, by recording and channel
     notices: list[str]
     doubts: list[str]  # the notices that speak against the model
+    # whether residuals are those of a right model, at least under the suspect that is named
+    explained: bool
+    # assumptions that the data would not show to be wrong, though estimates move
+    unseen: list[str]
     stages: list[dict[str, Any]]
     cost: dict[str, Number]
     made_by: dict[str, Any]
@@ -224,12 +228,13 @@ class IdentificationResult(Shown):
                 low, high = one.ci95
                 rows.append((one.label, f"{one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}"))
         rows += [("note", notice) for notice in self.notices]
+        rows += [("unseen", sentence) for sentence in self.unseen]
         return self.headline, rows
 
     @property
     def verdict(self) -> Verdict:
         """Whether the model holds, is in doubt, or does not explain the data."""
-        if not all(one.stated < UNEXPLAINED for one in self.residuals):
+        if not self.explained or not all(one.stated < UNEXPLAINED for one in self.residuals):
             return "does not explain"
         return "doubtful" if self.doubts else "holds"
 
@@ -252,6 +257,10 @@ class IdentificationResult(Shown):
             return text
         worst = max(self.residuals, key=lambda one: one.stated)
         size = f"residuals of {worst.channel} are {worst.stated:.2g} times the stated noise"
+        if worst.stated < UNEXPLAINED:
+            size = f"{len(self.doubts)} notes below say what it leaves"
+            if len(self.doubts) == 1:
+                size = "a note below says what it leaves"
         return (
             f"The model does not explain the data: {size} (χ² = {self.chi2_stated:.3g}), and "
             "intervals may miss the truth"
@@ -285,7 +294,7 @@ class IdentificationResult(Shown):
         one = self.recorded(recording)
         rig = deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()
         set_parameters(rig, one.identified)
-        self._told(one)
+        self._warn_unidentifiable(one)
         return rig
 
     def applied_to(self, rig: Rig, recording: str | None = None) -> Rig:
@@ -311,7 +320,7 @@ class IdentificationResult(Shown):
             )
         rig = deepcopy(rig)
         set_parameters(rig, one.identified)
-        self._told(one)
+        self._warn_unidentifiable(one)
         return rig
 
     def draws(
@@ -326,7 +335,7 @@ class IdentificationResult(Shown):
         """
         whole("count", count, 1)
         one = self.recorded(recording)
-        determined = self._told(one)
+        determined = self._warn_unidentifiable(one)
         mine = [(i, c) for i, c in enumerate(self.coordinates)
                 if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
         free = [i for i, c in mine if c.name in determined]
@@ -345,7 +354,7 @@ class IdentificationResult(Shown):
                 values[c.name] = values[c.name] * values.get(c.ratio_to, known_one)
         return values
 
-    def _told(self, one: RecordedRig) -> set[str]:
+    def _warn_unidentifiable(self, one: RecordedRig) -> set[str]:
         """Names of the identifiable parameters. Warns of the others, including those of a held-out
         recording."""
         mine = [

@@ -8,7 +8,7 @@ another run, is made again.
 import io
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
@@ -17,6 +17,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchsoft.cost import steps_per_second
@@ -45,7 +46,7 @@ from torchsoft.sysid.prediction import (
     misfit,
     predict,
 )
-from torchsoft.sysid.recording import Array, Recording, RunContext
+from torchsoft.sysid.recording import BETWEEN, Array, Grid, Recording, RunContext
 from torchsoft.sysid.unknowns import NUISANCES
 
 MEANING = (
@@ -173,6 +174,7 @@ class Job(NamedTuple):
 
     `interpolated` requests a grid between the samples; `judged` requests the misfit and its
     gradient in place of the signals, and holds every sensor's readout and the colour of its noise.
+    `varied` are amounts of variations of the recording, by name.
     """
 
     recording: int
@@ -181,32 +183,46 @@ class Job(NamedTuple):
     steps: Steps
     interpolated: bool = False
     judged: tuple[tuple[Readout, Autoregression | None], ...] | None = None
+    varied: tuple[tuple[str, float], ...] = ()
+
+
+Simulated = Callable[[Recording], Prediction]
+"""The run of a recording at the values of a job. Raises `SimulationFailed`."""
+
+Vary = Callable[[Recording, float, Simulated], Recording | None]
+"""A recording with an assumption varied by an amount, which may look at runs; None where the
+variation does not apply to it."""
 
 
 class Runner:
     """Runs jobs in `workers` threads (in this one, if it is one), and stores their results in the
-    folder `journal`."""
+    folder `journal`. `variations` of recordings are those that jobs name."""
 
     def __init__(
-        self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None
-    ) -> None:
+        self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None,
+        variations: Mapping[str, Vary] | None = None,
+    ) -> None:  # fmt: skip
         if workers < 1:
             raise ValueError(f"`workers` must be positive, but is {workers}")
+        self.variations = dict(variations or {})
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.gradients = self.remembered = 0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
         beginnings = {recording.beginning for recording in self.recordings}
         self._alike, self._lock = len(beginnings) < len(self.recordings), Lock()
         self._starts: dict[Any, tuple[Tensor, Tensor]] = {}
+        self._watched: dict[str, Prediction] = {}
         self._idle: list[list[RunContext]] = [
             [] for _ in self.recordings
         ]  # models that no thread is using
         self._parent: Runner | None = None
 
-    def of(self, recordings: Sequence[Recording]) -> "Runner":
+    def of(
+        self, recordings: Sequence[Recording], variations: Mapping[str, Vary] | None = None
+    ) -> "Runner":
         """A runner for other recordings, with the same number of threads and the same folder; what
         it runs counts here too."""
-        out = Runner(recordings, self.workers, self.folder)
+        out = Runner(recordings, self.workers, self.folder, variations)
         out._parent = self
         return out
 
@@ -227,17 +243,56 @@ class Runner:
 
     def _made(self, job: Job) -> Any:
         """Run a job and store its result, even if an interruption is pending."""
-        idle = self._idle[job.recording]
-        try:
-            begun = idle.pop()
-        except IndexError:
-            begun = self.recordings[job.recording].begin()
-        start = partial(self._start, begun, job) if self._alike else None
-        result = simulated(self.recordings[job.recording], begun, job, start)
-        idle.append(begun)
+        if job.varied:
+            result = self._varied(job)
+        else:
+            idle = self._idle[job.recording]
+            try:
+                begun = idle.pop()
+            except IndexError:
+                begun = self.recordings[job.recording].begin()
+            start = partial(self._start, begun, job) if self._alike else None
+            result = simulated(self.recordings[job.recording], begun, job, start)
+            idle.append(begun)
         if self._journal is not None:
             self._journal.keep(job, result)
         return result
+
+    def _varied(self, job: Job) -> Any:
+        """Run a job of a varied recording, of which each run has another."""
+        stated = self.recordings[job.recording]
+        plain = job._replace(varied=())
+
+        def run(one: Recording, job: Job = plain, fine: bool = False) -> Any:
+            job = job._replace(steps=since(job.steps, one.begins))
+            made = simulated(one, one.begin(), job, grid=between(one, job) if fine else None)
+            if isinstance(made, FailedRun):
+                raise SimulationFailed(made.reason, made.time)
+            own = [one.channels.index(channel) for channel in stated.channels]  # of more actuators
+            return made._replace(signals=made.signals[:, own])
+
+        def watched(one: Recording) -> Prediction:
+            """The run on a fine grid; that of the recording as stated is made once."""
+            fine = plain._replace(names=(), judged=None)
+            if one is not stated:
+                return run(one, fine, True)
+            with self._lock:
+                if repr(fine) not in self._watched:
+                    self._watched = {repr(fine): run(one, fine, True)}
+                return self._watched[repr(fine)]
+
+        recording: Recording | None = stated
+        try:
+            with warnings.catch_warnings(action="ignore"):  # such as of pads that creep for long
+                for name, amount in job.varied:
+                    recording = recording and self.variations[name](recording, amount, watched)
+                if recording is None:
+                    raise ValueError(f"it has no meaning where recording `{stated.name}` begins")
+                return run(recording)
+        except ValueError as error:  # a rig that cannot be so
+            return FailedRun(str(error), 0.0)
+        except SimulationFailed as failure:
+            return FailedRun(failure.reason, failure.time)
 
     def _start(self, begun: RunContext, job: Job) -> tuple[Tensor, Tensor]:
         """The initial state of a run, computed once for recordings that begin alike."""
@@ -265,13 +320,34 @@ class Runner:
             self._parent._count(job, remembered)
 
 
+EARLY = 2e-3
+"""Steps [s] before frozen ones, where the run of a varied recording begins earlier."""
+
+
+def since(steps: Steps, begin: float) -> Steps:
+    """The same steps for a run that begins at another time [s]."""
+    if not isinstance(steps, Frozen) or begin == steps.knots[0]:
+        return steps
+    knots = steps.knots
+    early = np.arange(begin, knots[0], EARLY) if begin < knots[0] else np.array([begin])
+    return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
+
+
+def between(recording: Recording, job: Job) -> Grid:
+    """Times every `BETWEEN` from the begin of a run to its end."""
+    own = recording.grid(job.interpolated).t.numpy()
+    first, last = (job.steps.knots if isinstance(job.steps, Frozen) else own)[[0, -1]]
+    return Grid(torch.from_numpy(np.append(np.arange(first, last - 1e-9, BETWEEN), last)), 0)
+
+
 def simulated(
     recording: Recording, begun: RunContext, job: Job,
-    start: Callable[[], tuple[Tensor, Tensor]] | None = None,
+    start: Callable[[], tuple[Tensor, Tensor]] | None = None, grid: Grid | None = None,
 ) -> Any:  # fmt: skip
     """A `Prediction`, a `Misfit`, or a `FailedRun`, with a rig that no other thread uses; `start`
-    computes the initial state."""
-    run = begun, job.values, recording.grid(job.interpolated), job.names, job.steps
+    computes the initial state. The grid is the recording's own unless another is given."""
+    grid = recording.grid(job.interpolated) if grid is None else grid
+    run = begun, job.values, grid, job.names, job.steps
     try:
         if job.judged is None:
             return predict(*run, start() if start is not None else None)

@@ -10,25 +10,30 @@ determine it.
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from tqdm import tqdm
 
 from torchsoft.display import hidden
-from torchsoft.physics.extensions import extend, extensions
-from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
+from torchsoft.sysid.assumptions import AMOUNTS, FAULTS, Assumption, Variation, assumptions
 from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
-from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import Array, extended
-from torchsoft.sysid.refits import NEARLY, End, Refit, difference, joint_fit, refit
-from torchsoft.sysid.residual_tests import LEVEL, parts
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.refits import (
+    NEARLY,
+    End,
+    Joint,
+    Refit,
+    difference,
+    exact_columns,
+    joint_fit,
+    refit,
+)
+from torchsoft.sysid.residual_tests import Verdict, judge_residuals, parts, systematic
 from torchsoft.tables import Number, plain
 
 EVIDENT = 20.0
@@ -45,7 +50,7 @@ LAGS = 10
 BY_CHANCE = 2.0
 """Largest statistic of Box and Pierce, over its expectation, that counts as chance."""
 
-MOST = 24
+MOST = 18
 """Most suspects with which a fit is repeated, besides laws and constants of the computation."""
 
 RIVAL = 0.3
@@ -66,7 +71,9 @@ class AssumptionTest(Assumption):
     none. With `refitted` the result is that of a new fit, else it is to first order. `unchecked` is
     the reason of a missing test. `value` is the favoured value of the `parameter`, `under` are the
     estimates at the favoured amplitude, by label. `suspected` is whether the data favour the
-    variation, and `odds` its share of the evidence among all suspects.
+    variation, `passed` whether residuals under it pass the tests of a fit, and `odds` its share of
+    the evidence among all suspects that do. `detectable` is the least amount [unit] that the data
+    would show.
     """
 
     moves: dict[str, Number] = field(default_factory=dict)
@@ -82,6 +89,8 @@ class AssumptionTest(Assumption):
     under: dict[str, Number] = field(default_factory=dict)
     odds: Number = 0.0
     suspected: bool | None = None
+    passed: bool = False
+    detectable: Number = float("inf")
 
     def __post_init__(self) -> None:
         if self.suspected is None:
@@ -131,6 +140,15 @@ class AssumptionTest(Assumption):
         return f" if {self.otherwise}"
 
     @property
+    def impact(self) -> tuple[str, float, float]:
+        """Label of the coordinate that moves most, its shift in standard deviations, and the amount
+        [unit] that makes it: the largest that the data would not show, up to `AMOUNTS` times that
+        of the variation."""
+        size = min(self.detectable, AMOUNTS * self.amount)
+        label, move = self.most_moved
+        return label, move * size / self.amount, size
+
+    @property
     def most_moved(self) -> tuple[str, float]:
         """Label of the coordinate with the largest shift, and the shift in standard deviations."""
         return max(self.moves.items(), key=lambda item: abs(item[1]), default=("", 0.0))
@@ -158,9 +176,33 @@ class Checked(NamedTuple):
     besides: tuple[AssumptionTest, ...] = ()
     """Effects that the data favour to first order besides the likeliest suspect, each beside those
     before it."""
-    left: Mapping[str, float] = MappingProxyType({})
-    """RMS residual of every channel, over its noise, with the likeliest suspect and the effects
-    besides."""
+    alarms: tuple[Verdict, ...] = ()
+    """Alarms of the residuals under the likeliest suspect and the effects besides, or of the fit
+    without a suspect."""
+    as_stated: tuple[Verdict, ...] = ()
+    """Alarms of the residuals of the fit itself."""
+    sd: Mapping[str, float] = MappingProxyType({})
+    """Standard deviations of the free coordinates, by label."""
+
+    @property
+    def favoured(self) -> list[AssumptionTest]:
+        """Suspects that the data favour, the likeliest first, those that pass the tests before
+        others."""
+        mine = [one for one in self.checks if one.suspected]
+        return sorted(mine, key=lambda one: (-one.odds, -one.passed, -one.gain))
+
+    @property
+    def explained(self) -> bool:
+        """Whether nothing is left under the likeliest suspect and the effects besides, and without
+        them something is."""
+        return bool(self.favoured and self.as_stated) and not self.alarms
+
+    @property
+    def wider(self) -> dict[str, float]:
+        """Factor on the standard deviation of every free coordinate by the constants of the
+        computation."""
+        plain, wider = fisher(self.J)[0], self.covariance()
+        return dict(zip(self.sd, np.sqrt(np.diag(wider) / np.diag(plain)).tolist()))
 
     def covariance(self) -> Array:
         """Covariance (n, n) of the free coordinates, widened by the constants of the
@@ -186,30 +228,31 @@ def check_assumptions(
     """
     candidates, explained = list[Variation](), False
     recordings = [recording for recording in problem.recordings if recording.name in end.which]
-    taken = assumptions(recordings, set(problem.coordinates.names))
-    judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
+    c = problem.coordinates
+    faults = [f"{one.kind} of {one.name}" for one in c.all if one.kind in FAULTS]
+    taken = assumptions(recordings, {*c.names, *faults}, problem.sensors)
+    checks, columns = dict[str, AssumptionTest](), list[Array]()
     untried = [one.name for one in taken if one.vary is not None]
+    # such as of pads that creep longer than the lead of a run
+    with warnings.catch_warnings(action="ignore"):
+        exact, J = exact_columns(problem, end, taken)
+    judge = Judge(problem, end, end.at.J[:, end.free] if J is None else J, loss != "linear")
     try:
-        # such as of pads that creep longer than the lead of a run
-        with warnings.catch_warnings(action="ignore"):
-            first = columns_of(problem, end, taken)
-        judge.columns = {one.name: d for one, d in first if d.any()}
-        checks |= {one.name: judge.column(one, d) for one, d in first if d.any()}
+        for one, d, reason in exact:
+            if d is None or d.any():
+                checks[one.name] = judge.first_order(one, d, reason)
         for one in taken:
             if one.vary is None:
                 continue
             d, reason = difference(problem, end, one)
-            if d is None:
-                checks[one.name] = assumption_test(one, left=judge.square, unchecked=reason)
-            else:
-                checks[one.name], judge.columns[one.name] = judge.column(one, d), d
-                columns += [d] if one.kind == "numerical" else []
+            checks[one.name] = judge.first_order(one, d, reason)
+            if d is not None and one.kind == "numerical":
+                columns.append(d)
             untried.remove(one.name)
-        suspects = {one.name: one for one in (*taken, *(one for one, _ in first))}
         explained = judge.explained(checks.values())
         if doubtful and not end.base.failed:
             look = rivals if explained else doubted
-            candidates = look(suspects.values(), checks)
+            candidates = look(taken, checks)
         if explain and candidates:
             untried = [f"a new fit with another {one.name}" for one in candidates]
             exact = end._replace(rtol=end.finest) if explained else end  # rivals differ by little
@@ -220,8 +263,12 @@ def check_assumptions(
         candidates = []
     rows = np.stack(columns, 1) if columns else np.zeros((len(end.at.r), 0))
     names = tuple(one.name for one in candidates)
-    done = Checked([*checks.values()], rows, judge.J, tuple(untried), names)
-    return compared(done, judge) if explained or not candidates else done
+    sd = dict(zip(judge.labels, judge.sd.tolist()))
+    done = Checked(
+        [*checks.values()], rows, judge.J, tuple(untried), names,
+        as_stated=tuple(judge.alarms(judge.r, judge.J)), sd=sd,
+    )  # fmt: skip
+    return compared(done, judge)
 
 
 def new_fits(
@@ -243,8 +290,8 @@ def new_fits(
 
         if end.far:
             bar.set_description("new fit with all suspects unknown at once")
-            joint = joint_fit(problem, end, candidates, judge.little, loss, notify)
-        explains = joint is not None and joint.left <= judge.little
+            joint = joint_fit(problem, end, candidates, judge.explained_chi2, loss, notify)
+        explains = joint is not None and joint.left <= judge.explained_chi2
         bounded = dict[str, float]()
         if joint is not None:  # where it leaves much, no number of it explains the data alone
             gains |= {name: explains * judge.square * part for name, part in joint.parts.items()}
@@ -259,16 +306,16 @@ def new_fits(
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, (), loss, notify)
         bar.update()
-        enough = 0.0
+        enough, ends = 0.0, dict[str, tuple[list[Variation], Refit]]()
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
             if gain < enough:
-                return
+                break
             if name in bounded and least < bounded[name]:
                 continue
             bar.set_description(plain(f"new fit with another {name} ({number} of {len(order)})"))
-            tried = [one.of(checks[one.name].favoured) for one in some]
+            tried = [one.within(checks[one.name].favoured) for one in some]
             other = refit(problem, end, tried, loss, notify, joint if explains else None)
             if other is not None and as_stated is not None:
                 found = [
@@ -276,13 +323,27 @@ def new_fits(
                     for one, changed in zip(some, tried)
                 ]
                 if all(one.refitted for one in found):
-                    checks[name] = judge.together(name, found)
+                    checks[name], ends[name] = judge.together(name, found), (tried, other)
                     least = min(least, judge.misfit(found[0].left))
             bar.update()
             if len(some) == 1:
                 yield some[0]
             if name in checks and judge.nearly(checks[name]):
                 enough = max(enough, RIVAL * gain)
+        best = max(
+            (name for name in ends if checks[name].suspected),
+            key=lambda name: (checks[name].passed, checks[name].gain), default="",
+        )  # fmt: skip
+        if best and as_stated is not None and not checks[best].passed and end.rtol > end.finest:
+            bar.set_description(plain(f"new fit with another {best}, by finer steps"))
+            tried, coarse = ends[best]
+            at = Joint(dict(zip(coarse.problem.coordinates.labels, coarse.fit.x)), 0.0, {})
+            fine = end._replace(rtol=end.finest)
+            other = refit(problem, fine, tried, loss, notify, at)
+            if other is not None:
+                linear = [replace(checks[one.name], refitted=False) for one in tried]
+                found = [judge.fit(one, other, as_stated, c) for one, c in zip(tried, linear)]
+                checks[best] = judge.together(best, found)
 
 
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
@@ -305,31 +366,35 @@ def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) 
 
 
 def compared(checked: Checked, judge: "Judge") -> Checked:
-    """Tests with odds: shares of the evidence, by Schwarz's criterion, of the suspected ones. A new
-    fit with a law that holds or does not has no amplitude."""
+    """Tests with odds: shares of the evidence, by Schwarz's criterion, of the suspects that pass
+    the tests of a fit, or of all where none does. A new fit with a law that holds or does not has
+    no amplitude."""
     out = list(checked.checks)
     favoured = [one for one in out if one.suspected]
     if not favoured:
-        return checked._replace(left=judge.remaining(judge.r))
-    rest = max(1.0, min(one.left for one in favoured) / judge.dof)
+        return checked._replace(alarms=checked.as_stated)
+    some = [one for one in favoured if one.passed] or favoured
+    rest = max(1.0, min(one.left for one in some) / judge.dof)
     amplitudes = [
         one.amount if one.kind == "several"
-        else float(not one.refitted or one.kind in ("known", "sensor")) for one in favoured
+        else float(not one.refitted or one.kind in ("known", "sensor")) for one in some
     ]  # fmt: skip
-    left = np.array([one.left for one in favoured])
+    left = np.array([one.left for one in some])
     score = left / rest + np.log(judge.dof) * np.array(amplitudes)
     odds = np.exp(-0.5 * (score - score.min()))
-    for one, share in zip(favoured, odds / odds.sum()):
+    for one, share in zip(some, odds / odds.sum()):
         out[out.index(one)] = replace(one, odds=float(share))
-    besides, r = judge.besides(favoured[int(score.argmin())], out)
-    return checked._replace(checks=out, besides=besides, left=judge.remaining(r))
+    besides, r, J = judge.besides(some[int(score.argmin())], out)
+    return checked._replace(checks=out, besides=besides, alarms=tuple(judge.alarms(r, J)))
 
 
 class Judge:
     """Tests of variations at the end of a fit."""
 
-    def __init__(self, problem: Problem, end: End) -> None:
-        self.end, self.r, self.J = end, end.at.r, end.at.J[:, end.free]
+    def __init__(self, problem: Problem, end: End, J: Array, robust: bool = False) -> None:
+        """J (m, n) is the Jacobian of the free coordinates on the steps of the variations."""
+        self.problem, self.robust = problem, robust
+        self.end, self.r, self.J = end, end.at.r, J
         self.Q, _ = np.linalg.qr(self.J)
         self.sd = standard_deviations(self.J)
         self.coordinates = problem.coordinates.within(end.free)
@@ -340,21 +405,25 @@ class Judge:
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
         misfit = self.misfit(self.square)
-        self.little = self.square - NEARLY * misfit if misfit > 0.0 else 0.0
+        self.explained_chi2 = self.square - NEARLY * misfit if misfit > 0.0 else 0.0
         """Sum of squares below which next to nothing is left above the noise."""
 
     def misfit(self, left: float) -> float:
         """Part of a sum of squares that is above the noise."""
         return left - self.dof
 
+    def alarms(self, r: Array, J: Array) -> list[Verdict]:
+        """What a wrong model would leave in residuals r (m,) with their Jacobian J (m, n)."""
+        left = parts(self.problem, r, self.end.which)
+        return systematic(judge_residuals(left, r, J, robust=self.robust))
+
     def explained(self, checks: Iterable[AssumptionTest]) -> bool:
-        """Whether with a suspected variation residuals are no larger than the noise."""
-        left = min((one.left for one in checks if one.suspected), default=np.inf)
-        return float(stats.chi2.sf(left, self.dof)) > LEVEL
+        """Whether with a suspected variation nothing is left."""
+        return any(one.suspected and one.passed for one in checks)
 
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""
-        return self.explained([one]) or (one.refitted and one.left < self.little)
+        return self.explained([one]) or (one.refitted and one.left < self.explained_chi2)
 
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
@@ -375,15 +444,17 @@ class Judge:
             refitted=refitted, value=one.nominal + favoured / one.amount * one.step, under=under,
         )  # fmt: skip
 
-    def remaining(self, r: Array) -> dict[str, float]:
-        """RMS of residuals r (m,) by channel."""
-        rows: dict[str, list[Array]] = {}
-        for part in self.parts:
-            rows.setdefault(part.channel, []).append(r[part.rows])
-        return {
-            channel: float(np.sqrt(np.mean(np.concatenate(some) ** 2)))
-            for channel, some in rows.items()
-        }
+    def first_order(self, one: Assumption, d: Array | None, reason: str) -> AssumptionTest:
+        """Test of a variation that adds the column d (m,) to the residuals, or that could not be
+        run for a `reason`."""
+        if d is None:
+            return assumption_test(one, left=self.square, unchecked=reason)
+        self.columns[one.name] = d
+        test = self.column(one, d)
+        if not test.suspected:
+            return test
+        J = np.column_stack((self.J, d))
+        return replace(test, passed=not self.alarms(self.r - J @ shift(J, self.r), J))
 
     def column(
         self, one: Assumption, d: Array, Q: Array | None = None, r: Array | None = None
@@ -400,11 +471,11 @@ class Judge:
             return self.made(one, moves, 0.0, square, 0.0, float("inf"), 1.0, r, r)
         gain, alpha = along**2 / size, -along / size
         rest = max(1.0, (square - gain) / max(self.dof - 1, 1))
-        sd = (max(1.0, square / self.dof) / size) ** 0.5
-        return self.made(
-            one, moves, gain, square - gain, alpha * one.amount, sd * one.amount, rest,
-            r + alpha * across, r,
-        )  # fmt: skip
+        sd = (max(1.0, square / self.dof) / size) ** 0.5 * one.amount
+        test = self.made(
+            one, moves, gain, square - gain, alpha * one.amount, sd, rest, r + alpha * across, r
+        )
+        return replace(test, detectable=EVIDENT**0.5 * sd)
 
     def fit(
         self, one: Variation, again: Refit, as_stated: Refit, linear: AssumptionTest
@@ -419,18 +490,22 @@ class Judge:
         rest = max(1.0, left / self.dof)
         moves = np.array([again.of(label) for label in self.labels]) - self.end.x[self.end.free]
         favoured, sd = one.amount, (rest / max(gain, 1e-300)) ** 0.5 * abs(one.amount)
-        if one.label:
+        if one.kind in ("known", "sensor"):
             c, free = again.problem.coordinates, again.free
             k = c.labels.index(one.label)
             mine = c.all[k]
             value, slope = mine.to_value(again.fit.x[k]), mine.slope(again.fit.x[k])
             place = int(np.flatnonzero(free).tolist().index(k))
             own = rest**0.5 * float(standard_deviations(at.J[:, free])[place]) * slope
-            scale = one.amount / one.step
-            favoured, sd = (value - one.nominal) * scale, own * scale
+            by_amount = one.vary is not None or one.read is not None
+            nominal, scale = (0.0, 1.0) if by_amount else (one.nominal, one.amount / one.step)
+            favoured, sd = (value - nominal) * scale, own * scale
         self.ends[one.name] = at.r, at.J[:, again.free]
         test = self.made(one, moves / self.sd, gain, left, favoured, sd, rest, at.r, before.r, True)
-        return replace(test, amount=linear.amount, step=linear.step)
+        return replace(
+            test, amount=linear.amount, step=linear.step, detectable=linear.detectable,
+            passed=not self.alarms(*self.ends[one.name]),
+        )  # fmt: skip
 
     def together(self, name: str, found: Sequence[AssumptionTest]) -> AssumptionTest:
         """The test of one or several variations in one new fit, from the test of each in that
@@ -446,9 +521,9 @@ class Judge:
 
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]
-    ) -> tuple[tuple[AssumptionTest, ...], Array]:
+    ) -> tuple[tuple[AssumptionTest, ...], Array, Array]:
         """Tests to first order of effects besides one suspect, at most `BESIDES`, each beside those
-        before it; and the residuals (m,) that all of them leave."""
+        before it; and the residuals (m,) that all of them leave, with their Jacobian."""
         out: list[AssumptionTest] = []
         r, J = self.r, self.J
         if best.refitted:
@@ -469,7 +544,7 @@ class Judge:
             r = r + found.favoured / found.amount * (d - Q @ (Q.T @ d))
             J = np.column_stack((J, d))
             left = [one for one in left if one.name != found.name]
-        return tuple(out), r
+        return tuple(out), r, J
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
@@ -491,68 +566,3 @@ def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> flo
     if before <= BY_CHANCE * by_chance:
         return 0.0
     return (max(after - rest, 0.0) / (before - by_chance)) ** 0.5
-
-
-def columns_of(
-    problem: Problem, end: End, taken: Sequence[Variation]
-) -> list[tuple[Variation, Array]]:
-    """Columns of the residuals, to first order, for known parameters, extensions of the rigs, and
-    faults of sensors that are not unknowns: from one run for each recording with its derivatives,
-    and another for extensions that exclude each other. Empty where a run fails."""
-    if end.base.failed:
-        return []
-    out: list[tuple[Variation, Array]] = []
-    for number, known in enumerate(batches(problem, [one for one in taken if one.parameter])):
-        names = tuple(one.parameter for one in known)
-        added = [one.parameter for one in known if one.extension]
-        recordings = [extended(recording, added) for recording in problem.recordings]
-        jobs = [
-            job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)
-        ]
-        runs = end.runner.of(recordings).run(jobs)
-        if any(isinstance(run, FailedRun) for run in runs):
-            return out
-        faults = faults_of(problem) if number == 0 else []
-        blocks = []
-        for job, run in zip(jobs, runs):
-            recording = problem.recordings[job.recording]
-            for one in problem.readings(end.x, job, run):
-                block = np.zeros((len(one.t), len(known) + len(faults)))
-                if one.slopes is not None:
-                    block[:, : len(known)] = one.slopes * [float(each.step) for each in known]
-                for k, fault in enumerate(faults, len(known)):
-                    assert fault.fault is not None
-                    if fault.fault[0] == one.channel:
-                        block[:, k] = one.by[fault.fault[1]] * fault.step
-                rows = problem.whitened(recording, one.channel, one.weight[:, None] * block)
-                blocks.append(np.asarray(rows))
-        blocks.append(np.zeros((len(problem.coordinates.priors), len(known) + len(faults))))
-        out += zip((*known, *faults), np.concatenate(blocks).T)
-    return out
-
-
-def batches(problem: Problem, known: Sequence[Variation]) -> Iterator[list[Variation]]:
-    """Parameters grouped into sets that one rig can have, with those that it already has in the
-    first."""
-    left = list(known)
-    while left:
-        rig, mine = deepcopy(problem.recordings[0].rig), list[Variation]()
-        for one in left:
-            if not one.extension:
-                mine.append(one)
-            elif one.parameter in extensions(rig):
-                extend(rig, [one.parameter])
-                mine.append(one)
-        yield mine
-        left = [one for one in left if one not in mine]
-
-
-def faults_of(problem: Problem) -> list[Variation]:
-    """Faults of sensors that are not unknowns."""
-    have = {(one.name, one.kind) for one in problem.coordinates.all}
-    first = problem.recordings[0]
-    return [
-        FAULTS[kind].assumption(channel, kind, problem.unit(channel), sensor, first)
-        for channel, sensor in problem.sensors.items() for kind in FAULTS
-        if (channel, kind) not in have
-    ]  # fmt: skip

@@ -1,81 +1,98 @@
 """Sentences on the tests of assumptions: the likeliest suspects, further effects, the remaining
-misfit, and constants of the computation that affect the estimates."""
+misfit, constants of the computation that affect the estimates, and what would not be noticed."""
 
 from collections.abc import Sequence
 
+from torchsoft.sysid.assumptions import AMOUNTS
 from torchsoft.sysid.sensitivity import AssumptionTest, Checked
 
 LIKELY = 0.01
 """Least odds of a suspect that is named."""
 
-UNEXPLAINED = 1.15
-"""Least RMS residual of a channel, over its noise, that is reported as unexplained."""
-
-NO_CAUSE = 5.0
-"""RMS residual of a channel, over its noise, left by the new fit with the likeliest suspect, from
-which on that suspect explains nothing."""
+NAMED = 6
+"""Most suspects that a sentence names where only new fits can tell them apart."""
 
 UNDER = 8
 """Most estimates that a sentence states under an alternative."""
+
+ALLOWED = 1.05
+"""Least factor by which an interval is wider that allows for a constant of the computation."""
 
 MOVED = 0.5
 """Largest shift of an estimate by a constant of the computation, in standard deviations, that gets
 no notice."""
 
 
+WORST = 3
+"""Most sentences on assumptions of each kind that the data would not show to be wrong."""
+
+
 def assumption_notices(checked: Checked) -> list[str]:
-    """Sentences on suspected assumptions, the strongest first, on those that were not tried, and on
-    constants of the computation that affect the estimates."""
-    out = assumption_doubts(checked)
+    """Sentences on what was not tried, and on constants of the computation that affect the
+    estimates."""
+    out = list[str]()
     if checked.untried:
         out.append(
             f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
             "tries them"
         )
-    return out + constant_notices(checked.checks)
+    return out + constant_notices(checked)
 
 
 def assumption_doubts(checked: Checked) -> list[str]:
-    """Sentences on what the data hold against the assumptions, the strongest first."""
-    out, checks = [], checked.checks
-    favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
-    if checked.candidates and not favoured:
-        square = max((c.left + c.gain for c in checks), default=1.0)
+    """Sentences on what the data hold against the assumptions, the strongest first. A suspect is
+    the cause where nothing is left under it; else the misfit stands for something else."""
+    favoured, candidates = checked.favoured, len(checked.candidates)
+    again = f": `explain` fits again with each of {candidates} and compares them"
+    if favoured and checked.explained:
+        near = [c for c in checked.checks if c.name in checked.candidates]
+        return contradictions(favoured, near) + [
+            f"besides, the data contradict that {c.stated}: the sum of squares would fall by "
+            f"another {c.gain:.0f}{c.found}"
+            for c in checked.besides
+        ]
+    if favoured and not checked.as_stated:
+        near = [f"{c.name}{c.found}" for c in favoured if c.odds > LIKELY][:NAMED]
+        return [
+            f"something is not as stated: the sum of squares {favoured[0].falls}"
+            f"{favoured[0].found}, which is more than chance. Residuals pass every test without "
+            "it, so that nothing confirms the cause"
+            + (f"; as likely are {'; '.join(near[1:])}" if near[1:] else "")
+        ]
+    looks = "; ".join(SHORT[one.test].format(one.words) for one in checked.alarms[:WORST])
+    if favoured:
+        best = favoured[0]
+        return [
+            "the misfit stands for something that is none of the assumptions tested: with the "
+            f"nearest one, {best.name}, the sum of squares {best.falls}{best.found}, but "
+            f"{looks}{again * bool(candidates)}"
+        ]
+    if candidates:
+        square = max((c.left + c.gain for c in checked.checks), default=1.0)
         near = ", ".join(
             f"{c.name} ({c.gain / square:.0%} of the sum of squares)"
-            for c in sorted((c for c in checks if c.suspected), key=lambda c: -c.gain)[:4]
+            for c in sorted(checked.checks, key=lambda c: -c.gain)[:WORST]
         )
-        nearest = f"nearest come {near}" if near else "the data favour none"
-        out.append(
-            f"no suspect explains to first order all that the fit left; {nearest}: `explain` fits "
-            f"again with each of {len(checked.candidates)} and compares them"
-        )
-    if favoured and favoured[0].refitted and max(checked.left.values(), default=0.0) > NO_CAUSE:
-        best = favoured[0]
-        out.append(
-            f"no suspect explains these data: the sum of squares {best.falls}{best.found}, which "
-            "leaves too much to be the cause"
-        )
-    elif favoured:
-        out += contradictions(favoured, [c for c in checks if c.name in checked.candidates])
-    out += [
-        f"besides, the data contradict that {c.stated}: the sum of squares would fall by another "
-        f"{c.gain:.0f}{c.found}"
-        for c in checked.besides
-    ]
-    left = {channel: size for channel, size in checked.left.items() if size > UNEXPLAINED}
-    if left and any(c.refitted for c in checks):
-        sizes = ", ".join(
-            f"{channel}: {size:.2g} times the noise left"
-            for channel, size in sorted(left.items(), key=lambda item: -item[1])
-        )
-        out.append(f"none of {len(checks)} suspects explains {sizes}")
-    return out
+        return [
+            f"no suspect explains to first order all that the fit left; nearest come {near}{again}"
+        ]
+    if checked.alarms and any(c.refitted for c in checked.checks):
+        return [f"none of {len(checked.checks)} suspects explains the misfit: {looks}"]
+    return []
 
 
-def constant_notices(checks: Sequence[AssumptionTest]) -> list[str]:
+SHORT = {
+    "level": "residuals are larger than the noise, {}",
+    "white": "residuals are not white in {}",
+    "motion": "residuals follow the motion in {}",
+    "channels": "residuals belong together, {}",
+}
+"""Alarms of residuals under a suspect."""
+
+
+def constant_notices(checked: Checked) -> list[str]:
     """Sentences on constants of the computation that affect the estimates."""
-    out = list[str]()
+    out, checks = list[str](), checked.checks
     moved_on = any(c.refitted and c.suspected for c in checks)  # to another end than the fit's
     for c in checks:
         if c.kind == "numerical" and c.unchecked:
@@ -83,20 +100,61 @@ def constant_notices(checks: Sequence[AssumptionTest]) -> list[str]:
         elif c.kind == "numerical" and not c.suspected and c.favoured_sd > MOVED:
             label, move = c.most_moved
             if abs(move) > MOVED and not moved_on:
+                wide = checked.wider[label]
+                allowed = f"the interval, {wide:.2g} times as wide, allows for that"
+                if wide < ALLOWED:
+                    allowed = "the interval does not allow for that"
                 out.append(
                     f"{label} hangs on a constant of the computation: {c.stated}; if {c.otherwise} "
                     f"it would move by {abs(move):.2g} standard deviations, and the data cannot "
-                    "tell: the interval allows for that"
+                    f"tell: {allowed}"
                 )
     return out
+
+
+def unseen(checked: Checked) -> list[str]:
+    """Sentences on assumptions that the data would not show to be wrong though estimates move by
+    more than a standard deviation, the worst first: those with a size from which on they would, and
+    those that only a change of the estimates could tell."""
+    hidden, priced = list[tuple[float, str]](), list[tuple[float, str]]()
+    for c in checked.checks:
+        label, move, size = c.impact
+        if c.kind not in ("known", "sensor") or c.unchecked or c.suspected or abs(move) < 1.0:
+            continue
+        if c.detectable <= AMOUNTS * c.amount:
+            hidden.append((
+                abs(move),
+                f"{c.name}: {size:.2g} {c.unit}".rstrip() + " more or less than stated would not "
+                f"be seen, and moves {label} by {abs(move):.2g} standard deviations",
+            ))  # fmt: skip
+        else:
+            part = 100 * c.moves[label] * checked.sd[label]
+            priced.append((
+                abs(move),
+                f"{label} takes {c.name} as exact: {c.amount:.2g} {c.unit}".rstrip()
+                + f" of it is {part:+.2g} % of {label}",
+            ))  # fmt: skip
+    return [
+        sentence for some in (hidden, priced)
+        for _, sentence in sorted(some, key=lambda row: -row[0])[:WORST]
+    ]  # fmt: skip
 
 
 def contradictions(
     favoured: Sequence[AssumptionTest], candidates: Sequence[AssumptionTest]
 ) -> list[str]:
-    """A sentence on the suspect with the best odds, and on those that the data, or tests to first
-    order, cannot tell from it."""
+    """A sentence on the suspect with the best odds, and on those that the data cannot tell from it;
+    on all of them alike, where tests to first order cannot."""
     best = favoured[0]
+    if candidates:
+        order = sorted(candidates, key=lambda c: -c.gain)
+        listed = "; ".join(f"{c.name} (by {c.gain:.0f})" for c in order[:NAMED])
+        more = f"; {len(order) - NAMED} more" * (len(order) > NAMED)
+        return [
+            f"the data contradict one of {len(order)} assumptions, with which to first order the "
+            f"sum of squares would fall about as far: {listed}{more}: `explain` compares them by "
+            "new fits"
+        ]
     label, move = best.most_moved
     text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
     if best.kind in ("known", "sensor") and not best.refitted:
@@ -109,11 +167,7 @@ def contradictions(
             f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
             f"{under}"
         )
-    if candidates:
-        others = sorted((c for c in candidates if c is not best), key=lambda c: -c.gain)
-        near = ", ".join(f"{c.name} (by {c.gain:.0f})" for c in others)
-        return [f"{text}. Nearly as much falls with {near}: `explain` compares them by new fits"]
-    rivals = [c for c in favoured[1:] if c.odds > LIKELY]
+    rivals = [c for c in favoured[1:] if c.odds > LIKELY and c.passed]
     if rivals:
         listed = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
         text += f". The data cannot tell it (odds {best.odds:.2g}) from: {listed}"

@@ -7,7 +7,7 @@ deviation is a relative one either way.
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Self, TypeVar, get_args
 
 import numpy as np
@@ -93,7 +93,7 @@ class Unknown(Table):
         return self
 
 
-Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia", "clock"]
+Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia", "clock", "lag"]
 NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
 """Faults of a sensor, in the order of a problem's coordinates."""
 
@@ -105,7 +105,8 @@ class Sensor(Table):
     Faults are a constant `bias` [unit], a `delay` [s], an error of its `gain` [1], a `drift`
     [unit/s] from the middle of the recording on, its `misalignment` [rad] about the axis out of the
     plane; the `inertia` [kg] between a force sensor and the body that it pushes, whose acceleration
-    it does not feel; the `clock` [1] that runs too fast, counted from the middle of the recording.
+    it does not feel; the `clock` [1] that runs too fast, counted from the middle of the recording;
+    the `lag` [s], the time constant of a low-pass of first order that rests at the first sample.
     Zero leaves a fault out; others are identified, one for all recordings or one for each (`per`).
     Samples at `low` or `high` [unit] or beyond are saturated: they only say that value plus noise
     is there or beyond (Tobin's likelihood), and the noise must be white. Readings in steps of a
@@ -122,6 +123,7 @@ class Sensor(Table):
     misalignment: float = Field(default=0.0, ge=0, le=0.5)
     inertia: float = Field(default=0.0, ge=0, le=1e5)
     clock: float = Field(default=0.0, ge=0, le=0.1)
+    lag: float = Field(default=0.0, ge=0, le=REACH)
     resolution: float = Field(default=0.0, ge=0, le=1e6)
     per: Per = "all"
     low: float | None = None
@@ -154,7 +156,8 @@ class Sensor(Table):
         for kind in NUISANCES:
             nominal, reach = float(kind == "gain"), float(getattr(self, kind))
             if nominal + reach > nominal:
-                out[kind] = nominal - reach, nominal, nominal + reach
+                least = 0.0 if kind == "lag" else nominal - reach
+                out[kind] = least, nominal, nominal + reach
         return out
 
 
@@ -206,10 +209,10 @@ def by_channel(
 @dataclass(frozen=True)
 class Coordinate:
     """One entry of the vector of coordinates: name and kind, its bounds and start in physical
-    units, its scale, and its prior."""
+    units, its scale, and its prior. A `variation` is an assumption of which this is the amount."""
 
     name: str
-    kind: Literal["parameter", "start"] | Nuisance
+    kind: Literal["parameter", "start", "variation"] | Nuisance
     recording: str | None
     nominal: float
     low: float
@@ -227,7 +230,8 @@ class Coordinate:
     @property
     def label(self) -> str:
         """Readable name: `materials.rubber.E`, `bodies.a.mass / bodies.b.mass`, `delay of x_C`."""
-        quantity = self.name if self.of_the_rig else f"{self.kind} of {self.name}"
+        plain = self.of_the_rig or self.kind == "variation"
+        quantity = self.name if plain else f"{self.kind} of {self.name}"
         ratio = f" / {self.ratio_to}" if self.ratio_to else ""
         return f"{quantity}{ratio}" + (f" in {self.recording}" if self.recording else "")
 
@@ -314,7 +318,8 @@ it."""
 
 class Coordinates:
     """All coordinates of a problem, in a fixed order, and the map from their vector x (n,) to
-    parameters of the rig, starts of runs, and faults of sensors.
+    parameters of the rig, starts of runs, faults of sensors, and amounts of variations, which have
+    bounds by name. Coordinates `held`, by label, are not free.
 
     Raises `ValueError` for unknowns that some recording's rig lacks, a ratio to an unknown
     parameter, or a nominal value or median of a prior out of bounds.
@@ -325,6 +330,8 @@ class Coordinates:
         unknowns: dict[str, Unknown],
         sensors: dict[str, Sensor],
         recordings: Sequence[Recording],
+        amounts: Mapping[str, tuple[float, float]] | None = None,
+        held: Collection[str] = (),
     ) -> None:
         self.recordings, self.all = tuple(r.name for r in recordings), list[Coordinate]()
         given = {
@@ -420,6 +427,9 @@ class Coordinates:
                     else [None]
                 )
                 self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
+        for name, (low, high) in (amounts or {}).items():
+            self.all.append(Coordinate(name, "variation", None, 0.0, low, high))
+        self.all = [replace(c, fixed=c.fixed or c.label in held) for c in self.all]
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 
     def _check_order(self, lower: str, upper: str, given: Mapping[str, float]) -> None:

@@ -1,0 +1,229 @@
+"""Variations of a recording: each does what it says, by closed forms and by invariances; readings
+behind a low-pass."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE, PAPER, RUBBER, dry, excited, stroked
+
+from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Reference, Rig
+from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid.assumptions import (
+    COORDINATES,
+    assumptions,
+    late_effort,
+    lifted,
+    limited_effort,
+    off_centre,
+    pushed,
+    read_across,
+    rescaled,
+    resized,
+    tilted,
+    with_loads,
+)
+from torchsoft.sysid.prediction import Prediction, Readout, Signals, Term, lagged, predict
+from torchsoft.sysid.refits import assuming, begun
+from torchsoft.sysid.runs import Runner
+
+E = "materials.rubber.E"
+SENSORS = {"x_C": Sensor(noise=1e-5), "effort_x": Sensor(noise=0.1), "effort_y": Sensor(noise=0.1)}
+
+
+def run_of(recording: Recording) -> Prediction:
+    return predict(recording.begin(), {}, recording.grid(True), (), 1e-6)
+
+
+@cache
+def strokes() -> Recording:
+    motion = stroked(travel=8e-3, stroke_time=0.15, duration=0.4, grasp=0.15, since=0.2)
+    return record("strokes", excited(motion, PAPER.override(COARSE)), {E: 0.9e6}, SENSORS)
+
+
+@cache
+def thrown() -> Recording:
+    """A disc in free flight, which spins; the pad is far below."""
+    mesh = PadMesh(length=20e-3, height=4e-3, elements_x=4, elements_y=2)
+    rig = Rig(
+        bodies={"disc": Body(0.4, Circle(19e-3))},
+        pads={"floor": Pad(mesh, KelvinVoigt(**RUBBER, tau=0.01))},
+        contacts={"floor": Contact("floor", "disc", dry(), may_leave=True)}, reference=Reference(),
+    )  # fmt: skip
+    y0 = rig.state(disc={"x": 0.01, "y": 2.0, "v_x": 0.3, "v_y": 1.0, "omega": 20.0})
+    t = np.linspace(0.0, 0.2, 21)
+    return Recording("flight", rig, {"x_disc": (t, 0 * t)}, Known(y0))
+
+
+def test_a_body_whose_mass_is_off_its_contour_flies_about_its_centre_of_mass():
+    """Which goes on a parabola, while the spin stays what it is."""
+    c, flight = np.array([2e-3, -1e-3]), thrown()
+    made = off_centre(flight, run_of, "disc", (c[0], c[1]))
+    at = run_of(made)
+    named = dict(zip(made.channels, at.signals.T))
+    angle, t = 20.0 * at.t, at.t[:, None]
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    arm = np.einsum("ijt,j->ti", R, c)
+    start = np.array([0.01, 2.0]) + c
+    speed = np.array([0.3, 1.0]) + 20.0 * np.array([-c[1], c[0]])
+    mass_centre = start + speed * t + 0.5 * np.array([0.0, -9.81]) * t**2
+    exact = mass_centre - arm
+    for k, axis in enumerate("xy"):
+        moved = np.abs(named[f"{axis}_disc"] - exact[:, k]).max()
+        assert moved < 1e-3 * np.linalg.norm(c), axis
+    np.testing.assert_allclose(named["theta_disc"], angle, atol=1e-5)
+
+
+def test_a_load_along_a_run_adds_to_gravity():
+    """Its weight once more makes a body fall at 2 g."""
+    flight = thrown()
+    t = np.linspace(0.0, 0.2, 21)
+    loads = np.zeros((21, len(COORDINATES)))
+    loads[:, 1] = -0.4 * 9.81
+    at = run_of(with_loads(flight, t, "disc", loads))
+    y = at.signals[:, with_loads(flight, t, "disc", loads).channels.index("y_disc")]
+    np.testing.assert_allclose(y, 2.0 + 1.0 * at.t - 9.81 * at.t**2, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["x", "y"])
+def test_a_controller_that_is_late_pushes_by_what_it_measured_before(name):
+    """The y loop has a feed-forward of its own beside it."""
+    late = pushed(strokes(), run_of, [name], late_effort, 0.2)
+    at = run_of(late)
+    named = dict(zip(late.channels, at.signals.T))
+    actuator = late.rig.actuators[name]
+    reference = late.rig.reference(torch.from_numpy(at.t), [actuator.setpoint]).numpy()[:, 0]
+    body, axis = actuator.measured.split(".")
+    channel = f"{axis}_{late.rig.symbols[body]}"
+    law = actuator.law
+    effort = law.Kp.item() * (reference[:, 0] - named[channel])
+    effort += law.Kd.item() * (reference[:, 1] - named[f"v_{channel}"])
+    known = strokes().rig.actuators[name].feed_forward
+    if known is not None:
+        effort += late.rig.reference(torch.from_numpy(at.t), [known]).numpy()[:, 0, 0]
+    inside = (at.t > 0.05) & (at.t < 0.35)
+    apart = late_effort(at.t, effort, 0.2) - named[f"effort_{name}"]
+    change = late_effort(at.t, effort, 0.2) - effort
+    assert np.abs(change[inside]).max() > 0.02
+    assert np.sqrt(np.mean(apart[inside] ** 2)) < 0.1 * np.sqrt(np.mean(change[inside] ** 2))
+
+
+def test_a_limit_cuts_the_largest_efforts_off():
+    effort = np.array([1.0, -4.0, 2.0, 3.9])
+    np.testing.assert_allclose(limited_effort(np.arange(4.0), effort, 10.0), [1, -3.6, 2, 3.6])
+    assert (limited_effort(np.arange(4.0), effort, 0.0) == effort).all()
+
+
+def middle(recording: Recording, name: str) -> np.ndarray:
+    pad = recording.rig.pads[name]
+    return pad.placed(pad.mesh.nodes[pad.mesh.face].mean(0))
+
+
+@pytest.mark.parametrize("name", ["L", "U"])
+def test_sizes_and_angles_of_pads_are_about_the_middle_of_their_faces(name):
+    stated = strokes()
+    pad = stated.rig.pads[name]
+    for extent in ("height", "length"):
+        other = resized(stated, [name], extent, 0.02)
+        new = other.rig.pads[name]
+        assert getattr(new.mesh, extent) == pytest.approx(1.02 * getattr(pad.mesh, extent))
+        np.testing.assert_allclose(middle(other, name), middle(stated, name), atol=1e-15)
+        assert new.material.E is not pad.material.E
+    turned = tilted(stated, name, 5e-3)
+    np.testing.assert_allclose(middle(turned, name), middle(stated, name), atol=1e-15)
+    face = turned.rig.pads[name].positions
+    slope = (face[-1, 1] - face[0, 1]) / (face[-1, 0] - face[0, 0])
+    assert slope.item() == pytest.approx(np.tan(5e-3))
+    nearer = middle(lifted(stated, name, 1e-4), name) - middle(stated, name)
+    np.testing.assert_allclose(nearer, [0.0, 1e-4 if name == "L" else -1e-4], atol=1e-15)
+
+
+def test_a_run_from_a_state_of_the_pads_has_no_other_pads():
+    assert tilted(thrown(), "floor", 1e-3) is None
+    assert resized(thrown(), ["floor"], "height", 0.01) is None
+
+
+def test_a_channel_reads_a_part_of_another_and_a_camera_has_a_scale():
+    data = strokes()
+    (_, x), (_, fy) = data.samples["effort_x"], data.samples["effort_y"]
+    np.testing.assert_allclose(
+        read_across(data, "effort_x", "effort_x", "effort_y", 0.02), -0.02 * fy
+    )
+    assert not read_across(data, "effort_y", "effort_x", "effort_y", 0.02).any()
+    place = data.samples["x_C"][1]
+    np.testing.assert_allclose(rescaled(data, "x_C", ["x_C"], 0.01), -0.01 * (place - place[0]))
+    assert not rescaled(data, "effort_x", ["x_C"], 0.01).any()
+    assert len(x) == len(fy)
+
+
+def test_amounts_of_variations_are_coordinates_with_differences_as_derivatives():
+    """Held at zero they change nothing; at an amount residuals are those of the varied recording,
+    and the column of a free one is the difference by its amount."""
+    data = strokes()
+    problem = Problem([data], SENSORS, {E: Unknown()})
+    known = {one.name: one for one in assumptions([data], {E}, SENSORS)}
+    chosen = [known["height of pads"], known["crosstalk effort_y to effort_x"]]
+    other = assuming(problem, chosen, free=True)
+    c, which = other.coordinates, problem.names
+    assert c.labels == (E, *(one.name for one in chosen))
+    x = begun(other, chosen, {E: problem.coordinates.start[0]})
+    base, steps = problem.freeze(Runner([data]), problem.coordinates.start, which, 1e-4)
+    at = other.residuals(other.runner(Runner([data])), x, which, steps, c.free)
+    np.testing.assert_allclose(at.r, base.r, atol=1e-6)
+    thicker = resized(data, ["L", "U"], "height", 0.01)
+    own = Problem([thicker], SENSORS, {E: Unknown()})
+    moved = own.residuals(Runner([thicker]), problem.coordinates.start, which, steps)
+    one = c.all[1]
+    np.testing.assert_allclose(at.J[:, 1] * one.to_x(1.0), moved.r - base.r, rtol=1e-9, atol=1e-9)
+    rows = len(data.samples["effort_x"][0])
+    crossed = -1e-3 * data.samples["effort_y"][1] / 0.1
+    column = at.J[rows : 2 * rows, 2] * c.all[2].to_x(0.1)
+    np.testing.assert_allclose(column, -crossed, rtol=1e-6, atol=1e-9)
+    held = assuming(problem, chosen, free=False)
+    assert held.coordinates.free.tolist() == [True, False, False]
+
+
+def test_a_reading_behind_a_low_pass_with_its_derivatives():
+    """A step and a ramp by their closed forms; the derivative by the time constant by differences,
+    and at zero that of a delay; weights pulled back by the transpose."""
+    t = np.linspace(0.0, 0.1, 401)
+    ramp = np.maximum(t - 0.02, 0.0)
+    exact = np.where(t > 0.02, ramp - 5e-3 * (1 - np.exp(-ramp / 5e-3)), 0.0)
+    np.testing.assert_allclose(lagged(t, ramp, 5e-3), exact, atol=1e-12)
+    y = np.sin(60 * t)[:, None]
+    signals, times = Signals(t, ("y",), y, y[..., None]), np.linspace(0.01, 0.09, 40)
+
+    def read(lag: float) -> Readout:
+        return Readout(
+            "y", 1.0, None, None, 1.2, 0.0, 0.0, 0.0, 0.05, (Term("y", 0, 1.0),), 0.0, lag
+        )
+
+    value, slopes, by = read(4e-3).expected(signals, times)
+    np.testing.assert_allclose(slopes[:, 0], value, rtol=1e-9)  # linear in the signal
+    step = 1e-6
+    near = [read(4e-3 + part).expected(signals, times)[0] for part in (step, -step)]
+    np.testing.assert_allclose(by["lag"], (near[0] - near[1]) / (2 * step), rtol=1e-5, atol=1e-3)
+    *_, still = read(0.0).expected(signals, times)
+    np.testing.assert_array_equal(still["lag"], still["delay"])
+    v = np.random.default_rng(0).standard_normal(len(times))
+    pulled = read(4e-3).pulled_back(signals, times, v)
+    assert float(np.sum(pulled * y)) == pytest.approx(float(v @ value), rel=1e-9)
+
+
+def test_a_number_that_recordings_state_otherwise_is_varied_in_each():
+    first = strokes()
+    mass = "bodies.disc.mass"
+    other = replace(first, name="other", rig=replace_mass(first, 0.5))
+    (one,) = (v for v in assumptions([first, other], {E}, SENSORS) if v.name == mass)
+    assert not one.parameter
+    made = [one.vary(r, 2.0, run_of).parameters[mass] for r in (first, other)]
+    np.testing.assert_allclose(made, [1.02 * first.parameters[mass], 1.02 * 0.5])
+
+
+def replace_mass(recording: Recording, mass: float) -> Rig:
+    rig = recording.begin().rig
+    with torch.no_grad():
+        rig.parameter("bodies.disc.mass").fill_(mass)
+    return rig
