@@ -177,8 +177,9 @@ class Checked(NamedTuple):
     """Effects that the data favour to first order besides the likeliest suspect, each beside those
     before it."""
     alarms: tuple[Verdict, ...] = ()
-    """Alarms of the residuals under the likeliest suspect and the effects besides, or of the fit
-    without a suspect."""
+    """Alarms of the residuals under the likeliest suspect, or of the fit without a suspect."""
+    left: tuple[Verdict, ...] = ()
+    """Alarms under the likeliest suspect and the effects besides."""
     as_stated: tuple[Verdict, ...] = ()
     """Alarms of the residuals of the fit itself."""
     sd: Mapping[str, float] = MappingProxyType({})
@@ -193,8 +194,8 @@ class Checked(NamedTuple):
 
     @property
     def explained(self) -> bool:
-        """Whether nothing is left under the likeliest suspect and the effects besides, and without
-        them something is."""
+        """Whether nothing is left under the likeliest suspect alone, and without it something is.
+        Several suspects at once explain what none of them causes."""
         return bool(self.favoured and self.as_stated) and not self.alarms
 
     @property
@@ -277,9 +278,9 @@ def new_fits(
 ) -> Iterator[Variation]:  # fmt: skip
     """Repeat the fit with one suspect after the other, and replace its test in `checks`.
 
-    Suspects that explain the misfit between them come first, in one fit. Once one explains it, or
-    `NEARLY` all of it, those with much smaller gains are left out; numbers are left out, too, once
-    a law leaves less than `RIVAL` of the misfit that all numbers together leave.
+    Sensors that explain the misfit by one kind of fault come first, in one fit. Once one suspect
+    explains it, or `NEARLY` all of it, those with much smaller gains are left out; numbers are left
+    out, too, once a law leaves less than `RIVAL` of the misfit that all numbers together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(progress))
@@ -302,7 +303,9 @@ def new_fits(
             candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name])
         )]  # fmt: skip
         if joint is not None and explains and len(joint.together) > 1:
-            order.insert(0, [one for one in candidates if one.name in joint.together])
+            several = [one for one in candidates if one.name in joint.together]
+            if len({one.fault and one.fault[1] for one in several} - {None}) == 1:
+                order.insert(0, several)
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, (), loss, notify)
         bar.update()
@@ -384,8 +387,8 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
     odds = np.exp(-0.5 * (score - score.min()))
     for one, share in zip(some, odds / odds.sum()):
         out[out.index(one)] = replace(one, odds=float(share))
-    besides, r, J = judge.besides(some[int(score.argmin())], out)
-    return checked._replace(checks=out, besides=besides, alarms=tuple(judge.alarms(r, J)))
+    besides, alone, left = judge.besides(some[int(score.argmin())], out)
+    return checked._replace(checks=out, besides=besides, alarms=tuple(alone), left=tuple(left))
 
 
 class Judge:
@@ -521,9 +524,9 @@ class Judge:
 
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]
-    ) -> tuple[tuple[AssumptionTest, ...], Array, Array]:
+    ) -> tuple[tuple[AssumptionTest, ...], list[Verdict], list[Verdict]]:
         """Tests to first order of effects besides one suspect, at most `BESIDES`, each beside those
-        before it; and the residuals (m,) that all of them leave, with their Jacobian."""
+        before it; the alarms of residuals under the suspect alone, and under all of them."""
         out: list[AssumptionTest] = []
         r, J = self.r, self.J
         if best.refitted:
@@ -531,6 +534,7 @@ class Judge:
         else:
             J = np.column_stack((J, self.columns[best.name]))
             r = r - J @ shift(J, r)
+        alone = self.alarms(r, J)
         left = [one for one in checks if one.name in self.columns and one.name != best.name]
         while left and len(out) < BESIDES:
             Q = np.linalg.qr(J)[0]
@@ -544,7 +548,7 @@ class Judge:
             r = r + found.favoured / found.amount * (d - Q @ (Q.T @ d))
             J = np.column_stack((J, d))
             left = [one for one in left if one.name != found.name]
-        return tuple(out), r, J
+        return tuple(out), alone, self.alarms(r, J)
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:

@@ -46,11 +46,7 @@ def assumption_doubts(checked: Checked) -> list[str]:
     again = f": `explain` fits again with each of {candidates} and compares them"
     if favoured and checked.explained:
         near = [c for c in checked.checks if c.name in checked.candidates]
-        return contradictions(favoured, near) + [
-            f"besides, the data contradict that {c.stated}: the sum of squares would fall by "
-            f"another {c.gain:.0f}{c.found}"
-            for c in checked.besides
-        ]
+        return contradictions(favoured, near)
     if favoured and not checked.as_stated:
         near = [f"{c.name}{c.found}" for c in favoured if c.odds > LIKELY][:NAMED]
         return [
@@ -65,7 +61,7 @@ def assumption_doubts(checked: Checked) -> list[str]:
         return [
             "the misfit stands for something that is none of the assumptions tested: with the "
             f"nearest one, {best.name}, the sum of squares {best.falls}{best.found}, but "
-            f"{looks}{again * bool(candidates)}"
+            f"{looks}{several(checked)}{again * bool(candidates)}"
         ]
     if candidates:
         square = max((c.left + c.gain for c in checked.checks), default=1.0)
@@ -79,6 +75,14 @@ def assumption_doubts(checked: Checked) -> list[str]:
     if checked.alarms and any(c.refitted for c in checked.checks):
         return [f"none of {len(checked.checks)} suspects explains the misfit: {looks}"]
     return []
+
+
+def several(checked: Checked) -> str:
+    """A clause on effects besides the likeliest suspect that would leave nothing."""
+    if checked.left or not checked.besides:
+        return ""
+    others = " and".join(f" {c.name}{c.found}" for c in checked.besides)
+    return f"; nothing would be left with{others} besides"
 
 
 SHORT = {
