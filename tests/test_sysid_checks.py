@@ -335,7 +335,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     """Where it explains the data, those first that explain it together, then numbers by their part;
     where not, no number before a law, and none at all after a law that leaves much less than all
     numbers together."""
-    taken = [Variation(name, "known", "", "", parameter=name) for name in "ab"]
+    taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}

@@ -139,6 +139,11 @@ def conclude(
     c = coloured.problem.coordinates
     free, stages = np.isin(c.labels, stage.free), list(stages)
     hopeless = context.loss == "linear" and coloured.before[1].chi2 > FAR_OFF
+    if hopeless:  # or only its steps are too coarse
+        fine, _ = coloured.before[0].freeze(
+            runner, coloured.fit.x, stage.recordings, FINER * stage.rtol
+        )
+        hopeless = not fine.failed and float(np.mean(fine.r**2)) > FAR_OFF
     tightenings = 0 if hopeless else context.tightenings
 
     def at_rest() -> Settled:
