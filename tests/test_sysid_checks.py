@@ -445,9 +445,9 @@ def test_a_suspect_is_no_cause_where_residuals_pass_without_it(same):
     checked = same._replace(checks=[found])
     (said,) = notices(checked)
     assert said == (
-        f"something is not as stated: the sum of squares would fall by 31 with {RADIUS} = 0.0198 "
-        "(+2 %, +- 0.4), which is more than chance. Residuals pass every test without it, so that "
-        "nothing confirms the cause"
+        f"something is not as stated, most like {RADIUS}: the sum of squares would fall by 31 with "
+        f"{RADIUS} = 0.0198 (+2 %, +- 0.4), which is more than chance. Residuals pass every test "
+        "without it, so that nothing confirms the cause"
     )
     assert not checked.explained
 

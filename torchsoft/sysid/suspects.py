@@ -50,9 +50,9 @@ def assumption_doubts(checked: Checked) -> list[str]:
     if favoured and not checked.as_stated:
         near = [f"{c.name}{c.found}" for c in favoured if c.odds > LIKELY][:NAMED]
         return [
-            f"something is not as stated: the sum of squares {favoured[0].falls}"
-            f"{favoured[0].found}, which is more than chance. Residuals pass every test without "
-            "it, so that nothing confirms the cause"
+            f"something is not as stated, most like {favoured[0].name}: the sum of squares "
+            f"{favoured[0].falls}{favoured[0].found}, which is more than chance. Residuals pass "
+            "every test without it, so that nothing confirms the cause"
             + (f"; as likely are {'; '.join(near[1:])}" if near[1:] else "")
         ]
     looks = "; ".join(SHORT[one.test].format(one.words) for one in checked.alarms[:WORST])
