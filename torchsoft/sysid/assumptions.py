@@ -417,6 +417,11 @@ def signals_by_name(rig: Rig) -> dict[str, nn.Module]:
     return {name.replace(":", "."): one for name, one in rig.reference.signals.items()}
 
 
+def follow_also(rig: Rig, signals: Mapping[str, nn.Module]) -> None:
+    """Replace signals of a rig's reference, or add them."""
+    rig.reference = Reference(**(signals_by_name(rig) | dict(signals)))
+
+
 def signals_of(recording: Recording) -> dict[str, nn.Module]:
     """Signals of a recording's reference by name."""
     return signals_by_name(recording.rig)
@@ -424,11 +429,7 @@ def signals_of(recording: Recording) -> dict[str, nn.Module]:
 
 def with_reference(recording: Recording, **signals: nn.Module) -> Recording:
     """The recording with some signals replaced."""
-
-    def change(rig: Rig) -> None:
-        rig.reference = Reference(**(signals_of(recording) | signals))
-
-    return with_rig(recording, change)
+    return with_rig(recording, lambda rig: follow_also(rig, signals))
 
 
 def sparser(recording: Recording) -> Recording:
@@ -639,7 +640,7 @@ def with_efforts(recording: Recording, t: Array, fed: Mapping[str, Array]) -> Re
             value, rate = (x.detach().numpy() for x in known(torch.from_numpy(every)))
             sums = value + spline(every), rate + spline(every, 1)
             more[actuator.feed_forward] = signal(every, *sums)
-        rig.reference = Reference(**(signals_by_name(rig) | more))
+        follow_also(rig, more)
 
     return with_rig(recording, change)
 
@@ -697,7 +698,7 @@ def with_loads(recording: Recording, t: Array, body: str, loads: Array) -> Recor
                 f"{body}.{axis}", f"{body}.{axis}", Load(), setpoint=(), feed_forward=name,
                 elements=("Se: load",),
             )  # fmt: skip
-        rig.reference = Reference(**(signals_by_name(rig) | more))
+        follow_also(rig, more)
 
     return with_rig(recording, change)
 

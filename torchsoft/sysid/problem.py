@@ -284,10 +284,10 @@ class Problem(Shown):
     ) -> list[Job]:
         """One run for each recording; with `free`, differentiated by the parameters that depend on
         free coordinates (n,)."""
-        c, out = self.coordinates, []
+        c, out, varying = self.coordinates, [], self.varying
         varied = tuple(
             (one.name, amount) for i, one in enumerate(c.all)
-            if one.name in self.varying and (amount := one.to_value(x[i])) != 0.0
+            if one.name in varying and (amount := one.to_value(x[i])) != 0.0
         )  # fmt: skip
         for k, recording in enumerate(self.recordings):
             if recording.name not in which:
@@ -352,8 +352,9 @@ class Problem(Shown):
                 continue
             step = self.variations[one.name].amount / (one.high - one.low)
             moved = x + step * np.eye(len(x))[i]
-            there = self.gather(moved, jobs, runs)
-            if one.name in self.varying:
+            if self.variations[one.name].vary is None:
+                there = self.gather(moved, jobs, runs)
+            else:
                 others = self.jobs(moved, which, steps, None)
                 there = self.gather(moved, others, runner.run(others))
             if there.failed:

@@ -143,8 +143,9 @@ def exact_columns(
     try:
         wide = assuming(problem, mine, free=False)
     except ValueError:
-        out += [(one, None, why) for one in mine if (why := impossible(problem, one))]
-        mine = [one for one in mine if not impossible(problem, one)]
+        why = {one.name: impossible(problem, one) for one in mine}
+        out += [(one, None, why[one.name]) for one in mine if why[one.name]]
+        mine = [one for one in mine if not why[one.name]]
         wide = assuming(problem, mine, free=False)
     c = wide.coordinates
     x = c.begun(dict(zip(problem.coordinates.labels, end.x)))
