@@ -25,7 +25,7 @@ FLOWS = {
         names motion validity graph energy statics start namespace rig extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",
-    "physics.shapes": "shape rounded contour .",
+    "physics.shapes": "shape rounded contour eccentric .",
     "solve": """
         kernel structure laws steps progress model system stepper trajectory gradients formats
         diagnostics simulate batch torchdiffeq .

@@ -18,6 +18,7 @@ from torchsoft import (
     Body,
     Circle,
     Contour,
+    Eccentric,
     Ellipse,
     RigFile,
     RoundedBox,
@@ -466,3 +467,73 @@ def test_a_long_box_rests_on_its_whole_side():
     assert float(state.pads["L"][0, :, 1].sum()) == pytest.approx(
         -float(model.bodies["disc"].mass.detach()) * 9.81, rel=1e-9
     )
+
+
+# A centre of mass off that of the area
+
+ECCENTRIC = {
+    "bodies": {"disc": {
+        "mass": 0.4, "inertia": 8e-5, "shape": {"kind": "circle", "radius": 19e-3},
+        "centre_y": -4e-3, "start": {"x": 60e-3, "y": "rest", "theta": 0.05},
+    }},
+    "materials": {"gel": {
+        "kind": "kelvin_voigt", "E": 1e6, "nu": 0.45, "tau": 1e-4, "depth": 40e-3,
+    }},
+    "pads": {"ground": {
+        "material": "gel", "length": 120e-3, "height": 12e-3, "elements_x": 240, "elements_y": 8,
+    }},
+    "laws": {"dry": {
+        "K_n": 1e6, "R_n": 20.0, "K_t": 1e6, "R_t": 20.0,
+        "friction": {"kind": "smooth", "mu_s": 0.8, "mu_k": 0.7, "v_s": 50e-3},
+    }},
+    "contacts": {"ground": {"pad": "ground", "body": "disc", "law": "dry"}},
+    "outputs": {"duration": 0.9, "interval": 2e-3},
+}  # fmt: skip
+"""A disc with its centre of mass below that of its area, which rocks on a pad."""
+
+
+def test_an_eccentric_shape_is_its_contour_moved() -> None:
+    box, c = RoundedBox(20e-3, 9e-3, 2e-3), f64([3e-3, -1e-3])
+    moved = Eccentric(box, 3e-3, -1e-3)
+    x = 25e-3 * torch.randn(200, 2, generator=torch.Generator().manual_seed(0)).double()
+    for own, others in zip(moved(x), box(x + c)):
+        assert torch.equal(own, others)
+    way = f64([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    assert moved.support(way).flatten().tolist() == pytest.approx([17e-3, 10e-3, 23e-3, 8e-3])
+    assert moved.size() == pytest.approx(float(moved.outline(2001).norm(dim=-1).max()), rel=1e-3)
+    free = Eccentric(contour(), 1e-3, 0.0)  # whose law is compiled from another shape
+    assert torch.allclose(free(x)[0], contour()(x + f64([1e-3, 0.0]))[0], atol=1e-12)
+    assert torch.equal(free.prepared()(x)[0], free(x)[0])
+
+
+def test_an_eccentric_disc_rocks_like_a_pendulum() -> None:
+    built = RigFile.from_tree(ECCENTRIC).build()
+    run = built.run(rtol=1e-5, gradient="discrete")
+    theta, t = run["theta_disc"].detach().numpy(), run.t.numpy()
+    down = np.flatnonzero((theta[:-1] > 0) & (theta[1:] <= 0))
+    period = np.diff(
+        t[down] + (t[down + 1] - t[down]) * theta[down] / (theta[down] - theta[down + 1])
+    )
+    m, e, R, J, g = 0.4, 4e-3, 19e-3, 8e-5, 9.81
+    assert period == pytest.approx(
+        2 * np.pi * np.sqrt((J + m * (R - e) ** 2) / (m * g * e)), rel=0.01
+    )
+    names = "bodies.disc.centre_x", "bodies.disc.centre_y"
+    values = [built.rig.parameter(name) for name in names]
+    got = torch.autograd.grad(run["theta_disc"][100], values)
+    for name, value, slope in zip(names, values, got):
+        ends = []
+        for h in (-1e-9, 1e-9):
+            with torch.no_grad():
+                value += h
+                ends.append(float(built.run(knots=run.knots)["theta_disc"][100]))
+                value -= h
+        assert float(slope) == pytest.approx((ends[1] - ends[0]) / 2e-9, rel=1e-5), name
+
+
+def test_a_centre_of_mass_needs_a_shape() -> None:
+    tree = {**ECCENTRIC, "contacts": {}, "pads": {}, "bodies": {"a": {
+        "mass": 1.0, "theta": 0.0, "centre_x": 1e-3, "start": {"x": 0.0, "y": 0.0},
+    }}}  # fmt: skip
+    with pytest.raises(ValueError, match="have no meaning without a shape"):
+        RigFile.from_tree(tree)

@@ -15,7 +15,8 @@ rigs        RigFile, BuiltRig, excite; Rig, Body, Pad, Contact, SoftContact, Act
 meshes      PadMesh, CurvedPadMesh, FingertipMesh, QuadMesh
 materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony; at finite strain NeoHookean,
             MooneyRivlin, Yeoh, Ogden, Hyperelastic (an energy of one's own)
-shapes      Circle, Ellipse, Superellipse, RoundedBox, RoundedPolygon, Contour
+shapes      Circle, Ellipse, Superellipse, RoundedBox, RoundedPolygon, Contour,
+            Eccentric
 friction    SmoothSlip, Coulomb, RateAndState, or any torch function
 motions     Reference, Profile, Sampled, hold
 runs        simulate, simulate_batch, Trajectory, Batch; register_method (torchdiffeq)

@@ -12,6 +12,7 @@ from .physics.rig import Rig
 from .physics.shapes import (
     Circle,
     Contour,
+    Eccentric,
     Ellipse,
     RoundedBox,
     RoundedPolygon,
@@ -43,6 +44,7 @@ __all__ = [
     "Contour",
     "Coulomb",
     "CurvedPadMesh",
+    "Eccentric",
     "Ellipse",
     "FingertipMesh",
     "GeneralisedKelvin",

@@ -674,8 +674,11 @@ def own_name(file: RigFile, rig: Rig, group: str, part: str = "", *rest: str) ->
     elif part in made:
         group, part = "controllers", made[part]
         rest = tuple(one for one in rest if one not in ("law", "module", "feedback"))
-    elif group in ("actuators", "bodies"):
-        rest = tuple(one for one in rest if one not in ("law", "fixed"))
+    elif group == "actuators":
+        rest = tuple(one for one in rest if one != "law")
+    elif group == "bodies":
+        rest = tuple(one for one in rest if one not in ("fixed", "contour"))
+        rest = rest[1:] if rest[-1].startswith("centre_") else rest
     last = ["inertia" if name == "own_inertia" else name for name in rest]
     return ".".join([group, part, *last] if part else [group])
 

@@ -22,6 +22,7 @@ from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.shapes import (
     Circle,
     Contour,
+    Eccentric,
     Ellipse,
     RoundedBox,
     RoundedPolygon,
@@ -29,6 +30,7 @@ from torchsoft.physics.shapes import (
     Superellipse,
 )
 from torchsoft.physics.shapes.contour import read_points
+from torchsoft.physics.shapes.eccentric import Offset
 from torchsoft.physics.start import RATES, REST, TOUCH
 from torchsoft.quantity import Angle, Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
 from torchsoft.rigs.fields import (
@@ -167,6 +169,10 @@ class BodyTable(Group):
     shape: ShapeTable | None = Field(
         default=None, description="what touches pads; not needed where nothing touches it"
     )
+    centre_x: Offset = Field(
+        default=0.0, description="centre of mass in the frame of its shape, along the body's own x"
+    )
+    centre_y: Offset = Field(default=0.0, description="the same along the body's own y")
     start: StartTable = StartTable()
 
     @property
@@ -198,6 +204,10 @@ class BodyTable(Group):
             raise ValueError(
                 f"mass is missing, but {' and '.join(self.free)} can move freely; give it, or "
                 "density and depth"
+            )
+        if (self.centre_x or self.centre_y) and self.shape is None:
+            raise ValueError(
+                "centre_x and centre_y have no meaning without a shape; leave them out"
             )
         if self.inertia_ratio != 1.0 and (self.inertia is not None or self.shape is None):
             raise ValueError(
@@ -240,6 +250,8 @@ class BodyTable(Group):
         with at_field("shape"):
             shape = own if self.shape is None or own is not None else self.shape.build(folder)
         assert shape is not None
+        if self.centre_x or self.centre_y:
+            shape = Eccentric(shape, self.centre_x, self.centre_y)
         if self.density is not None and self.depth is not None:
             return Body.uniform(shape, self.density, self.depth, **given)
         return Body(self.mass or 1.0, shape, **given)

@@ -278,7 +278,7 @@ def of_places(recording: Recording, unknown: Collection[str]) -> Iterator[Variat
         for k, axis in enumerate("xy"):
             yield Variation(
                 f"bodies.{name}.centre_{axis}", "known",
-                f"the centre of mass of {name} is that of its contour",
+                f"the centre of mass of {name} is where it is stated",
                 f"it were {1e3 * CENTRE:g} mm off along {axis}", 1e3 * CENTRE, "mm",
                 vary=lambda r, mm, run, name=name, k=k: off_centre(
                     r, run, name, (1e-3 * mm * (k == 0), 1e-3 * mm * (k == 1))

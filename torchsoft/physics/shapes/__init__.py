@@ -6,6 +6,7 @@ which the compiled kernels are generated.
 """
 
 from torchsoft.physics.shapes.contour import Contour
+from torchsoft.physics.shapes.eccentric import Eccentric
 from torchsoft.physics.shapes.rounded import (
     Circle,
     Ellipse,
@@ -18,6 +19,7 @@ from torchsoft.physics.shapes.shape import Shape, parameter
 __all__ = [
     "Circle",
     "Contour",
+    "Eccentric",
     "Ellipse",
     "RoundedBox",
     "RoundedPolygon",
