@@ -25,7 +25,7 @@ from torchsoft.sysid.assumptions import (
     tilted,
     with_loads,
 )
-from torchsoft.sysid.prediction import Prediction, Readout, Signals, Term, lagged, predict
+from torchsoft.sysid.prediction import Frozen, Prediction, Readout, Signals, Term, lagged, predict
 from torchsoft.sysid.refits import assuming, begun
 from torchsoft.sysid.runs import Runner
 
@@ -227,3 +227,45 @@ def replace_mass(recording: Recording, mass: float) -> Rig:
     with torch.no_grad():
         rig.parameter("bodies.disc.mass").fill_(mass)
     return rig
+
+
+# Numbers that drift along a recording
+
+
+def drifted(by: float) -> Recording:
+    return replace(strokes(), drifts={E: by})
+
+
+def test_a_number_that_drifts_changes_along_the_samples():
+    """Before them it is as stated; after them, where all is at rest, that of a softer pad, but for
+    the friction on the way."""
+    whole, grid = run_of(strokes()), strokes().grid(True)
+    frozen = Frozen(np.array(whole.knots))
+    as_stated, pieces, softer, soft = (
+        predict(one.begin(), at, grid, (), frozen).signals
+        for one, at in (
+            (strokes(), {}), (drifted(0.0), {}), (drifted(-0.1), {}),
+            (strokes(), {E: 0.9 * strokes().parameters[E]}),
+        )
+    )  # fmt: skip
+    np.testing.assert_allclose(pieces, as_stated, atol=1e-8)
+    assert (softer[whole.t < 0.0] == as_stated[whole.t < 0.0]).all()
+    y = strokes().channels.index("effort_y")
+    fallen = soft[-1, y] / as_stated[-1, y] - 1
+    assert fallen < -0.05
+    assert softer[-1, y] / as_stated[-1, y] - 1 == pytest.approx(fallen, rel=0.03)
+
+
+def test_derivatives_of_a_run_that_drifts():
+    names = [E, "laws.steel_on_rubber.friction.mu_s"]
+    grid, made = strokes().grid(True), drifted(-0.05)
+    frozen = Frozen(np.array(run_of(strokes()).knots))
+    at = {name: strokes().parameters[name] for name in names}
+    got = predict(made.begin(), at, grid, names, frozen)
+    for k, name in enumerate(names):
+        ends = [
+            predict(made.begin(), at | {name: at[name] * (1 + part)}, grid, (), frozen).signals
+            for part in (-1e-6, 1e-6)
+        ]
+        slope = (ends[1] - ends[0]) / (2e-6 * at[name])
+        np.testing.assert_allclose(got.derivatives[..., k], slope, atol=1e-5 * np.abs(slope).max())

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import simulate
 from torchsoft.solve.trajectory import Trajectory, channels
 from torchsoft.sysid.initial_state import PREFIX
-from torchsoft.sysid.recording import REACH, Array, Grid, RunContext
+from torchsoft.sysid.recording import REACH, SAME, Array, Grid, RunContext
 from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
 
 
@@ -329,7 +330,9 @@ def by_motion(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
         torch.zeros((), dtype=torch.float64, requires_grad=True)
         for _ in range(run.sensitivities.shape[-1])
     ]
-    q = run.y[:, rig.layout.rigid].detach() + run.sensitivities @ torch.stack(along)
+    slopes, rigid = run.sensitivities, rig.layout.rigid
+    slopes = slopes[:, rigid] if slopes.shape[1] == run.y.shape[1] else slopes
+    q = run.y[:, rigid].detach() + slopes @ torch.stack(along)
     known = channels(rig, bodies.unpack(q, *rig.held(signals)), signals)
     measured = torch.stack([known[name] for name in names], -1)
     out = directions(measured, along)
@@ -365,6 +368,8 @@ def predict(
     set_parameters(rig, values)
     touch = [key for key in keys if key not in measurable(rig)] if names else ()
     wrt = tuple(name for name in names if not name.startswith(PREFIX))
+    if begun.drift.changes:
+        return drifting(begun, grid, names, steps, y0, dy0, wrt, touch)
     out = simulate(
         rig, grid.t, y0=y0, gradient="forward" if names else "none", wrt=wrt,
         dy0=dy0 if names else None, rigid=bool(names), touch=touch, **choice(steps),
@@ -380,6 +385,46 @@ def predict(
     )
 
 
+PIECES = 24
+"""Pieces of a run, along each of which a number that drifts is held at its value in the middle."""
+
+
+def drifting(
+    begun: RunContext, grid: Grid, names: Sequence[str], steps: Steps, y: Tensor, dy: Tensor,
+    wrt: Sequence[str], touch: Sequence[str],
+) -> Prediction:  # fmt: skip
+    """`predict` from the state y (size,) with derivatives dy (size, n), of a run whose rig drifts:
+    piece after piece, by the frozen steps, or by those that a tolerance chooses without drift."""
+    rig, keys, drift, t = begun.rig, begun.channels, begun.drift, grid.t.numpy()
+    if not isinstance(steps, Frozen):
+        steps = Frozen(simulate(rig, grid.t, y0=y, **choice(steps)).knots.numpy())
+    knots, stated = steps.knots, {name: rig.parameter(name).item() for name in drift.changes}
+    ends = np.searchsorted(knots, np.linspace(drift.first, drift.last, PIECES + 1)[1:-1])
+    values, slopes = list[Array](), list[Array]()
+    for first, last in pairwise(np.unique([0, *ends, len(knots) - 1]).tolist()):
+        middle = 0.5 * (knots[first] + knots[last])
+        set_parameters(rig, {k: value * drift.factor(k, middle) for k, value in stated.items()})
+        scale = np.array([drift.factor(name, middle) for name in names])
+        end = t[-1] if last == len(knots) - 1 else knots[last]
+        own = t[(t > knots[first] + SAME) & (t <= end + SAME)]
+        between = [knots[first], *own, *([] if own.size and end - own[-1] <= SAME else [end])]
+        out = simulate(
+            rig, between, y0=y, gradient="forward" if names else "none", wrt=wrt,
+            dy0=dy / torch.from_numpy(scale) if names else None, touch=touch,
+            **choice(Frozen(knots[first : last + 1])),
+        )  # fmt: skip
+        rows = np.isin(out.t.numpy(), t if first == 0 else own)
+        values.append(out.together(*keys)[rows].detach().numpy())
+        y = out.y[-1].detach()
+        if out.sensitivities is not None:
+            slopes.append(derivatives(rig, out, keys)[rows] * scale)
+            dy = out.sensitivities[-1] * torch.from_numpy(scale)
+    set_parameters(rig, stated)
+    rows = slice(grid.early, None)
+    by = np.concatenate(slopes)[rows] if names else None
+    return Prediction(t[rows], np.concatenate(values)[rows], by, knots)
+
+
 def misfit(
     begun: RunContext,
     values: Mapping[str, float],
@@ -390,6 +435,11 @@ def misfit(
 ) -> Misfit:
     """The misfit by `judge`, with its gradient by `names`, by the discrete adjoint. Raises
     `SimulationFailed`."""
+    if begun.drift.changes:
+        made = predict(begun, values, grid, names, steps)
+        loss, weights, nuisances = judge(Signals(made.t, begun.channels, made.signals, None))
+        by = np.einsum("gc,gcn->n", weights, np.array(made.derivatives))
+        return Misfit(loss, by, nuisances)
     rig, run = begun.rig, prepared(begun, values, names)
     out = simulate(rig, grid.t, y0=run.y0, gradient="discrete", **choice(steps))
     keys, rows = begun.channels, slice(grid.early, None)
