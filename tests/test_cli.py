@@ -389,6 +389,7 @@ def test_a_window_system_that_is_not_there_is_not_asked(tmp_path):
     subprocess.run([sys.executable, "-c", code], check=True, env=env, stdout=subprocess.DEVNULL)
 
 
+@pytest.mark.slow
 def test_an_interrupt_among_the_assumptions_draws_nothing(folder, monkeypatch, capsys):
     """Ctrl-C took 5 s, in which figures of a report were drawn."""
 

@@ -87,7 +87,13 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("page", having(lambda p: code(p) and DATASET not in str(p)), ids=name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=name(page), marks=[pytest.mark.slow] * (page.stem == "laboratory"))
+        for page in having(lambda p: code(p) and DATASET not in str(p))
+    ],
+)
 def test_python_runs(page, folder):
     if "IPython" in code(page):
         pytest.importorskip("IPython")

@@ -63,6 +63,7 @@ def test_values_set_on_the_module_run_and_are_saved():
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # torch's, of what it does not compile
+@pytest.mark.slow
 def test_torch_compile_leaves_a_run_alone():
     """A run in a compiled function is the run, gradient and all."""
     model = coarse()

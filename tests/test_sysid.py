@@ -536,6 +536,7 @@ def test_what_a_fit_cannot_honour_is_refused_before_it(strokes, how, message):
         identify(Problem([strokes], SENSORS, four()), **how)
 
 
+@pytest.mark.slow
 def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes):
     problem = Problem(
         [strokes], SENSORS, {E: Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known()

@@ -169,16 +169,15 @@ def late(data: Recording) -> Recording:
     [
         (lambda: delayed(brief(), -3e-4), "clock of the set-points", 0.3,
          "set-points and sensors"),
-        *(pytest.param(*row, marks=pytest.mark.slow) for row in (
-            (lambda: sampled(file=further(1.5 * PLACE)), "start of disc.x", 30.0,
-             "disc begins where the start says"),
-            (lambda: turned(recorded()), "bias theta_C", 2e-3, "theta_C has no unknown bias"),
-            (lambda: late(recorded()), "delay x_C", 1.0, "x_C has no unknown delay"),
-            (lambda: sampled({RATIO: 1.2}, excitation=HARD), RATIO, 20.0, f"{RATIO} is 1"),
-            (lambda: sampled({RADIUS: 19.39e-3}), RADIUS, 0.103, f"{RADIUS} is 0.01937"),
-        )),
+        (lambda: sampled(file=further(1.5 * PLACE)), "start of disc.x", 30.0,
+         "disc begins where the start says"),
+        (lambda: turned(recorded()), "bias theta_C", 2e-3, "theta_C has no unknown bias"),
+        (lambda: late(recorded()), "delay x_C", 1.0, "x_C has no unknown delay"),
+        (lambda: sampled({RATIO: 1.2}, excitation=HARD), RATIO, 20.0, f"{RATIO} is 1"),
+        (lambda: sampled({RADIUS: 19.39e-3}), RADIUS, 0.103, f"{RADIUS} is 0.01937"),
     ],
 )  # fmt: skip
+@pytest.mark.slow
 def test_the_cause_is_named_with_its_amount(made, name, favoured, says):
     found = checked(made(), doubtful=True)
     (one,) = (one for one in found.checks if one.name == name)
@@ -269,6 +268,7 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
         assert again.of(name) == pytest.approx(np.log(value), abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     """A heavier disc: at the end of a fit without it, other numbers explain more to first order."""
     truth = TRUTH | {MASS: 1.08 * BASE.bodies["disc"].mass}
@@ -497,6 +497,7 @@ def test_what_would_not_be_seen_is_said_with_its_size_or_its_price(same):
     ]
 
 
+@pytest.mark.slow
 def test_two_causes_are_both_named_and_neither_is_the_cause():
     """An offset of one sensor and the gain of another: the second one besides the first."""
     data = turned(brief())

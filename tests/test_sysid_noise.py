@@ -126,6 +126,7 @@ def test_order_and_coefficients_are_found_over_several_recordings(phi, kept):
     assert -1.0 < true - found.scores[len(phi)].deviance < stats.chi2.isf(1e-3, len(phi) + 1)
 
 
+@pytest.mark.slow
 def test_recordings_at_half_the_rate_take_part():
     rng, noise = np.random.default_rng(0), Autoregression((1.6, -0.8), 1.0, H)
     t = np.arange(1000) * H

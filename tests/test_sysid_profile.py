@@ -98,6 +98,7 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters():
     assert seen([1, 0, 0]) == []  # K and R are not seen at all
 
 
+@pytest.mark.slow
 def test_profile_and_combination_of_stiffnesses_in_series():
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in
     series."""

@@ -53,7 +53,8 @@ def test_an_explicit_integration_backwards_is_warned_about_once():
     odeint_adjoint(model, y0, t, method="rk4", options=options)[-1].sum().backward()
 
 
-@pytest.mark.parametrize("method", ["rk4", pytest.param("dopri5", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["rk4", "dopri5"])
+@pytest.mark.slow
 @torch.no_grad()
 def test_explicit_methods_agree(method):
     """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window,
