@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-import tyro
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import lfilter
@@ -20,6 +19,7 @@ from tqdm import tqdm
 
 from torchsoft import Rig
 from torchsoft.display import markdown
+from torchsoft.extras import needed
 from torchsoft.files import save_text, write_json
 from torchsoft.parallel import parallel_map
 from torchsoft.plot.figures import save
@@ -50,7 +50,7 @@ def options(config: type[C], description: str | None) -> C:
     Ends with status 2 and a sentence for a number that no experiment can use.
     """
     torch.set_num_threads(1)
-    given: Any = tyro.cli(config, description=description)
+    given: Any = needed("tyro", "experiments").cli(config, description=description)
     for name, value in asdict(given).items():
         least = 0.0 if isinstance(value, tuple | int) else SMALLEST
         for one in value if isinstance(value, tuple) else (value,):
