@@ -41,7 +41,7 @@ FLOWS = {
     "plan": "knots problem search planning .",
     "rigs": """
         fields places parts control motion outputs geometry built build excite written
-        course recorded gripped check goal run .
+        course recorded gripped alone check goal run .
     """,
     "cli": "results rigs plan identify design material dataset reduce plot .",
     "solve.kernel": """

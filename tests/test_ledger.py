@@ -14,6 +14,7 @@ from torchsoft import (
     Body,
     Circle,
     Contact,
+    Coulomb,
     KelvinVoigt,
     Pad,
     PadMesh,
@@ -95,6 +96,80 @@ def test_a_law_that_detaches_what_it_depends_on_is_told_of(what, line):
         rf"none at .*test_ledger.py:\d+, `{line}.*so that derivatives by the normal force, `mu` are"
     )
     assert [bool(re.match(sentence, text)) for text in said] == [True] * bool(what), said
+
+
+@pytest.mark.parametrize(
+    ("slip", "told_of"),
+    [
+        (Coulomb(0.5, 0.4), True),
+        (lambda E, F_N, R: torch.where(0.5 * F_N <= E, (E - 0.4 * F_N) / R, 0.0), True),
+        (Coulomb(0.5, 0.5), False),
+        (SmoothSlip(0.5, 0.4, 0.05), False),
+        (lambda E, F_N, R: (E - 0.5 * F_N).clamp(min=0.0) / R, False),
+    ],
+)
+def test_friction_that_jumps_is_told_of_where_a_gradient_leaves_that_out(slip, told_of):
+    """By its static coefficient the adjoint is zero, where it decides how far points stick."""
+    model = still(COARSE, friction=slip)
+    run = {"t": times(4e-3, 3), "y0": grasped(model, (0.05, -0.01))}
+    assert told(model, **run, gradient="none") == []
+    for route in ({"gradient": "discrete"}, {"gradient": "forward", "wrt": ["pad.E"]}):
+        said = told(model, **run, **route)
+        assert [text.split(":")[0] for text in said] == ["contact `L`", "contact `U`"] * told_of
+        assert all("leaves such jumps out" in text for text in said)
+    if isinstance(slip, Coulomb) and told_of:
+        with pytest.warns(UserWarning, match="zero by a static coefficient"):
+            made = simulate(model, **run, gradient="discrete")
+        (slope,) = torch.autograd.grad(made["x_C"][-1], slip.mu_s)
+        assert slope == 0.0
+
+
+@pytest.mark.parametrize("of", ["effort", "normal force"])
+def test_friction_of_the_trial_effort_is_told_of(of):
+    """What a stage adds to the dashpot is in it: forces depend on the steps (0.1 N of 83 in a
+    random rig), and gradients of forces at their ends are of others."""
+
+    def slip(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        mu = 0.3 + 0.2 * torch.tanh((E if of == "effort" else F_N) / 10)
+        return (E - mu * F_N).clamp(min=0.0) / (R + 0.0 * F_N)
+
+    model = still(COARSE, friction=slip)
+    said = told(model, t=times(1e-3, 2), y0=grasped(model))
+    assert [("leaves the same effort" in text) for text in said] == [True] * (of == "effort")
+
+
+class Repelling(nn.Module):
+    """A spring that pushes away from x_0, 10 1/s for 0.4 kg."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.x_0 = nn.Parameter(f64(0.1)[0])
+
+    def forward(self, w: Tensor, w_dot: Tensor, F: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+        return 40.0 * (q - self.x_0) + 0.0 * (w + w_dot + F + q_dot)
+
+
+def test_a_gradient_that_the_rig_amplifies_is_told_of():
+    """At the top of a hill x stays, and its derivatives grow by cosh(10 t): by 3.6e10 in 2.5 s."""
+    push = Actuator("disc.x", "disc.x", Repelling(), setpoint="x")
+    rig = Rig(
+        bodies={"disc": Body(0.4, Circle(0.02), weighted=False)}, pads={}, contacts={},
+        actuators={"push": push}, reference=hold(x=0.0),
+    )  # fmt: skip
+    y0 = torch.zeros(rig.layout.size, dtype=torch.float64)
+    y0[0] = 0.1
+
+    def backward(model: Rig, t: Tensor) -> None:
+        made = simulate(model, t, y0=y0, step=2e-3, gradient="discrete")
+        made["x_disc"][-1].backward()
+
+    def forward(model: Rig, t: Tensor) -> None:
+        simulate(model, t, y0=y0, step=2e-3, gradient="forward", wrt=["actuators.push.law.x_0"])
+
+    for route in (backward, forward):
+        (text,) = told(rig, route, t=times(2.5, 2))
+        assert re.search(r"changes by 1e-1\d of itself moves the run by its own size", text)
+        assert told(rig, route, t=times(1.0, 2)) == []
 
 
 def test_a_parameter_that_is_held_may_be_detached():

@@ -59,6 +59,39 @@ def slip_of(
     return friction(E, F_N, R, z, stage)
 
 
+STEEPEST = 5.0
+"""Efforts are tried up to so many normal forces, in search of where slip begins."""
+
+JUMP = 1e-6
+"""Part of the normal force that the force of a slip may change by within a rounding of the
+effort."""
+
+
+class Onset(NamedTuple):
+    """An effort [N] at which the slip rate jumps, and by how much [m/s]."""
+
+    effort: float
+    jump: float
+
+
+@torch.no_grad()
+def sharp_onset(friction: SlipLaw, F_N: float, R: float) -> Onset | None:
+    """Where the slip rate of a law jumps under a normal force F_N [N] with the dashpot R [N.s/m];
+    None where it does not."""
+    dashpot, held = (torch.tensor(x, dtype=torch.float64) for x in (R, F_N))
+    rate = lambda E: slip_of(friction, E, held.expand(E.shape), dashpot)[0]
+    E = torch.linspace(0.0, STEEPEST * F_N, 2001, dtype=torch.float64)
+    at = int(rate(E).diff().abs().argmax())
+    low, high = E[at], E[at + 1]
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        before, here, after = rate(torch.stack((low, middle, high)))
+        low, high = (low, middle) if abs(here - before) > abs(after - here) else (middle, high)
+    before, after = rate(torch.stack((low, high)))
+    jump = float(after - before)
+    return None if abs(jump) * R <= JUMP * F_N else Onset(float(high), jump)
+
+
 class Frame(NamedTuple):
     """The moving frame at points: moment arm d [m], normal n, tangent t (..., 2), penetration g [m]
     (...)."""
@@ -204,8 +237,19 @@ class Coulomb(Friction):
     """Stick up to mu_s F_N, then mu_k F_N (Eq. 12-13 with the force's modulus).
 
     The spring re-anchors so that the Voigt pair carries just mu_k F_N, |gamma'| = (E - mu_k F_N) /
-    R. Discontinuous at slip onset unless mu_s = mu_k: gradients across it are biased.
+    R. Discontinuous at slip onset unless mu_s = mu_k: gradients across it are biased, and zero by
+    mu_s.
     """
+
+    def jumps(self, F_N: float, R_t: Tensor, K_t: Tensor) -> str:
+        """Why the slip rate jumps under F_N [N]; empty if it does not."""
+        mu_s, mu_k = self.mu_s.item(), self.mu_k.item()
+        if mu_k >= mu_s:
+            return ""
+        return (
+            f"friction falls from mu_s = {mu_s:g} to mu_k = {mu_k:g} at once; let it fall over a "
+            "slip speed v_s, as SmoothSlip does, or take mu_k = mu_s"
+        )
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         return torch.where(self.mu_s * F_N <= E, (E - self.mu_k * F_N) / R, 0.0)
@@ -288,11 +332,19 @@ class SoftContact(nn.Module):
 
     def jumps(self, F_N: float) -> str:
         """Why the slip rate jumps under a normal force F_N [N] per reference spacing: friction
-        falls with slip faster than spring and dashpot balance, as far as the law of friction knows.
-        Empty if it does not."""
+        falls with slip faster than spring and dashpot balance, as the law of friction says, or as
+        it does where it says nothing. Empty if it does not."""
         judge = getattr(self.friction, "jumps", None)
-        ratio = 1.0 if self.friction_ratio is None else self.friction_ratio.item()
-        reason = judge(ratio * F_N, self.R_t, self.K_t) if judge is not None else ""
+        held = F_N if self.friction_ratio is None else self.friction_ratio.item() * F_N
+        if judge is not None:
+            reason = judge(held, self.R_t, self.K_t)
+        elif F_N > 0 and (onset := sharp_onset(self.friction, held, self.R_t.item())):
+            reason = (
+                f"it jumps by {onset.jump:.3g} m/s at an effort of {onset.effort:.3g} N; let "
+                "friction fall steadily with slip, as SmoothSlip does, or take a larger R_t"
+            )
+        else:
+            reason = ""
         return f"slip is not single-valued at a normal force of {F_N:.3g} N: {reason}" * bool(
             reason
         )

@@ -169,6 +169,13 @@ class Pad(nn.Module):
         return own @ self.axes.numpy().T + self.origin.numpy()
 
     @property
+    def space(self) -> Array:
+        """Least and largest coordinates (2, 2) [m] in the base's frame between which the centre of
+        a body must be to touch the pad."""
+        corners = self.placed(np.stack(np.meshgrid(*self.mesh.space.T), -1).reshape(-1, 2))
+        return np.stack((corners.min(0), corners.max(0)))
+
+    @property
     def point_positions(self) -> Tensor:
         """Undeformed places of the contact points in the base's frame (points, 2) [m]."""
         return self.spread @ self.positions

@@ -274,9 +274,10 @@ def check_slip(where: str, law: Any, R: float) -> str:
     where there is none.
 
     A slip that takes more than the effort, R gamma' > E, supplies power; one that leaves some of it
-    at F_N = 0 makes friction jump at touch-down. Raises `ValueError` for a
-    function that is no law of three tensors, gives no number, or gives several points at once other
-    rates than each alone.
+    at F_N = 0 makes friction jump at touch-down; one that is not decided by F_N and by the effort
+    that it leaves, E - R gamma', depends on the length of steps, which a stage adds to R. Raises
+    `ValueError` for a function that is no law of three tensors, gives no number, or gives several
+    points at once other rates than each alone.
     """
     E, F_N = tried()
     together, alone = (
@@ -311,6 +312,16 @@ def check_slip(where: str, law: Any, R: float) -> str:
             f"the slip law of `{where}` leaves {left[k]:.3g} N of an effort of {E[k]:g} N "
             "where nothing presses, so that friction jumps at touch-down and exceeds mu F_N under "
             "light loads; divide by R alone, or make a viscosity proportional to F_N"
+        )
+    same = slip_rates(where, law, E + R * alone, F_N, 2 * R)
+    if len(others := torch.nonzero((same - alone).abs() > ALIKE * alone)[:, 0]):
+        k = int(others[0])
+        return (
+            f"the slip law of `{where}` gives {alone[k]:.6g} m/s at an effort of {E[k]:g} N, a "
+            f"normal force of {F_N[k]:g} N and a dashpot of {R:.3g} N.s/m, and {same[k]:.6g} m/s "
+            "where a dashpot twice as large leaves the same effort, so that friction depends on "
+            "the length of steps and gradients of forces are off; let friction be a function of "
+            "the normal force, or of the slip rate"
         )
     return ""
 

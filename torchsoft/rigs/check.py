@@ -19,6 +19,7 @@ from torchsoft.physics.motion import hold
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.setup import PadSetup
 from torchsoft.physics.statics import NoEquilibrium, condensed, standing
+from torchsoft.rigs.alone import dragged, falls
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, signals
 from torchsoft.rigs.fields import Refused
@@ -57,10 +58,7 @@ def at_moments(e: Estimate) -> list[Diagnostic]:
     rig, found, there = condensed(e.rig), list[Diagnostic](), list[Moment]()
     for time in e.moments(MOMENTS):
         scene = Scene(rig, e.balanced(time))
-        found += [
-            one for one in fits(time, scene) if one.where not in {other.where for other in found}
-        ]
-        if found:
+        if found := list(fits(time, scene, Scene(rig, e(time)))):
             return found
         try:
             y = standing(rig, {name: torch.from_numpy(x) for name, x in scene.pose.items()})
@@ -84,16 +82,18 @@ def at_moments(e: Estimate) -> list[Diagnostic]:
             )
         )  # fmt: skip
     return [
-        *found, *presses(there), *strains(e, there), *drags(e, there), *softens(there),
-        *swings(e, there), *slips(e, there),
+        *found, *presses(there), *strains(e, there), *drags(e, there), *dragged(e, there),
+        *falls(e), *softens(there), *swings(e, there), *slips(e, there),
     ]  # fmt: skip
 
 
-def fits(time: float, scene: Scene) -> Iterator[Diagnostic]:
-    """Errors on bodies that do not fit between their pads."""
-    pairs = [pair for body in scene.rig.bodies for pair in scene.facing(body)]
-    alone = [(key,) for key in scene.rig.contacts if not any(key in pair for pair in pairs)]
+def fits(time: float, balanced: Scene, placed: Scene) -> Iterator[Diagnostic]:
+    """Errors on bodies that do not fit between their pads in a balance, or where set-points and
+    the start put them on a pad that none faces."""
+    pairs = [pair for body in balanced.rig.bodies for pair in balanced.facing(body)]
+    alone = [(key,) for key in placed.rig.contacts if not any(key in pair for pair in pairs)]
     for group in [*pairs, *alone]:
+        scene = balanced if len(group) > 1 else placed
         give, height = room(scene, group), sum(scene.pad(key).mesh.height for key in group)
         if give / height >= COMPRESSED:
             body, pads = scene.rig.contacts[group[0]].body, named(scene, group)
@@ -434,6 +434,20 @@ def carried(e: Estimate) -> Iterator[Diagnostic]:
         )  # fmt: skip
 
 
+def lost(e: Estimate) -> Iterator[Diagnostic]:
+    """Errors on bodies outside the space over a pad, where a run ends: at the start, and later
+    those of known course."""
+    for key, contact in e.rig.contacts.items():
+        times = [time for time, scene in e.course if scene.away(key)]
+        if times and (times[0] == 0 or e.known(contact.body)):
+            yield Diagnostic(
+                "error", f"bodies.{contact.body}",
+                f"at t = {times[0]:.3g} s it is outside the space over the pad `{contact.pad}`, "
+                "further from it than the pad is long, and the run would end there; bring it "
+                f"nearer, or say may_leave = true of contacts.{key}",
+            )  # fmt: skip
+
+
 def overlaps(e: Estimate) -> Iterator[Diagnostic]:
     """Errors on overlapping things without a contact between them: at the start, and later those of
     known course."""
@@ -526,6 +540,6 @@ def bears(pad: Pad) -> float:
 
 
 CHECKS: tuple[Callable[[Estimate], Iterator[Diagnostic]], ...] = (
-    ties, recordings, travels, jumps, carried, overlaps, corners, overloads,
+    ties, recordings, travels, jumps, carried, lost, overlaps, corners, overloads,
 )  # fmt: skip
 """All checks, in order; a new one is added here."""

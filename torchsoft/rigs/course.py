@@ -112,28 +112,43 @@ class Estimate:
     @torch.no_grad()
     def balanced(self, time: float) -> dict[str, Array]:
         """Poses by the static estimate, by the geometric one where no equilibrium is found.
-        Coordinates in equilibrium are those pushed by their own loop, and those of bodies between
-        pads along the direction of the press."""
+        Coordinates in equilibrium are those pushed by their own loop, and those of bodies on pads
+        along the direction of the press; on a pad that none faces where a balance is found."""
         scene = Scene(self.rig, self(time))
         own = [name for name, one in self.file.actuators.items() if one.measured == one.pushes]
         freed = {at(self.file.actuators[name].pushes) for name in own}
-        for name in self.rig.bodies:
-            for one, _ in scene.facing(name):
-                n = scene.surface(one).normal
-                freed |= {(name, i) for i in (0, 1) if abs(n[i]) > ALONG and self.is_own(name, i)}
-        free = {name: [i for i in range(3) if (name, i) in freed] for name in self.rig.bodies}
-        if not freed:
-            return dict(scene.pose)
+        pairs = [(name, one) for name in self.rig.bodies for one, _ in scene.facing(name)]
+        freed |= self._across(scene, pairs)
+        touched = [
+            (contact.body, key) for key, contact in self.rig.contacts.items()
+            if scene.pressed(key) > 0
+        ]  # fmt: skip
         followed = self.rig.follow(time) * torch.tensor([1.0, 0.0], dtype=torch.float64)
         pose = {name: torch.from_numpy(x) for name, x in scene.pose.items()}
-        try:
-            found = resting(
-                self.rig, pose, free, signals=followed, actuators=own, residual=BALANCED
-            )
-        except NoEquilibrium as error:
-            self.unbalanced[time] = str(error)
-            return dict(scene.pose)
-        return {name: x.numpy() for name, x in found.items()}
+        for sought in (freed | self._across(scene, touched), freed):
+            free = {name: [i for i in range(3) if (name, i) in sought] for name in self.rig.bodies}
+            if not sought:
+                continue
+            try:
+                found = resting(
+                    self.rig, pose, free, signals=followed, actuators=own, residual=BALANCED
+                )
+            except NoEquilibrium as error:
+                if sought == freed:
+                    self.unbalanced[time] = str(error)
+            else:
+                return {name: x.numpy() for name, x in found.items()}
+        return dict(scene.pose)
+
+    def _across(self, scene: Scene, touched: list[tuple[str, str]]) -> set[tuple[str, int]]:
+        """Coordinates of bodies across the pads of some of their contacts, that no loop
+        measures."""
+        return {
+            (name, i)
+            for name, key in touched
+            for i in (0, 1)
+            if abs(scene.surface(key).normal[i]) > ALONG and self.is_own(name, i)
+        }
 
     def knots(self) -> list[float]:
         """Times [s] of the run's ends, and those at which motions begin, end or have their
@@ -155,21 +170,28 @@ class Estimate:
         return [(float(time), Scene(self.rig, self(float(time)))) for time in times]
 
     def moments(self, most: int) -> list[float]:
-        """Up to so many of the knots [s] at which the rig is in different poses: the first, the one
-        at which pads are pressed most, and others."""
-        seen: list[tuple[float, Scene]] = []
+        """Up to so many of the knots [s] at which the rig is in different poses or pushed by other
+        feed-forward efforts: the first, those at which pads are pressed and bodies are pushed most,
+        and others."""
+        fed = [one.feed_forward for one in self.file.actuators.values() if one.feed_forward]
+        seen: list[tuple[float, Scene, Array]] = []
         for time in self.knots():
-            pose = self(time)
+            pose, values = self(time), signals(self.rig, time)
+            pushes = np.array([values[name] for name in fed])
             if not any(
                 all(np.allclose(pose[k], old.pose[k], rtol=0, atol=1e-6) for k in pose)
-                for _, old in seen
+                and np.allclose(pushes, before, rtol=1e-3, atol=0)
+                for _, old, before in seen
             ):
-                seen.append((time, Scene(self.rig, pose)))
+                seen.append((time, Scene(self.rig, pose), pushes))
         grips = [
-            max((scene.pressed(key) for key in self.rig.contacts), default=0.0) for _, scene in seen
+            max((scene.pressed(key) for key in self.rig.contacts), default=0.0)
+            for _, scene, _ in seen
         ]
-        spread = np.linspace(0, len(seen) - 1, min(most - 1, len(seen))).astype(int).tolist()
-        return [seen[i][0] for i in sorted({0, int(np.argmax(grips)), *spread})][:most]
+        loads = [float(np.abs(pushes).sum()) for *_, pushes in seen]
+        chosen = {0, int(np.argmax(grips)), int(np.argmax(loads))}
+        spread = np.linspace(0, len(seen) - 1, min(most - len(chosen) + 1, len(seen))).astype(int)
+        return [seen[i][0] for i in sorted(chosen.union(spread.tolist()))][:most]
 
 
 def signals(rig: Graph, time: float) -> dict[str, float]:

@@ -141,6 +141,13 @@ class Scene(NamedTuple):
         pad = self.pad(contact)
         return in_world(pad, self.pose, pad.point_positions.numpy())
 
+    def away(self, contact: str) -> bool:
+        """Whether a body is outside the space over the pad of a contact that it must not leave."""
+        own, (low, high) = self.rig.contacts[contact], self.pad(contact).space
+        base = np.zeros(3) if (on := self.pad(contact).base) is None else self.pose[on]
+        place = turned(self.pose[own.body][:2] - base[:2], -base[2])
+        return not own.may_leave and bool(((place < low) | (place > high)).any())
+
     def reach(self, body: str, direction: Array) -> float:
         """Extent [m] of a body from its centre along a unit vector of the world."""
         return float(

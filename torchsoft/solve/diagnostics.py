@@ -93,9 +93,13 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
             "(`stats.failed_steps`): the run is not one of the same steps; its own `knots` are "
             "those that it took"
         )
+    slips = dict(zip(ledger.names, ledger.dissipated[-1]))["slip"] > 0
+    biased = slips and (run.y.requires_grad or run.sensitivities is not None)
     for name in rig.contacts:
         if bounded := softened(run, rig, name):
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"
+        if biased and (jump := jumped(run, rig, name)):
+            found[f"gradient {name}"] = jump
     most, atol = ledger.force, ledger.steps.get("atol", 0.0)
     if 0 < RESOLVED * most < atol * UNITS["force"]:
         unit = own_units(rig)["force"]
@@ -118,6 +122,18 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
                 "linear elasticity"
             )
     return found
+
+
+@torch.no_grad()
+def jumped(run: Trajectory, rig: Rig, name: str) -> str:
+    """Sentence on a gradient of a run in which the slip rate of a contact's points jumps; empty
+    where it does not."""
+    most = float((run.force[name][..., 0].detach() / rig.weight(name)).max())
+    reason = rig.contacts[name].law.jumps(most) if most > 0 else ""
+    return (
+        f"contact `{name}`: {reason}; the gradient of the run leaves such jumps out, so that it is "
+        "zero by a static coefficient of friction and biased by all that decides when points slip"
+    ) * bool(reason)
 
 
 @torch.no_grad()

@@ -1,5 +1,7 @@
 """Derivatives of a whole run: the discrete adjoint, and forward sensitivities."""
 
+import math
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -8,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.parallel import parallel_map, released_turn
+from torchsoft.physics.state import Layout
 from torchsoft.solve.kernel.arrays import Backward, Forward, room
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
@@ -26,6 +29,35 @@ from torchsoft.solve.trajectory import Sums
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from
 where it began."""
+
+
+AMPLIFIED = 1e8
+"""Change of a run, over its own size, by a parameter or a start that changes by their own size,
+from which on a gradient is of no use."""
+
+SMALL = 1e-3
+"""Size [N, m, rad, m/s] below which a part of the state or a force counts as that large."""
+
+
+def sizes_of(layout: Layout, y: Array) -> Array:
+    """Sizes (size,) of the components of states y (T, size): of the largest of their part."""
+    sizes = np.full(layout.size, SMALL)
+    for where in layout.slices.values():
+        sizes[where] = np.abs(y[:, where]).max(initial=SMALL)
+    return sizes
+
+
+def warn_of_amplified(most: float) -> None:
+    """A warning of a gradient that is `most` times as large as what is differentiated."""
+    if most > AMPLIFIED:
+        warnings.warn(
+            f"a parameter or a start that changes by 1e-{math.floor(math.log10(most)):02d} of "
+            "itself moves the run by its own size: the gradient is exact for the steps that ran "
+            "and holds for no change that matters, since the rig amplifies differences, by an "
+            "unstable loop that friction or lost contact bounds, or by impacts; differentiate a "
+            "shorter run, or a stable rig",
+            stacklevel=3,
+        )
 
 
 class GradientFailed(RuntimeError):
@@ -137,6 +169,9 @@ def run_adjoint(
             raise GradientFailed(
                 f"the cotangent of output {np.argwhere(~np.isfinite(bar))[0][0]} is not finite"
             )
+    sizes = sizes_of(stepper.layout, run.out.y)
+    own = float((np.abs(rows) @ sizes).sum())
+    own += float(np.abs(felt).sum()) * float(np.abs(run.out.recorded).max(initial=SMALL))
     carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
     signals_bar = [np.zeros(segment.signals.shape) for segment in run.segments or []]
     outputs_bar = np.zeros((len(run.t), *signals_bar[0].shape[1:]))
@@ -154,6 +189,9 @@ def run_adjoint(
         if failed[0] >= 0:
             time = stepper.origin + plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
+    if own > 0:
+        by_parameters = np.abs(p_bar * stepper.compiled.p.detach().numpy()).max(initial=0.0)
+        warn_of_amplified(max(np.abs(carried * sizes).max(), by_parameters) / own)
     parts = carried, p_bar, np.concatenate(signals_bar), outputs_bar
     return tuple(torch.from_numpy(part) for part in parts)  # pyright: ignore[reportReturnType]
 
@@ -234,3 +272,8 @@ def iterate(
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(kept), torch.from_numpy(felt), out
+    rigid = [k for k, column in enumerate(columns) if column in set(stepper.layout.rigid)]
+    own = np.array([float(p.detach()) for p in wrt])
+    moved = np.abs(kept[:, rigid, : len(wrt)] * own).max((0, 2), initial=0.0)
+    sizes = sizes_of(stepper.layout, out.y)[[columns[k] for k in rigid]]
+    warn_of_amplified(float((moved / sizes).max(initial=0.0)))

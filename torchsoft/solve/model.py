@@ -387,9 +387,8 @@ class Model:
             laws.append(self._laws(name, contact.law, shape))
             starts.append(self._add(*laws[-1].parameters.values()))
             pad = rig.pads[contact.pad]
-            corners = pad.placed(np.stack(np.meshgrid(*pad.mesh.space.T), -1).reshape(-1, 2))
-            box = np.stack((corners.min(0), corners.max(0)), 1).ravel()
-            limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
+            anywhere = (-np.inf, np.inf, -np.inf, np.inf)
+            limits.append(anywhere if contact.may_leave else pad.space.T.ravel())
         owners = [list(rig.pads).index(contact.pad) for contact in contacts]
         body = np.array(
             [3 * list(rig.bodies).index(contact.body) for contact in contacts], np.int64

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchsoft.codegen import compile_law
 from torchsoft.codegen.stops import evaluate
-from torchsoft.physics.contact import SlipLaw, SoftContact, slip_of
+from torchsoft.physics.contact import SlipLaw, SoftContact, sharp_onset
 from torchsoft.physics.parts import Actuator
 from torchsoft.physics.shapes import Circle
 from torchsoft.physics.validity import NORMALS, check_slip
@@ -27,13 +27,6 @@ from torchsoft.testing.energy import conclude
 
 ALIKE = 1e-9
 """Part of the largest value, or derivative, by which compiled code may differ from torch's."""
-
-STEEPEST = 5.0
-"""Efforts are tried up to so many normal forces, in search of where slip begins."""
-
-JUMP = 1e-6
-"""Part of the normal force that the force of a slip may change by within a rounding of the
-effort."""
 
 
 def check_law(
@@ -113,25 +106,14 @@ def _otherwise(what: str, law: Callable[..., Any], x: Tensor) -> Iterator[str]:
             yield f"{what} has other {part} once compiled than in torch"
 
 
-@torch.no_grad()
 def _jump(name: str, slip: Any, R: float) -> str:
     """Sentence on an effort at which the slip rate jumps, under one of several normal forces; empty
     where there is none."""
-    dashpot = torch.tensor(R, dtype=torch.float64)
     for F_N in NORMALS[1:]:
-        rate = lambda E, F_N=F_N: slip_of(slip, E, torch.full_like(E, F_N), dashpot)[0]
-        E = torch.linspace(0.0, STEEPEST * F_N, 2001, dtype=torch.float64)
-        at = int(rate(E).diff().abs().argmax())
-        low, high = E[at], E[at + 1]
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            before, here, after = rate(torch.stack((low, middle, high)))
-            low, high = (low, middle) if abs(here - before) > abs(after - here) else (middle, high)
-        before, after = rate(torch.stack((low, high)))
-        if not float(abs(after - before)) * R <= JUMP * F_N:
+        if (onset := sharp_onset(slip, F_N, R)) is not None:
             return (
-                f"the slip rate of `{name}` jumps by {float(after - before):.3g} m/s at an effort "
-                f"of {float(high):.3g} N under a normal force of {F_N:g} N with a dashpot of "
+                f"the slip rate of `{name}` jumps by {onset.jump:.3g} m/s at an effort "
+                f"of {onset.effort:.3g} N under a normal force of {F_N:g} N with a dashpot of "
                 f"{R:.3g} N.s/m: gradients across it are biased, and Newton's iteration may fail; "
                 "let friction fall steadily with slip, as SmoothSlip does, or use a larger R_t"
             )
