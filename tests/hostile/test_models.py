@@ -41,15 +41,15 @@ SIZES = ("length", "height", "radius", "origin", "elements_x", "elements_y", "x"
 
 
 class Network(nn.Module):
-    """A slip rate by a small network."""
+    """A coefficient of friction that a small network makes of the normal force."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.mu = nn.Sequential(nn.Linear(2, 4), nn.Tanh(), nn.Linear(4, 1), nn.Tanh()).double()
+        self.mu = nn.Sequential(nn.Linear(1, 4), nn.Tanh(), nn.Linear(4, 1), nn.Tanh()).double()
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        mu = 0.3 + 0.2 * self.mu(torch.stack((E, F_N), -1) / 10)[..., 0]
-        return (E - mu * F_N).clamp(min=0.0) / (R + 10.0)
+        mu = 0.3 + 0.2 * self.mu(F_N[..., None] / 10)[..., 0]
+        return (E - mu * F_N).clamp(min=0.0) / R
 
 
 # random models
