@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import RUBBER, f64, paper
+from conftest import PAPER, RUBBER, f64, paper
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
@@ -274,6 +274,14 @@ def test_a_run_is_kept_in_files(run, tmp_path: Path):
     loaded = Trajectory.load(tmp_path / "run.nc")
     assert torch.equal(loaded.y, run.y)
     assert loaded.setup.pads["L"].energy == {"rho": 1100.0, **NEO}
+
+
+def test_its_numbers_are_unknowns_by_the_files_names(grasp):
+    names = {"materials.rubber.moduli_1": 4.5e5, "materials.rubber.times_1": 0.05}
+    for name, value in names.items():
+        assert float(grasp.rig.parameter(name).detach()) == value
+        changed = PAPER.override(COARSE).override({name: 2 * value}).build()
+        assert float(changed.rig.parameter(name).detach()) == 2 * value
 
 
 def let_go(material: Material, force: Tensor, times: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ them as far as the strain is small (`physics/elements` has the equations).
 
 from collections.abc import Iterable, Mapping
 from inspect import signature
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -66,17 +66,18 @@ class Hyperelastic(OneTime):
     incompressible elements too stiff.
     """
 
+    lists: ClassVar[Mapping[str, str]] = {"E": "moduli", "tau": "times"}
+
     def __init__(
         self, E: Modulus | None, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth,
         moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, tau, depth)
-        given = {"E": moduli, "tau": times}
-        self.relaxing = numbered(self, "a relaxing energy", ("moduli", "times"), given, 0)
+        self.relaxing = numbered(self, "a relaxing energy", self.lists, moduli, times, least=0)
 
     def relaxation(self) -> list[tuple[Tensor, Tensor]]:
         """Of every branch the modulus over the relaxed one [1], and the relaxation time [s]."""
-        return [(E / self.E, tau) for E, tau in pairs(self, self.relaxing, "E", "tau")]
+        return [(E / self.E, tau) for E, tau in pairs(self, self.relaxing, *self.lists)]
 
     def chain(self) -> tuple[Tensor, Tensor]:
         """The chain of small strains."""
@@ -227,8 +228,8 @@ class Ogden(_ByShear):
         depth: Depth, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
         super().__init__(None, nu, rho, tau, depth, moduli, times)
-        given = {"mu": mu, "alpha": alpha}
-        self.terms = numbered(self, "Ogden's energy", ("mu", "alpha"), given)
+        own = {"mu": "mu", "alpha": "alpha"}
+        self.terms = numbered(self, "Ogden's energy", own, mu, alpha)
         if any(exponent.item() == 0.0 for _, exponent in self.series()):
             raise ValueError("an exponent `alpha` is zero; leave that term out")
 
@@ -304,7 +305,7 @@ def described(material: Material) -> dict[str, Any] | None:
     if isinstance(material, Ogden):
         lists["mu", "alpha"] = material.series()
     if isinstance(material, Hyperelastic):
-        lists["moduli", "times"] = pairs(material, material.relaxing, "E", "tau")
+        lists["moduli", "times"] = pairs(material, material.relaxing, *material.lists)
     for names, rows in lists.items():
         numbers |= {name: [row[i].item() for row in rows] for i, name in enumerate(names)}
     for name in signature(KINDS[kind]).parameters:

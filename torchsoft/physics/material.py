@@ -6,7 +6,7 @@ part of the nodal forces that has set in, tau_b z_b' + z_b = f.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
@@ -57,6 +57,8 @@ class Material(nn.Module):
 
     E: Tensor
     added: Sequence[Branch]
+    lists: ClassVar[Mapping[str, str]] = {}
+    """Parameters of which there are several, E_1, E_2, ..., and the argument that has them all."""
 
     def __init__(self, E: Modulus | None, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         """E is None where a material makes it of other numbers."""
@@ -157,29 +159,24 @@ class StandardLinearSolid(Material):
 
 
 class Series(Material):
-    """A material of any number of terms, each a strength and a time: scalar parameters <symbol>_1,
-    tau_1, <symbol>_2, ...
+    """A material of any number of terms, each a strength and a time, as its `lists` call them.
 
     An instantaneous spring stands before them in the chain, with the retardation time tau_instant
     [s], below every tau. Raises `ValueError` unless there are as many strengths as times, and at
     least one.
     """
 
-    symbol = strength = ""
-    """Names of a strength's parameters, and of the constructor's argument."""
-
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, strengths: Iterable[float],
         tau: Retardations, tau_instant: InstantRetardation,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
-        given = {self.symbol: strengths, "tau": tau}
-        self.terms = numbered(self, "a series", (self.strength, "tau"), given)
+        self.terms = numbered(self, "a series", self.lists, strengths, tau)
         self.tau_instant = parameter(tau_instant)
 
     def series(self) -> tuple[Tensor, Tensor]:
         """Strengths and times [s] of the terms, (terms,) each."""
-        one, other = zip(*pairs(self, self.terms, self.symbol, "tau"))
+        one, other = zip(*pairs(self, self.terms, *self.lists))
         return torch.stack(one), torch.stack(other)
 
     def well_posed(self) -> str:
@@ -201,7 +198,7 @@ class GeneralisedKelvin(Series):
     Parameters are called J_1, tau_1 and so on.
     """
 
-    symbol = strength = "J"
+    lists: ClassVar[Mapping[str, str]] = {"J": "J", "tau": "tau"}
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, J: Fractions,
@@ -231,7 +228,7 @@ class Prony(Series):
     but for the instantaneous spring, which takes tau_instant [s] to give way.
     """
 
-    symbol, strength = "E", "moduli"
+    lists: ClassVar[Mapping[str, str]] = {"E": "moduli", "tau": "tau"}
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, moduli: Moduli,
@@ -314,20 +311,20 @@ def distances(w: Tensor, t: Tensor) -> Tensor:
 
 
 def numbered(
-    module: nn.Module, what: str, names: tuple[str, str], given: Mapping[str, Iterable[float]],
-    least: int = 1,
-) -> int:  # fmt: skip
-    """Give a module the parameters <symbol>_1, <symbol>_2, ... of two lists by their symbols, which
-    arguments call `names`; returns their length. Raises `ValueError` unless they are as long as
-    each other, with at least so many entries."""
-    one, other = (terms(symbol, values) for symbol, values in given.items())
+    module: nn.Module, what: str, lists: Mapping[str, str], *given: Iterable[float], least: int = 1
+) -> int:
+    """Give a module the parameters <symbol>_1, <symbol>_2, ... of two lists, which arguments call
+    as `lists` says; returns their length. Raises `ValueError` unless they are as long as each
+    other, with at least so many entries."""
+    one, other = (terms(symbol, values) for symbol, values in zip(lists, given))
     if len(one) != len(other) or not least <= len(one) <= TERMS:
+        names = " as ".join(f"`{name}`" for name in lists.values())
         raise ValueError(
-            f"{what} needs as many `{names[0]}` as `{names[1]}`, from {least} to {TERMS}, but has "
-            f"{len(one)} and {len(other)}"
+            f"{what} needs as many {names}, from {least} to {TERMS}, but has {len(one)} and "
+            f"{len(other)}"
         )
     for k, values in enumerate(zip(one, other), 1):
-        for symbol, value in zip(given, values):
+        for symbol, value in zip(lists, values):
             module.register_parameter(f"{symbol}_{k}", parameter(value))
     return len(one)
 
