@@ -136,10 +136,10 @@ def law(friction: Any = None) -> SoftContact:
 def grip(
     shape: nn.Module | None = None, material: Any = None, tip: Mesh = MESH, friction: Any = None,
     lower: Body | None = None, jaw: Body | None = None, motion: dict[str, nn.Module] | None = None,
-    loops: Callable[[float], dict[str, Any]] | None = None, **pad: Any,
+    loops: Callable[[float], dict[str, Any]] | None = None, under: Any = None, **pad: Any,
 ) -> Start:  # fmt: skip
-    """A body pressed between a pad below and one under a jaw, which is driven or pushed by loops;
-    it is rolled and slips."""
+    """A body pressed between a pad below, of the material `under` if given, and one under a jaw,
+    which is driven or pushed by loops; it is rolled and slips."""
     shape, soft, contact = (
         shape or Circle(R),
         material or KelvinVoigt(**RUBBER, tau=0.01),
@@ -156,7 +156,8 @@ def grip(
     rig = Rig(
         bodies={"disc": Body(0.4, shape),
         "jaw": jaw or driven} | ({"lower": lower} if lower else {}), pads={
-            "lower": Pad(MESH, soft, base="lower" if lower else None, origin=(-30e-3, 0.0), **pad),
+            "lower": Pad(MESH, under or soft, base="lower" if lower else None,
+                         origin=(-30e-3, 0.0), **pad),
             "upper": Pad(tip, soft, base="jaw", origin=(-tip.length / 2, 0.0), mirrored=True,
             **pad),
         },
@@ -282,6 +283,12 @@ RIGS: dict[str, Callable[[], Start]] = {
     "points between nodes": lambda: grip(points=2),
     "inertial pads": lambda: grip(inertial=True),
     "neo-Hookean pads": lambda: grip(material=NeoHookean(**RUBBER, tau=0.01)),
+    "relaxing pad under another": lambda: grip(
+        material=NeoHookean(**RUBBER, tau=0.01),
+        under=NeoHookean(**RUBBER, tau=0.01, moduli=[6e5], times=[0.02])),
+    "pads that relax twice": lambda: grip(Circle(12e-3), tip=FingertipMesh(8e-3, 12), points=2,
+        material=Yeoh(C10=1.3e5, C20=-1e4, C30=3e3, nu=0.48, rho=1100.0, tau=0.01, depth=0.044,
+        moduli=[3e5, 2e5], times=[0.05, 4e-3])),
     "neo-Hookean pads with inertia": lambda: grip(
         material=NeoHookean(**RUBBER, tau=0.01), inertial=True),
     "Mooney-Rivlin pads on turning bases": lambda: grip(
@@ -320,7 +327,12 @@ RIGS: dict[str, Callable[[], Start]] = {
 }  # fmt: skip
 
 
-SLOW = "Ogden pads", "Mooney-Rivlin pads on turning bases", "neo-Hookean pads with inertia"
+SLOW = (
+    "pads that relax twice",
+    "Ogden pads",
+    "Mooney-Rivlin pads on turning bases",
+    "neo-Hookean pads with inertia",
+)
 PARAMS = [
     pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in RIGS
 ]  # fmt: skip

@@ -24,6 +24,9 @@ pads."""
 PER_NODE = {False: 2.2e-6, True: 6.5e-6}
 """Time of one step [s] for every node of two nodal pads, linear and at finite strain."""
 
+FIELDS = 1.8
+"""Power of the number of fields that the time of a step grows with."""
+
 SHARE = 0.8
 """And so does work that needs more than this part of the machine's memory."""
 
@@ -78,17 +81,17 @@ def rig_step(rig: Rig, differentiated: bool = False) -> float:
         points = len(pad.point_nodes) if pad.points else 0
         nodal = len(pad.mesh.free) if pad.nodal else 0
         finite = isinstance(pad.material, Hyperelastic)
-        own = 0.5 * step_time(len(pad.mesh.surface), points, nodal, finite)
+        own = 0.5 * step_time(len(pad.mesh.surface), points, nodal, finite, pad.fields)
         seconds += own * (DIFFERENTIATED[pad.nodal] if differentiated else 1.0)
     return seconds
 
 
-def step_time(surface: int, points: int, nodal: int, finite: bool) -> float:
+def step_time(surface: int, points: int, nodal: int, finite: bool, fields: int = 1) -> float:
     """Time of one step [s] with two pads of so many nodes on the `surface`, contact `points`
     between nodes, and `nodal` nodes each whose displacements are in the state, at `finite` strain
-    or linear."""
-    between = 0.5e-6 * points
-    return between + (PER_NODE[finite] * nodal if nodal else 50e-6 + 90e-6 * (surface / 121) ** 2)
+    or linear, in so many fields."""
+    own = PER_NODE[finite] * nodal * fields**FIELDS
+    return 0.5e-6 * points + (own if nodal else 50e-6 + 90e-6 * (surface / 121) ** 2)
 
 
 def steps_per_second(rtol: float) -> float:
@@ -99,7 +102,7 @@ def steps_per_second(rtol: float) -> float:
 
 def rig_row(rig: Rig) -> float:
     """Memory [GiB] of one row of a run of a rig: states, forces, displacements and energies."""
-    pads = [(pad.nodes, len(pad.point_nodes)) for pad in rig.pads.values()]
+    pads = [(pad.fields * pad.nodes, len(pad.point_nodes)) for pad in rig.pads.values()]
     return 0.5 * sum(row_bytes(*one) for one in pads) / 2**30
 
 

@@ -75,7 +75,8 @@ class Preset:
         values = {name: one.value for name, one in self.coefficients.items()}
         if "E" in values:
             return KelvinVoigt(**values, depth=depth)
-        return Ogden([values.pop("mu")], [values.pop("alpha")], **values, depth=depth)
+        lists = {name: [values.pop(name)] for name in ("mu", "alpha")}
+        return Ogden(**lists, nu=values["nu"], rho=values["rho"], tau=values["tau"], depth=depth)
 
     def described(self) -> str:
         """Every coefficient with its unit, its source and where that is."""

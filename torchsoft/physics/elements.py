@@ -1,19 +1,29 @@
 """Elements of nodal pads: bilinear quadrilaterals in plane strain, each an energy of the
 displacements of its corners and a dissipation potential of their rates.
 
-An element's inputs x are displacements u (8), rates u' (8), x and y corner by corner, and its
-constants, as `element_constants` orders them. The force on a corner is the derivative of the energy
-by its displacement plus that of the potential by its rate; the power that the element dissipates is
-twice the potential.
+An element's inputs x are displacements u (8), x and y corner by corner, then the v_b of every
+relaxing branch, the rates of them all, and its constants, as `element_constants` orders them. The
+force on a corner is the derivative of the energy by its displacement plus that of the potential by
+its rate; the power that the element dissipates is twice the potential.
 
 The volume counts by its change at the centre, so that nearly incompressible elements do not lock.
 At finite strain the energy of distortion is one of the deformation gradient F at the Gauss points,
 that of dilatation one of J_0 = det F at the centre; mu (J - J_0)^2 / 3 is added (`WITHIN`), which
 opposes changes of volume within the element that nothing else would: with it the limit of small
 strains is the linear element.
+
+A relaxing branch is a second network in the same pad, whose nodes, displaced by v_b, flow after
+those at u. Of F = 1 + grad u only F F_b^-1, F_b = 1 + grad v_b, distorts its spring, and J - J_b
+changes its volume: the energy is the material's, times the branch's modulus over the relaxed one,
+at 1 + J - J_b. Its dashpot takes the deviator of the rate of deformation, the symmetric part of
+F_b' F_b^-1, and J_b', with the moduli of small strains times tau_b: C_b = F_b^T F_b and J_b go to C
+and J with the relaxation time tau_b at any strain. The network bears no load, and the forces on its
+nodes are zero. At rest v_b = u; at small strains v_b' = (u - v_b) / tau_b, the linear pad's branch.
+Turning u or v_b costs nothing, and what is dissipated is never negative.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,7 +40,7 @@ WITHIN = 1 / 3
 """Modulus against changes of volume within an element, over the shear modulus of small strains."""
 
 CORNERS = 8
-"""Displacements of an element."""
+"""Displacements of an element in one field."""
 
 CONSTANTS = 9 * (1 + len(GAUSS))
 """Number of an element's constants."""
@@ -49,18 +59,21 @@ def element_constants(corners: Array) -> Array:
 
 
 class Place(NamedTuple):
-    """An area of an element, and gradients there of the displacements and of their rates, each as
-    (xx, xy, yx, yy), xy that of x along y; of the Gauss points with these along the last axis."""
+    """An area of an element, and gradients there of displacements and of their rates, each as (xx,
+    xy, yx, yy), xy that of x along y; of the Gauss points with these along the last axis."""
 
     area: Tensor
     gradient: tuple[Tensor, Tensor, Tensor, Tensor]
     rate: tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def places(x: Tensor) -> tuple[Place, Place]:
-    """The centre, for the whole element, and the Gauss points."""
-    u, rate = x[..., :8], x[..., 8:16]
-    constants = x[..., 16:].unflatten(-1, (1 + len(GAUSS), 9))
+Places = tuple[Place, Place]
+"""The centre, for the whole element, and the Gauss points."""
+
+
+def places(x: Tensor) -> list[Places]:
+    """Places of an element with the gradients of u, and with those of every v_b."""
+    constants = x[..., -CONSTANTS:].unflatten(-1, (1 + len(GAUSS), 9))
     gx, gy, area = constants[..., 0:8:2], constants[..., 1:8:2], constants[..., 8]
 
     def gradient(of: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -68,41 +81,52 @@ def places(x: Tensor) -> tuple[Place, Place]:
         xx, xy = (gx * ux).sum(-1), (gy * ux).sum(-1)
         return xx, xy, (gx * uy).sum(-1), (gy * uy).sum(-1)
 
-    of_u, of_rate = gradient(u), gradient(rate)
+    moved = x[..., :-CONSTANTS].unflatten(-1, (2, -1, CORNERS))
+    fields = []
+    for u, rate in zip(moved[..., 0, :, :].unbind(-2), moved[..., 1, :, :].unbind(-2)):
+        of_u, of_rate = gradient(u), gradient(rate)
 
-    def at(which: int | slice) -> Place:
-        xx, xy, yx, yy = (one[..., which] for one in of_u)
-        x, a, b, y = (one[..., which] for one in of_rate)
-        return Place(area[..., which], (xx, xy, yx, yy), (x, a, b, y))
+        def at(which: int | slice, of_u: Any = of_u, of_rate: Any = of_rate) -> Place:
+            xx, xy, yx, yy = (one[..., which] for one in of_u)
+            x, a, b, y = (one[..., which] for one in of_rate)
+            return Place(area[..., which], (xx, xy, yx, yy), (x, a, b, y))
 
-    return at(0), at(slice(1, None))
+        fields.append((at(0), at(slice(1, None))))
+    return fields
 
 
 def element_potentials(material: Material, factors: Tensor, x: Tensor) -> Tensor:
-    """Energy [J] and dissipation potential [W] (..., 2) of an element in the state x (..., 61);
-    `factors` (..., 4) are the pad's depth [m], retardation time tau [s], and the Lame moduli lambda
-    and mu [Pa] of small strains."""
+    """Energy [J] and dissipation potential [W] (..., 2) of an element in the state x (..., 16
+    (branches + 1) + 45); `factors` (..., 4 + 2 branches) are the pad's depth [m], retardation time
+    tau [s], and the Lame moduli lambda and mu [Pa] of small strains, then of every branch its
+    modulus over the relaxed one and its relaxation time [s]."""
     parts = element_energy(material, factors, x), element_potential(material, factors, x)
     return torch.stack(parts, -1)
 
 
 def element_energy(material: Material, factors: Tensor, x: Tensor) -> Tensor:
-    """Energy (...) [J] of an element in the state x (..., 61)."""
-    depth, _, lame_lambda, lame_mu = factors.unbind(-1)
-    centre, gauss = places(x)
-    if isinstance(material, Hyperelastic):
-        return depth * finite_energy(material, lame_mu, centre, gauss)
-    return depth * linear(lame_lambda, lame_mu, centre, gauss, "gradient")
+    """Energy (...) [J] of an element in the state x (..., inputs)."""
+    depth, _, lame_lambda, lame_mu, *arms = factors.unbind(-1)
+    own, *others = places(x)
+    if not isinstance(material, Hyperelastic):
+        return depth * linear(lame_lambda, lame_mu, *own, "gradient")
+    W = finite_energy(material, lame_mu, *own)
+    for share, flown in zip(arms[::2], others):
+        W = W + share * finite_energy(material, lame_mu, *own, flown)
+    return depth * W
 
 
 def element_potential(material: Material, factors: Tensor, x: Tensor) -> Tensor:
-    """Dissipation potential (...) [W] of an element in the state x (..., 61)."""
-    depth, tau, lame_lambda, lame_mu = factors.unbind(-1)
-    centre, gauss = places(x)
-    if isinstance(material, Hyperelastic):
-        bulk = lame_lambda + 2 / 3 * lame_mu
-        return depth * tau * finite_potential(bulk, lame_mu, centre, gauss)
-    return depth * tau * linear(lame_lambda, lame_mu, centre, gauss, "rate")
+    """Dissipation potential (...) [W] of an element in the state x (..., inputs)."""
+    depth, tau, lame_lambda, lame_mu, *arms = factors.unbind(-1)
+    own, *others = places(x)
+    if not isinstance(material, Hyperelastic):
+        return depth * tau * linear(lame_lambda, lame_mu, *own, "rate")
+    bulk = lame_lambda + 2 / 3 * lame_mu
+    total = tau * finite_potential(bulk, lame_mu, *own)
+    for share, time, flown in zip(arms[::2], arms[1::2], others):
+        total = total + share * time * flow_potential(bulk, lame_mu, *flown)
+    return depth * total
 
 
 def linear(lame_lambda: Tensor, lame_mu: Tensor, centre: Place, gauss: Place, kind: str) -> Tensor:
@@ -113,10 +137,16 @@ def linear(lame_lambda: Tensor, lame_mu: Tensor, centre: Place, gauss: Place, ki
     return 0.5 * lame_lambda * centre.area * (x + y) ** 2 + shear.sum(-1)
 
 
-def finite_energy(material: Hyperelastic, shear: Tensor, centre: Place, gauss: Place) -> Tensor:
-    """Energy per depth at finite strain."""
-    (J_0, _), (J, _) = volume(centre), volume(gauss)
-    xx, xy, yx, yy = gauss.gradient
+def finite_energy(
+    material: Hyperelastic, shear: Tensor, centre: Place, gauss: Place, flown: Places | None = None
+) -> Tensor:
+    """Energy per depth at finite strain, of a branch that has `flown` if given."""
+    (J_0, _), (J, _), felt = volume(centre), volume(gauss), gauss.gradient
+    if flown is not None:
+        (J_0_b, _), (J_b, _) = map(volume, flown)
+        J_0, J = 1 + (J_0 - J_0_b), 1 + (J - J_b)
+        felt = over([one - other for one, other in zip(felt, flown[1].gradient)], flown[1])
+    xx, xy, yx, yy = felt
     zero, one = torch.zeros_like(J), torch.ones_like(J)
     rows = (1 + xx, xy, zero), (yx, 1 + yy, zero), (zero, zero, one)
     W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
@@ -143,6 +173,29 @@ def finite_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: Place) -
     within = WITHIN * (J_rate - J_0_rate[..., None]) ** 2
     distortion = (gauss.area * shear * (square + within)).sum(-1)
     return 0.5 * bulk * centre.area * J_0_rate**2 + distortion
+
+
+def flow_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: Place) -> Tensor:
+    """Dissipation potential of a branch's dashpot per depth and relaxation time: quadratic in the
+    deviator of the rate of deformation, and in the rates of J_0 and of J - J_0."""
+    (_, J_0_rate), (_, J_rate) = volume(centre), volume(gauss)
+    x, a, b, y = over(gauss.rate, gauss)
+    square = x**2 + y**2 + 0.5 * (a + b) ** 2 - (x + y) ** 2 / 3
+    within = WITHIN * (J_rate - J_0_rate[..., None]) ** 2
+    distortion = (gauss.area * shear * (square + within)).sum(-1)
+    return 0.5 * bulk * centre.area * J_0_rate**2 + distortion
+
+
+def over(A: Sequence[Tensor], place: Place) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A F^-1 of A and F = 1 + gradient, as (xx, xy, yx, yy)."""
+    (xx, xy, yx, yy), (J, _) = place.gradient, volume(place)
+    a, b, c, d = A
+    return (
+        (a * (1 + yy) - b * yx) / J,
+        (b * (1 + xx) - a * xy) / J,
+        (c * (1 + yy) - d * yx) / J,
+        (d * (1 + xx) - c * xy) / J,
+    )
 
 
 def volume(place: Place) -> tuple[Tensor, Tensor]:

@@ -89,8 +89,7 @@ def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]
     for name, pad in rig.pads.items():
         port = graph.ports[f"pad_{name}"]
         if pad.nodal:
-            rate = port.transformer.flow(graph.flows)
-            powers[f"pad_{name}"] = pad.dissipation(state.pads[name], rate)
+            powers[f"pad_{name}"] = pad.dissipation(state.pads[name], graph.pad_rates(name))
         else:
             fractions, times = pad.chain()
             rate = (
@@ -124,7 +123,7 @@ def contact_states(
     rig: Graph, state: State, force: Mapping[str, Tensor], rates: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
     """State of every point by contact, int8 (..., points); `force` (..., points, 2) [N] and the
-    `rates` of nodal pads (..., nodes, 2) [m/s] as a run records them.
+    `rates` of nodal pads (..., nodes, 2 fields) [m/s] as a run records them.
 
     The recorded forces say how fast condensed pads give way, so that nothing is solved for. A point
     without normal force is separated; one whose slip dissipates power slips.
@@ -134,7 +133,7 @@ def contact_states(
         own = rig.contacts_of(name)
         touched = {key: force[key][..., 0].flatten(0, -2).any(0).nonzero()[:, 0] for key in own}
         u = rig.displacement(name, state)
-        rate = rates[name] if pad.nodal else _rates(rig, name, touched, state, u, force)
+        rate = rates[name][..., :2] if pad.nodal else _rates(rig, name, touched, state, u, force)
         for key, which in touched.items():
             law, shape = rig.contacts[key].law, rig.shape_of(key)
             spread = pad.spread[which]

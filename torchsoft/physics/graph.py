@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from torchsoft.display import suggestion
-from torchsoft.physics.balance import Balance
+from torchsoft.physics.balance import Balance, Forces
 from torchsoft.physics.contact import (
     Frame,
     PointLaw,
@@ -24,6 +25,7 @@ from torchsoft.physics.contact import (
     relative_motion,
     turned,
 )
+from torchsoft.physics.elements import CORNERS
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import check_names
@@ -55,11 +57,18 @@ class Interface(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """The graph at one state: ports and junction flows by name, and the interfaces by contact."""
+    """The graph at one state: ports and junction flows by name, the interfaces by contact, and the
+    rates (..., nodes, 2 branches) [m/s] of a pad's relaxing branches."""
 
     ports: dict[str, Port]
     flows: dict[str, Tensor]
     interfaces: dict[str, Interface]
+    branches: dict[str, Tensor]
+
+    def pad_rates(self, name: str) -> Tensor:
+        """Rates (..., nodes, 2 fields) [m/s] of a nodal pad's displacements in its base's frame."""
+        u_dot = self.ports[f"pad_{name}"].transformer.flow(self.flows)
+        return torch.cat((u_dot, self.branches[name]), -1) if name in self.branches else u_dot
 
 
 class Graph(nn.Module):
@@ -267,7 +276,7 @@ class Graph(nn.Module):
         """Displacements of the nodes of a pad's state in its base's frame (..., nodes, 2) [m]."""
         pad, part = self.pads[name], state.pads[name]
         if pad.nodal:
-            return part
+            return part if pad.fields == 1 else part[..., :2]
         fractions, _ = pad.chain()
         return nodal(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
 
@@ -322,14 +331,13 @@ class Graph(nn.Module):
         effort = net_efforts(graph.ports, self.junctions)
         pads, rates = {}, {}
         for name, pad in self.pads.items():
-            u_dot = graph.ports[f"pad_{name}"].transformer.flow(graph.flows)
             if pad.inertial:
                 angle = self.base_motion(name, state)[0][..., 2]
                 rates[name] = (
                     turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
                 )
             if pad.nodal:
-                pads[name] = u_dot
+                pads[name] = graph.pad_rates(name)
             else:
                 f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.chain()
                 pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
@@ -386,7 +394,7 @@ class Graph(nn.Module):
         for name in self.bodies:
             flows[name] = state.velocity[name][..., None, :2]
             flows[f"{name}_spin"] = state.velocity[name][..., None, 2:]
-        ports, interfaces = {}, {}
+        ports, interfaces, branches = {}, {}, {}
         for name, pad in self.pads.items():
             own = self.contacts_of(name)
             r_B, v_B = self.base_motion(name, state)
@@ -398,6 +406,8 @@ class Graph(nn.Module):
                 u_dot = turned(flows[f"pad_{name}"] - base_rate, -angle)
             else:
                 u_dot = torch.zeros_like(u) if settled else self._rates(name, own, state, u)
+                if not settled and pad.fields > 1:
+                    branches[name] = self._branch_rates(name, state)
                 flows[f"pad_{name}"] = base_rate + turned(u_dot, angle)
             for key in own:
                 interfaces[key] = self._interface(key, state, u, u_dot, flows)
@@ -417,7 +427,7 @@ class Graph(nn.Module):
                 else self._left(name, own, ports, u, angle)
             )
             ports[f"pad_{name}"] = self._pad_port(name, effort, moment_arm, angle)
-        return Evaluation(ports | self._sources(state, signals), flows, interfaces)
+        return Evaluation(ports | self._sources(state, signals), flows, interfaces, branches)
 
     def point_inputs(
         self,
@@ -468,30 +478,48 @@ class Graph(nn.Module):
         pad = self.pads[name]
         law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
         if pad.nodal:
-            at, none = pad.at_corners(u), torch.zeros_like(u)
-            internal = lambda rate: pad.element_forces(at, rate)
-            balance = Balance(pad, internal, law if own else None)
-            try:
-                u_dot, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
-            except FloatingPointError:
-                raise RuntimeError(
-                    f"the massless pad `{name}` has no rates in this state; is an element inside "
-                    "out?"
-                ) from None
-            u_dot = balance.corrected(u_dot, factors)
-        else:
-            free, P = free_rates(pad, state.pads[name], 0.0)
-            with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
-                first = law(torch.zeros_like(pad.spread @ free))
-            F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
-            u_dot = free + nodal(P, F)
+            return self._field_rates(name, state, 0, law if own else None)
+        free, P = free_rates(pad, state.pads[name], 0.0)
+        with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
+            first = law(torch.zeros_like(pad.spread @ free))
+        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
+        self._check_rates(name, left)
+        return free + nodal(P, F)
+
+    def _branch_rates(self, name: str, state: State) -> Tensor:
+        """Rates (..., nodes, 2 branches) [m/s] of the relaxing branches of a nodal pad."""
+        numbers = range(1, self.pads[name].fields)
+        return torch.cat([self._field_rates(name, state, k) for k in numbers], -1)
+
+    def _field_rates(
+        self, name: str, state: State, field: int, law: Forces | None = None
+    ) -> Tensor:
+        """Rates (..., nodes, 2) [m/s] of one field of a massless nodal pad: of its nodes, field 0,
+        under the forces of a law of contact points, or of a branch. No dashpot is between two of
+        them."""
+        pad, part = self.pads[name], state.pads[name]
+        at, own = pad.at_corners(part), slice(CORNERS * field, CORNERS * (field + 1))
+        others = own.start, at.shape[-1] - own.stop
+        internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., own]
+        balance = Balance(pad, internal, law)
+        none = torch.zeros_like(part[..., :2])
+        try:
+            rate, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
+        except FloatingPointError:
+            raise RuntimeError(
+                f"the massless pad `{name}` has no rates in this state; is an element inside out?"
+            ) from None
+        self._check_rates(name, left)
+        return balance.corrected(rate, factors)
+
+    def _check_rates(self, name: str, left: float) -> None:
+        """Raises `RuntimeError` for rates of a massless pad with a residual [m/s]."""
         if not left <= 1e3 * RATE_TOLERANCE:
             raise RuntimeError(
                 f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s "
                 f"after {RATE_ITERATIONS} iterations; is v_s large enough for the pads' damping to "
                 "balance the fall of friction with slip?"
             )
-        return u_dot
 
     def _interface(
         self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]

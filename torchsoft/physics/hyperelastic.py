@@ -1,20 +1,33 @@
-"""Materials at finite strain: a strain energy W(F) of the deformation gradient, and one retardation
-time.
+"""Materials at finite strain: a strain energy W(F) of the deformation gradient, a retardation time,
+and relaxing branches.
 
 W is of a distortion and of a change of volume, kappa (J - 1)^2 / 2 with J = det F. Viscous stresses
 are those of a quadratic potential of the rates of J and of the distorted Cauchy-Green tensor, with
 the moduli of small strains times tau: no turning costs anything, what is dissipated is never
 negative, and small strains are those of `KelvinVoigt`.
+
+A branch adds the same energy, times E_i / E, of what has not relaxed: after a step of strain the
+stress is 1 + sum of E_i exp(-t / tau_i) / E times that of W, at first and at last exactly, between
+them as far as the strain is small (`physics/elements` has the equations).
 """
 
 from collections.abc import Iterable, Mapping
 from inspect import signature
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchsoft.physics.material import LINEAR, TERMS, KelvinVoigt, Material, OneTime, terms
+from torchsoft.physics.material import (
+    LINEAR,
+    GeneralisedKelvin,
+    KelvinVoigt,
+    Material,
+    OneTime,
+    creeping,
+    numbered,
+    pairs,
+)
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Density, Depth, Modulus, PoissonRatio, Quantity, Retardation
 
@@ -23,6 +36,11 @@ Coefficients = Annotated[
     Iterable[float], Quantity("Pa", -1e13, 1e13, "shear moduli, one per exponent, in sum positive")
 ]
 Exponents = Annotated[Iterable[float], Quantity("1", -50.0, 50.0, "exponents of the stretches")]
+Moduli = Annotated[
+    Iterable[float],
+    Quantity("Pa", 1.0, 1e13, "Young's moduli at small strains that fade, one per time"),
+]
+Times = Annotated[Iterable[float], Quantity("s", 1e-9, 1e6, "relaxation times, no two equal")]
 
 ALIKE = 1e-6
 """Largest relative difference between the moduli that a material states and those of its energy,
@@ -37,11 +55,43 @@ class Hyperelastic(OneTime):
     """Interface of a material at finite strain, W(F) = `distortion`(F) + `dilatation`(det F); E and
     nu are the moduli of small strains.
 
+    Relaxing branches have `moduli` E_i [Pa], by which the modulus of small strains is higher at
+    first, and relaxation `times` tau_i [s]; parameters are called E_1, tau_1 and so on. The
+    retardation time tau [s] is that of the relaxed energy. Raises `ValueError` unless there are as
+    many moduli as times.
+
     A material of one's own gives `distortion`, for example a network of `invariants`, without
     stress at F = 1 and with the shear modulus E / (2 (1 + nu)) there. What depends on the volume
     should stand in `dilatation`, which elements take at their centre: elsewhere it makes nearly
     incompressible elements too stiff.
     """
+
+    lists: ClassVar[Mapping[str, str]] = {"E": "moduli", "tau": "times"}
+
+    def __init__(
+        self, E: Modulus | None, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth,
+        moduli: Moduli = (), times: Times = (),
+    ) -> None:  # fmt: skip
+        super().__init__(E, nu, rho, tau, depth)
+        self.relaxing = numbered(self, "a relaxing energy", self.lists, moduli, times, least=0)
+
+    def relaxation(self) -> list[tuple[Tensor, Tensor]]:
+        """Of every branch the modulus over the relaxed one [1], and the relaxation time [s]."""
+        return [(E / self.E, tau) for E, tau in pairs(self, self.relaxing, *self.lists)]
+
+    def chain(self) -> tuple[Tensor, Tensor]:
+        """The chain of small strains."""
+        if not self.relaxing:
+            return super().chain()
+        shares, times = (torch.stack(part) for part in zip(*self.relaxation()))
+        times, order = times.sort()
+        first = self.tau[None]
+        w = torch.cat((first, shares[order] * times))
+        return creeping(w, torch.cat((torch.zeros_like(first), times)))
+
+    @property
+    def branches(self) -> int:
+        return 1 + self.relaxing
 
     def distortion(self, F: Tensor) -> Tensor:
         """Strain energy (...) [J/m3] of the distortion by F (..., 3, 3), in plane strain: F_zz = 1,
@@ -67,10 +117,13 @@ class Hyperelastic(OneTime):
         """Bulk modulus [Pa] of small strains."""
         return 2 * self.shear * (1 + self.nu) / (3 * (1 - 2 * self.nu))
 
-    def linear(self) -> KelvinVoigt:
+    def linear(self) -> KelvinVoigt | GeneralisedKelvin:
         """The material at small strains, as it is now."""
-        numbers = (self.E, self.nu, self.rho, self.tau, self.depth)
-        return KelvinVoigt(*(float(x.detach()) for x in numbers))
+        E, nu, rho, depth = (x.item() for x in (self.E, self.nu, self.rho, self.depth))
+        J, (first, *tau) = (x.tolist() for x in self.chain())
+        if not tau:
+            return KelvinVoigt(E, nu, rho, first, depth)
+        return GeneralisedKelvin(E, nu, rho, depth, J[1:], tau, first)
 
     def well_posed(self) -> str:
         with torch.enable_grad():
@@ -81,6 +134,9 @@ class Hyperelastic(OneTime):
             (P,) = torch.autograd.grad(self.energy(F), F, create_graph=True)
             if float(P.detach().abs().max()) > ALIKE * shear:
                 return "the energy has a stress without strain; make its slope zero at F = 1"
+            times = [tau.item() for _, tau in self.relaxation()]
+            if len(set(times)) < len(times):
+                return "two relaxation times are equal"
             found = {}
             for name, (i, j) in {"xx": (0, 0), "xy": (0, 1)}.items():
                 (row,) = torch.autograd.grad(P[i, j], F, retain_graph=True)
@@ -99,9 +155,10 @@ class NeoHookean(Hyperelastic):
     """W = mu (I1 - 3) / 2 of the distortion's first invariant, mu = E / (2 (1 + nu))."""
 
     def __init__(
-        self, E: Modulus, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth
-    ) -> None:
-        super().__init__(E, nu, rho, tau, depth)
+        self, E: Modulus, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth,
+        moduli: Moduli = (), times: Times = (),
+    ) -> None:  # fmt: skip
+        super().__init__(E, nu, rho, tau, depth, moduli, times)
 
     def distortion(self, F: Tensor) -> Tensor:
         I1, _, _ = invariants(F)
@@ -123,9 +180,9 @@ class MooneyRivlin(_ByShear):
 
     def __init__(
         self, C10: Coefficient, C01: Coefficient, nu: PoissonRatio, rho: Density, tau: Retardation,
-        depth: Depth,
+        depth: Depth, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
-        super().__init__(None, nu, rho, tau, depth)
+        super().__init__(None, nu, rho, tau, depth, moduli, times)
         self.C10, self.C01 = parameter(C10), parameter(C01)
 
     @property
@@ -143,9 +200,9 @@ class Yeoh(_ByShear):
 
     def __init__(
         self, C10: Coefficient, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth,
-        C20: Coefficient = 0.0, C30: Coefficient = 0.0,
+        C20: Coefficient = 0.0, C30: Coefficient = 0.0, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
-        super().__init__(None, nu, rho, tau, depth)
+        super().__init__(None, nu, rho, tau, depth, moduli, times)
         self.C10, self.C20, self.C30 = (parameter(x) for x in (C10, C20, C30))
 
     @property
@@ -168,26 +225,17 @@ class Ogden(_ByShear):
 
     def __init__(
         self, mu: Coefficients, alpha: Exponents, nu: PoissonRatio, rho: Density, tau: Retardation,
-        depth: Depth,
+        depth: Depth, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
-        super().__init__(None, nu, rho, tau, depth)
-        one, other = terms("mu", mu), terms("alpha", alpha)
-        if len(one) != len(other) or not 1 <= len(one) <= TERMS:
-            raise ValueError(
-                f"Ogden's energy needs as many `mu` as `alpha`, from 1 to {TERMS}, but has "
-                f"{len(one)} and {len(other)}"
-            )
-        if 0.0 in other:
+        super().__init__(None, nu, rho, tau, depth, moduli, times)
+        own = {"mu": "mu", "alpha": "alpha"}
+        self.terms = numbered(self, "Ogden's energy", own, mu, alpha)
+        if any(exponent.item() == 0.0 for _, exponent in self.series()):
             raise ValueError("an exponent `alpha` is zero; leave that term out")
-        self.terms = len(one)
-        for k, (modulus, exponent) in enumerate(zip(one, other), 1):
-            self.register_parameter(f"mu_{k}", parameter(modulus))
-            self.register_parameter(f"alpha_{k}", parameter(exponent))
 
     def series(self) -> list[tuple[Tensor, Tensor]]:
         """Moduli [Pa] and exponents."""
-        numbers = range(1, self.terms + 1)
-        return [(getattr(self, f"mu_{k}"), getattr(self, f"alpha_{k}")) for k in numbers]
+        return [(mu, alpha) for mu, alpha in pairs(self, self.terms, "mu", "alpha")]
 
     @property
     def shear(self) -> Tensor:
@@ -253,14 +301,17 @@ def described(material: Material) -> dict[str, Any] | None:
     kind = next((name for name, own in KINDS.items() if type(material) is own), None)
     if kind is None:
         return None
-    numbers: dict[str, Any] = {}
+    numbers, lists = dict[str, Any](), dict[tuple[str, str], Any]()
     if isinstance(material, Ogden):
-        columns = zip(*material.series())
-        numbers |= zip(("mu", "alpha"), ([x.item() for x in column] for column in columns))
+        lists["mu", "alpha"] = material.series()
+    if isinstance(material, Hyperelastic):
+        lists["moduli", "times"] = pairs(material, material.relaxing, *material.lists)
+    for names, rows in lists.items():
+        numbers |= {name: [row[i].item() for row in rows] for i, name in enumerate(names)}
     for name in signature(KINDS[kind]).parameters:
         if name not in numbers:
             numbers[name] = getattr(material, name).item()
-    return {"kind": kind, **numbers}
+    return {"kind": kind, **{name: value for name, value in numbers.items() if value != []}}
 
 
 def again(described: Mapping[str, Any]) -> Any:

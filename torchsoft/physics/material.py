@@ -6,7 +6,7 @@ part of the nodal forces that has set in, tau_b z_b' + z_b = f.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
@@ -57,6 +57,8 @@ class Material(nn.Module):
 
     E: Tensor
     added: Sequence[Branch]
+    lists: ClassVar[Mapping[str, str]] = {}
+    """Parameters of which there are several, E_1, E_2, ..., and the argument that has them all."""
 
     def __init__(self, E: Modulus | None, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         """E is None where a material makes it of other numbers."""
@@ -157,41 +159,24 @@ class StandardLinearSolid(Material):
 
 
 class Series(Material):
-    """A material of any number of terms, each a strength and a time: scalar parameters <symbol>_1,
-    tau_1, <symbol>_2, ...
+    """A material of any number of terms, each a strength and a time, as its `lists` call them.
 
     An instantaneous spring stands before them in the chain, with the retardation time tau_instant
     [s], below every tau. Raises `ValueError` unless there are as many strengths as times, and at
     least one.
     """
 
-    symbol = strength = ""
-    """Names of a strength's parameters, and of the constructor's argument."""
-
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, strengths: Iterable[float],
         tau: Retardations, tau_instant: InstantRetardation,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
-        one, other = terms(self.symbol, strengths), terms("tau", tau)
-        if len(one) != len(other) or not 1 <= len(one) <= TERMS:
-            raise ValueError(
-                f"a series needs as many `{self.strength}` as `tau`, from 1 to {TERMS}, but has "
-                f"{len(one)} and {len(other)}"
-            )
-        self.terms = len(one)
-        for k, (strength, time) in enumerate(zip(one, other), 1):
-            self.register_parameter(f"{self.symbol}_{k}", parameter(strength))
-            self.register_parameter(f"tau_{k}", parameter(time))
+        self.terms = numbered(self, "a series", self.lists, strengths, tau)
         self.tau_instant = parameter(tau_instant)
 
     def series(self) -> tuple[Tensor, Tensor]:
         """Strengths and times [s] of the terms, (terms,) each."""
-        numbers = range(1, self.terms + 1)
-        one, other = (
-            tuple(getattr(self, f"{symbol}_{k}") for k in numbers)
-            for symbol in (self.symbol, "tau")
-        )
+        one, other = zip(*pairs(self, self.terms, *self.lists))
         return torch.stack(one), torch.stack(other)
 
     def well_posed(self) -> str:
@@ -213,7 +198,7 @@ class GeneralisedKelvin(Series):
     Parameters are called J_1, tau_1 and so on.
     """
 
-    symbol = strength = "J"
+    lists: ClassVar[Mapping[str, str]] = {"J": "J", "tau": "tau"}
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, J: Fractions,
@@ -243,7 +228,7 @@ class Prony(Series):
     but for the instantaneous spring, which takes tau_instant [s] to give way.
     """
 
-    symbol, strength = "E", "moduli"
+    lists: ClassVar[Mapping[str, str]] = {"E": "moduli", "tau": "tau"}
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, moduli: Moduli,
@@ -273,17 +258,8 @@ class Prony(Series):
 def retarded(m: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     """Fractions J (n + 1,) [1] of the relaxed compliance, which sum to one, and retardation times
     tau (n,) [s] of the solid with moduli E m (n,), m > 0, and distinct relaxation times t (n,) [s];
-    J[0] is the instantaneous spring's.
-
-    With E(t) = E (1 + sum of m_i exp(-t / t_i)) stress over strain is E (1 + sum of m_i s t_i / (1
-    + s t_i)) at a complex frequency s. Its zeros s = -1/tau are the rates of creep: tau are the
-    roots of 1 = sum of m_i t_i / (tau - t_i), the eigenvalues of diag(t) + v v^T with v_i^2 = m_i
-    t_i. Each lies above its own relaxation time and below the next one.
-
-    The roots come from LAPACK's secular equation, with the distances tau - t_i to full relative
-    precision, whatever decades the times span; one Newton step with the gradient on makes their
-    derivative the implicit function theorem's (so a second derivative is not exact). Raises
-    `ValueError` for moduli or times that are not positive, and equal times.
+    J[0] is the instantaneous spring's. Raises `ValueError` for moduli or times that are not
+    positive, and equal times.
     """
     t, order = t.sort()
     if not (bool((m > 0).all()) and bool((t > 0).all()) and bool((t.diff() > 0).all())):
@@ -291,22 +267,40 @@ def retarded(m: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
             "a relaxation series needs positive moduli and positive times, no two of them equal"
         )
     m = m[order]
-    with torch.no_grad():
-        apart = distances(m, t)  # tau_k - t_i
-        slope = (m * t / apart**2).sum(-1)
-        roots = t + apart.diagonal()
-    apart = apart - (t - t.detach())
-    step = ((m * t / apart).sum(-1) - 1) / slope
-    tau, apart = roots + step, apart + step[:, None]
-    J = 1 / (tau * (m * t / apart**2).sum(-1))
+    J, tau = creeping(m * t, t)
     return torch.cat((1 / (1 + m.sum())[None], J)), tau
 
 
-def distances(m: Tensor, t: Tensor) -> Tensor:
+def creeping(w: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Fractions J (n,) [1] of the relaxed compliance and retardation times tau (n,) [s] of the
+    solid with relaxation times t (n,) [s] that increase, and moduli over the relaxed one that are w
+    / t, w > 0; a time of zero is that of a dashpot with the retardation time w [s] beside the
+    relaxed spring.
+
+    Stress over strain is E (1 + sum of s w_i / (1 + s t_i)) at a complex frequency s. Its zeros s =
+    -1/tau are the rates of creep: tau are the roots of 1 = sum of w_i / (tau - t_i), the
+    eigenvalues of diag(t) + v v^T with v_i^2 = w_i. Each lies above its own relaxation time and
+    below the next one.
+
+    The roots come from LAPACK's secular equation, with the distances tau - t_i to full relative
+    precision, whatever decades the times span; one Newton step with the gradient on makes their
+    derivative the implicit function theorem's (so a second derivative is not exact).
+    """
+    with torch.no_grad():
+        apart = distances(w, t)  # tau_k - t_i
+        slope = (w / apart**2).sum(-1)
+        roots = t + apart.diagonal()
+    apart = apart - (t - t.detach())
+    step = ((w / apart).sum(-1) - 1) / slope
+    tau, apart = roots + step, apart + step[:, None]
+    return 1 / (tau * (w / apart**2).sum(-1)), tau
+
+
+def distances(w: Tensor, t: Tensor) -> Tensor:
     """tau_k - t_i (n, n) [s] for increasing times t (n,)."""
     if len(t) == 1:
-        return (m * t)[:, None]
-    v, d = (m * t).sqrt().numpy(), t.sqrt().numpy()
+        return w[:, None]
+    v, d = w.sqrt().numpy(), t.sqrt().numpy()
     size = float(np.linalg.norm(v))
     rows = []
     for k in range(len(d)):
@@ -314,6 +308,31 @@ def distances(m: Tensor, t: Tensor) -> Tensor:
         assert not failed
         rows.append(-minus * plus)
     return torch.from_numpy(np.stack(rows))
+
+
+def numbered(
+    module: nn.Module, what: str, lists: Mapping[str, str], *given: Iterable[float], least: int = 1
+) -> int:
+    """Give a module the parameters <symbol>_1, <symbol>_2, ... of two lists, which arguments call
+    as `lists` says; returns their length. Raises `ValueError` unless they are as long as each
+    other, with at least so many entries."""
+    one, other = (terms(symbol, values) for symbol, values in zip(lists, given))
+    if len(one) != len(other) or not least <= len(one) <= TERMS:
+        names = " as ".join(f"`{name}`" for name in lists.values())
+        raise ValueError(
+            f"{what} needs as many {names}, from {least} to {TERMS}, but has {len(one)} and "
+            f"{len(other)}"
+        )
+    for k, values in enumerate(zip(one, other), 1):
+        for symbol, value in zip(lists, values):
+            module.register_parameter(f"{symbol}_{k}", parameter(value))
+    return len(one)
+
+
+def pairs(module: nn.Module, count: int, *symbols: str) -> list[tuple[Tensor, ...]]:
+    """The parameters that `numbered` gave, one of each symbol a number."""
+    numbers = range(1, count + 1)
+    return [tuple(getattr(module, f"{symbol}_{k}") for symbol in symbols) for k in numbers]
 
 
 def terms(name: str, values: Iterable[float]) -> list[float]:

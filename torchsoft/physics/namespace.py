@@ -21,9 +21,10 @@ OF_CONTACT = (
     "{}_state", "{}_point",
 )  # fmt: skip
 OF_PAD = (
-    "displacement_{}", "velocity_{}", "nodal_force_{}", "mesh_nodes_{}", "mesh_elements_{}",
-    "mesh_bonded_{}", "mesh_face_{}", "energy_strain_{}", "energy_kinetic_{}", "dissipated_pad_{}",
-    "{}_node", "{}_branch", "{}_mesh_node", "{}_element", "{}_face",
+    "displacement_{}", "velocity_{}", "nodal_force_{}", "relaxing_{}", "mesh_nodes_{}",
+    "mesh_elements_{}", "mesh_bonded_{}", "mesh_face_{}", "energy_strain_{}",
+    "energy_kinetic_{}", "dissipated_pad_{}", "{}_node", "{}_branch", "{}_mesh_node", "{}_element",
+    "{}_face",
 )  # fmt: skip
 OF_BODY = "outline_{}", "energy_{}", "energy_{}_spin", "supplied_drive_{}", "{}_outline"
 OF_RIG = (

@@ -3,7 +3,7 @@
 Displacements are in the frame of the base, which turns with it. A condensed pad is linear and
 massless: its state are the parts z_b (nodes, 2) [N] of its nodal forces that have set in, branch by
 branch of its material's chain. A nodal pad, at finite strain or inertial, has the displacements of
-its nodes, and with inertia their velocities.
+its nodes, beside them those of its relaxing branches, and with inertia the nodes' velocities.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -160,9 +160,14 @@ class Pad(nn.Module):
 
     @property
     def state_shape(self) -> tuple[int, ...]:
-        """Shape of the pad's part of the state: displacements (nodes, 2), or forces that have set
-        in (branches, nodes, 2)."""
-        return (self.nodes, 2) if self.nodal else (self.branches, self.nodes, 2)
+        """Shape of the pad's part of the state: displacements of all fields (nodes, 2 fields), or
+        forces that have set in (branches, nodes, 2)."""
+        return (self.nodes, 2 * self.fields) if self.nodal else (self.branches, self.nodes, 2)
+
+    @property
+    def fields(self) -> int:
+        """Displacements of a nodal pad's nodes: their own, and those of every relaxing branch."""
+        return self.branches if isinstance(self.material, Hyperelastic) else 1
 
     def placed(self, own: Array) -> Array:
         """Places (..., 2) in the pad's own frame, in the base's."""
@@ -211,11 +216,12 @@ class Pad(nn.Module):
 
     def check_chain(self, name: str) -> None:
         """Raises `NotImplementedError` naming the nodal pad for a material with several retardation
-        times."""
-        if self.nodal and self.branches != 1:
+        times, unless it is massless and at finite strain with branches of its own."""
+        count = self.branches if self.inertial else 1 + len(self.material.added)
+        if self.nodal and count != 1:
             raise NotImplementedError(
                 f"the pad `{name}` needs a material of one retardation time, being "
-                f"{'inertial' if self.inertial else 'at finite strain'}, but has {self.branches}; "
+                f"{'inertial' if self.inertial else 'at finite strain'}, but has {count}; "
                 "take a massless pad of a linear material"
             )
 
@@ -223,7 +229,8 @@ class Pad(nn.Module):
         """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
         elements of its chain, or of its strain energy W."""
         if isinstance(self.material, Hyperelastic):
-            return f"C: W_{name}", f"R: R_{name}"
+            own = name if self.fields == 1 else f"{name},0..{self.fields - 1}"
+            return f"C: W_{own}", f"R: R_{own}"
         own = name if self.branches == 1 else f"{name},1..{self.branches}"
         return f"C: [K_{own}]^-1", f"R: [R_{own}]"
 
@@ -233,17 +240,25 @@ class Pad(nn.Module):
         return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
 
     def factors(self) -> Tensor:
-        """Numbers (4,) of the elements besides the material's energy, as `element_potentials` has
-        them."""
-        material, (_, times) = self.material, self.chain()
+        """Numbers (4 + 2 branches,) of the elements besides the material's energy, as
+        `element_potentials` has them."""
+        material, branches = self.material, list[tuple[Tensor, Tensor]]()
+        if isinstance(material, Hyperelastic):
+            tau, branches = material.tau, material.relaxation()
+        else:
+            tau = material.chain()[1][0]
+        if self.tau_ratio is not None:
+            tau, branches = self.tau_ratio * tau, [(m, self.tau_ratio * t) for m, t in branches]
         depth = material.depth if self.E_ratio is None else self.E_ratio * material.depth
-        return torch.stack((depth, times[0], *lame_moduli(material.E, material.nu)))
+        arms = [number for branch in branches for number in branch]
+        return torch.stack((depth, tau, *lame_moduli(material.E, material.nu), *arms))
 
     def at_corners(self, x: Tensor) -> Tensor:
-        """Nodal vectors (..., nodes, 2) at the corners of the elements (..., elements, 8), zero
-        where they are bonded."""
+        """Nodal vectors (..., nodes, 2 fields) at the corners of the elements (..., elements, 8
+        fields), field by field, zero where they are bonded."""
         held, dofs = torch.from_numpy(self.corners < 0), torch.from_numpy(self.corners.clip(0))
-        return torch.where(held, 0.0, x.flatten(-2)[..., dofs])
+        own = [torch.where(held, 0.0, one.flatten(-2)[..., dofs]) for one in x.split(2, -1)]
+        return own[0] if len(own) == 1 else torch.cat(own, -1)
 
     def from_corners(self, f: Tensor) -> Tensor:
         """Sum (..., nodes, 2) of vectors at the corners of the elements (..., elements, 8)."""
@@ -254,14 +269,14 @@ class Pad(nn.Module):
 
     def element_inputs(self, u: Tensor, rate: Tensor) -> tuple[Material, Tensor, Tensor]:
         """Arguments of the laws of a nodal pad's elements, with displacements and rates (...,
-        elements, 8) at their corners."""
+        elements, 8 fields) at their corners; without those of branches these have relaxed."""
         constants = torch.from_numpy(self.constants).expand(*u.shape[:-1], -1)
         inputs = torch.cat((u, rate, constants), -1)
         return self.material, self.factors(), inputs
 
     def element_forces(self, u: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Forces (..., elements, 8) [N] on the corners of a nodal pad's elements, by default at
-        rest."""
+        """Forces (..., elements, 8 fields) [N] on the corners of a nodal pad's elements, by default
+        at rest."""
         u, still = torch.broadcast_tensors(u, torch.zeros_like(u) if rate is None else rate)
         recorded = torch.is_grad_enabled()
         with torch.enable_grad():
@@ -279,13 +294,13 @@ class Pad(nn.Module):
         return force
 
     def internal_force(self, u: Tensor, rate: Tensor) -> Tensor:
-        """Forces of a nodal pad (..., nodes, 2) [N] at displacements u (..., nodes, 2) [m] and
+        """Forces of an inertial pad (..., nodes, 2) [N] at displacements u (..., nodes, 2) [m] and
         their rates [m/s]."""
         return self.from_corners(self.element_forces(self.at_corners(u), self.at_corners(rate)))
 
     def strain_energy(self, u: Tensor) -> Tensor:
-        """Energy (...) [J] of a nodal pad at displacements u (..., nodes, 2) [m]. Its graph is made
-        when it is asked for, some samples at a time: that of a long run would not fit."""
+        """Energy (...) [J] of a nodal pad at displacements u (..., nodes, 2 fields) [m]. Its graph
+        is made when it is asked for, some samples at a time: that of a long run would not fit."""
 
         def own(u: Tensor) -> Tensor:
             at = self.at_corners(u)

@@ -14,7 +14,8 @@ class State(NamedTuple):
     units.
 
     pads: of condensed pads the nodal forces that have set in (..., branches, nodes, 2) [N], of
-    nodal pads the displacements (..., nodes, 2) [m]; stretch: of contacts (..., points); pose,
+    nodal pads the displacements (..., nodes, 2 fields) [m], those of relaxing branches beside the
+    nodes' own; stretch: of contacts (..., points); pose,
     velocity: of bodies (..., 3), x, y and theta, those that are fixed or driven included; rates:
     velocities of inertial pads' nodes (..., nodes, 2), absolute; friction: of contacts whose law of
     friction has states of its own (..., states, points).

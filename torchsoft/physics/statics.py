@@ -4,7 +4,7 @@ balance on them.
 Without rates all branches of a condensed pad carry the contact force itself, z_b = f, and its
 displacements are u = C f. At the contact points that is u = A f(u), with A the pad's compliance
 from point to point and f the contact law, without any rate, at the bodies' given poses and the
-points' given stretches. A nodal pad's elements are in balance with f(u).
+points' given stretches. A nodal pad's elements are in balance with f(u), its branches relaxed.
 """
 
 import math
@@ -114,7 +114,7 @@ def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, i
 
 def carried(rig: Graph, name: str, state: State, known: dict[str, Tensor] | None = None) -> Tensor:
     """A pad's part of the state at rest, by semi-smooth Newton from the undeformed pad: its nodes'
-    displacements (..., nodes, 2) [m], or the forces on them (..., branches, nodes, 2) [N].
+    displacements (..., nodes, 2 fields) [m], or the forces on them (..., branches, nodes, 2) [N].
 
     Batch dimensions of `state` hold copies of one state: one backward pass then gives as many rows
     of a Jacobian. A nodal pad is sought from the displacements that `known` holds of a state
@@ -137,7 +137,9 @@ def carried(rig: Graph, name: str, state: State, known: dict[str, Tensor] | None
             f"the pad `{name}` does not settle (residual {left:.2g} m after {SETTLING} "
             "iterations); is a body deep in it, or are the stretches large?"
         )
-    return found if pad.nodal else found[..., None, :, :].expand(*batch, pad.branches, -1, -1)
+    if pad.nodal:
+        return torch.cat([found] * pad.fields, -1)
+    return found[..., None, :, :].expand(*batch, pad.branches, -1, -1)
 
 
 def displaced(

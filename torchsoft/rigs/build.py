@@ -15,7 +15,6 @@ from torch import nn
 from torchsoft.display import Shown, suggestion
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.graph import Graph
-from torchsoft.physics.material import Series
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.names import check_names
@@ -666,9 +665,9 @@ def own_name(file: RigFile, rig: Rig, group: str, part: str = "", *rest: str) ->
     if group == "pads" and rest[:1] == ("material",):
         material = rig.pads[part].material
         group, part, rest = "materials", file.pads[part].material, rest[1:]
-        if isinstance(material, Series):
-            last = re.sub(rf"^{material.symbol}(?=_\d)", material.strength, rest[-1])
-            rest = (*rest[:-1], last)
+        symbol, _, number = rest[-1].rpartition("_")
+        if symbol in material.lists and number.isdigit():
+            rest = (*rest[:-1], f"{material.lists[symbol]}_{number}")
     elif group == "contacts" and rest[:1] == ("law",):
         group, part, rest = "laws", file.contacts[part].law, rest[1:]
     elif part in made:

@@ -181,13 +181,14 @@ def cost(file: RigFile, runs: bool) -> Cost:
         for mesh, table in zip(meshes, file.pads.values()):
             material = file.materials[table.material].build(file.folder)
             finite = isinstance(material, Hyperelastic)
+            fields = material.branches if finite else 1
             nodal = table.inertial or finite
             surface, free, _ = mesh.counts()
             points = table.points * surface
-            seconds += 0.5 * steps * step_time(surface, points, free if nodal else 0, finite)
-            memory += (
-                span / file.outputs.interval * row_bytes(free if nodal else surface, points) / 2**30
-            )
+            own = step_time(surface, points, free if nodal else 0, finite, fields)
+            seconds += 0.5 * steps * own
+            nodes = fields * free if nodal else surface
+            memory += span / file.outputs.interval * row_bytes(nodes, points) / 2**30
     return Cost(steps, seconds, memory)
 
 

@@ -96,6 +96,10 @@ def add_results(run: Trajectory, add: Add) -> None:
         if key in run.state.rates:
             meaning = f"velocities of the nodes of the pad {key}"
             add(f"velocity_{key}", ("time", *nodes), run.state.rates[key], "m/s", meaning)
+        elif run.setup.pads[key].nodal and run.state.pads[key].shape[-1] > 2:
+            meaning = f"displacements of the relaxing branches of the pad {key}"
+            v = run.state.pads[key][..., 2:].unflatten(-1, (-1, 2)).movedim(-2, 1)
+            add(f"relaxing_{key}", ("time", f"{key}_branch", *nodes), v, "m", meaning)
         elif not run.setup.pads[key].nodal:
             meaning = f"nodal forces of the pad {key} that have set in, by retardation time"
             where = ("time", f"{key}_branch", *nodes)
@@ -234,6 +238,10 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
         name: displacement[name] if pad.nodal else of(f"nodal_force_{name}")
         for name, pad in setup.pads.items()
     }
+    for name in pads:
+        if f"relaxing_{name}" in data:
+            v = of(f"relaxing_{name}").movedim(1, -2).flatten(-2)
+            pads[name] = torch.cat((pads[name], v), -1)
     rates = by("velocity", [name for name, pad in setup.pads.items() if pad.inertial])
     friction = by("friction_state", [name for name in contacts if f"friction_state_{name}" in data])
     state = State(pads, by("stretch", contacts), pose, rates, velocity, friction)

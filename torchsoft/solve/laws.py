@@ -292,18 +292,21 @@ def element(material: Material, factors: Factors, x: Tensor) -> Tensor:
     return element_potentials(material, factors.values, x)
 
 
-def element_law(name: str, material: Material, factors: Tensor) -> tuple[Law, dict[str, Tensor]]:
-    """The law of the elements of the pad called `name`, and its parameters.
+def element_law(
+    name: str, material: Material, factors: Tensor, fields: int
+) -> tuple[Law, dict[str, Tensor]]:
+    """The law of the elements of the pad called `name`, of at least so many fields as it has, and
+    its parameters.
 
     Raises `UnknownOperation` for an energy that cannot be compiled, with the pad's name.
     """
     own = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
     parameters: dict[str, Tensor] = {f"material.{key}": value for key, value in own.items()}
     parameters["factors.values"] = factors
-    size = 2 * CORNERS + CONSTANTS
+    corners = CORNERS * fields
     try:
         law = compiled_law(
-            parameters, element, size, CORNERS, 2 * CORNERS, conjugates=CORNERS,
+            parameters, element, 2 * corners + CONSTANTS, corners, 2 * corners, conjugates=corners,
             lanes=LANES, material=material, factors=Factors(factors),
         )  # fmt: skip
     except UnknownOperation as error:

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from torchsoft.codegen import Law
 from torchsoft.physics.contact import Friction, SoftContact
-from torchsoft.physics.elements import CONSTANTS
+from torchsoft.physics.elements import CONSTANTS, CORNERS
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
-from torchsoft.physics.mesh import dofs_of
+from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.rig import Rig
@@ -160,7 +160,9 @@ class Model:
         parts = self._bodies, self._make_sources(), self._pads, self._make_condensed()
         self._parts = *parts, self._make_nodal(), *self._make_contacts()
         self.index = torch.tensor(self._index, dtype=torch.int64)
-        self.nodal = {name: 2 * pad.nodes for name, pad in rig.pads.items() if pad.nodal}
+        self.nodal = {
+            name: 2 * pad.fields * pad.nodes for name, pad in rig.pads.items() if pad.nodal
+        }
         points = [2 * count for count in rig.point_counts.values()]
         self.felt = [*points, 3 * len(rig.pads), 3 * len(rig.bodies) + 3]
         self._chains = [
@@ -286,14 +288,17 @@ class Model:
         """Elements of the pads that are not condensed."""
         rig, slices = self.rig, self.layout.slices
         pads = [pad if pad.nodal else None for pad in rig.pads.values()]
-        dofs = [0 if pad is None else 2 * pad.nodes for pad in pads]
-        band = [0 if pad is None else 2 * spread(pad.corners // 2) + 1 for pad in pads]
+        dofs = [0 if pad is None else 2 * pad.fields * pad.nodes for pad in pads]
+        numbers = [None if pad is None else field_dofs(pad) for pad in pads]
+        band = [0 if dof is None else spread(dof) for dof in numbers]
+        fields = max((pad.fields for pad in rig.pads.values() if pad.nodal), default=1)
         elements = [0 if pad is None else -(-len(pad.corners) // LANES) * LANES for pad in pads]
         laws, starts, ends, density = list[Law | None](), list[int](), list[int](), list[int]()
         for name, pad in rig.pads.items():
             law, parameters = None, dict[str, Tensor]()
             if pad.nodal:
-                law, parameters = element_law(name, pad.material, self._made["factors", name])
+                factors = self._made["factors", name]
+                law, parameters = element_law(name, pad.material, factors, fields)
             laws.append(law)
             starts.append(self._add(*parameters.values()))
             ends.append(len(self._index))
@@ -304,7 +309,7 @@ class Model:
         surface = [
             np.full(2 * len(pad.mesh.surface), -1)
             if not pad.nodal
-            else dofs_of(pad.surface.numpy())
+            else (2 * pad.fields * pad.surface.numpy()[:, None] + np.arange(2)).ravel()
             for pad in rig.pads.values()
         ]
         address = lambda name: [0 if law is None else getattr(law, name) for law in laws]
@@ -319,9 +324,12 @@ class Model:
             value=address("value"), linearise=address("linearise"), pullback=address("pullback"),
             push=address("push"),
             p_first=starts, p_last=ends,
-            X=joined(lambda pad: pad.positions.numpy().ravel()),
-            area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2)),
-            dof=joined(lambda pad: lengthened(pad.corners, -1), 8),
+            X=joined(lambda pad: np.tile(pad.positions.numpy(), pad.fields).ravel()),
+            area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2 * pad.fields)),
+            dof=np.concatenate([np.zeros((0, CORNERS * fields)), *(
+                filled_up(lengthened(dof, -1), CORNERS * fields) for dof in numbers
+                if dof is not None
+            )]),
             constants=joined(lambda pad: lengthened(pad.constants, 0.0), CONSTANTS),
             surface=np.concatenate([np.zeros(0), *surface]),
         )  # fmt: skip
@@ -425,14 +433,27 @@ class Model:
         )  # fmt: skip
 
 
+def field_dofs(pad: Pad) -> Index:
+    """Dofs of the corners of every element of a nodal pad (elements, 8 fields), field by field, -1
+    where they are bonded. A node's are side by side."""
+    node, axis = np.divmod(pad.corners, 2)
+    numbers = [2 * (pad.fields * node + k) + axis for k in range(pad.fields)]
+    return np.concatenate([np.where(pad.corners < 0, -1, own) for own in numbers], 1)
+
+
 def lengthened(rows: Any, value: float) -> Any:
     """Rows of a pad's elements, with rows of one value up to a multiple of `LANES`."""
     more = -len(rows) % LANES
     return np.concatenate((rows, np.full((more, rows.shape[1]), value, rows.dtype)))
 
 
+def filled_up(rows: Index, width: int) -> Index:
+    """Rows with -1 after their entries, up to a width."""
+    return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=-1)
+
+
 def spread(corners: Index) -> int:
-    """Largest difference between the nodes of one element, bonded ones (below zero) apart."""
+    """Largest difference between the dofs of one element, bonded ones (below zero) apart."""
     free = corners >= 0
     most = np.where(free, corners, -1).max(1) - np.where(free, corners, corners.max()).min(1)
     return int(most.max())

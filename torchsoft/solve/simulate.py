@@ -381,7 +381,8 @@ class _Rest:
     def rates(self) -> dict[str, Tensor]:
         nodal = self._model.nodal
         parts = torch.from_numpy(self._out.rate[: self._count]).split([*nodal.values()], -1)
-        return {name: x.unflatten(-1, (-1, 2)) for name, x in zip(nodal, parts)}
+        pads = self._model.rig.pads
+        return {name: x.unflatten(-1, (pads[name].nodes, -1)) for name, x in zip(nodal, parts)}
 
     def _integrals(self, names: Iterable[str]) -> dict[str, Tensor]:
         every, rows = self._model.integrals.names, torch.from_numpy(self._out.integrals)

@@ -46,9 +46,10 @@ but the powers are differentiated, by the motion and by s*."""
 CONDENSED, NODAL = range(2)
 """Kinds of pads: condensed onto its surface, or with the displacements of all of its nodes."""
 
-CORNERS = 8
-"""Displacements of the four corners of an element: its law has them, their rates and the element's
-constants as inputs, and as outputs the forces on them and the power that it dissipates."""
+FIELD = 8
+"""Displacements of the four corners of an element in one field: its law has those of as many fields
+as any pad of the rig has, their rates and the element's constants as inputs, and as outputs the
+forces on them and the power that it dissipates."""
 
 LANES = 4
 """Elements whose law is called at once."""
@@ -114,9 +115,9 @@ class Nodal(NamedTuple):
     density_at of rho depth in p, hold: strain up to which an element's derivatives are held while
     it changes, band: the largest difference between dofs of one element, its place in the banded
     matrices; law addresses of its elements, ends of their parameters in p. Per dof: X, place of its
-    node (its own coordinate), and area. Per element: its dofs, -1 where it is bonded, and
-    constants; their number is a multiple of `LANES`, the last without dofs. surface: dof of every
-    surface dof."""
+    node (its own coordinate), and area. Per element: its dofs, -1 where it is bonded and for fields
+    that its pad has not, and constants; their number is a multiple of `LANES`, the last without
+    dofs. surface: dof of every surface dof."""
 
     dof_start: Index
     element_start: Index
@@ -312,9 +313,9 @@ SCRATCH: dict[str, dict[str, str]] = {
         # of every group of elements: inputs of its law, and held its derivatives with the
         # displacements and rates that they are of
         "groups element_inputs lanes": "element_x",
-        "groups 8 16 lanes": "element_J",
-        "groups 16 lanes": "element_at",
-        "9 lanes": "element",
+        "groups corners 2corners lanes": "element_J",
+        "groups 2corners lanes": "element_at",
+        "corners+1 lanes": "element",
         # of every nodal pad held: its dofs' rates per unit force on the touched nodes, row by row
         "responses": "responses",
         "state": "k",
@@ -346,12 +347,12 @@ SCRATCH: dict[str, dict[str, str]] = {
         "points rows": "out",
         "rows": "weights",
         "6": "by",
-        "8 lanes": "element",
+        "corners lanes": "element",
         "4 state": "state",
     },
     "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
         "rows": "weights",
-        "8 lanes": "element",
+        "corners lanes": "element",
         "parameters": "gradient direction",
         "rows columns": "change",
         "free columns": "r V",
@@ -532,7 +533,7 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
     that it does not decide."""
     states, nodes = int(s.contact_states.max(initial=1)), int(s.pad_node_start[-1])
     dofs, band = np.diff(s.nodal_dof_start), 2 * s.nodal_band + 1
-    widest = 2 * int(np.diff(s.pad_node_start).max(initial=0))
+    widest, corners = 2 * int(np.diff(s.pad_node_start).max(initial=0)), s.nodal_dof.shape[1]
     sizes |= {
         "state": state, "coordinates": len(s.body_free), "free": len(s.body_coordinate),
         "contacts": len(s.contact_pad), "points": len(s.point_X), "pads": len(s.pad_base),
@@ -544,7 +545,8 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
         "lanes": LANES, "groups": int(s.nodal_element_start[-1]) // LANES,
         "dofs": int(s.nodal_dof_start[-1]), "banded": int((dofs * band).sum()),
-        "element_inputs": 2 * CORNERS + s.nodal_constants.shape[1], "parameters": len(s.p),
+        "corners": corners, "2corners": 2 * corners,
+        "element_inputs": 2 * corners + s.nodal_constants.shape[1], "parameters": len(s.p),
         "recorded": recorded_size(s),
     }  # fmt: skip
     sizes["responses"] = sizes["dofs"] * (widest + 2)
@@ -562,7 +564,7 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
     if kind == "Work":
         constants = s.nodal_constants
         grouped = constants.reshape(sizes["groups"], LANES, constants.shape[1])
-        made["element_x"][:, 2 * CORNERS :] = grouped.swapaxes(1, 2)
+        made["element_x"][:, 2 * corners :] = grouped.swapaxes(1, 2)
     return KINDS[kind](**made)
 
 

@@ -1,10 +1,11 @@
-"""Nodal pads: the displacements u of all nodes that move, elements of any law, inertia or none.
+"""Nodal pads: the displacements u of all nodes that move, in one field or several, elements of any
+law, inertia or none.
 
     f(u* + a h u', u') + M (u' + V_B - v*) / (a h) = F
 
 with the forces f of the elements. At an iterate of Newton's method, with A the derivative of the
 left side by u' (banded), the nodal rates are u' = free + A^-1 F - D dV_B, D = A^-1 M / (a h), and
-the base feels - sum of M v'. With inertia a base may not turn.
+the base feels - sum of M v'. With inertia a base may not turn, and there is one field.
 """
 
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled, inlined
-from torchsoft.solve.kernel.arrays import CORNERS, LANES
+from torchsoft.solve.kernel.arrays import FIELD, LANES
 from torchsoft.solve.kernel.invoke import (
     call_linearise,
     call_pullback,
@@ -77,13 +78,14 @@ def element_inputs(s: Any, w: Any, pad: int, g: int, y: Array, a: float) -> None
     """Displacements and rates of the corners of a group of elements at the stage's end into
     w.element_x, where their constants stand."""
     x, i0, U = w.element_x[g], s.nodal_dof_start[pad], s.pad_y_start[pad]
+    corners = s.nodal_dof.shape[1]
     for lane in range(LANES):
-        for c in range(CORNERS):
+        for c in range(corners):
             dof = s.nodal_dof[g * LANES + lane, c]
-            x[c, lane], x[CORNERS + c, lane] = 0.0, 0.0
+            x[c, lane], x[corners + c, lane] = 0.0, 0.0
             if dof >= 0:
                 rate = w.rate[i0 + dof]
-                x[c, lane], x[CORNERS + c, lane] = y[U + dof] + a * rate, rate
+                x[c, lane], x[corners + c, lane] = y[U + dof] + a * rate, rate
 
 
 @compiled
@@ -111,13 +113,13 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
     first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
     own = s.p[element_parameters(s, pad)]
     w.internal[first:last], w.noise[first:last], w.power[pad] = 0.0, 0.0, 0.0
-    low, high = groups(s, pad)
+    (low, high), corners = groups(s, pad), s.nodal_dof.shape[1]
     for g in range(low, high):
         element_inputs(s, w, pad, g, y, a)
         call_value(s.nodal_value[pad], w.element_x[g], own, w.element)
         for lane in range(LANES):
-            w.power[pad] += w.element[CORNERS, lane]
-            for c in range(CORNERS):
+            w.power[pad] += w.element[corners, lane]
+            for c in range(corners):
                 dof = s.nodal_dof[g * LANES + lane, c]
                 if dof >= 0:
                     w.internal[first + dof] += w.element[c, lane]
@@ -152,12 +154,13 @@ def matrix(s: Any, w: Any, pad: int) -> Array:
 def strained(s: Any, w: Any, g: int, a: float) -> float:
     """A bound of how far any element of a group is strained from where its derivatives are held."""
     x, held, worst = w.element_x[g], w.element_at[g], 0.0
+    corners = s.nodal_dof.shape[1]
     for lane in range(LANES):
         total = 0.0
-        for c in range(CORNERS):
+        for c in range(corners):
             off = abs(x[c, lane] - held[c, lane])
-            off += a * abs(x[CORNERS + c, lane] - held[CORNERS + c, lane])
-            total += off * abs(x[2 * CORNERS + c, lane])  # gradients at the centre
+            off += a * abs(x[corners + c, lane] - held[corners + c, lane])
+            total += off * abs(x[2 * corners + c % FIELD, lane])  # gradients at the centre
         if not total <= worst:
             worst = total
     return worst
@@ -168,12 +171,12 @@ def linearise(s: Any, w: Any, pad: int, y: Array, a: float, hold: float) -> bool
     """Derivatives of the elements' forces, w.element_J, anew where they are strained by more than
     `hold`; whether any are."""
     own, changed = s.p[element_parameters(s, pad)], False
-    low, high = groups(s, pad)
+    (low, high), corners = groups(s, pad), s.nodal_dof.shape[1]
     for g in range(low, high):
         element_inputs(s, w, pad, g, y, a)
         if w.held[pad] == 0.0 or not strained(s, w, g, a) <= hold:
             call_linearise(s.nodal_linearise[pad], w.element_x[g], own, w.element, w.element_J[g])
-            put(w.element_x[g, : 2 * CORNERS], w.element_at[g])
+            put(w.element_x[g, : 2 * corners], w.element_at[g])
             changed = True
     return changed
 
@@ -189,16 +192,16 @@ def relinearise(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 def factor(s: Any, w: Any, pad: int, a: float) -> None:
     """A of a pad, factorised, in w.band, from the elements' derivatives."""
     first, last, band = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.nodal_band[pad]
-    width, A = 2 * band + 1, matrix(s, w, pad)
+    width, A, corners = 2 * band + 1, matrix(s, w, pad), s.nodal_dof.shape[1]
     A[:] = 0.0
     for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
         J, lane = w.element_J[e // LANES], e % LANES
-        for c in range(CORNERS):
+        for c in range(corners):
             row = s.nodal_dof[e, c]
-            for d in range(CORNERS if row >= 0 else 0):
+            for d in range(corners if row >= 0 else 0):
                 column = s.nodal_dof[e, d]
                 if column >= 0:
-                    by = a * J[c, d, lane] + J[c, CORNERS + d, lane]
+                    by = a * J[c, d, lane] + J[c, corners + d, lane]
                     A[row * width + band + column - row] += by
     for i in range(last - first):
         A[i * width + band] += mass_rate(s, pad, first + i, a)
@@ -433,17 +436,18 @@ def push_elements(
     m), by the parameters, and with `rates` by rates dv (all dofs, m)."""
     own, i0, m = element_parameters(s, pad), s.nodal_dof_start[pad], dp.shape[1]
     d, (low, high) = z.direction[: own.stop - own.start], groups(s, pad)
+    corners = s.nodal_dof.shape[1]
     for g in range(low, high):
         J, dofs = w.element_J[g], s.nodal_dof[g * LANES : (g + 1) * LANES]
         for lane in range(LANES):
-            for c in range(CORNERS):
+            for c in range(corners):
                 row = dofs[lane, c]
-                for e in range(CORNERS if row >= 0 else 0):
+                for e in range(corners if row >= 0 else 0):
                     dof = dofs[lane, e]
                     if dof >= 0:
                         add(J[c, e, lane], du[dof], out[i0 + row])
                         if rates:
-                            add(J[c, CORNERS + e, lane], dv[i0 + dof], out[i0 + row])
+                            add(J[c, corners + e, lane], dv[i0 + dof], out[i0 + row])
     for k in range(m):
         moved = False
         for j in range(d.size):
@@ -452,7 +456,7 @@ def push_elements(
         for g in range(low, high if moved else low):
             call_push(s.nodal_push[pad], w.element_x[g], s.p[own], d, z.element)
             for lane in range(LANES):
-                for c in range(CORNERS):
+                for c in range(corners):
                     row = s.nodal_dof[g * LANES + lane, c]
                     if row >= 0:
                         out[i0 + row, k] += z.element[c, lane]
@@ -586,22 +590,22 @@ def pull_elements(
     """Add to the cotangents of displacements (dofs,), of rates (all dofs,) and of the parameters
     those of the elements' forces, `factor` forces_bar (all dofs,)."""
     own, i0, bar = element_parameters(s, pad), s.nodal_dof_start[pad], z.element
-    low, high = groups(s, pad)
+    (low, high), corners = groups(s, pad), s.nodal_dof.shape[1]
     for g in range(low, high):
         J, dofs = w.element_J[g], s.nodal_dof[g * LANES : (g + 1) * LANES]
-        for c in range(CORNERS):
+        for c in range(corners):
             for lane in range(LANES):
                 dof = dofs[lane, c]
                 bar[c, lane] = factor * forces_bar[i0 + dof] if dof >= 0 else 0.0
         call_pullback(s.nodal_pullback[pad], w.element_x[g], s.p[own], bar, p_bar[own])
-        for d in range(CORNERS):
+        for d in range(corners):
             for lane in range(LANES):
                 dof = dofs[lane, d]
                 if dof >= 0:
                     by_u = by_rate = 0.0
-                    for c in range(CORNERS):
+                    for c in range(corners):
                         by_u += J[c, d, lane] * bar[c, lane]
-                        by_rate += J[c, CORNERS + d, lane] * bar[c, lane]
+                        by_rate += J[c, corners + d, lane] * bar[c, lane]
                     u_bar[dof] += by_u
                     rate_bar[i0 + dof] += by_rate
 
