@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.problem import Problem, Residuals
-from torchsoft.sysid.recording import Array
+from torchsoft.sysid.recording import Array, Mask
 from torchsoft.sysid.residual_tests import parts, whiteness
 from torchsoft.sysid.unknowns import Coordinate, Prior
 from torchsoft.tables import Number
@@ -123,7 +122,7 @@ class Quantity(NamedTuple):
         return self.value * float(np.exp(-reach)), self.value * float(np.exp(reach))
 
 
-def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[Quantity]:
+def quantities(problem: Problem, x: Array, free: Mask) -> Iterator[Quantity]:
     """Parameters in physical units, then coordinates of starts and faults of sensors, at x (n,)."""
     c = problem.coordinates
     for k, recording in enumerate(problem.recordings):
@@ -140,11 +139,17 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
                 size = first.high - first.low if alone else abs(value)
             declared = recording.rig.quantity(name)
             yield Quantity(
-                name, "parameter", recording.name if own else None,
-                declared.unit if declared else "", value, first.nominal if alone else before[name],
-                size, chain[row] / (value if size is None else size), places,
+                name,
+                "parameter",
+                recording.name if own else None,
+                declared.unit if declared else "",
+                value,
+                first.nominal if alone else before[name],
+                size,
+                chain[row] / (value if size is None else size),
+                places,
                 first.prior if alone else None,
-            )  # fmt: skip
+            )
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
             name, where, unit = (
@@ -158,9 +163,7 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
             )
 
 
-def estimates(
-    problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array
-) -> list[Estimate]:
+def estimates(problem: Problem, x: Array, free: Mask, C: Array, shift: Array) -> list[Estimate]:
     """All estimates in physical units; covariance C (n, n) and shift by the steps (n,) are those of
     all coordinates."""
     edge, out = free & problem.coordinates.at_bound(x), []
@@ -171,9 +174,19 @@ def estimates(
         relative = sd if one.size is None else sd * one.size / max(abs(one.value), 1e-300)
         bias = float(one.slope @ shift) / sd if sd > 0 else 0.0
         found = Estimate(
-            one.name, one.unit, one.recording, *known, relative, one.value, identifiable,
-            bool(edge[one.places].any()), bias, one.kind, one.start, one.prior,
-        )  # fmt: skip
+            one.name,
+            one.unit,
+            one.recording,
+            *known,
+            relative,
+            one.value,
+            identifiable,
+            bool(edge[one.places].any()),
+            bias,
+            one.kind,
+            one.start,
+            one.prior,
+        )
         out.append(found)
     return out
 
@@ -185,9 +198,13 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
         return ("rad" if axis.endswith("theta") else "m") + ("/s" if axis.startswith("v_") else "")
     own = problem.unit(one.name)
     units = {
-        "bias": own, "drift": f"{own}/s", "delay": "s", "lag": "s", "misalignment": "rad",
+        "bias": own,
+        "drift": f"{own}/s",
+        "delay": "s",
+        "lag": "s",
+        "misalignment": "rad",
         "inertia": "kg",
-    }  # fmt: skip
+    }
     return units.get(one.kind, "1")
 
 
@@ -245,7 +262,7 @@ class Contribution:
 
 
 def contributions(
-    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, fitted: Sequence[str]
+    problem: Problem, x: Array, free: Mask, J: Array, fitted: Sequence[str]
 ) -> list[Contribution]:
     """Contributions of the recordings `fitted`, then of the priors, from the whitened Jacobian J
     (m, n) at x (n,), whose rows are in this order."""

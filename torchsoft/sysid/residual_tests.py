@@ -171,9 +171,10 @@ def systematic(verdicts: Sequence[Verdict]) -> list[Verdict]:
     coloured, follow the motion, or belong together."""
     kinds = ("white", "motion", "channels")
     found = [
-        one for one in verdicts
+        one
+        for one in verdicts
         if one.alarming and (one.test in kinds or (one.test == "level" and one.size > 1))
-    ]  # fmt: skip
+    ]
     return sorted(found, key=lambda one: one.p)
 
 
@@ -311,10 +312,12 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
     out, t = [], part.t
     y = CubicSpline(t, part.reading)
     own = {
-        "an offset": np.ones(len(t)), "a drift": t - t.mean(),
+        "an offset": np.ones(len(t)),
+        "a drift": t - t.mean(),
         "the reading itself, as an error of its gain would be": y(t),
-        "its rate, as a delay would be": y(t, 1), "its acceleration": y(t, 2),
-    }  # fmt: skip
+        "its rate, as a delay would be": y(t, 1),
+        "its acceleration": y(t, 2),
+    }
     others = {}
     for other in beside:
         if (

@@ -37,7 +37,7 @@ from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import Array
+from torchsoft.sysid.recording import Array, Mask
 from torchsoft.sysid.sensitivity import AssumptionTest
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
@@ -118,10 +118,18 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
         began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
         start = line(str(recording.start), 300)
         one = RecordedRig(
-            recording.name, recording.name in fitted, recording.fingerprint,
-            problem.samples([recording.name]), recording.duration, start, type(rig).__qualname__,
-            rig.description(), tables, identified, began,
-        )  # fmt: skip
+            recording.name,
+            recording.name in fitted,
+            recording.fingerprint,
+            problem.samples([recording.name]),
+            recording.duration,
+            start,
+            type(rig).__qualname__,
+            rig.description(),
+            tables,
+            identified,
+            began,
+        )
         out.append(one)
     return out
 
@@ -336,8 +344,11 @@ class IdentificationResult(Shown):
         whole("count", count, 1)
         one = self.recorded(recording)
         determined = self._warn_unidentifiable(one)
-        mine = [(i, c) for i, c in enumerate(self.coordinates)
-                if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
+        mine = [
+            (i, c)
+            for i, c in enumerate(self.coordinates)
+            if c.kind == "parameter" and c.recording in (None, one.name)
+        ]
         free = [i for i, c in mine if c.name in determined]
         if not free:
             raise ValueError("no parameter is identifiable, so that there is nothing to draw")
@@ -362,10 +373,13 @@ class IdentificationResult(Shown):
         ]
         identifiable, named = {e.name for e in mine if e.identifiable}, {e.name for e in mine}
         weak = {
-            c.name: one.identified[c.name] for c in self.coordinates
-            if c.kind == "parameter" and c.recording in (None, one.name)
-            and c.name not in identifiable and (c.name in named or not self.unknowns[c.name].fixed)
-        }  # fmt: skip
+            c.name: one.identified[c.name]
+            for c in self.coordinates
+            if c.kind == "parameter"
+            and c.recording in (None, one.name)
+            and c.name not in identifiable
+            and (c.name in named or not self.unknowns[c.name].fixed)
+        }
         if weak:
             warnings.warn(undetermined(weak), stacklevel=3)
         return identifiable
@@ -479,7 +493,7 @@ BLURRED = 0.1
 reported in its place."""
 
 
-def seen_together(problem: Problem, free: NDArray[np.bool_], C: Array) -> list[Combination]:
+def seen_together(problem: Problem, free: Mask, C: Array) -> list[Combination]:
     """Products of powers of parameters that the data determine better than each of them."""
     mine = [
         i
