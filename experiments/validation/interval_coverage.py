@@ -149,7 +149,7 @@ def by_white_least_squares(stated: Problem, truth: dict[str, float], rtol: float
     stage = Stage("all", stated.names, tuple(one.label for one in c.within(c.free)), rtol)
     end = chord(Fit(stated, runner, c.start, stage).begun())
     C = fisher(end.at.J)[0] * max(1.0, end.chi2)
-    found = estimates(stated, end.x, c.free, C, np.zeros(len(c)))
+    found = estimates(end, C, np.zeros(len(c)))
     return Repetition(judged({e.name: e for e in found}, truth), [], [])
 
 

@@ -170,7 +170,7 @@ def conclude(
     )
     C_fit = C_fit + spread(end.J, C_free, left, colour.refused)
     C[np.ix_(free, free)] = C_fit + checked.widening()
-    found = estimates(problem, x, free, C, shift)
+    found = estimates(end, C, shift)
     predicted, notices = {}, [*findings, *planned.notices]
     if heldout:
         held = problem.with_noise({}).residuals(runner, x, heldout, rtol)
@@ -215,7 +215,7 @@ def conclude(
         chi2_stated=sum(float(one.raw @ one.raw) for one in left)
         / max(len(exact) - int(free.sum()), 1),
         converged=end.converged,
-        residuals=residual_channels(problem, at, fitted),
+        residuals=residual_channels(end),
         heldout=predicted,
         notices=notices,
         doubts=against + [text for kind, text in alarms.items() if kind != "smaller"],
@@ -244,12 +244,12 @@ def conclude(
             "recordings": {r.name: r.fingerprint for r in problem.recordings},
         },
         covariance=C.tolist(),
-        recordings=recorded_rigs(problem, x, fitted),
+        recordings=recorded_rigs(end),
         unknowns=dict(problem.unknowns),
         sensors=dict(problem.sensors),
         coordinates=[replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
-        contributions=contributions(problem, x, free, at.J, fitted),
-        combinations=seen_together(problem, free, C),
+        contributions=contributions(end),
+        combinations=seen_together(end, C),
         noise=[
             ChannelNoise(name, model, [*colour.found[name].scores] if name in colour.found else [])
             for name, model in problem.noise.items()

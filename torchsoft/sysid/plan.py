@@ -81,12 +81,7 @@ def visible(J: Array, candidates: Mask) -> Mask:
 def informative(problem: Problem, which: Sequence[str]) -> Mask:
     """Mask (n,) of coordinates that recordings can constrain: not those of other recordings, nor of
     sensors that they lack."""
-    channels = {
-        channel
-        for recording in problem.recordings
-        if recording.name in which
-        for channel in recording.samples
-    }
+    channels = {channel for _, channel, _ in problem.measured(which)}
     return np.array(
         [
             one.recording in (None, *which) and (one.of_the_rig or one.name in channels)

@@ -195,20 +195,14 @@ class Problem(Shown):
     def check_saturated(self) -> None:
         """Raises `ValueError` for saturated samples with coloured noise, whose likelihood is
         intractable."""
-        for recording in self.recordings:
-            for channel, sensor in self.sensors.items():
-                coloured = sensor.colour == "ar" or channel in self.noise
-                if (
-                    coloured
-                    and channel in recording.samples
-                    and sensor.saturated(recording.samples[channel][1]).any()
-                ):
-                    raise ValueError(
-                        f"sensors.{channel}: in `{recording.name}` samples are at its `low` or "
-                        "`high`, which cannot go "
-                        'together with noise of `colour = "ar"`; declare it "white", or record '
-                        "within the range"
-                    )
+        for recording, channel, sensor in self.measured():
+            coloured = sensor.colour == "ar" or channel in self.noise
+            if coloured and sensor.saturated(recording.samples[channel][1]).any():
+                raise ValueError(
+                    f"sensors.{channel}: in `{recording.name}` samples are at its `low` or `high`, "
+                    'which cannot go together with noise of `colour = "ar"`; declare it "white", '
+                    "or record within the range"
+                )
 
     def with_noise(self, noise: Mapping[str, Autoregression]) -> "Problem":
         """The same problem with other noise, by channel."""
@@ -254,15 +248,20 @@ class Problem(Shown):
     def names(self) -> tuple[str, ...]:
         return tuple(recording.name for recording in self.recordings)
 
-    def samples(self, which: Sequence[str] | None = None) -> int:
+    def measured(
+        self, which: Collection[str] | None = None
+    ) -> Iterator[tuple[Recording, str, Sensor]]:
+        """Recordings, by default all, with each channel that counts and its sensor, in the order of
+        residuals."""
+        for recording in self.recordings:
+            if which is None or recording.name in which:
+                for channel, sensor in self.sensors.items():
+                    if channel in recording.samples:
+                        yield recording, channel, sensor
+
+    def samples(self, which: Collection[str] | None = None) -> int:
         """Number of samples that count in some recordings, by default all."""
-        return sum(
-            len(t)
-            for recording in self.recordings
-            if which is None or recording.name in which
-            for channel, (t, _) in recording.samples.items()
-            if channel in self.sensors
-        )
+        return sum(len(one.samples[channel][0]) for one, channel, _ in self.measured(which))
 
     def values(self, x: Array, k: int) -> dict[str, float]:
         """Values of the unknowns of the rig and of the start in recording k."""
@@ -272,12 +271,11 @@ class Problem(Shown):
     def readouts(self, x: Array, k: int) -> dict[str, Readout]:
         """Readouts of the sensors with samples in recording k, at x (n,)."""
         recording, out = self.recordings[k], {}
-        for channel, sensor in self.sensors.items():
-            if channel in recording.samples:
-                at = self.coordinates.nuisances(x, channel, recording.name)
-                span = float(recording.times[0]), float(recording.times[-1])
-                values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
-                out[channel] = readout(recording.rig, channel, sensor, values, span)
+        span = float(recording.times[0]), float(recording.times[-1])
+        for _, channel, sensor in self.measured([recording.name]):
+            at = self.coordinates.nuisances(x, channel, recording.name)
+            values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
+            out[channel] = readout(recording.rig, channel, sensor, values, span)
         return out
 
     def unit(self, channel: str) -> str:

@@ -76,38 +76,22 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
     from the prediction stay.
     """
     out, at = [], 0
-    for recording in problem.recordings:
-        for channel, sensor in problem.sensors.items() if recording.name in which else ():
-            if channel not in recording.samples:
+    for recording, channel, sensor in problem.measured(which):
+        t, measured = recording.samples[channel]
+        rows, noise = at + np.arange(len(t)), problem.noise.get(channel)
+        at += len(t)
+        raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
+        reading = predicted(sensor, measured, raw)
+        saturated = int(sensor.saturated(measured).sum())
+        if saturated:
+            ends = (reading + sign * CLEAR * sensor.sd for sign in (-1, 1))
+            near = np.logical_or(*map(sensor.saturated, ends))
+            kept = ~near | (np.abs(raw) > CLEAR)
+            if kept.sum() < FEWEST:
                 continue
-            t, measured = recording.samples[channel]
-            rows, noise = at + np.arange(len(t)), problem.noise.get(channel)
-            at += len(t)
-            raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
-            reading = predicted(sensor, measured, raw)
-            saturated = int(sensor.saturated(measured).sum())
-            if saturated:
-                near = sensor.saturated(reading - CLEAR * sensor.sd) | sensor.saturated(
-                    reading + CLEAR * sensor.sd
-                )
-                kept = ~near | (np.abs(raw) > CLEAR)
-                if kept.sum() < FEWEST:
-                    continue
-                t, rows, raw, reading = t[kept], rows[kept], raw[kept], reading[kept]
-            whitened = partial(problem.whitened, recording, channel)
-            out.append(
-                Part(
-                    recording.name,
-                    channel,
-                    t,
-                    rows,
-                    raw,
-                    reading,
-                    noise,
-                    whitened,
-                    saturated,
-                )
-            )
+            t, rows, raw, reading = t[kept], rows[kept], raw[kept], reading[kept]
+        whitened = partial(problem.whitened, recording, channel)
+        out.append(Part(recording.name, channel, t, rows, raw, reading, noise, whitened, saturated))
     return out
 
 
