@@ -118,13 +118,12 @@ def assess(excitation: Excitation, rtol: float) -> Information:
     problem = Problem([recording], RIG, {name: Unknown() for name in NAMES} | apart)
     x, v = problem.coordinates.start, np.random.default_rng(0).standard_normal(len(NAMES))
     runner = Runner(problem.recordings)
-    at, steps = problem.freeze(runner, x, ["one"], rtol, problem.coordinates.free)
-    check(at)
+    at = check(problem.residuals(runner, x, ["one"], rtol, problem.coordinates.free))
     ahead, behind = (
-        check(problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], steps))
+        check(problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], at.steps))
         for s in (1.0, -1.0)
     )
-    finer = check(problem.freeze(runner, x, ["one"], FINER * rtol)[0])
+    finer = check(problem.residuals(runner, x, ["one"], FINER * rtol))
     slope = (ahead.r - behind.r) / (2 * DIFFERENCE)
     return Information(
         at.J, finer.r - at.r, float(np.linalg.norm(at.J @ v - slope) / np.linalg.norm(slope))

@@ -91,8 +91,8 @@ def problem(data: Recording, sets: tuple[str, ...], start: dict[str, float]) -> 
 def jacobian(config: Config, stated: Problem) -> tuple[Array, Any]:
     """That of the residuals at the nominal values, and the steps of the run."""
     c, runner = stated.coordinates, Runner(stated.recordings)
-    at, steps = stated.freeze(runner, c.start, stated.names, config.rtol, c.free)
-    return at.J, steps
+    at = stated.residuals(runner, c.start, stated.names, config.rtol, c.free)
+    return at.J, at.steps
 
 
 def cost(config: Config, data: Recording, truth: dict[str, float]) -> dict[str, float]:

@@ -66,6 +66,8 @@ class FiniteDifferences(Problem):
     ) -> Residuals:
         if free is None:
             return super().residuals(runner, x, which, steps)
+        if isinstance(steps, float):  # the same for all of them
+            steps = super().residuals(runner, x, which, steps).steps
         inside = x + DIFFERENCE <= self.coordinates.bounds[1]
         step = np.where(inside, DIFFERENCE, -DIFFERENCE)
         moved = [x, *(x + step[i] * np.eye(len(x))[i] for i in np.flatnonzero(free))]
@@ -78,7 +80,7 @@ class FiniteDifferences(Problem):
         for i, one in zip(np.flatnonzero(free), ahead):
             J[:, i] = (one.r - at.r) / step[i]
         failed = at.failed | {name: run for one in ahead for name, run in one.failed.items()}
-        return Residuals(at.r, J, failed)
+        return Residuals(at.r, J, failed, at.steps)
 
 
 def excitations(config: Config) -> dict[str, Excitation]:

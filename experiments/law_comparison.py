@@ -33,6 +33,7 @@ from torchsoft.experiment import COARSE, RIG, markdown, options, repeated, timed
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Comparison, Evidence, compare, fitted
+from torchsoft.sysid.fit import Fit
 from torchsoft.sysid.runs import Runner
 
 NOMINAL = RigFile.ready("paper").override(
@@ -252,9 +253,8 @@ def judge(case: Case) -> Judged:
     wrong, exact = next(
         one for one in problems(case, data(case, 0.0)).items() if one[0] != case.law
     )
-    runner, names = Runner(exact.recordings), exact.names
-    fit = fitted(wrong, exact, runner, names, plan(exact), RTOL, 1, False)
-    left = Evidence(fit, runner, names, [])
+    begin = Fit(exact, Runner(exact.recordings), exact.coordinates.start)
+    left = Evidence(wrong, fitted(wrong, begin, exact.names, plan(exact)))
     return Judged(case, float(np.linalg.norm(left.fitted.r)), found, wall)
 
 

@@ -143,9 +143,9 @@ def price(cut: Cut, config: Config) -> Price:
     assert isinstance(start, MovingStart)
     stated = problem(recording, config, 1.0)
     runner, free, x = Runner(stated.recordings), stated.coordinates.free, stated.coordinates.start
-    at, steps = stated.freeze(runner, x, stated.names, config.rtol, free)
-    _, exact = timed(lambda: stated.residuals(runner, x, stated.names, steps, free))
-    _, plain = timed(lambda: stated.residuals(runner, x, stated.names, steps))
+    at = stated.residuals(runner, x, stated.names, config.rtol, free)
+    _, exact = timed(lambda: stated.residuals(runner, x, stated.names, at.steps, free))
+    _, plain = timed(lambda: stated.residuals(runner, x, stated.names, at.steps))
     other = problem(replace(recording, start=Known(cut.y0, start.lead)), config, 1.0)
     c = other.coordinates
     better = other.residuals(Runner(other.recordings), c.start, other.names, config.rtol, c.free)

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from torchsoft.sysid.fit import Fit, Stage
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
-from torchsoft.sysid.profile import Optimum
+from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Coordinate, Coordinates, Prior
 
 WALL = "the disc has left the pads"
@@ -57,11 +58,6 @@ class ClosedForm:
             else Residuals(r + np.inf, J, {"data": FailedRun(WALL, 0.1)})
         )
 
-    def freeze(
-        self, runner: Any, x: np.ndarray, which: object, rtol: float, free: Any = None
-    ) -> Any:
-        return self.residuals(runner, x, which, None, free), {}
-
     def misfit(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any) -> Any:
         runner.gradients += 1
         at = self.residuals(runner, x, which, steps, free)
@@ -70,6 +66,10 @@ class ClosedForm:
         )
 
 
-def optimum(problem: Any, *x: float, **options: Any) -> Optimum:
-    """At the coordinates x."""
-    return Optimum(problem, np.array(x), rtol=1e-4, **options)
+def optimum(
+    problem: Any, *x: float, free: Any = None, workers: int = 1, variance: float = 1.0
+) -> Fit:
+    """At the coordinates x, of which the names in `free` are fitted, by default all."""
+    labels = problem.coordinates.labels if free is None else free
+    stage, runner = Stage("optimum", tuple(problem.names), labels, 1e-4), Runner((), workers)
+    return Fit(problem, runner, np.array(x, float), stage, variance=variance).begun()

@@ -31,13 +31,11 @@ from torchsoft.sysid.fit import (
     Fit,
     descend,
     gauss_newton,
-    newton_step,
     standard_deviations,
 )
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.plan import (
     SCANNED,
-    PlanEnd,
     default_plan,
     jacobian_error,
     run_plan,
@@ -98,7 +96,8 @@ def check_derivatives(
     """Columns of the Jacobian, or only some of them, against central differences, of `near` [1];
     the gradient of the adjoint against the Jacobian's. A larger h [1] passes kinks of contact."""
     free, which, runner = problem.coordinates.free, problem.names, Runner(problem.recordings)
-    chosen, steps = problem.freeze(runner, x, which, rtol)
+    chosen = problem.residuals(runner, x, which, rtol)
+    steps = chosen.steps
     at = problem.residuals(runner, x, which, steps, free)
     assert np.abs(at.r - chosen.r).max() < 1e-6
     for label in only or problem.coordinates.labels:
@@ -155,15 +154,15 @@ def test_a_fit_without_headway_ends_where_it_is_and_says_so(level, stalls):
         return np.array([level, x[0] + 2.0 * np.abs(np.sin(40 * x[0])), 0.3 * x[1]])
 
     problem, x = ClosedForm(residuals, 2), np.array([2.0, 3.0])
-    common: dict[str, Any] = {"which": (), "free": np.array([True, True]), "steps": {}}
-    fit = gauss_newton(problem, None, x, tolerance=1e-9, **common)
+    runner: Any = None
+    stage = Stage("all", (), problem.coordinates.labels, 1e-3)
+    fit = gauss_newton(Fit(problem, runner, x, stage), tolerance=1e-9)
     assert fit.stalled == stalls
     assert fit.evaluations == (8 if stalls else 30)
     assert not fit.converged
     assert fit.chi2 == pytest.approx(float(np.mean(residuals(fit.x) ** 2)))
-    end = PlanEnd(fit, Stage("all", (), (), 1e-3), [])
-    assert bool(end.notices) == stalls
-    assert not stalls or "the fit made no headway: over 6 evaluations" in end.notices[0]
+    assert bool(fit.notices) == stalls
+    assert not stalls or "the fit made no headway: over 6 evaluations" in fit.notices[0]
 
 
 def test_a_fit_far_above_the_noise_is_not_refined(strokes):
@@ -184,15 +183,12 @@ def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
         [strokes], SENSORS, {E: Unknown(nominal=1.0e6), TAU: Unknown()} | rest_known()
     )
     runner = Runner(problem.recordings)
-    _, steps = problem.freeze(runner, problem.coordinates.start, ["strokes"], RTOL)
-    common: dict[str, Any] = {
-        "which": ["strokes"],
-        "free": problem.coordinates.free,
-        "steps": steps,
-    }
-    newton = gauss_newton(problem, runner, problem.coordinates.start, **common)
-    descent = descend(problem, runner, problem.coordinates.start, evaluations=20, **common)
-    adam = descend(problem, runner, newton.x, method="adam", evaluations=2, **common)
+    c = problem.coordinates
+    free = tuple(one.label for one in c.within(c.free))
+    begin = Fit(problem, runner, c.start, Stage("all", ("strokes",), free, RTOL)).begun()
+    newton = gauss_newton(begin)
+    descent = descend(begin._replace(method="lbfgs"), evaluations=20)
+    adam = descend(newton._replace(method="adam"), evaluations=2)
     free = problem.coordinates.free
     np.testing.assert_allclose(descent.x[free], newton.x[free], atol=2e-3)
     assert adam.evaluations == 2
@@ -284,16 +280,14 @@ def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest():
     J, x = np.array([[1.0, 0.9], [0.0, 0.3], [0.2, 0.1]]), np.array([0.0, 1.0])
     r = np.array([-0.9, -2.0, 0.0])
     r -= J[:, 0] * (J[:, 0] @ r) / (J[:, 0] @ J[:, 0])
-    problem: Any = SimpleNamespace(
-        coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 1.0])))
-    )
-    assert newton_step(problem, x, Residuals(r, J, {}), np.array([True, True])) == pytest.approx(
-        [0.0, 0.0], abs=1e-9
-    )
-    wider: Any = SimpleNamespace(
-        coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 9.0])))
-    )
-    assert abs(newton_step(wider, x, Residuals(r, J, {}), np.array([True, True]))).min() > 0.5
+    for most, moves in ((1.0, False), (9.0, True)):
+        bounds = np.array([-5.0, 0.0]), np.array([5.0, most])
+        problem: Any = SimpleNamespace(
+            coordinates=SimpleNamespace(bounds=bounds, labels=("a", "b"))
+        )
+        at, stage = Residuals(r, J, {}), Stage("both", (), ("a", "b"), RTOL)
+        step = Fit(problem, Runner(()), x, stage, at).newton_step()
+        assert np.abs(step).min() > 0.5 if moves else step == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
 def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes):
@@ -444,14 +438,15 @@ def test_data_out_of_reach_name_the_recording():
 
 def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
     """The fit is kept, says so, and is tested on its own steps."""
-    freeze, first = Problem.freeze, iter([True])
+    residuals, first = Problem.residuals, iter([True])
 
-    def failing(*given: Any) -> Any:
-        at, steps = freeze(*given)
-        failed = {} if next(first, False) else {"strokes": FailedRun("at t = 0.5 s: no", 0.5)}
-        return at._replace(failed=failed), steps
+    def failing(self: Problem, runner: Any, x: Any, which: Any, steps: Any, free: Any = None):
+        at = residuals(self, runner, x, which, steps, free)
+        if not isinstance(steps, float) or next(first, False):
+            return at
+        return at._replace(failed={"strokes": FailedRun("at t = 0.5 s: no", 0.5)})
 
-    monkeypatch.setattr(Problem, "freeze", failing)
+    monkeypatch.setattr(Problem, "residuals", failing)
     few = lambda *given: [one for one in assumptions(*given) if one.name in tried]
     tried = "mesh", "clock of the set-points", "bodies.disc.mass"
     monkeypatch.setattr(sensitivity, "assumptions", few)
@@ -493,7 +488,7 @@ def test_a_ratio_is_scanned_with_its_denominator(strokes, monkeypatch, truth, fr
     place = lambda values: np.array([one.to_x(v) for one, v in zip(c.all, values)])
     at, tied = place(truth), place((0.3708, 1.0))
     stage = Stage("everything", ("strokes",), free, 1e-4)
-    x = scan(problem, runner, stage, tied, 1, SCANNED, lambda chi2: None)
+    x = scan(Fit(problem, runner, tied, stage), 1, SCANNED)
     assert x == pytest.approx(place(ends), abs=1e-3)
 
 
@@ -501,22 +496,23 @@ def test_another_stage_that_cannot_begin_there_begins_where_the_plan_did(strokes
     """One that has other coordinates or recordings; it is refused only if it fails there, too."""
     begun: list[list[float]] = []
 
-    def simulated(problem, runner, stage, x, *_: Any):
-        begun.append(list(x))
-        if stage.name in failing and x[0] == failing[stage.name]:
+    def simulated(fit: Fit, seed: int) -> Fit:
+        begun.append(list(fit.x))
+        if fit.x[0] == failing.get(fit.stage.name):
             raise Unreachable({"strokes": FailedRun("no", 0.5)})
-        return Fit(x + 1.0, 1.0, 1, True, {}, None)
+        return fit._replace(x=fit.x + 1.0, at=fit.at._replace(r=np.ones(1)))
 
     monkeypatch.setattr("torchsoft.sysid.plan.run_stage", simulated)
     stages = [Stage(name, ("strokes",), (name,), 1e-3) for name in ("one", "two", "three")]
-    failing = {"two": 1.0}
-    end = run_plan(strokes, None, stages, np.zeros(2))
+    failing, runner = {"two": 1.0}, Runner(())
+    begin: Any = Fit(strokes, runner, np.zeros(2))
+    end = run_plan(begin, stages)
     assert begun == [[0.0, 0.0], [1.0, 1.0], [0.0, 0.0], [1.0, 1.0]]
     assert end.failure is None
-    assert [entry["name"] for entry in end.entries] == ["one", "two", "three"]
+    assert [entry["name"] for entry in end.stages] == ["one", "two", "three"]
     failing = {"one": 0.0}
     with pytest.raises(Unreachable, match="recording `strokes`"):
-        run_plan(strokes, None, stages, np.zeros(2))
+        run_plan(begin, stages)
 
 
 @pytest.mark.parametrize(
@@ -542,8 +538,8 @@ def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes):
         [strokes], SENSORS, {E: Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known()
     )
     stage = Stage("all", ("strokes",), (E,), 1e-3, starts=3)
-    free = np.array([c.name == E for c in problem.coordinates.all])
-    points = sobol(problem, problem.coordinates.start, free, stage, 0)
+    begin = Fit(problem, Runner(problem.recordings), problem.coordinates.start, stage)
+    points = sobol(begin, 0)
     low, high = problem.coordinates.bounds
     assert len({p.tobytes() for p in points}) == len(points) == 2
     assert all((low <= p).all() and (p <= high).all() for p in points)

@@ -30,6 +30,7 @@ from torchsoft.sysid import (
     record,
 )
 from torchsoft.sysid.estimate import Number, contributions, estimates
+from torchsoft.sysid.fit import Fit
 from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.result import checksum, load_answer, recorded_rigs, schema
 from torchsoft.sysid.runs import Runner
@@ -291,6 +292,13 @@ def test_a_recording_must_be_named_where_rigs_differ(result):
             result.model(*given)
 
 
+def at(problem: Problem, x: np.ndarray) -> Fit:
+    """A fit that is at x (n,)."""
+    c = problem.coordinates
+    free = tuple(one.label for one in c.within(c.free))
+    return Fit(problem, Runner(problem.recordings), x, Stage("all", problem.names, free, 1e-3))
+
+
 @pytest.fixture(scope="module")
 def slippery(problem, result):
     """A result for rigs with a law of the user's own, whose alpha is not identifiable."""
@@ -298,9 +306,10 @@ def slippery(problem, result):
     mine = Problem(own, SENSORS, {ALPHA: Unknown(), E: Unknown()})
     c, C = mine.coordinates, np.zeros((len(mine.coordinates),) * 2)
     x, C[0, 0] = c.start + 0.1, 1.0
-    found = estimates(mine, x, c.free, C, np.zeros(len(x)))
+    fit = at(mine, x)
+    found = estimates(fit, C, np.zeros(len(x)))
     rigs = {r.name: r.rig for r in own}
-    recordings = recorded_rigs(mine, x, mine.names)
+    recordings = recorded_rigs(fit)
     return replace(
         result, estimates=found, x=x.tolist(), coordinates=list(c.all), unknowns=mine.unknowns,
         recordings=recordings, rigs=rigs,
@@ -344,16 +353,16 @@ def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
 
 def test_contributions_are_those_of_the_inverse_matrices(problem, result):
     """Against numpy's inverses of what Fisher's matrices of the recordings add up to."""
-    x, free = np.array(result.x), problem.coordinates.free
-    J = problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3, free).J
+    fit = at(problem, np.array(result.x)).begun()
+    J = fit.at.J
     m, k = problem.samples(["first"]), list(problem.coordinates.labels)
     parts = {"first": J[:m], "second": J[m:-2], None: J[-2:]}
     known = [i for i, label in enumerate(k) if label != V_S]
     J[:, k.index(V_S)] = 0.0
-    seen = np.array([i in known for i in range(len(k))])
+    stage = replace(fit.stage, free=tuple(k[i] for i in known))
     F = {name: rows[:, known].T @ rows[:, known] for name, rows in parts.items()}
     C = np.linalg.inv(sum(F.values()))
-    for one in contributions(problem, x, seen, J, problem.names):
+    for one in contributions(fit._replace(stage=stage)):
         left = np.linalg.pinv(sum(part for name, part in F.items() if name != one.source))
         for i, label in enumerate(k[i] for i in known):
             assert one.shares[label] == pytest.approx(
@@ -382,9 +391,7 @@ def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinat
     x = c.start + np.array([np.log(1.1), 0.0, -0.05 / 0.19])
     found = {
         e.name: e
-        for e in estimates(
-            own, x, c.free, np.diag([0.1**2, 0.0, 0.2**2]), np.array([0.05, 0.0, 0.0])
-        )
+        for e in estimates(at(own, x), np.diag([0.1**2, 0.0, 0.2**2]), np.array([0.05, 0.0, 0.0]))
     }
     assert list(found) == list(unknowns)
     for name, start in ((MU_S, 0.8), (MU_K, 0.4)):

@@ -169,7 +169,8 @@ def test_amounts_of_variations_are_coordinates_with_differences_as_derivatives()
     c, which = other.coordinates, problem.names
     assert c.labels == (E, *(one.name for one in chosen))
     x = begun(other, chosen, {E: problem.coordinates.start[0]})
-    base, steps = problem.freeze(Runner([data]), problem.coordinates.start, which, 1e-4)
+    base = problem.residuals(Runner([data]), problem.coordinates.start, which, 1e-4)
+    steps = base.steps
     at = other.residuals(other.runner(Runner([data])), x, which, steps, c.free)
     np.testing.assert_allclose(at.r, base.r, atol=1e-6)
     thicker = resized(data, ["L", "U"], "height", 0.01)

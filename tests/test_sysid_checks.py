@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from closed_forms import ClosedForm
 from conftest import COARSE, PAPER, RIG, excited, stroked
 
 from torchsoft import RigFile
@@ -34,18 +35,17 @@ from torchsoft.sysid.assumptions import (
     remeshed,
 )
 from torchsoft.sysid.estimate import Quantity
+from torchsoft.sysid.fit import Check, Fit
 from torchsoft.sysid.identification import notices_on, ordering_constraints
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import (
-    End,
-    Joint,
     assuming,
     difference,
-    ended,
     fewest,
     joint_fit,
     refit,
+    shares,
 )
 from torchsoft.sysid.residual_tests import Verdict
 from torchsoft.sysid.runs import Runner
@@ -103,13 +103,17 @@ def checked(
     explain: bool = True,
 ) -> Checked:
     problem = Problem([data], sensors, {name: Unknown() for name in TRUTH})
-    free, runner = problem.coordinates.free, Runner(problem.recordings)
     stages = [Stage("all", problem.names, problem.coordinates.labels, RTOL)]
     answer = identify(problem, plan=stages, assumptions="trusted")
-    x = np.array(answer.x)
-    at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    end = ended(problem, runner, x, at, free, problem.names, RTOL)
-    return check_assumptions(problem, end, doubtful=doubtful, explain=explain)
+    end = ended(problem, np.array(answer.x))
+    return check_assumptions(end, doubtful=doubtful, explain=explain)
+
+
+def ended(problem: Problem, x: np.ndarray) -> Fit:
+    """A fit that has ended at x (n,)."""
+    stage = Stage("all", problem.names, problem.coordinates.labels, RTOL)
+    end = Fit(problem, Runner(problem.recordings), x, stage).begun()
+    return end._replace(check=Check(RTOL, end.at))
 
 
 @pytest.fixture(scope="module")
@@ -226,9 +230,7 @@ def far_off():
     known = BASE.override({"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1})
     data = record("light", excited(LIGHT, known), TRUTH, SENSORS, rtol=1e-5, noise=0.0)
     problem = Problem([made_by(coulomb(data), data)], SENSORS, {name: Unknown() for name in TRUTH})
-    x, free = problem.coordinates.start + [-0.5, 0.5], problem.coordinates.free
-    at, _ = problem.freeze(Runner(problem.recordings), x, problem.names, RTOL, free)
-    return problem, x, at
+    return ended(problem, problem.coordinates.start + [-0.5, 0.5])
 
 
 @pytest.mark.slow
@@ -236,11 +238,7 @@ def test_what_no_test_explains_has_candidates(
     far_off,
 ):
     """Nothing is fitted again: a notice says what `explain` would try."""
-    problem, x, at = far_off
-    free = problem.coordinates.free
-    runner = Runner(problem.recordings)
-    end = ended(problem, runner, x, at, free, problem.names, RTOL)
-    found = check_assumptions(problem, end, doubtful=True)
+    found = check_assumptions(far_off, doubtful=True)
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
     assert any(": `explain` fits again with each of " in text for text in notices(found))
@@ -250,22 +248,17 @@ def test_what_no_test_explains_has_candidates(
 def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     far_off,
 ):
-    problem, x, at = far_off
-    runner = Runner(problem.recordings)
-    base, steps = problem.freeze(runner, x, problem.names, RTOL)
-    end = End(x, at, problem.coordinates.free, problem.names, base, steps, RTOL, runner, RTOL)
+    problem = far_off.problem
     law = next(
         one
         for one in assumptions(problem.recordings, set(TRUTH), problem.sensors)
         if one.name == "Coulomb friction"
     )
-    as_stated, again = (
-        refit(problem, end, tried, "linear", lambda chi2: None) for tried in ((), [law])
-    )
-    assert as_stated.fit.chi2 > 20  # nothing can be done with smooth friction
-    assert again.fit.chi2 < 2  # on steps as coarse as those of the checks
+    as_stated, again = (refit(far_off, tried) for tried in ((), [law]))
+    assert as_stated.chi2 > 20  # nothing can be done with smooth friction
+    assert again.chi2 < 2  # on steps as coarse as those of the checks
     for name, value in TRUTH.items():
-        assert again.of(name) == pytest.approx(np.log(value), abs=0.1)
+        assert again.by_label[name] == pytest.approx(np.log(value), abs=0.1)
 
 
 @pytest.mark.slow
@@ -274,21 +267,21 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     truth = TRUTH | {MASS: 1.08 * BASE.bodies["disc"].mass}
     data = record("strokes", excited(STROKES, BASE), truth, QUIET, rtol=1e-6, seed=4)
     problem = Problem([data], QUIET, {name: Unknown() for name in TRUTH})
-    runner, c = Runner(problem.recordings), problem.coordinates
-    x = c.start + [0.7, -0.7]
-    at, steps = problem.freeze(runner, x, problem.names, RTOL, c.free)
-    end = End(x, at, c.free, problem.names, at, steps, RTOL, runner, RTOL)
+    end = ended(problem, problem.coordinates.start + [0.7, -0.7])
     suspects = [
         one
         for one in assumptions(problem.recordings, set(TRUTH), problem.sensors)
         if one.name in (MASS, NU, V_S, "mesh")
     ]
-    found = joint_fit(problem, end, suspects, 1.1 * len(at.r), "linear", lambda chi2: None)
-    assert found.left < 1.1 * len(at.r)
-    assert found.parts.keys() == {MASS, NU, V_S}
-    assert max(found.parts, key=lambda name: found.parts[name]) == MASS
-    assert 0.95 < found.parts[MASS] < 1.05
-    assert np.exp(found.at[E]) == pytest.approx(TRUTH[E], rel=0.01)
+    enough = 1.1 * len(end.at.r)
+    found = joint_fit(end, suspects, enough)
+    assert found.square < enough
+    parts, together = shares(end, found, suspects)
+    assert parts.keys() == {MASS, NU, V_S}
+    assert max(parts, key=lambda name: parts[name]) == MASS
+    assert 0.95 < parts[MASS] < 1.05
+    assert together == [MASS]
+    assert np.exp(found.by_label[E]) == pytest.approx(TRUTH[E], rel=0.01)
 
 
 @pytest.mark.slow
@@ -344,19 +337,19 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
         explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
-        fit=lambda one, again, stated, linear: replace(
-            linear, left=lefts.get(one.name, 999.0), refitted=True
+        together=lambda name, again, stated, tried, linear: replace(
+            linear[0], name=name, left=50.0 if len(tried) > 1 else lefts.get(name, 999.0),
+            refitted=True,
         ),
-        together=lambda name, found: replace(
-            found[0], name=name, left=50.0 if len(found) > 1 else found[0].left
-        ),
-    )
-    joint = Joint({}, joint_left, {"a": 0.25, "b": 0.25 if together else 0.9}, together)
+    )  # fmt: skip
+    parts = {"a": 0.25, "b": 0.25 if together else 0.9}
+    joint = SimpleNamespace(square=joint_left)
     monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)
+    monkeypatch.setattr(sensitivity, "shares", lambda *given: (parts, together))
     monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
-    end: Any = SimpleNamespace(far=True)
-    problem: Any = None
-    found = [one.name for one in new_fits(problem, end, taken, "linear", judge, checks, False)]
+    problem: Any = ClosedForm(lambda x: 10.0 + x, 1)
+    end = Fit(problem, Runner(()), np.zeros(1), Stage("far off", ("data",), ("p0",), RTOL)).begun()
+    found = [one.name for one in new_fits(end, taken, judge, checks)]
     assert found == tried
 
 

@@ -109,7 +109,7 @@ def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact):
     coloured = plain.with_noise({"x_C": AR, "effort_x": Autoregression((1.2, -0.5), 0.7, 5e-3)})
     runner, which, x = Runner(plain.recordings), ["strokes"], plain.coordinates.start
     free = plain.coordinates.free
-    _, steps = plain.freeze(runner, x, which, 1e-4)
+    steps = plain.residuals(runner, x, which, 1e-4).steps
     one = plain.residuals(runner, x, which, steps, free)
     other = coloured.residuals(runner, x, which, steps, free)
     again = rewhitened(coloured, one, parts(plain, one.r, which))

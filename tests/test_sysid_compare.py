@@ -221,12 +221,12 @@ def test_densities_are_those_of_the_normal_distribution():
     rng, n = np.random.default_rng(6), 40
     t: Any = np.arange(n) * 5e-3
     sigma, noise = 0.3, Autoregression.stated((0.6, 0.2), 5e-3)
+    sensor = Sensor(noise=sigma)
+    recording = SimpleNamespace(name="one", samples={"effort_x": (t, t)})
     problem: Any = SimpleNamespace(
-        recordings=[SimpleNamespace(name="one", samples={"effort_x": (t, t)})],
-        sensors={"effort_x": Sensor(noise=sigma)},
-        noise={"effort_x": noise},
-        whitened=print,
-    )
+        measured=lambda which: [(recording, "effort_x", sensor)], sensors={"effort_x": sensor},
+        noise={"effort_x": noise}, whitened=print,
+    )  # fmt: skip
     lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     J = rng.standard_normal((n, 2))
     K: Any = sigma**2 * noise.autocovariance(n)[lags]

@@ -15,7 +15,7 @@ from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.rigs.excite import Excitation
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.design import BENT, design, rank
+from torchsoft.sysid.design import LINEARIZATION_ERROR, design, rank
 from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.planner import LEFT, Optimality, Planner, chosen, deviations, optimality
@@ -115,7 +115,7 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan):
         )
         parts.append(np.abs(at.errors) / sd)
         sds.append(sd)
-    assert parts[0].max() < 0.5 * BENT
+    assert parts[0].max() < 0.5 * LINEARIZATION_ERROR
     assert parts[1].max() > 10
     np.testing.assert_allclose(sds[0], 1e4 * sds[1], rtol=1e-9)
 

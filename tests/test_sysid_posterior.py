@@ -13,10 +13,11 @@ from conftest import COARSE, PAPER, RIG, excited, rolled
 from scipy import stats
 
 from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import Prior, Problem, Sensor, Unknown, record
+from torchsoft.sysid import Prior, Problem, Sensor, Stage, Unknown, record
+from torchsoft.sysid.fit import Fit
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.posterior import Whitened, laplace, nuts
-from torchsoft.sysid.profile import Optimum
+from torchsoft.sysid.runs import Runner
 
 STRAIGHT = np.random.default_rng(0).standard_normal((20, 3))
 BENT = ClosedForm(lambda x: [np.sinh(x[0]) + 0.3 * x[0] ** 2], 1)
@@ -215,7 +216,9 @@ def rolling():
 
 
 def test_the_density_on_a_rig_has_its_gradient(rolling):
-    o = Optimum(rolling, rolling.coordinates.start, rtol=1e-4)
+    c = rolling.coordinates
+    stage = Stage("all", rolling.names, c.labels, 1e-4)
+    o = Fit(rolling, Runner(rolling.recordings), c.start, stage).begun()
     white, z = Whitened.of(o), np.array([0.4, -0.3, 0.2])
     _, gradient = white.density(o, z)
     by = [

@@ -10,7 +10,8 @@ from conftest import COARSE, PAPER, RIG, excited
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import Problem, Stage, Unknown, identify, record
 from torchsoft.sysid.fit import Combination, combinations
-from torchsoft.sysid.profile import RISE, Optimum, profiles
+from torchsoft.sysid.profile import RISE, profiles
+from torchsoft.sysid.profile import optimum as of_answer
 
 E, K_N = "materials.rubber.E", "laws.steel_on_rubber.K_n"
 RNG = np.random.default_rng(0)
@@ -74,7 +75,7 @@ def test_a_fit_that_was_not_at_its_optimum_is_found_out():
 
 
 def test_a_profile_of_what_is_not_free_is_refused():
-    o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, free=np.array([True, True, False]))
+    o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, free=("p0", "p1"))
     with pytest.raises(ValueError, match="no free coordinate 'p2' to profile; there are p0, p1"):
         profiles(o, ["p2"])
 
@@ -116,7 +117,7 @@ def test_profile_and_combination_of_stiffnesses_in_series():
         tightenings=0,
         assumptions="trusted",
     )
-    o = Optimum.of(problem, result)
+    o = of_answer(problem, result)
     np.testing.assert_allclose(o.x, result.x)
     (one,) = profiles(o, [E])
     low, high = one.ci95

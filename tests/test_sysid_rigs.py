@@ -329,8 +329,8 @@ def test_a_body_rests_where_the_parameters_let_it_rest(tmp_path, folder):
     problem = load([folder / "run.csv"], folder / "fit.toml").problem
     c, runner = problem.coordinates, Runner(problem.recordings)
     x = np.array([np.log(truth[name]) for name in c.names])
-    at, steps = problem.freeze(runner, x, problem.names, 1e-6, c.free)
+    at = problem.residuals(runner, x, problem.names, 1e-6, c.free)
     assert np.abs(at.r).max() < 0.05
     h = np.array([1e-4, 0.0])
-    ends = [problem.residuals(runner, x + s * h, problem.names, steps).r for s in (1, -1)]
+    ends = [problem.residuals(runner, x + s * h, problem.names, at.steps).r for s in (1, -1)]
     assert at.J[:, 0] == pytest.approx((ends[0] - ends[1]) / 2e-4, abs=1e-4 * np.abs(at.J).max())

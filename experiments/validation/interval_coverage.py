@@ -40,7 +40,7 @@ from torchsoft.experiment import COARSE, RIG, markdown, options, repeated, write
 from torchsoft.rigs.excite import CATALOGUE, Excitation
 from torchsoft.sysid import Problem, Sensor, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
-from torchsoft.sysid.fit import chord, fisher
+from torchsoft.sysid.fit import Fit, chord, fisher
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.measured import load
 from torchsoft.sysid.runs import Runner
@@ -146,9 +146,10 @@ def by_identify(stated: Problem, truth: dict[str, float], rtol: float) -> Repeti
 def by_white_least_squares(stated: Problem, truth: dict[str, float], rtol: float) -> Repetition:
     """As if all noise were white: a few steps by one Jacobian, which is enough from so near."""
     c, runner = stated.coordinates, Runner(stated.recordings)
-    at, steps = stated.freeze(runner, c.start, stated.names, rtol, c.free)
-    end = chord(stated, runner, c.start, at, which=stated.names, free=c.free, steps=steps)
-    found = estimates(stated, end.x, c.free, fisher(at.J)[0] * max(1.0, end.chi2), np.zeros(len(c)))
+    stage = Stage("all", stated.names, tuple(one.label for one in c.within(c.free)), rtol)
+    end = chord(Fit(stated, runner, c.start, stage).begun())
+    C = fisher(end.at.J)[0] * max(1.0, end.chi2)
+    found = estimates(end, C, np.zeros(len(c)))
     return Repetition(judged({e.name: e for e in found}, truth), [], [])
 
 

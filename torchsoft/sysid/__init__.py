@@ -2,10 +2,9 @@
 
 from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.first_samples import estimate_initial_state
-from torchsoft.sysid.fit import Unreachable
+from torchsoft.sysid.fit import Stage, Unreachable
 from torchsoft.sysid.identification import explain, identify
 from torchsoft.sysid.initial_state import Known, MovingStart, Standing
-from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.result import IdentificationResult, load_answer
@@ -31,4 +30,4 @@ __all__ = [
     "identify",
     "load_answer",
     "record",
-]  # fmt: skip
+]

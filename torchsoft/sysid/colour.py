@@ -1,17 +1,15 @@
 """Coloured noise that residuals show, and fits that allow for it."""
 
 import time as clock
-from collections.abc import Callable, Collection, Mapping, Sequence
-from types import MappingProxyType
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.fit import Fit, settled
+from torchsoft.sysid.fit import Colour, Fit, chord
 from torchsoft.sysid.noise import Autoregression, NoiseFit, fit_noise
+from torchsoft.sysid.plan import iterated
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import FAINT, LEVEL, Part, named, parts
@@ -26,90 +24,68 @@ WORSE = 4.0
 colour is a misfit of the model and no noise."""
 
 
-Refit = Callable[[Problem, Fit, int], Fit]
-"""The fit of a problem from the end of another, in a round."""
-
-
-class Coloured(NamedTuple):
-    """A problem with estimated noise, its fit, the noise by channel with the scores of every order,
-    the fits on the way with their ends on the clock [s], and problem and fit `before`; `refused` is
-    colour that would explain a misfit away that is larger by `worse` [1]."""
-
-    problem: Problem
-    fit: Fit
-    found: dict[str, NoiseFit]
-    fits: list[tuple[Fit, float]]
-    before: tuple[Problem, Fit]
-    refused: Mapping[str, NoiseFit] = MappingProxyType({})
-    worse: float = 1.0
-
-    @property
-    def undeclared(self) -> dict[str, NoiseFit]:
-        """Noise of channels whose sensors declare none."""
-        sensors = self.problem.sensors
-        return {name: one for name, one in self.found.items() if sensors[name].colour != "ar"}
-
-    def grown(self, r: Array, which: Sequence[str]) -> float:
-        """Sum of squares of residuals r (m,) of this problem over that before, in channels of
-        undeclared colour."""
-        problem, fit = self.before
-        own = self.undeclared
-        return misfit(self.problem, r, which, own) / max(
-            misfit(problem, fit.at.r, which, own), 1e-300
-        )
-
-
-def allow_for_colour(
-    problem: Problem,
-    fit: Fit,
-    free: NDArray[np.bool_],
-    which: Sequence[str],
-    refit: Refit,
-    undeclared: bool = True,
-) -> Coloured:
-    """Estimate the noise from a fit's residuals in the recordings `which`, and continue the fit
-    with it by `refit(problem, fit, round)`, while coordinates that are `free` (n,) move.
+def allow_for_colour(fit: Fit, undeclared: bool = True) -> Fit:
+    """Estimate the noise from a fit's residuals, and continue the fit with it, on its steps, while
+    its coordinates move: with a new Jacobian first, then with the last one.
 
     Nothing changes where all noise is white. Without `undeclared`, only declared colour is
     estimated, and that of other channels stays as it is in the problem; so it does where undeclared
     colour would let the fit go to a misfit `WORSE` times as large, which no sensor makes.
     """
-    before = problem, fit  # `WORSE` than this no noise may make it
-    declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
-    given = {} if undeclared else problem.noise
-    found, fits = dict[str, NoiseFit](), list[tuple[Fit, float]]()
+    given = {} if undeclared else fit.problem.noise
+    stated = fit.colour.stated or fit
     for number in range(ROUNDS):
-        now = parts(problem, fit.at.r, which)
-        found = colours(now, fit.at.J[:, free], declared)
+        began, problem = clock.perf_counter(), fit.problem
+        now, declared = parts(problem, fit.at.r, fit.which), declared_colour(problem)
+        found = colours(now, fit.J, declared)
         if not undeclared:
             found = {channel: found[channel] for channel in declared if channel in found}
+        fit = fit._replace(colour=Colour(found, stated))
         if not found and not problem.noise:
             break
         problem = problem.with_noise(given | {name: one.noise for name, one in found.items()})
-        at = rewhitened(problem, fit.at, now)
-        fit = fit._replace(at=at, chi2=float(np.mean(at.r**2)))
-        if settled(problem, fit.x, at, free):
+        fit = fit._replace(problem=problem, at=rewhitened(problem, fit.at, now))
+        if fit.settled:
             break
-        fit = refit(problem, fit, number)
-        fits.append((fit, clock.perf_counter()))
-        coloured = Coloured(problem, fit, found, fits, before)
-        if undeclared and (worse := coloured.grown(fit.at.r, which)) > WORSE:
-            return without(coloured, worse, free, which, refit)
-    return Coloured(problem, fit, found, fits, before)
+        fit = chord(fit) if number > 0 and fit.loss == "linear" else iterated(fit)
+        fit = fit.noted("with the noise that was found", began)
+        if undeclared and growth(fit) > WORSE:
+            return without_colour(fit)
+    return fit
 
 
-def without(
-    coloured: Coloured, worse: float, free: NDArray[np.bool_], which: Sequence[str], refit: Refit
-) -> Coloured:
-    """The fit before, with declared colour only: undeclared colour made the misfit `worse`."""
-    kept = allow_for_colour(*coloured.before, free, which, refit, undeclared=False)
-    return kept._replace(fits=coloured.fits + kept.fits, refused=coloured.undeclared, worse=worse)
+def without_colour(fit: Fit) -> Fit:
+    """The fit as it was before its noise was estimated, with declared colour only: undeclared
+    colour made its misfit worse."""
+    before = fit.colour.stated or fit
+    before = before._replace(stages=fit.stages, stage=fit.stage, notify=fit.notify)
+    kept = allow_for_colour(before, undeclared=False)
+    return kept._replace(
+        colour=kept.colour._replace(refused=undeclared_colour(fit), worse=growth(fit))
+    )
 
 
-def misfit(problem: Problem, r: Array, which: Sequence[str], channels: Collection[str]) -> float:
-    """Sum of squared residuals of some channels over their stated noise; r (m,) are whitened."""
-    now = parts(problem, r, which)
-    return sum(float(part.raw @ part.raw) for part in now if part.channel in channels)
+def declared_colour(problem: Problem) -> list[str]:
+    """Channels whose sensors declare colour."""
+    return [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
+
+
+def undeclared_colour(fit: Fit) -> dict[str, NoiseFit]:
+    """Noise of channels whose sensors declare none."""
+    declared = declared_colour(fit.problem)
+    return {channel: one for channel, one in fit.colour.found.items() if channel not in declared}
+
+
+def growth(fit: Fit) -> float:
+    """Sum of squared residuals, over the stated noise, in channels of undeclared colour, over that
+    of the fit before its noise was estimated."""
+    own = undeclared_colour(fit)
+
+    def misfit(one: Fit) -> float:
+        now = parts(one.problem, one.at.r, one.which)
+        return sum(float(part.raw @ part.raw) for part in now if part.channel in own)
+
+    return misfit(fit) / max(misfit(fit.colour.stated or fit), 1e-300)
 
 
 def spread(J: Array, C: Array, left: Sequence[Part], refused: Mapping[str, NoiseFit]) -> Array:
@@ -138,7 +114,7 @@ def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residual
         )
         r[part.rows] = problem.whitened(recordings[part.recording], part.channel, part.raw)
         J[part.rows] = problem.whitened(recordings[part.recording], part.channel, rows)
-    return Residuals(r, J, at.failed)
+    return at._replace(r=r, J=J)
 
 
 def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> dict[str, NoiseFit]:
@@ -170,32 +146,27 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
     return out
 
 
-def refusal(coloured: Coloured) -> list[str]:
-    """Sentence on colour that was refused."""
-    if not coloured.refused:
-        return []
-    return [
-        f"what the fit left is coloured in {named(list(coloured.refused))}; taken for noise, that "
-        f"would move the estimates to {coloured.worse:.2g} times the sum of squares, which is a "
-        "misfit of the model and no noise: the estimates are those of white noise, and intervals "
-        "count the misfit as if it were the sensor's"
-    ]
-
-
-def colour_notices(found: Mapping[str, NoiseFit], declared: Sequence[str] = ()) -> list[str]:
-    """Sentences on undeclared colour, which intervals allow for."""
-    names = [
-        f"{channel} (order {fit.noise.order}, neighbouring samples correlate by "
-        f"{correlation(fit.noise):.2f})"
-        for channel, fit in found.items() if channel not in declared
-    ]  # fmt: skip
-    if not names:
-        return []
-    return [
-        f"what the fit left is coloured in {named(names)}, which nobody has declared: intervals "
-        "allow for it as noise, but a wrong model leaves such residuals too; where it is the "
-        "sensor, declare its `colour`"
-    ]
+def colour_notices(undeclared: Mapping[str, NoiseFit], colour: Colour) -> list[str]:
+    """Sentences on colour that was refused, and on undeclared colour, which intervals allow for."""
+    out = list[str]()
+    if colour.refused:
+        out.append(
+            f"what the fit left is coloured in {named(list(colour.refused))}; taken for noise, "
+            f"that would move the estimates to {colour.worse:.2g} times the sum of squares, which "
+            "is a misfit of the model and no noise: the estimates are those of white noise, and "
+            "intervals count the misfit as if it were the sensor's"
+        )
+    if names := [
+        f"{channel} (order {one.noise.order}, neighbouring samples correlate by "
+        f"{correlation(one.noise):.2f})"
+        for channel, one in undeclared.items()
+    ]:
+        out.append(
+            f"what the fit left is coloured in {named(names)}, which nobody has declared: "
+            "intervals allow for it as noise, but a wrong model leaves such residuals too; where "
+            "it is the sensor, declare its `colour`"
+        )
+    return out
 
 
 def correlation(noise: Autoregression) -> float:

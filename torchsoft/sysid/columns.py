@@ -129,8 +129,10 @@ class Tables:
         """Times (n,) [s] and values (n,) by column."""
         return {
             name: (table.values["t"], column)
-            for table in self.tables for name, column in table.values.items() if name != "t"
-        }  # fmt: skip
+            for table in self.tables
+            for name, column in table.values.items()
+            if name != "t"
+        }
 
     @property
     def begin(self) -> float:

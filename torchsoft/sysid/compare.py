@@ -28,17 +28,16 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
 from torchsoft.display import suggestion
 from torchsoft.files import write_json
-from torchsoft.sysid.colour import allow_for_colour
-from torchsoft.sysid.fit import Fit, Unreachable, gauss_newton
+from torchsoft.sysid.colour import allow_for_colour, declared_colour
+from torchsoft.sysid.fit import Fit, Stage, Unreachable
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
-from torchsoft.sysid.plan import FINER, Stage, default_plan, run_plan
+from torchsoft.sysid.plan import FINER, continued, default_plan, run_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.residual_tests import (
@@ -274,52 +273,37 @@ def density(
     return Density(mine, r, s, float(log))
 
 
-class FittedLaw(NamedTuple):
-    """A fitted law: final coordinates x (n,), mask `free` (n,) of the fitted ones, tolerance, and
-    convergence. The problem includes the estimated noise."""
-
-    name: str
-    problem: Problem
-    x: Array
-    free: NDArray[np.bool_]
-    rtol: float
-    converged: bool
-
-
 class Evidence:
-    """A fitted law's densities of the fitted recordings `which` and of the held-out ones.
+    """Densities under a law, by its fit, of the fitted recordings and of held-out ones.
 
     They come from runs with a tenth of the fit's tolerance; `numerical` is the change that this
     makes. Raises `ValueError` where a run fails.
     """
 
-    def __init__(
-        self, law: FittedLaw, runner: Runner, which: Sequence[str], heldout: Sequence[str]
-    ) -> None:
-        self.law, self.name, self.which, self._runner = law, law.name, list(which), runner
-        problem, free = law.problem, law.free
+    def __init__(self, name: str, fit: Fit, heldout: Sequence[str] = ()) -> None:
+        self.name, self.fit, which, free = name, fit, fit.which, fit.free
+        problem = fit.problem
         self.parameters = int(free.sum()) + sum(one.order + 1 for one in problem.noise.values())
         m = problem.samples(which)
-        usual = self._at(which, law.rtol, False).r[:m]
-        r, J, _ = self._at(which, FINER * law.rtol, True)
-        self.fitted = density(problem, which, r[:m])
-        self.verdicts = judge_residuals(self.fitted.parts, r, J[:, free])
+        usual = self._at(which, fit.rtol, False).r[:m]
+        at = self._at(which, FINER * fit.rtol, True)
+        J = at.J[:, free]
+        self.fitted = density(problem, which, at.r[:m])
+        self.verdicts = judge_residuals(self.fitted.parts, at.r, J)
         self.numerical = abs(0.5 * float(usual @ usual - self.fitted.r @ self.fitted.r))
         self.dof, self.heldout = max(self.fitted.samples - int(free.sum()), 1), None
         if heldout:
-            low, high = (bound[free] for bound in problem.coordinates.bounds)
-            F = J[:, free].T @ J[:, free] + np.diag(
-                12 / (high - low) ** 2
-            )  # what is unknown is between its bounds
-            m = problem.samples(heldout)
-            r, J, _ = self._at(heldout, FINER * law.rtol, True)
-            spread = np.linalg.solve(np.linalg.cholesky(F), J[:m, free].T).T
-            self.heldout = density(problem, heldout, r[:m], np.asarray(spread, np.float64))
+            low, high = fit.bounds
+            F = J.T @ J + np.diag(12 / (high - low) ** 2)  # what is unknown is between its bounds
+            m, at = problem.samples(heldout), self._at(heldout, FINER * fit.rtol, True)
+            spread = np.linalg.solve(np.linalg.cholesky(F), at.J[:m, free].T).T
+            self.heldout = density(problem, heldout, at.r[:m], np.asarray(spread, np.float64))
 
     def _at(self, which: Sequence[str], rtol: float, derivatives: bool) -> Residuals:
         """Residuals at the estimates, and their Jacobian with `derivatives`."""
-        at = self.law.problem.residuals(
-            self._runner, self.law.x, which, rtol, self.law.free if derivatives else None
+        fit = self.fit
+        at = fit.problem.residuals(
+            fit.runner, fit.x, which, rtol, fit.free if derivatives else None
         )
         if at.failed:
             raise ValueError(
@@ -396,11 +380,16 @@ CLOSE = 1e-3
 
 
 def compare(
-    laws: Mapping[str, Problem], *, heldout: Sequence[str] = (),
-    plans: Mapping[str, Sequence[Stage]] | None = None, rtol: float = RTOL, starts: int = 1,
-    workers: int = 1, checkpoint: str | Path | Mapping[str, str | Path] | None = None,
+    laws: Mapping[str, Problem],
+    *,
+    heldout: Sequence[str] = (),
+    plans: Mapping[str, Sequence[Stage]] | None = None,
+    rtol: float = RTOL,
+    starts: int = 1,
+    workers: int = 1,
+    checkpoint: str | Path | Mapping[str, str | Path] | None = None,
     progress: bool = False,
-) -> Comparison:  # fmt: skip
+) -> Comparison:
     """Fit every law to the same recordings, and say which one made them, or that the data cannot
     tell: `Comparison.verdict`, by the rule of `torchsoft.sysid.compare`.
 
@@ -426,22 +415,23 @@ def compare(
     folders = dict(checkpoint) if isinstance(checkpoint, Mapping) else {}
     if checkpoint is not None and not isinstance(checkpoint, Mapping):
         folders = {name: Path(checkpoint) / name for name in laws}
-    evidence, runners = dict[str, Evidence](), dict[str, Runner]()
+    evidence = dict[str, Evidence]()
     for name, problem in laws.items():
         own = folders.get(name)
-        runners[name] = Runner(problem.recordings, workers, Path(own) if own is not None else None)
+        runner = Runner(problem.recordings, workers, Path(own) if own is not None else None)
+        begin = Fit(problem, runner, problem.coordinates.start, progress=progress)
         try:
-            law = fitted(
-                name, problem, runners[name], which, (plans or {}).get(name), rtol, starts, progress
-            )
+            plan = (plans or {}).get(name)
+            if plan is None:
+                plan = default_plan(problem, runner, rtol, which, starts)
+            evidence[name] = Evidence(name, fitted(name, begin, which, plan), heldout)
         except Unreachable as error:
             raise ValueError(f"the law `{name}` cannot follow the recordings: {error}") from None
-        evidence[name] = Evidence(law, runners[name], which, heldout)
     best = max(evidence, key=lambda name: evidence[name].total)
     for name in (name for name in laws if name != best):
-        other = refitted(evidence[name].law, evidence[best].law, runners[name], which)
+        other = refitted(evidence[name].fit, evidence[best].fit)
         if other is not None:
-            better = Evidence(other, runners[name], which, heldout)
+            better = Evidence(name, other, heldout)
             if better.fitted.log > evidence[name].fitted.log:
                 evidence[name] = better
     first = max(evidence.values(), key=lambda one: one.total)
@@ -494,59 +484,29 @@ def same_reference(one: Recording, other: Recording) -> bool:
     )
 
 
-def fitted(
-    name: str, problem: Problem, runner: Runner, which: Sequence[str], plan: Sequence[Stage] | None,
-    rtol: float, starts: int, progress: bool,
-) -> FittedLaw:  # fmt: skip
+def fitted(name: str, begin: Fit, which: Sequence[str], plan: Sequence[Stage]) -> Fit:
     """A law at the end of its plan, with its noise estimated where sensors declare colour. Raises
     `Unreachable`."""
-    if plan is None:
-        plan = default_plan(problem, runner, rtol, which, starts)
     if not plan or list(plan[-1].recordings) != list(which):
         raise ValueError(f"the last stage of the plan of `{name}` must fit {', '.join(which)}")
-    end = run_plan(
-        problem, runner, plan, problem.coordinates.start, label=f"{name} ", progress=progress
-    )
-    if end.failure is not None:  # laws are compared by the same tolerance
-        raise end.failure
-    fit = end.fit
-    free = np.isin(problem.coordinates.labels, plan[-1].free)
-
-    def again(one: Problem, last: Fit, number: int) -> Fit:
-        return gauss_newton(
-            one, runner, last.x, which=which, free=free, steps=last.steps, tolerance=CLOSE,
-            first=last.at,
-        )  # fmt: skip
-
-    if any(sensor.colour == "ar" for sensor in problem.sensors.values()):
-        problem, fit, *_ = allow_for_colour(problem, fit, free, which, again, undeclared=False)
-    return FittedLaw(name, problem, fit.x, free, plan[-1].rtol, fit.converged)
+    fit = run_plan(begin, plan, label=f"{name} ")
+    if fit.failure is not None:  # laws are compared by the same tolerance
+        raise fit.failure
+    return allow_for_colour(fit, undeclared=False) if declared_colour(fit.problem) else fit
 
 
-def refitted(
-    law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[str]
-) -> FittedLaw | None:
+def refitted(law: Fit, best: Fit) -> Fit | None:
     """The law fitted once more, from the estimates of another; None where they share no coordinate,
     or the fit cannot start there."""
-    c, x = law.problem.coordinates, law.x.copy()
-    known = {
-        label: one.to_value(v)
-        for label, one, v in zip(
-            best.problem.coordinates.labels, best.problem.coordinates.all, best.x
-        )
-    }
-    for i, one in enumerate(c.all):
+    x, c = law.x.copy(), best.problem.coordinates
+    known = {one.label: one.to_value(v) for one, v in zip(c.all, best.x)}
+    for i, one in enumerate(law.problem.coordinates.all):
         if law.free[i] and one.label in known:
             x[i] = one.to_x(float(np.clip(known[one.label], one.low, one.high)))
     if (x == law.x).all():
         return None
-    free = tuple(one.label for one in c.within(law.free))
-    try:
-        stage = Stage("again", tuple(which), free, law.rtol, tolerance=CLOSE)
-        fit = run_plan(law.problem, runner, [stage], x).fit
-    except Unreachable:
-        return None
-    return FittedLaw(law.name, law.problem, fit.x, law.free, law.rtol, fit.converged)
+    stage = Stage("again", law.which, law.labels, law.rtol, tolerance=CLOSE)
+    return continued(law._replace(x=x), stage)
 
 
 def versus(best: Evidence, other: Evidence) -> Versus:
@@ -561,11 +521,17 @@ def versus(best: Evidence, other: Evidence) -> Versus:
         held, z = ahead.log, ahead.z
     evidence -= 0.5 * max(best.parameters - other.parameters, 0) * float(np.log(n))
     return Versus(
-        best.name, other.name, fitted.log, held,
-        stated**0.5, variance / stated if stated > 0 else 1.0, evidence,
-        log / variance**0.5 if variance > 0 else 0.0, z,
+        best.name,
+        other.name,
+        fitted.log,
+        held,
+        stated**0.5,
+        variance / stated if stated > 0 else 1.0,
+        evidence,
+        log / variance**0.5 if variance > 0 else 0.0,
+        z,
         (best.numerical + other.numerical) / fitted.inflation,
-    )  # fmt: skip
+    )
 
 
 def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
@@ -583,18 +549,27 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
         square, held, c = (
             float(one.fitted.r @ one.fitted.r),
             one.heldout,
-            one.law.problem.coordinates,
+            one.fit.problem.coordinates,
         )
-        found = zip(c.all, one.law.x, one.law.free)
+        found = zip(c.all, one.fit.x, one.fit.free)
         out.append(
             LawFit(
-                name, int(k[i]), {a.label: a.to_value(x) for a, x, free in found if free},
+                name,
+                int(k[i]),
+                {a.label: a.to_value(x) for a, x, free in found if free},
                 one.fitted.log,
-                square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]),
-                float(aicc[i]), float(bic[i]), float(weight[i] / weight.sum()),
-                None if held is None else held.log / len(held.r), None if held is None else held.p,
-                one.numerical, one.law.converged, [*residual_notices(one.verdicts).values()],
+                square / one.dof,
+                float(stats.chi2.sf(square, one.dof)),
+                float(aic[i]),
+                float(aicc[i]),
+                float(bic[i]),
+                float(weight[i] / weight.sum()),
+                None if held is None else held.log / len(held.r),
+                None if held is None else held.p,
+                one.numerical,
+                one.fit.converged,
+                [*residual_notices(one.verdicts).values()],
                 any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
             )
-        )  # fmt: skip
+        )
     return out

@@ -114,7 +114,7 @@ class Search:
 # The design of a motion
 
 
-BENT = 1.0
+LINEARIZATION_ERROR = 1.0
 """Largest error, in standard deviations, of a fit's Gauss-Newton step that gets no notice."""
 
 
@@ -150,12 +150,21 @@ class Design:
 
 
 def design(
-    problem: Problem, plan: str, bounds: Mapping[str, Bounds], *,
-    limits: Mapping[str, Range] | None = None, criterion: Optimality = "D",
-    names: Sequence[str] | None = None, iterations: int = 100, rate: float = 0.03,
-    smoothing: float = 0.02, rtol: float = RTOL, seed: int = 0, workers: int = 1,
+    problem: Problem,
+    plan: str,
+    bounds: Mapping[str, Bounds],
+    *,
+    limits: Mapping[str, Range] | None = None,
+    criterion: Optimality = "D",
+    names: Sequence[str] | None = None,
+    iterations: int = 100,
+    rate: float = 0.03,
+    smoothing: float = 0.02,
+    rtol: float = RTOL,
+    seed: int = 0,
+    workers: int = 1,
     progress: bool = False,
-) -> Design:  # fmt: skip
+) -> Design:
     """Move the knots of the recording `plan` of a problem to minimise the uncertainty of the
     parameters `names`, by default all.
 
@@ -215,28 +224,41 @@ def design(
         for name, part in last.peaks.items()
         if part > 1
     ]
-    bent = {name: float(np.abs(part).max()) for name, part in planner.bent(x, last).items()}
-    most = max(bent, key=lambda name: bent[name])
-    if bent[most] > BENT:
+    off = {
+        name: float(np.abs(part).max())
+        for name, part in planner.linearization_error(x, last).items()
+    }
+    most = max(off, key=lambda name: off[name])
+    if off[most] > LINEARIZATION_ERROR:
         notices.append(
             f"a fit on steps by rtol = {rtol:g} that begins a standard deviation from the truth "
-            f"ends {bent[most]:.2g} of them from it in `{most}`: take finer steps, and count "
+            f"ends {off[most]:.2g} of them from it in `{most}`: take finer steps, and count "
             "intervals that hold before this motion is used"
         )
     if search.failed:
         notices.append(f"{search.failed} motions that the search tried could not be run")
     return Design(
-        given=given, recording=planner.made(search.z, x, last), before=before,
-        after=planner.deviations(x, last), history=tuple(search.history),
-        limits=(*planner.moves.active(search.z), *peaks), notices=tuple(notices),
+        given=given,
+        recording=planner.made(search.z, x, last),
+        before=before,
+        after=planner.deviations(x, last),
+        history=tuple(search.history),
+        limits=(*planner.moves.active(search.z), *peaks),
+        notices=tuple(notices),
         made_by={
-            "torchsoft": version("torchsoft"), "criterion": criterion,
+            "torchsoft": version("torchsoft"),
+            "criterion": criterion,
             "bounds": {name: one.model_dump() for name, one in bounds.items()},
-            "limits": planner.limits, "iterations": search.iteration, "rate": rate,
-            "smoothing": smoothing, "rtol": rtol, "seed": seed,
-            **planner.cost, "wall_s": clock.perf_counter() - began,
+            "limits": planner.limits,
+            "iterations": search.iteration,
+            "rate": rate,
+            "smoothing": smoothing,
+            "rtol": rtol,
+            "seed": seed,
+            **planner.cost,
+            "wall_s": clock.perf_counter() - began,
         },
-    )  # fmt: skip
+    )
 
 
 # Rehearsal of an experiment: simulated recordings with the sensors' noise, whose identification
@@ -248,9 +270,14 @@ FINER = 0.1
 
 
 def planned(
-    stated: Config, file: RigFile, built: BuiltRig, name: str, rtol: float,
-    start: Beginning | None = None, **options: Any,
-) -> Recording:  # fmt: skip
+    stated: Config,
+    file: RigFile,
+    built: BuiltRig,
+    name: str,
+    rtol: float,
+    start: Beginning | None = None,
+    **options: Any,
+) -> Recording:
     """A planned recording of a file's rig, `built`, by a configuration, from a run with the
     tolerance `rtol`; `options` are further arguments of `record`. Raises `ValueError`, and
     `SimulationFailed`."""
@@ -371,19 +398,29 @@ class Chosen(NamedTuple):
         if self.found is not None:
             one = self.found
             out |= {
-                "before": one.before, "after": one.after, "limits": one.limits,
-                "history": [asdict(visit) for visit in one.history], "notices": one.notices,
-                "confirmed": one.confirmed, "made_by": one.made_by,
-            }  # fmt: skip
+                "before": one.before,
+                "after": one.after,
+                "limits": one.limits,
+                "history": [asdict(visit) for visit in one.history],
+                "notices": one.notices,
+                "confirmed": one.confirmed,
+                "made_by": one.made_by,
+            }
         return out
 
 
 def rank(
-    recorded: Sequence[Recording], candidates: Sequence[Recording], sensors: dict[str, Sensor],
-    unknowns: dict[str, Unknown], *, limits: Mapping[str, Range] | None = None,
-    criterion: Optimality = "D", names: Sequence[str] | None = None, rtol: float = RTOL,
+    recorded: Sequence[Recording],
+    candidates: Sequence[Recording],
+    sensors: dict[str, Sensor],
+    unknowns: dict[str, Unknown],
+    *,
+    limits: Mapping[str, Range] | None = None,
+    criterion: Optimality = "D",
+    names: Sequence[str] | None = None,
+    rtol: float = RTOL,
     workers: int = 1,
-) -> list[Rated]:  # fmt: skip
+) -> list[Rated]:
     """Candidates for the next recording, the best first: by the uncertainty of the parameters
     `names` (all by default), at their nominal values, from each together with what is `recorded`.
 
@@ -394,9 +431,15 @@ def rank(
     for one in candidates:
         problem = Problem([*recorded, one], sensors, unknowns)
         planner = Planner(
-            problem, one.name, Moves(one.rig.reference, {}, 0.0), limits or {}, criterion, names,
-            rtol, workers,
-        )  # fmt: skip
+            problem,
+            one.name,
+            Moves(one.rig.reference, {}, 0.0),
+            limits or {},
+            criterion,
+            names,
+            rtol,
+            workers,
+        )
         x = problem.coordinates.start
         try:
             seen = planner.evaluate(np.zeros(0), x)
@@ -428,9 +471,13 @@ def unlike(found: Recording, again: Recording) -> list[str]:
 
 
 def choose(
-    config: Path, stated: Config, recorded: Sequence[Recording] = (), *, workers: int = 1,
+    config: Path,
+    stated: Config,
+    recorded: Sequence[Recording] = (),
+    *,
+    workers: int = 1,
     progress: bool = False,
-) -> Chosen:  # fmt: skip
+) -> Chosen:
     """Rank a configuration's candidates for the motion by the uncertainty of its unknowns, together
     with the recordings in `recorded`, and move the knots of the best one that `bounds` name.
 
@@ -451,9 +498,12 @@ def choose(
         except SimulationFailed as failure:
             failures.append(Rated(name, np.inf, {}, {}, str(failure)))
     common: dict[str, Any] = {
-        "limits": plan.limits, "criterion": plan.criterion, "names": plan.parameters or None,
-        "rtol": plan.rtol, "workers": workers,
-    }  # fmt: skip
+        "limits": plan.limits,
+        "criterion": plan.criterion,
+        "names": plan.parameters or None,
+        "rtol": plan.rtol,
+        "workers": workers,
+    }
     rated = rank(recorded, [*made.values()], stated.sensors, stated.unknowns, **common) + failures
     best = rated[0].name
     if rated[0].failure:
@@ -462,9 +512,14 @@ def choose(
     if plan.bounds:
         problem = Problem([*recorded, made[best]], stated.sensors, stated.unknowns)
         found = design(
-            problem, best, plan.bounds, iterations=plan.iterations, seed=plan.seed,
-            progress=progress, **common,
-        )  # fmt: skip
+            problem,
+            best,
+            plan.bounds,
+            iterations=plan.iterations,
+            seed=plan.seed,
+            progress=progress,
+            **common,
+        )
         chosen = chosen.override(motion=knots(found.recording.rig.reference, plan.bounds))
         try:
             again = planned(stated, chosen, chosen.build(), best, plan.rtol, noise=0.0)

@@ -1,18 +1,17 @@
 """Estimates with intervals, identifiability, residuals by channel, and contributions of
 recordings."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
-from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.fit import Fit, fisher
 from torchsoft.sysid.initial_state import PREFIX
-from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import parts, whiteness
 from torchsoft.sysid.unknowns import Coordinate, Prior
@@ -123,9 +122,9 @@ class Quantity(NamedTuple):
         return self.value * float(np.exp(-reach)), self.value * float(np.exp(reach))
 
 
-def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[Quantity]:
-    """Parameters in physical units, then coordinates of starts and faults of sensors, at x (n,)."""
-    c = problem.coordinates
+def quantities(fit: Fit) -> Iterator[Quantity]:
+    """Fitted parameters in physical units, then coordinates of starts and faults of sensors."""
+    problem, x, free, c = fit.problem, fit.x, fit.free, fit.problem.coordinates
     for k, recording in enumerate(problem.recordings):
         values, before = problem.values(x, k), problem.values(c.start, k)
         chain = c.jacobian(x, recording.name, values)
@@ -140,40 +139,50 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
                 size = first.high - first.low if alone else abs(value)
             declared = recording.rig.quantity(name)
             yield Quantity(
-                name, "parameter", recording.name if own else None,
-                declared.unit if declared else "", value, first.nominal if alone else before[name],
-                size, chain[row] / (value if size is None else size), places,
+                name,
+                "parameter",
+                recording.name if own else None,
+                declared.unit if declared else "",
+                value,
+                first.nominal if alone else before[name],
+                size,
+                chain[row] / (value if size is None else size),
+                places,
                 first.prior if alone else None,
-            )  # fmt: skip
+            )
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
-            name, where, unit = (
-                replace(one, recording=None).label,
-                one.recording,
-                nuisance_unit(one, problem),
-            )
+            name, unit = replace(one, recording=None).label, nuisance_unit(one, problem)
             slope, size, value = np.eye(len(c))[i], float(one.slope(x[i])), one.to_value(x[i])
             yield Quantity(
-                name, one.kind, where, unit, value, one.nominal, size, slope, [i], one.prior
+                name, one.kind, one.recording, unit, value, one.nominal, size, slope, [i], one.prior
             )
 
 
-def estimates(
-    problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array
-) -> list[Estimate]:
+def estimates(fit: Fit, C: Array, shift: Array) -> list[Estimate]:
     """All estimates in physical units; covariance C (n, n) and shift by the steps (n,) are those of
     all coordinates."""
-    edge, out = free & problem.coordinates.at_bound(x), []
-    for one in quantities(problem, x, free):
+    edge, out = fit.free & fit.problem.coordinates.at_bound(fit.x), []
+    for one in quantities(fit):
         sd = float(np.sqrt(max(one.slope @ C @ one.slope, 0.0)))
         identifiable = one.identifiable(sd)
         known = (one.value, one.interval(sd)) if identifiable else (None, None)
         relative = sd if one.size is None else sd * one.size / max(abs(one.value), 1e-300)
         bias = float(one.slope @ shift) / sd if sd > 0 else 0.0
         found = Estimate(
-            one.name, one.unit, one.recording, *known, relative, one.value, identifiable,
-            bool(edge[one.places].any()), bias, one.kind, one.start, one.prior,
-        )  # fmt: skip
+            one.name,
+            one.unit,
+            one.recording,
+            *known,
+            relative,
+            one.value,
+            identifiable,
+            bool(edge[one.places].any()),
+            bias,
+            one.kind,
+            one.start,
+            one.prior,
+        )
         out.append(found)
     return out
 
@@ -185,9 +194,13 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
         return ("rad" if axis.endswith("theta") else "m") + ("/s" if axis.startswith("v_") else "")
     own = problem.unit(one.name)
     units = {
-        "bias": own, "drift": f"{own}/s", "delay": "s", "lag": "s", "misalignment": "rad",
+        "bias": own,
+        "drift": f"{own}/s",
+        "delay": "s",
+        "lag": "s",
+        "misalignment": "rad",
         "inertia": "kg",
-    }  # fmt: skip
+    }
     return units.get(one.kind, "1")
 
 
@@ -214,20 +227,15 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
     return out
 
 
-def residual_channels(
-    problem: Problem, residuals: Residuals, which: list[str]
-) -> list[ChannelResiduals]:
-    orders = {channel: noise.order for channel, noise in problem.noise.items()}
-    return [
-        ChannelResiduals(
-            part.recording,
-            part.channel,
-            float(np.sqrt(np.mean((r := residuals.r[part.rows]) ** 2))),
-            *whiteness(r, orders.get(part.channel, 0)),
-            float(np.sqrt(np.mean(part.raw**2))),
-        )
-        for part in parts(problem, residuals.r, which)
-    ]
+def residual_channels(fit: Fit) -> list[ChannelResiduals]:
+    """Residuals of every channel of the fitted recordings."""
+    orders, out = {channel: one.order for channel, one in fit.problem.noise.items()}, []
+    for part in parts(fit.problem, fit.at.r, fit.which):
+        r = fit.at.r[part.rows]
+        rms, stated = (float(np.sqrt(np.mean(rows**2))) for rows in (r, part.raw))
+        white = whiteness(r, orders.get(part.channel, 0))
+        out.append(ChannelResiduals(part.recording, part.channel, rms, *white, stated))
+    return out
 
 
 # Contributions of recordings and priors to the estimates
@@ -244,19 +252,15 @@ class Contribution:
     without: dict[str, float | None]
 
 
-def contributions(
-    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, fitted: Sequence[str]
-) -> list[Contribution]:
-    """Contributions of the recordings `fitted`, then of the priors, from the whitened Jacobian J
-    (m, n) at x (n,), whose rows are in this order."""
-    rows, at = dict[str | None, slice](), 0
-    for name in (name for name in problem.names if name in fitted):
-        rows[name] = slice(at, at + problem.samples([name]))
+def contributions(fit: Fit) -> list[Contribution]:
+    """Contributions of the fitted recordings, then of the priors."""
+    rows, at, J = dict[str | None, slice](), 0, fit.J
+    for name in (name for name in fit.problem.names if name in fit.which):
+        rows[name] = slice(at, at + fit.problem.samples([name]))
         at = rows[name].stop
     if at < len(J):
         rows[None] = slice(at, len(J))
-    J = J[:, free]
-    C, slopes = fisher(J)[0], {one.label: one.slope[free] for one in quantities(problem, x, free)}
+    C, slopes = fit.covariance, {one.label: one.slope[fit.free] for one in quantities(fit)}
     sd = {label: float(np.sqrt(g @ C @ g)) for label, g in slopes.items()}
     parts = {
         name: {label: float(np.sum((J[own] @ (C @ g)) ** 2)) for label, g in slopes.items()}

@@ -103,9 +103,16 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
             continue
         low, value, high = (max(v / s, 1e-6) for v in (e.ci95[0], e.value, e.ci95[1]))
         axes.errorbar(
-            value, row, xerr=[[value - low], [high - value]], fmt="o", color=ACTUAL, ms=6, lw=2.4,
-            capsize=4, capthick=1.2,
-        )  # fmt: skip
+            value,
+            row,
+            xerr=[[value - low], [high - value]],
+            fmt="o",
+            color=ACTUAL,
+            ms=6,
+            lw=2.4,
+            capsize=4,
+            capthick=1.2,
+        )
         reach += [low, high]
     axes.set_xscale("log")
     low, high = min(reach) / 1.15, max(reach) * 1.15

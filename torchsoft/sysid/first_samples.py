@@ -54,9 +54,12 @@ them."""
 
 
 def estimate_initial_state(
-    recording: Recording, sensors: Mapping[str, Sensor], *, lead: float = LEAD,
+    recording: Recording,
+    sensors: Mapping[str, Sensor],
+    *,
+    lead: float = LEAD,
     given: Mapping[str, Normal] | None = None,
-) -> Recording:  # fmt: skip
+) -> Recording:
     """The recording with a moving start at its first sample; the samples of the first `lead` [s]
     determine its initial state, and are left out.
 

@@ -1,8 +1,10 @@
 """Least squares on frozen steps: Gauss-Newton with exact sensitivities, descent with the adjoint,
 covariance and robust losses."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -10,10 +12,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear, minimize
 
 from torchsoft.plan.search import ProjectedAdam
+from torchsoft.sysid.noise import NoiseFit
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
-from torchsoft.sysid.recording import Array
+from torchsoft.sysid.recording import Array, Mask
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.unknowns import Coordinate
 
 
 def fisher(J: Array) -> tuple[Array, Array, Array]:
@@ -204,10 +208,18 @@ def covariance(
     return inverse @ (max(power, least) * J[:m].T @ J[:m] + J[m:].T @ J[m:]) @ inverse
 
 
-# Gauss-Newton and gradient descent
+# A fit, from its begin to its end
 
+
+Method = Literal["gauss_newton", "lbfgs", "adam"]
 
 Notify = Callable[[float], None]
+"""Called with chi2 after every evaluation."""
+
+
+def silent(chi2: float) -> None:
+    """Notify nobody."""
+
 
 SETTLED = 0.2
 """Largest remaining move of a coordinate, in standard deviations, at which a fit has ended."""
@@ -229,29 +241,253 @@ class Unreachable(RuntimeError):
         self.failed, self.findings = failed, tuple(findings)
 
 
-class Fit(NamedTuple):
-    """End of a fit on `steps`: coordinates x (n,), chi2 (mean squared residual), evaluations,
-    convergence, the residuals there with their Jacobian, and whether it was `stalled`, far above
-    the noise."""
+@dataclass(frozen=True)
+class Stage:
+    """One fit: recordings, free coordinates by label, the relative tolerance that chooses its
+    steps, limits of its iteration, and coordinates to set or scan before it.
 
+    `tied` sets coordinates to values; `scanned` tries each value of a ratio with the relative
+    tolerance `LOOSE`, the others held but for its denominator, and keeps the best. With `starts`
+    above one, that many Sobol points within a factor `spread` of the start are fitted, and the best
+    end is kept.
+    """
+
+    name: str
+    recordings: tuple[str, ...]
+    free: tuple[str, ...]
+    rtol: float
+    evaluations: int = 30
+    tolerance: float = 1e-6
+    tied: tuple[tuple[str, float], ...] = ()
+    scanned: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    starts: int = 1
+    spread: float = 3.0
+
+
+class Colour(NamedTuple):
+    """Noise of a fit: by channel what was `found`, with the scores of every order, and the fit
+    before, with the noise as `stated`; `refused` is colour that would explain a misfit away that is
+    larger by `worse` [1]."""
+
+    found: Mapping[str, NoiseFit] = MappingProxyType({})
+    stated: "Fit | None" = None
+    refused: Mapping[str, NoiseFit] = MappingProxyType({})
+    worse: float = 1.0
+
+
+NOTHING = Residuals(np.zeros(0), np.zeros((0, 0)), {})
+"""Residuals of a fit that has not been evaluated."""
+
+
+class Check(NamedTuple):
+    """Check of the steps of a fit by `rtol`: residuals and Jacobian with a tenth of it, or the
+    fit's own where such runs fail.
+
+    `bias` is the shift of every coordinate (n,) by finite steps, None where it could not be
+    checked; `jacobian_error` is that of `plan.JACOBIAN_ERROR`. `rough` names the coordinates that
+    would move although steps do not matter, the largest move first: samples are not smooth in them.
+    """
+
+    rtol: float = float("nan")
+    finer: Residuals = NOTHING
+    bias: Array | None = None
+    jacobian_error: float = 0.0
+    rough: tuple[str, ...] = ()
+
+
+class Fit(NamedTuple):
+    """A fit of a problem by a `stage`: coordinates x (n,), the residuals there with their Jacobian
+    and the steps of their runs, evaluations, whether it has `converged`, or is `stalled` far above
+    the noise.
+
+    `stages` are the result's entries on the fits up to this one; `failure` is the error of a stage
+    that could not begin at its end; `colour` is the noise that was estimated from its residuals,
+    `check` that of its steps. `variance` is the factor on the stated variance of the noise;
+    `progress` whether bars are shown.
+    """
+
+    problem: Problem
+    runner: Runner
     x: Array
-    chi2: float
-    evaluations: int
-    converged: bool
-    steps: StepsByName
-    at: Residuals
+    stage: Stage = Stage("", (), (), float("nan"))
+    at: Residuals = NOTHING
+    loss: Loss = "linear"
+    method: Method = "gauss_newton"
+    notify: Notify = silent
+    progress: bool = False
+    evaluations: int = 0
+    converged: bool = False
     stalled: bool = False
+    stages: tuple[dict[str, Any], ...] = ()
+    failure: Unreachable | None = None
+    colour: Colour = Colour()
+    check: Check = Check()
+    variance: float = 1.0
+
+    @property
+    def which(self) -> tuple[str, ...]:
+        """Names of the fitted recordings."""
+        return self.stage.recordings
+
+    @property
+    def rtol(self) -> float:
+        return self.stage.rtol
+
+    @property
+    def free(self) -> Mask:
+        """Mask (n,) of the fitted coordinates."""
+        return np.isin(self.problem.coordinates.labels, self.stage.free)
+
+    @property
+    def coordinates(self) -> list[Coordinate]:
+        """The fitted coordinates."""
+        return self.problem.coordinates.within(self.free)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the fitted coordinates."""
+        return tuple(one.label for one in self.coordinates)
+
+    @property
+    def by_label(self) -> dict[str, float]:
+        """x by label."""
+        return dict(zip(self.problem.coordinates.labels, self.x.tolist()))
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Bounds of the fitted coordinates."""
+        low, high = self.problem.coordinates.bounds
+        return low[self.free], high[self.free]
+
+    @property
+    def J(self) -> Array:
+        """Jacobian (m, fitted coordinates)."""
+        return self.at.J[:, self.free]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the fitted coordinates, by the Fisher matrix."""
+        return fisher(self.J)[0]
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations of the fitted coordinates."""
+        return standard_deviations(self.J)
+
+    @property
+    def square(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.at.r @ self.at.r)
+
+    @property
+    def chi2(self) -> float:
+        """Mean squared residual."""
+        return float(np.mean(self.at.r**2))
+
+    def by(self, rtol: float) -> "Fit":
+        """The fit with another tolerance."""
+        return self._replace(stage=replace(self.stage, rtol=rtol))
+
+    def place(self, z: Array) -> Array:
+        """x (n,) with other fitted coordinates z."""
+        x = self.x.copy()
+        x[self.free] = z
+        return x
+
+    def values(self, z: Array) -> Array:
+        """Fitted coordinates z (..., fitted coordinates) in physical units."""
+        return np.stack(
+            [np.vectorize(c.to_value, [float])(z[..., i]) for i, c in enumerate(self.coordinates)],
+            -1,
+        )
+
+    def residuals(
+        self, x: Array | None = None, steps: StepsByName | None = None, jacobian: bool = False
+    ) -> Residuals:
+        """Residuals at x (n,), by default the fit's, on its steps or others."""
+        return self.problem.residuals(
+            self.runner,
+            self.x if x is None else x,
+            self.which,
+            self.at.steps if steps is None else steps,
+            self.free if jacobian else None,
+        )
+
+    def begun(self, x: Array | None = None, jacobian: bool = True) -> "Fit":
+        """The fit at x (n,), on the steps that its tolerance chooses there. Raises `Unreachable`
+        where x cannot be simulated."""
+        x = self.x if x is None else x
+        at = self.residuals(x, self.rtol, jacobian)
+        if at.failed:
+            raise Unreachable(at.failed)
+        return self._replace(x=x, at=at)
+
+    def misfit(self, x: Array) -> tuple[float, Array, dict[str, FailedRun]]:
+        """|r|^2 / 2 at x (n,) on the fit's steps with its gradient by the fitted coordinates, by
+        the adjoint; infinite where a run fails."""
+        value, gradient, failed = self.problem.misfit(
+            self.runner, x, self.which, self.at.steps, self.free
+        )
+        return value, gradient[self.free], failed
+
+    def step_effect(self, x: Array) -> float:
+        """Change of |r|^2 at x (n,) by steps chosen there, in place of the fit's; NaN where a run
+        fails."""
+        frozen, fresh = self.residuals(x), self.residuals(x, self.rtol)
+        failed = fresh.failed or frozen.failed
+        return float("nan") if failed else float(fresh.r @ fresh.r - frozen.r @ frozen.r)
+
+    def newton_step(self) -> Array:
+        """Gauss-Newton step of the fitted coordinates: the linear least squares within their
+        bounds. Clipping the free step would not do, since a coordinate at its bound changes the
+        step of the others."""
+        low, high = (bound - self.x[self.free] for bound in self.bounds)
+        J, r = self.J, self.at.r
+        step = -shift(J, r)
+        if ((low <= step) & (step <= high)).all():
+            return step
+        Q, R = np.linalg.qr(J)
+        return np.asarray(lsq_linear(R, -Q.T @ r, (np.minimum(low, 0.0), np.maximum(high, 0.0))).x)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the Gauss-Newton step is below `SETTLED` standard deviations for all fitted
+        coordinates."""
+        return bool((np.abs(self.newton_step()) <= SETTLED * self.sd).all())
+
+    def noted(self, name: str, began: float) -> "Fit":
+        """The fit with the result's entry on it, which `began` on the clock [s]."""
+        entry = {
+            "name": name,
+            "recordings": [*self.which],
+            "free": [*self.stage.free],
+            "rtol": self.rtol,
+            "evaluations": self.evaluations,
+            "chi2": self.chi2,
+            "converged": self.converged,
+            "wall_s": clock.perf_counter() - began,
+        }
+        return self._replace(stages=(*self.stages, entry))
 
     @property
     def notices(self) -> list[str]:
-        """A sentence on a fit that was stalled."""
-        if not self.stalled:
-            return []
-        return [
-            f"the fit made no headway: over {HEADWAY} evaluations chi2 fell by less than "
-            f"{LITTLE:.0%}, to {self.chi2:.3g}, which is far above the noise, and there it ended: "
-            "the model lacks something that these data show"
-        ]
+        """Sentences where the fit made no headway, and where a finer stage could not begin."""
+        out = []
+        if self.stalled:
+            out.append(
+                f"the fit made no headway: over {HEADWAY} evaluations chi2 fell by less than "
+                f"{LITTLE:.0%}, to {self.chi2:.3g}, which is far above the noise, and there it "
+                "ended: the model lacks something that these data show"
+            )
+        if self.failure is not None:
+            out.append(
+                f"the fit ended by rtol = {self.rtol:g}: by a finer tolerance {self.failure}; the "
+                "model may lack something that drives its parameters to where it has no solution"
+            )
+        return out
+
+
+# Gauss-Newton and gradient descent
 
 
 class Stalled(Exception):
@@ -269,31 +505,25 @@ def no_headway(chi2: Sequence[float]) -> bool:
 
 
 def gauss_newton(
-    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_],
-    steps: StepsByName, evaluations: int = 30, tolerance: float = 1e-6, loss: Loss = "linear",
-    notify: Notify = lambda chi2: None, first: Residuals | None = None,
-) -> Fit:  # fmt: skip
-    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss` but for
-    priors) on the coordinates that are `free`.
+    fit: Fit, evaluations: int = 30, tolerance: float = 1e-6, anew: bool = False
+) -> Fit:
+    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust loss but for
+    priors) on the steps of a fit, from its residuals and Jacobian, or from `anew` ones.
 
     `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated
     shortens the step. With the linear loss a fit that makes no headway far above the noise ends
-    early, as `Fit.stalled`. `first` holds residuals and Jacobian at x, if they are known. Raises
-    `Unreachable` where the start cannot be simulated.
+    early, as `Fit.stalled`. Raises `Unreachable` where the start cannot be simulated.
     """
-    low, high = problem.coordinates.bounds
-    gap = 1e-9 * (high - low)
-    begin = np.clip(x, low + gap, high - gap)
+    low, high = fit.problem.coordinates.bounds
+    gap, free = 1e-9 * (high - low), fit.free
+    fit, start = fit._replace(x=np.clip(fit.x, low + gap, high - gap)), fit.x
     zero = np.zeros(int(free.sum()))
-    seen = (
-        {zero.tobytes(): first} if first is not None and (begin == x).all() else {}
-    )  # the best and the latest
+    known = len(fit.at.r) and not anew and (fit.x == start).all()
+    seen = {zero.tobytes(): fit.at} if known else {}  # the best and the latest
     chi2 = [float(np.mean(one.r**2)) for one in seen.values()]
 
     def moved(z: Array) -> Array:
-        trial = begin.copy()
-        trial[free] += z
-        return trial
+        return fit.place(fit.x[free] + z)
 
     def at(z: Array) -> Residuals:
         key = z.tobytes()
@@ -301,10 +531,10 @@ def gauss_newton(
             best = min(seen, key=lambda k: float(seen[k].r @ seen[k].r), default=key)
             for old in seen.keys() - {best}:
                 del seen[old]
-            seen[key] = problem.residuals(runner, moved(z), which, steps, free)
+            seen[key] = fit.residuals(moved(z), jacobian=True)
             chi2.append(float(np.mean(seen[key].r ** 2)))
-            notify(chi2[-1])
-            if loss == "linear" and no_headway(chi2):
+            fit.notify(chi2[-1])
+            if fit.loss == "linear" and no_headway(chi2):
                 raise Stalled
         return seen[key]
 
@@ -313,95 +543,67 @@ def gauss_newton(
     solve: Any = least_squares
     try:
         out = solve(
-            lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free],
-            bounds=(low[free] - begin[free], high[free] - begin[free]),
-            loss=robust_loss_except_priors(loss, len(problem.coordinates.priors)),
-            f_scale=REACH[loss], max_nfev=evaluations, ftol=tolerance, xtol=tolerance,
+            lambda z: at(z).r,
+            zero,
+            jac=lambda z: at(z).J[:, free],
+            bounds=(low[free] - fit.x[free], high[free] - fit.x[free]),
+            loss=robust_loss_except_priors(fit.loss, len(fit.problem.coordinates.priors)),
+            f_scale=REACH[fit.loss],
+            max_nfev=evaluations,
+            ftol=tolerance,
+            xtol=tolerance,
             gtol=1e-12,
-        )  # fmt: skip
+        )
+        z, count, converged, stalled = out.x, int(out.nfev), out.status > 0, False
     except Stalled:
         key = min(seen, key=lambda k: float(seen[k].r @ seen[k].r))
-        x = moved(np.frombuffer(key))
-        return Fit(x, min(chi2), len(chi2), False, steps, seen[key], stalled=True)
-    return Fit(
-        moved(out.x), float(np.mean(out.fun**2)), int(out.nfev), out.status > 0, steps, at(out.x)
+        z, count, converged, stalled = np.frombuffer(key), len(chi2), False, True
+    return fit._replace(
+        x=moved(z), at=at(z), evaluations=count, converged=converged, stalled=stalled
     )
 
 
-def chord(
-    problem: Problem, runner: Runner, x: Array, at: Residuals, *, which: Sequence[str],
-    free: NDArray[np.bool_], steps: StepsByName, rounds: int = 5,
-    notify: Notify = lambda chi2: None,
-) -> Fit:  # fmt: skip
-    """Chord iteration from a fit on other steps to the fit on `steps`: `at` holds the residuals at
-    x on these steps, and the Jacobian on the others, which is kept. A round costs a run, not a
-    Jacobian. It ends where every coordinate would move by less than `SETTLED` standard deviations,
-    a run fails, or the misfit grows."""
+def chord(fit: Fit, rounds: int = 5) -> Fit:
+    """Chord iteration of a fit whose residuals are on the steps of `fit.at`, and whose Jacobian,
+    which is kept, may be on others. A round costs a run, not a Jacobian. It ends where every
+    coordinate would move by less than `SETTLED` standard deviations, a run fails, or the misfit
+    grows."""
     count = 0
-    while not (converged := settled(problem, x, at, free)) and count < rounds:
-        trial = x.copy()
-        trial[free] = x[free] + newton_step(problem, x, at, free)
-        there, count = problem.residuals(runner, trial, which, steps), count + 1
-        if there.failed or there.r @ there.r > at.r @ at.r:
+    while not (converged := fit.settled) and count < rounds:
+        trial = fit.place(fit.x[fit.free] + fit.newton_step())
+        there, count = fit.residuals(trial), count + 1
+        if there.failed or there.r @ there.r > fit.at.r @ fit.at.r:
             break
-        x, at = trial, there._replace(J=at.J)
-        notify(float(np.mean(at.r**2)))
-    return Fit(x, float(np.mean(at.r**2)), count, converged, steps, at)
+        fit = fit._replace(x=trial, at=there._replace(J=fit.at.J))
+        fit.notify(fit.chi2)
+    return fit._replace(evaluations=count, converged=converged, stalled=False)
 
 
-def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> Array:
-    """Gauss-Newton step of the free coordinates at x: the linear least squares within their bounds.
-    Clipping the free step would not do, since a coordinate at its bound changes the step of the
-    others."""
-    low, high = (bound[free] - x[free] for bound in problem.coordinates.bounds)
-    step = -shift(at.J[:, free], at.r)
-    if ((low <= step) & (step <= high)).all():
-        return step
-    Q, R = np.linalg.qr(at.J[:, free])
-    return np.asarray(lsq_linear(R, -Q.T @ at.r, (np.minimum(low, 0.0), np.maximum(high, 0.0))).x)
-
-
-def settled(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> bool:
-    """Whether the Gauss-Newton step is below `SETTLED` standard deviations for all free
-    coordinates."""
-    return bool(
-        (
-            np.abs(newton_step(problem, x, at, free))
-            <= SETTLED * standard_deviations(at.J[:, free])
-        ).all()
-    )
-
-
-def descend(
-    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_],
-    steps: StepsByName, method: Literal["lbfgs", "adam"] = "lbfgs", evaluations: int = 100,
-    rate: float = 0.05, notify: Notify = lambda chi2: None,
-) -> Fit:  # fmt: skip
-    """scipy's L-BFGS-B, or Adam (learning `rate`) projected on the bounds, on the misfit; the best
-    point visited.
+def descend(fit: Fit, evaluations: int = 100, rate: float = 0.05) -> Fit:
+    """scipy's L-BFGS-B, or Adam (learning `rate`) projected on the bounds, by the fit's `method`,
+    on the misfit on its steps; the best point visited.
 
     For many unknowns: a gradient costs less than one run more, however many there are. For a
     handful `gauss_newton` needs far fewer runs. Raises `Unreachable` where the start cannot be
     simulated.
     """
-    low, high = (bound[free] for bound in problem.coordinates.bounds)
-    samples, best, count = problem.samples(which), (np.inf, x), 0
+    low, high = fit.bounds
+    samples, best, count = fit.problem.samples(fit.which), (np.inf, fit.x), 0
 
     def slope(z: Array) -> tuple[float, Array]:
         nonlocal best, count
-        now = x.copy()
-        now[free] = z
-        value, gradient, failed = problem.misfit(runner, now, which, steps, free)
+        now = fit.place(z)
+        value, gradient, failed = fit.misfit(now)
         if failed and count == 0:
             raise Unreachable(failed)
         count += 1
         if value < best[0]:
             best = value, now
-        notify(2 * value / samples)
-        return min(value / samples, 1e9), np.nan_to_num(gradient)[free] / samples
+        fit.notify(2 * value / samples)
+        return min(value / samples, 1e9), np.nan_to_num(gradient) / samples
 
-    start = np.clip(x[free], low, high)
-    if method == "lbfgs":
+    start = np.clip(fit.x[fit.free], low, high)
+    if fit.method == "lbfgs":
         options = {"maxfun": evaluations, "maxcor": 20, "ftol": 1e-12, "gtol": 1e-9}
         bounds = list(zip(low, high))
         minimize(slope, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
@@ -409,5 +611,5 @@ def descend(
         adam = ProjectedAdam(start, lambda z: np.clip(z, low, high), (0.9, 0.999))
         for _ in range(evaluations):
             adam.step(slope(adam.z)[1], rate)
-    at = problem.residuals(runner, best[1], which, steps, free)
-    return Fit(best[1], 2 * best[0] / samples, count, count < evaluations, steps, at)
+    at = fit.residuals(best[1], jacobian=True)
+    return fit._replace(x=best[1], at=at, evaluations=count, converged=count < evaluations)

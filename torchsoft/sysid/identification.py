@@ -6,34 +6,34 @@ import sys
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
 from torchsoft.sysid.colour import (
     WORSE,
-    Coloured,
-    Refit,
     allow_for_colour,
     colour_notices,
-    refusal,
+    declared_colour,
+    growth,
     rewhitened,
     spread,
-    without,
+    undeclared_colour,
+    without_colour,
 )
 from torchsoft.sysid.estimate import contributions, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.fit import (
     FAR_OFF,
     Fit,
     Loss,
-    Notify,
+    Method,
+    Stage,
     Unreachable,
-    chord,
     covariance,
     fisher,
 )
@@ -41,20 +41,15 @@ from torchsoft.sysid.plan import (
     FINER,
     JACOBIAN_ERROR,
     STEP_BIAS,
-    Method,
-    Settled,
-    Stage,
     default_plan,
-    on_steps,
-    progress_bar,
     run_plan,
     settle,
-    stage_entry,
+    shown,
 )
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.refits import ended
+from torchsoft.sysid.refits import coarsened
 from torchsoft.sysid.residual_tests import (
     judge_residuals,
     parts,
@@ -111,222 +106,177 @@ class Settings(Table):
 # Conclusion of a fit
 
 
-class FitContext(NamedTuple):
-    """Arguments of an identification besides its stages; `identify` documents the fields."""
+def at_rest(planned: Fit, tightenings: int) -> Fit:
+    """The fit of a plan, continued with its noise until its steps do not matter, with a tighter
+    tolerance at most `tightenings` times."""
+    check = partial(shown, "check of the steps", partial(settle, tightenings=tightenings))
+    colour = partial(shown, "colour of the noise", allow_for_colour)
+    fit = colour(planned)
+    end = check(fit)
+    if end.colour.found and len(end.stages) > len(fit.stages):
+        end = check(colour(end))  # its noise was that of the residuals before
+    if growth(end) > WORSE:
+        end = check(shown("fit without the colour of the noise", without_colour, end))
+    return end
 
-    fitted: list[str]
-    heldout: tuple[str, ...]
-    acknowledged: tuple[str, ...]
-    settings: Settings
 
-    @property
-    def loss(self) -> Loss:
-        return self.settings.loss
-
-    @property
-    def tightenings(self) -> int:
-        """Most times that the tolerance may become tighter; a robust fit keeps its steps."""
-        return self.settings.tightenings if self.loss == "linear" else 0
+def is_hopeless(planned: Fit) -> bool:
+    """Whether a fit is far above the noise, and not by its steps."""
+    if planned.loss != "linear" or planned.chi2 <= FAR_OFF:
+        return False
+    fine = planned.residuals(steps=FINER * planned.rtol)
+    return not fine.failed and float(np.mean(fine.r**2)) > FAR_OFF
 
 
 def conclude(
-    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]],
-    context: FitContext, findings: list[str], rtol_asked: float, began: float, progress: bool,
-) -> IdentificationResult:  # fmt: skip
-    """The result, from the fit of the last stage with its estimated noise. `findings` are sentences
-    on the recordings and the plan, `rtol_asked` is the tolerance of the whole plan, `began` is on
-    the clock [s]."""
-    c = coloured.problem.coordinates
-    free, stages = np.isin(c.labels, stage.free), list(stages)
-    hopeless = context.loss == "linear" and coloured.before[1].chi2 > FAR_OFF
-    if hopeless:  # or only its steps are too coarse
-        fine, _ = coloured.before[0].freeze(
-            runner, coloured.fit.x, stage.recordings, FINER * stage.rtol
-        )
-        hopeless = not fine.failed and float(np.mean(fine.r**2)) > FAR_OFF
-    tightenings = 0 if hopeless else context.tightenings
-
-    def at_rest() -> Settled:
-        """Continue the fit with its noise until its steps do not matter."""
-        start, by = clock.perf_counter(), stage.rtol
-        with progress_bar("check of the steps", progress) as notify:
-            end = settle(coloured.problem, runner, stage, coloured.fit, free, tightenings, notify)
-        for rtol, one, at in end.fits:
-            name = "steps chosen anew" if rtol == by else "tighter tolerance"
-            stages.append(stage_entry(name, stage, rtol, one, start, at))
-            by, start = rtol, at
-        return end
-
-    end = at_rest()
-    if coloured.found and end.fits:  # its noise was that of the residuals before
-        stage, start = replace(stage, rtol=end.rtol), clock.perf_counter()
-        with progress_bar("colour of the noise", progress) as notify:
-            last = end.fits[-1][1]
-            refit = refitting(runner, stage, last, context.loss, context.settings.method, notify)
-            coloured = allow_for_colour(
-                coloured.problem, last, free, stage.recordings, refit
-            )._replace(before=coloured.before)
-        stages += noise_entries(coloured, stage, start)
-        end = at_rest()
-    if (worse := coloured.grown(end.at.r, stage.recordings)) > WORSE:
-        with progress_bar("fit without the colour of the noise", progress) as notify:
-            refit = refitting(
-                runner, stage, coloured.before[1], context.loss, context.settings.method, notify
-            )
-            coloured = without(coloured, worse, free, stage.recordings, refit)
-        end = at_rest()
-    problem, x, at, rtol = coloured.problem, end.x, end.at, end.rtol
-    J = at.J[:, free]
-    C_free, values, vectors = fisher(J)
-    left = parts(problem, at.r, stage.recordings)
+    planned: Fit,
+    settings: Settings,
+    heldout: Sequence[str],
+    acknowledged: Sequence[str],
+    findings: list[str],
+    rtol_asked: float,
+    began: float,
+) -> IdentificationResult:
+    """The result, from the fit at the end of the plan. `findings` are sentences on the recordings,
+    `rtol_asked` is the tolerance of the whole plan, `began` is on the clock [s]."""
+    hopeless, linear = is_hopeless(planned), planned.loss == "linear"
+    end = at_rest(planned, settings.tightenings if linear and not hopeless else 0)
+    problem, x, at, rtol, free, colour = end.problem, end.x, end.at, end.rtol, end.free, end.colour
+    c, fitted, runner = problem.coordinates, list(end.which), end.runner
+    check, own = end.check, undeclared_colour(end)
+    C_free, values, vectors = fisher(end.J)
+    left = parts(problem, at.r, fitted)
     exact = np.concatenate([np.arange(0), *(part.rows for part in left)])  # not saturated
     rows = np.append(exact, np.arange(len(at.r) - len(c.priors), len(at.r)))
     chi2 = float(at.r[rows] @ at.r[rows]) / max(len(rows) - int(free.sum()), 1)
     verdicts = judge_residuals(
-        left, at.r, J, robust=context.loss != "linear",
-        priors=[c.labels[i] for i, _ in c.priors] if end.at_rest else (),
-    )  # fmt: skip
-    declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
-    own = {*coloured.found, *coloured.refused} - {*declared}
-    colour, bound = bool(own), bool((free & c.at_bound(x)).any())
+        left,
+        at.r,
+        end.J,
+        robust=not linear,
+        priors=[c.labels[i] for i, _ in c.priors] if end.converged else (),
+    )
     larger = any(one.alarming and not (one.test == "level" and one.size < 1) for one in verdicts)
-    doubtful = not end.at_rest or colour or bound or larger
-    checked = None
-    if context.settings.assumptions != "trusted":
-        checked = tested_assumptions(
-            coloured, runner, end, stage, free, doubtful, context, progress
-        )
-    C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
+    bound = bool((free & c.at_bound(x)).any())
+    doubtful = not end.converged or bool(own) or bool(colour.refused) or bound or larger
+    checked = Checked([], np.zeros((len(at.r), 0)), end.J)
+    if settings.assumptions != "trusted":
+        checked = tested_assumptions(end, doubtful, settings.assumptions == "explained")
+    C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if check.bias is None else check.bias
     C_fit = (
         C_free * max(1.0, chi2)
-        if context.loss == "linear"
-        else covariance(J, at.r, context.loss, len(c.priors), exact)
+        if linear
+        else covariance(end.J, at.r, end.loss, len(c.priors), exact)
     )
-    C_fit = C_fit + spread(J, C_free, left, coloured.refused)
-    C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
-    labels = [one.label for one in c.within(free)]
-    found = estimates(problem, x, free, C, shift)
-    predicted, notices = {}, list(findings)
-    if context.heldout:
-        held = problem.with_noise({}).residuals(runner, x, context.heldout, rtol)
+    C_fit = C_fit + spread(end.J, C_free, left, colour.refused)
+    C[np.ix_(free, free)] = C_fit + checked.widening()
+    found = estimates(end, C, shift)
+    predicted, notices = {}, [*findings, *planned.notices]
+    if heldout:
+        held = problem.with_noise({}).residuals(runner, x, heldout, rtol)
         if held.failed:
             notices += [
                 f"held-out recording `{k}` could not be simulated: {v.reason}"
                 for k, v in held.failed.items()
             ]
         else:
-            predicted = nrmse(problem, held.r, list(context.heldout))
-            notices += guesses(problem, x, context.heldout)
-    sd = np.sqrt(np.diag(C_free))
+            predicted = nrmse(problem, held.r, list(heldout))
+            notices += guesses(problem, x, heldout)
     notices += notices_on(
-        found, ordering_constraints(problem), end.at_rest or bool(end.rough) or hopeless, rtol,
-        end.bias is None,
-    )  # fmt: skip
+        found,
+        ordering_constraints(problem),
+        end.converged or bool(check.rough) or hopeless,
+        rtol,
+        check.bias is None,
+    )
     if hopeless:
         notices.append(
-            f"steps were checked and not made finer, since chi2 = {coloured.before[1].chi2:.3g} is "
+            f"steps were checked and not made finer, since chi2 = {planned.chi2:.3g} is "
             "far above the noise"
         )
-    notices += rough_notices(c, end.rough)
-    if end.jacobian_error > JACOBIAN_ERROR and not end.rough and not hopeless:
+    notices += rough_notices(c, check.rough)
+    if check.jacobian_error > JACOBIAN_ERROR and not check.rough and not hopeless:
         notices.append(
             f"the tolerance rtol = {rtol:g} is too coarse for derivatives: their error is "
-            f"{end.jacobian_error:.2g} of the noise, and estimates scatter more than their "
+            f"{check.jacobian_error:.2g} of the noise, and estimates scatter more than their "
             f"intervals say; take rtol = {FINER * rtol:g}"
         )
-    alarms = residual_notices(verdicts, max(1.0, chi2) ** 0.5 if context.loss == "linear" else 1.0)
-    doubts = [sentence for kind, sentence in alarms.items() if kind != "smaller"]
-    explained, hidden = not systematic(verdicts), list[str]()
-    if checked is not None:
-        against = assumption_doubts(checked)
-        notices += against + assumption_notices(checked)
-        doubts = against + doubts
-        hidden = unseen(checked) if explained and not checked.favoured else []
-        explained = checked.explained or (explained and not checked.favoured)
-    notices += alarms.values()
-    notices += refusal(coloured) + colour_notices(coloured.found, declared)
+    alarms = residual_notices(verdicts, max(1.0, chi2) ** 0.5 if linear else 1.0)
+    against, plain = assumption_doubts(checked), not systematic(verdicts) and not checked.favoured
+    notices += [*against, *assumption_notices(checked), *alarms.values()]
+    notices += colour_notices(own, colour)
     return IdentificationResult(
         estimates=found,
-        labels=labels,
+        labels=[*end.labels],
         x=[float(v) for v in x],
-        correlation=(C_free / np.outer(sd, sd)).tolist(),
-        directions=directions(labels, values, vectors),
+        correlation=(C_free / np.outer(end.sd, end.sd)).tolist(),
+        directions=directions([*end.labels], values, vectors),
         chi2=chi2,
         chi2_stated=sum(float(one.raw @ one.raw) for one in left)
         / max(len(exact) - int(free.sum()), 1),
-        converged=end.at_rest,
-        residuals=residual_channels(problem, at, context.fitted),
+        converged=end.converged,
+        residuals=residual_channels(end),
         heldout=predicted,
         notices=notices,
-        doubts=doubts,
-        explained=explained,
-        unseen=hidden,
-        stages=stages,
+        doubts=against + [text for kind, text in alarms.items() if kind != "smaller"],
+        explained=plain or checked.explained,
+        unseen=unseen(checked) if plain else [],
+        stages=[*end.stages],
         cost={
-            "simulations": runner.simulations, "jacobians": runner.jacobians,
-            "gradients": runner.gradients, "remembered": runner.remembered, "samples": len(at.r),
+            "simulations": runner.simulations,
+            "jacobians": runner.jacobians,
+            "gradients": runner.gradients,
+            "remembered": runner.remembered,
+            "samples": len(at.r),
             "wall_s": clock.perf_counter() - began,
-            "data_seconds": sum(r.duration for r in problem.recordings if r.name in context.fitted),
+            "data_seconds": sum(r.duration for r in problem.recordings if r.name in fitted),
         },
         made_by={
-            "torchsoft": version("torchsoft"), **context.settings.model_dump(), "rtol": rtol,
-            "rtol_asked": rtol_asked, "acknowledged": list(context.acknowledged),
-            "untried": list(checked.untried) if checked is not None else [],
-            "candidates": list(checked.candidates) if checked is not None else [],
+            "torchsoft": version("torchsoft"),
+            **settings.model_dump(),
+            "rtol": rtol,
+            "rtol_asked": rtol_asked,
+            "acknowledged": list(acknowledged),
+            "untried": list(checked.untried),
+            "candidates": list(checked.candidates),
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
             "recordings": {r.name: r.fingerprint for r in problem.recordings},
         },
         covariance=C.tolist(),
-        recordings=recorded_rigs(problem, x, context.fitted), unknowns=dict(problem.unknowns),
+        recordings=recorded_rigs(end),
+        unknowns=dict(problem.unknowns),
         sensors=dict(problem.sensors),
         coordinates=[replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
-        contributions=contributions(problem, x, free, at.J, context.fitted),
-        combinations=seen_together(problem, free, C),
+        contributions=contributions(end),
+        combinations=seen_together(end, C),
         noise=[
-            ChannelNoise(
-                name, model, list(coloured.found[name].scores) if name in coloured.found else []
-            )
+            ChannelNoise(name, model, [*colour.found[name].scores] if name in colour.found else [])
             for name, model in problem.noise.items()
         ],
-        assumptions=checked.checks if checked is not None else [],
+        assumptions=checked.checks,
         versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
         rigs={recording.name: recording.rig for recording in problem.recordings},
-    )  # fmt: skip
+    )
 
 
-def noise_entries(coloured: Coloured, stage: Stage, began: float) -> list[dict[str, Any]]:
-    """The result's entries on the fits with estimated noise."""
-    name, out = "with the noise that was found", []
-    for one, at in coloured.fits:
-        out.append(stage_entry(name, stage, stage.rtol, one, began, at))
-        began = at
-    return out
-
-
-def tested_assumptions(
-    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_],
-    doubtful: bool, context: FitContext, progress: bool,
-) -> Checked:  # fmt: skip
+def tested_assumptions(end: Fit, doubtful: bool, explain: bool) -> Checked:
     """Tests of the assumptions at the end of a fit, on residuals whitened by declared colour only:
     undeclared colour may be the trace of a wrong assumption. The columns in the result are whitened
     by all of the noise."""
-    problem, which = coloured.problem, stage.recordings
-    declared = {
-        channel: noise
-        for channel, noise in problem.noise.items()
-        if problem.sensors[channel].colour == "ar"
-    }
-    plain = problem.with_noise(declared)
-    finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
-    there = ended(plain, plain.runner(runner), end.x, finer, free, which, end.rtol, end.steps)
-    found = check_assumptions(
-        plain, there, doubtful=doubtful, explain=context.settings.assumptions == "explained",
-        loss=context.loss, progress=progress,
-    )  # fmt: skip
+    problem, check = end.problem, end.check
+    declared = declared_colour(problem)
+    stated = problem.with_noise({k: one for k, one in problem.noise.items() if k in declared})
+    finer = rewhitened(stated, check.finer, parts(problem, check.finer.r, end.which))
+    there = coarsened(
+        end._replace(
+            problem=stated, runner=stated.runner(end.runner), check=check._replace(finer=finer)
+        )
+    )
+    found = check_assumptions(there, doubtful=doubtful, explain=explain)
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
-    columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
-    return found._replace(columns=columns, J=end.at.J[:, free])
+    columns: Array = rewhitened(problem, rows, parts(stated, rows.r, end.which)).J
+    return found._replace(columns=columns, J=end.J)
 
 
 def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
@@ -363,9 +313,12 @@ def ordering_constraints(problem: Problem) -> dict[str, tuple[str, float]]:
 
 
 def notices_on(
-    found: list[Any], held: Mapping[str, tuple[str, float]], converged: bool, rtol: float,
+    found: list[Any],
+    held: Mapping[str, tuple[str, float]],
+    converged: bool,
+    rtol: float,
     unchecked: bool,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Sentences on unidentifiable estimates, active bounds, tolerance and convergence."""
     out = []
     for e in found:
@@ -428,11 +381,22 @@ def rough_notices(c: Coordinates, rough: Sequence[str]) -> list[str]:
 
 
 def identify(
-    problem: Problem, *, rtol: float = RTOL, plan: Sequence[Stage] | None = None, starts: int = 1,
-    loss: Loss = "linear", method: Method = "gauss_newton", heldout: Sequence[str] = (),
-    workers: int = 1, checkpoint: str | Path | None = None, progress: bool = False, seed: int = 0,
-    tightenings: int = 2, assumptions: Assumed = "checked", acknowledged: Sequence[str] = (),
-) -> IdentificationResult:  # fmt: skip
+    problem: Problem,
+    *,
+    rtol: float = RTOL,
+    plan: Sequence[Stage] | None = None,
+    starts: int = 1,
+    loss: Loss = "linear",
+    method: Method = "gauss_newton",
+    heldout: Sequence[str] = (),
+    workers: int = 1,
+    checkpoint: str | Path | None = None,
+    progress: bool = False,
+    seed: int = 0,
+    tightenings: int = 2,
+    assumptions: Assumed = "checked",
+    acknowledged: Sequence[str] = (),
+) -> IdentificationResult:
     """Find the unknown parameters of `problem`, with intervals, and find which of them the data do
     not determine.
 
@@ -464,9 +428,15 @@ def identify(
             f"`heldout` must name some of {list(problem.names)}, but not all; it is {list(heldout)}"
         )
     settings = Settings(
-        rtol=rtol, starts=starts, loss=loss, method=method, workers=workers, seed=seed,
-        tightenings=tightenings, assumptions=assumptions,
-    )  # fmt: skip
+        rtol=rtol,
+        starts=starts,
+        loss=loss,
+        method=method,
+        workers=workers,
+        seed=seed,
+        tightenings=tightenings,
+        assumptions=assumptions,
+    )
     if plan is not None and (starts > 1 or rtol not in (RTOL, *(stage.rtol for stage in plan))):
         raise ValueError(
             "`starts` and `rtol` are those of the default plan: say them of the stages of `plan` "
@@ -482,29 +452,12 @@ def identify(
     try:
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
-        end = run_plan(
-            problem,
-            runner,
-            plan,
-            problem.coordinates.start,
-            loss=loss,
-            method=method,
-            seed=seed,
-            progress=progress,
-        )
+        start = problem.coordinates.start
+        begin = Fit(problem, runner, start, loss=loss, method=method, progress=progress)
+        planned = run_plan(begin, plan, seed=seed)
     except Unreachable as error:  # what looked wrong with the recordings may be behind it
         raise Unreachable(error.failed, findings) from None
-    before = clock.perf_counter()
-    with progress_bar("colour of the noise", progress) as bar:
-        free = np.isin(problem.coordinates.labels, end.stage.free)
-        refit = refitting(runner, end.stage, end.fit, loss, method, bar)
-        coloured = allow_for_colour(problem, end.fit, free, end.stage.recordings, refit)
-    stages = end.entries + noise_entries(coloured, end.stage, before)
-    context = FitContext(fitted, tuple(heldout), tuple(acknowledged), settings)
-    findings += end.notices
-    return conclude(
-        coloured, runner, end.stage, stages, context, findings, plan[-1].rtol, began, progress
-    )
+    return conclude(planned, settings, heldout, acknowledged, findings, plan[-1].rtol, began)
 
 
 def explain(problem: Problem, **options: Any) -> IdentificationResult:
@@ -517,19 +470,3 @@ def explain(problem: Problem, **options: Any) -> IdentificationResult:
     was tried. Raises what `identify` does.
     """
     return identify(problem, **options, assumptions="explained")
-
-
-def refitting(
-    runner: Runner, stage: Stage, fit: Fit, loss: Loss, method: Method, notify: Notify
-) -> Refit:
-    """The fit of a stage continued with other noise: with a new Jacobian first, then with the last
-    one."""
-
-    def refit(one: Problem, last: Fit, number: int) -> Fit:
-        if number > 0 and loss == "linear":
-            common: dict[str, Any] = {"which": stage.recordings, "notify": notify}
-            free = np.isin(one.coordinates.labels, stage.free)
-            return chord(one, runner, last.x, last.at, steps=fit.steps, free=free, **common)
-        return on_steps(one, runner, stage, last.x, fit.steps, loss, method, notify, last.at)
-
-    return refit

@@ -95,10 +95,13 @@ class Standing(NamedTuple):
 
     @classmethod
     def of(
-        cls, rig: Rig, y0: Tensor, lead: float = SETTLE,
+        cls,
+        rig: Rig,
+        y0: Tensor,
+        lead: float = SETTLE,
         rests: Mapping[str, Sequence[int]] | None = None,
         position_sd: Mapping[str, float] | None = None,
-    ) -> "Standing":  # fmt: skip
+    ) -> "Standing":
         """Bodies at the places of the state y0 (size,). Warns of pads that do not forget their
         beginning within the lead."""
         if lead > 0:

@@ -28,7 +28,7 @@ from torchsoft.sysid.columns import Tables, Vocabulary, read_tables
 from torchsoft.sysid.configuration import Beginning, Column, Config, Entry, Law, Moving, read_config
 from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.fit import Unreachable
-from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing, Start
+from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing
 from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.prechecks import channel as channel_of
 from torchsoft.sysid.problem import Problem
@@ -116,19 +116,6 @@ def measured_samples(
     return samples
 
 
-def recorded(
-    name: str, rig: Rig, tables: Tables, sensors: Mapping[str, Sensor], start: Beginning,
-    at_rest: Start,
-) -> Recording:  # fmt: skip
-    """The recording that tables hold, begun at rest, or in motion, which its first samples tell."""
-    made = Recording(name, rig, measured_samples(tables, sensors), at_rest)
-    if not isinstance(start, Moving):
-        return made
-    given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
-    used = {channel: sensors[channel] for channel in sensors if channel in made.samples}
-    return estimate_initial_state(made, used, lead=start.lead, given=given)
-
-
 def rig_recording(
     file: RigFile, tables: Tables, name: str, sensors: Mapping[str, Sensor], start: Beginning
 ) -> Recording:
@@ -140,11 +127,16 @@ def rig_recording(
     check_plausible(rig, rig.unpack(y0), tables)
     rig.reference = followed(tables, rig)
     if isinstance(start, Moving):
-        return recorded(name, rig, tables, sensors, start, Standing.of(rig, y0))
-    at_rest = Standing.of(rig, y0, start.lead, file.rests(), start.position_sd)
-    made = recorded(name, rig, tables, sensors, start, at_rest)
-    check_start(made, y0, own, tables, sensors)
-    return made
+        begins = Standing.of(rig, y0)
+    else:
+        begins = Standing.of(rig, y0, start.lead, file.rests(), start.position_sd)
+    made = Recording(name, rig, measured_samples(tables, sensors), begins)
+    if not isinstance(start, Moving):
+        check_start(made, y0, own, tables, sensors)
+        return made
+    given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
+    used = {channel: sensors[channel] for channel in sensors if channel in made.samples}
+    return estimate_initial_state(made, used, lead=start.lead, given=given)
 
 
 def check_plausible(rig: Rig, state: State, tables: Tables) -> None:
@@ -253,8 +245,11 @@ def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[f
             if made.units[name] in ("m", "rad")
         ]
         loads = net_loads(rig, state, rig.follow(first))
-        held = {contact.body for name, contact in rig.contacts.items()
-                if rig.penetration(name, state).max() > 0}  # fmt: skip
+        held = {
+            contact.body
+            for name, contact in rig.contacts.items()
+            if rig.penetration(name, state).max() > 0
+        }
     held |= {one.pushes.split(".")[0] for one in rig.actuators.values()}
     speeds = [rate.abs().max().item() for rate in state.velocity.values()]
     rushes = [
@@ -298,8 +293,11 @@ def cost(
         stages = [(first + ALL, loose), (FREE, usual), (LAST if rtol < usual else 0, rtol)]
         runs = [((4 if descent else 1) * number, by, True) for number, by in stages]
         runs += [(1, loose, False), (1, FINER * rtol, False), (CHECKED, usual, False)]
-        mine = [c for c in problem.coordinates.all
-                if c.of_the_rig and c.recording in (None, recording.name)]  # fmt: skip
+        mine = [
+            c
+            for c in problem.coordinates.all
+            if c.of_the_rig and c.recording in (None, recording.name)
+        ]
         more, span = 1 + COLUMN * max(len(mine) - FEW, 0), recording.duration + recording.start.lead
         seconds.append(0.0)
         for number, by, differentiated in runs:

@@ -25,7 +25,6 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchsoft.display import suggestion
 from torchsoft.parallel import parallel_map, single_threaded
@@ -36,7 +35,7 @@ from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choice, predict, prepared
 from torchsoft.sysid.problem import Problem, Residuals
-from torchsoft.sysid.recording import Array, Recording, RunContext
+from torchsoft.sysid.recording import Array, Mask, Recording, RunContext
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import in_full
 
@@ -157,9 +156,16 @@ class Planner:
     """The criterion of motions of one recording of a problem, and its gradient by their knots."""
 
     def __init__(
-        self, problem: Problem, plan: str, moves: Moves, limits: Mapping[str, Range],
-        criterion: Optimality, names: Sequence[str] | None, rtol: float, workers: int,
-    ) -> None:  # fmt: skip
+        self,
+        problem: Problem,
+        plan: str,
+        moves: Moves,
+        limits: Mapping[str, Range],
+        criterion: Optimality,
+        names: Sequence[str] | None,
+        rtol: float,
+        workers: int,
+    ) -> None:
         self.problem, self.k, self.moves = problem, problem.names.index(plan), moves
         self.recording, self.rtol, self.workers = problem.recordings[self.k], rtol, workers
         self.criterion: Optimality = criterion
@@ -211,7 +217,7 @@ class Planner:
         self._idle.append(begun)
 
     def run(
-        self, z: Array, x: Array, steps: Steps, free: NDArray[np.bool_] | None
+        self, z: Array, x: Array, steps: Steps, free: Mask | None
     ) -> tuple[Residuals, Prediction]:
         """Residuals of the motion z at x, those of the priors last, and the run. Raises
         `SimulationFailed`."""
@@ -266,8 +272,9 @@ class Planner:
                 raise SimulationFailed(
                     f"a change of `{c.labels[int(of.argmax())]}` by 1 % would change `{channel}` "
                     f"by {of.max():.0f} % of its largest value: nothing that follows from it can "
-                    "be predicted", float(signals.t[-1]),
-                )  # fmt: skip
+                    "be predicted",
+                    float(signals.t[-1]),
+                )
             at += len(t)
 
     def errors(self, z: Array, x: Array, rtol: float, at: Residuals, C: Array, T: Array) -> Array:
@@ -327,7 +334,7 @@ class Planner:
         variables = torch.tensor(z, requires_grad=True)
         reference = self.moves.reference(variables)
         with self._begun() as begun:
-            y0 = prepared(begun, self.problem.values(x, self.k), ()).y0.detach()
+            y0 = prepared(begun, self.problem.values(x, self.k), ())[0].detach()
             run = simulate(
                 begun.rig,
                 self.grid.t,
@@ -368,7 +375,7 @@ class Planner:
         names, T = chosen(self.problem, x, self.names)
         return deviations(names, T, at.C)
 
-    def bent(self, x: Array, at: DesignEvaluation) -> dict[str, Array]:
+    def linearization_error(self, x: Array, at: DesignEvaluation) -> dict[str, Array]:
         """Errors (k,) by parameter, over its standard deviation."""
         return {
             name: error / sd

@@ -23,7 +23,8 @@ from torchsoft.display import hidden
 from torchsoft.extras import needed
 from torchsoft.files import write_json
 from torchsoft.parallel import parallel_map, single_threaded
-from torchsoft.sysid.profile import CHOSEN_ANEW, Optimum
+from torchsoft.sysid.fit import Fit
+from torchsoft.sysid.profile import CHOSEN_ANEW
 from torchsoft.sysid.recording import Array
 
 WITHIN = 1e-3
@@ -104,9 +105,10 @@ class Posterior:
     def save(self, path: str | Path) -> None:
         """Write the JSON file. It appears whole or not at all."""
         content = asdict(self) | {
-            "draws": self.draws.tolist(), "weights": self.weights.tolist(),
+            "draws": self.draws.tolist(),
+            "weights": self.weights.tolist(),
             "marginals": [asdict(one) for one in self.marginals],
-        }  # fmt: skip
+        }
         write_json(path, content)
 
 
@@ -127,7 +129,7 @@ def quantile(values: Array, weights: Array, part: float) -> float:
     return float(np.interp(part, np.cumsum(weights[order]) - weights[order] / 2, values[order]))
 
 
-def measure(o: Optimum, x: Array) -> tuple[float, Array]:
+def measure(o: Fit, x: Array) -> tuple[float, Array]:
     """Log Jacobian factor between densities of values and of coordinates x (n,), and its gradient
     by the free coordinates: d value / d x where a prior is normal on a logarithmic scale, or
     log-normal on a linear one."""
@@ -142,7 +144,7 @@ def measure(o: Optimum, x: Array) -> tuple[float, Array]:
     return total, gradient[o.free]
 
 
-def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = False) -> Posterior:
+def laplace(o: Fit, *, draws: int = 400, seed: int = 0, progress: bool = False) -> Posterior:
     """Draws of the Gaussian at the optimum, with the covariance of the Fisher matrix, within the
     bounds.
 
@@ -169,7 +171,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
         return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
 
     with single_threaded(), tqdm(desc="Laplace", total=draws, disable=hidden(progress)) as bar:
-        for k, (value, reason) in parallel_map(density, draws, o.workers):
+        for k, (value, reason) in parallel_map(density, draws, o.runner.workers):
             log_p[k], failures = value, [*failures, reason] if reason else failures
             bar.update()
     w, k_hat = importance(log_p - log_q)
@@ -243,14 +245,14 @@ def inside(
     return mean + kept[:count] @ L, kept[:count]
 
 
-def steps_off(o: Optimum, z: Array) -> float:
+def steps_off(o: Fit, z: Array) -> float:
     """Largest change of |r|^2 by steps chosen anew, at free coordinates z (k, free coordinates);
     infinite where a run fails."""
-    off = [o.off(o.place(one)) for one in z]
+    off = [o.step_effect(o.place(one)) for one in z]
     return float(np.max(np.where(np.isnan(off), np.inf, np.abs(off))))
 
 
-def notices_on_steps(o: Optimum, off: float) -> list[str]:
+def notices_on_steps(o: Fit, off: float) -> list[str]:
     if off <= CHOSEN_ANEW:
         return []
     return [
@@ -259,7 +261,7 @@ def notices_on_steps(o: Optimum, off: float) -> list[str]:
     ]
 
 
-def notices_on_runs(o: Optimum, failures: Sequence[str], runs: int) -> list[str]:
+def notices_on_runs(o: Fit, failures: Sequence[str], runs: int) -> list[str]:
     """Sentences on failed runs, and on residuals larger than the noise."""
     m = o.problem.samples(o.which)
     chi2, out = o.square / m, []
@@ -305,7 +307,7 @@ class Whitened(NamedTuple):
     A: Array
 
     @classmethod
-    def of(cls, o: Optimum) -> "Whitened":
+    def of(cls, o: Fit) -> "Whitened":
         low, high = o.bounds
         width = high - low
         u = np.clip((o.x[o.free] - low) / width, EDGE, 1 - EDGE)
@@ -319,13 +321,13 @@ class Whitened(NamedTuple):
     def coordinates(self, z: Array) -> Array:
         return self.low + self.width * expit(self.middle + self.A @ z)
 
-    def density(self, o: Optimum, z: Array) -> tuple[float, Array]:
+    def density(self, o: Fit, z: Array) -> tuple[float, Array]:
         """Log posterior density of z, up to a constant, and its gradient (n,). Raises `Failed`."""
         y = self.middle + self.A @ z
         x, u = o.place(self.low + self.width * expit(y)), expit(y)
-        value, gradient, reason = o.misfit(x)
-        if reason:
-            raise Failed(reason)
+        value, gradient, failed = o.misfit(x)
+        for one in failed.values():
+            raise Failed(one.reason)
         more, by = measure(o, x)
         value = -value + more + float((log_expit(y) + log_expit(-y)).sum())
         return value, self.A.T @ ((by - gradient) * self.width * u * (1 - u) + 1 - 2 * u)
@@ -342,9 +344,15 @@ def sampler() -> Any:
 
 
 def nuts(
-    o: Optimum, *, chains: int = 4, draws: int = 250, tune: int = 100, accept: float = 0.8,
-    seed: int = 0, progress: bool = False,
-) -> Posterior:  # fmt: skip
+    o: Fit,
+    *,
+    chains: int = 4,
+    draws: int = 250,
+    tune: int = 100,
+    accept: float = 0.8,
+    seed: int = 0,
+    progress: bool = False,
+) -> Posterior:
     """Posterior draws by the No-U-Turn sampler of nutpie, in `chains` that run side by side in the
     optimum's threads, after `tune` draws of each for step size and scales. A larger target
     acceptance rate `accept` makes steps shorter.
@@ -391,9 +399,15 @@ def nuts(
     )
     with single_threaded(), warnings.catch_warnings(action="ignore"):
         trace = package.sample(
-            model, chains=chains, cores=min(chains, o.workers), draws=draws, tune=tune,
-            target_accept=accept, seed=seed, progress_bar=progress,
-        )  # fmt: skip
+            model,
+            chains=chains,
+            cores=min(chains, o.runner.workers),
+            draws=draws,
+            tune=tune,
+            target_accept=accept,
+            seed=seed,
+            progress_bar=progress,
+        )
     z, stats = complete(trace, draws)
     seconds = clock.perf_counter() - began
     values = o.values(z)

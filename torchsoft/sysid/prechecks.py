@@ -311,10 +311,12 @@ def controller_findings(
         lacking = [one for one in every if not comparable(recording, sensors, one)]
         if lacking and force not in lacking and not actuator.is_loop:
             yield Diagnostic(
-                "note", recording.name, f"recording `{recording.name}`: {force} is not compared "
+                "note",
+                recording.name,
+                f"recording `{recording.name}`: {force} is not compared "
                 f"with its controller, since {lacking[0]} is not recorded",
                 f"controller of {force}",
-            )  # fmt: skip
+            )
         faults = [(s.bias, s.delay, s.gain, s.drift) for s in map(sensors.get, every) if s]
         if lacking or np.any(faults) or any(id(p) in tensors for p in actuator.parameters()):
             continue

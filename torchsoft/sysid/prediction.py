@@ -218,9 +218,19 @@ def readout(
     if sensor.inertia > 0:
         terms.append(Term(pushed(rig, channel), 1, -at["inertia"], ("inertia", -1.0)))
     return Readout(
-        channel, sensor.sd, sensor.low, sensor.high, at["gain"], at["bias"], at["drift"],
-        at["delay"], 0.5 * (span[0] + span[1]), tuple(terms), at["clock"], at["lag"],
-    )  # fmt: skip
+        channel,
+        sensor.sd,
+        sensor.low,
+        sensor.high,
+        at["gain"],
+        at["bias"],
+        at["drift"],
+        at["delay"],
+        0.5 * (span[0] + span[1]),
+        tuple(terms),
+        at["clock"],
+        at["lag"],
+    )
 
 
 # Runs: signals with derivatives, or the misfit with its gradient
@@ -286,17 +296,11 @@ def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
             rig.parameter(name).fill_(value)
 
 
-class Run(NamedTuple):
-    """Begin of a run: the state y0 (size,), and the tensors for differentiation, those of
-    parameters before those of the start."""
-
-    y0: Tensor
-    parameters: tuple[str, ...]
-    inputs: list[Tensor]
-
-
-def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str]) -> Run:
-    """Set the rig's parameters, and make its initial state, differentiable by `names`."""
+def prepared(
+    begun: RunContext, values: Mapping[str, float], names: Sequence[str]
+) -> tuple[Tensor, list[Tensor]]:
+    """Set the rig's parameters, and make its initial state y0 (size,), differentiable by `names`,
+    whose tensors are returned, too."""
     set_parameters(begun.rig, values)
     at = {
         name: torch.tensor(value, dtype=torch.float64, requires_grad=name in names)
@@ -306,7 +310,7 @@ def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str
     parameters = tuple(name for name in names if name not in at)
     assert tuple(names[: len(parameters)]) == parameters
     inputs = [*map(begun.rig.parameter, parameters), *(at[name] for name in names if name in at)]
-    return Run(begun.y0(at), parameters, inputs)
+    return begun.y0(at), inputs
 
 
 def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
@@ -353,14 +357,18 @@ def initial_state(
 ) -> tuple[Tensor, Tensor]:
     """Initial state y0 (size,) of a run, and its derivatives (size, n) by `names`. Raises
     `SimulationFailed`."""
-    run = prepared(begun, values, names)
-    return run.y0.detach(), torch.from_numpy(directions(run.y0, run.inputs))
+    y0, inputs = prepared(begun, values, names)
+    return y0.detach(), torch.from_numpy(directions(y0, inputs))
 
 
 def predict(
-    begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps,
+    begun: RunContext,
+    values: Mapping[str, float],
+    grid: Grid,
+    names: Sequence[str],
+    steps: Steps,
     start: tuple[Tensor, Tensor] | None = None,
-) -> Prediction:  # fmt: skip
+) -> Prediction:
     """Signals on the grid, and their derivatives by `names`, if any. `start` is the
     `initial_state`, if known. Raises `SimulationFailed`."""
     rig, keys = begun.rig, begun.channels
@@ -371,9 +379,16 @@ def predict(
     if begun.drift.changes:
         return drifting(begun, grid, names, steps, y0, dy0, wrt, touch)
     out = simulate(
-        rig, grid.t, y0=y0, gradient="forward" if names else "none", wrt=wrt,
-        dy0=dy0 if names else None, rigid=bool(names), touch=touch, **choice(steps),
-    )  # fmt: skip
+        rig,
+        grid.t,
+        y0=y0,
+        gradient="forward" if names else "none",
+        wrt=wrt,
+        dy0=dy0 if names else None,
+        rigid=bool(names),
+        touch=touch,
+        **choice(steps),
+    )
     rows = slice(grid.early, None)
     slopes = derivatives(rig, out, keys)[rows] if names else None
     knots = None if isinstance(steps, Frozen) else out.knots.numpy()
@@ -440,15 +455,13 @@ def misfit(
         loss, weights, nuisances = judge(Signals(made.t, begun.channels, made.signals, None))
         by = np.einsum("gc,gcn->n", weights, np.array(made.derivatives))
         return Misfit(loss, by, nuisances)
-    rig, run = begun.rig, prepared(begun, values, names)
-    out = simulate(rig, grid.t, y0=run.y0, gradient="discrete", **choice(steps))
+    y0, inputs = prepared(begun, values, names)
+    out = simulate(begun.rig, grid.t, y0=y0, gradient="discrete", **choice(steps))
     keys, rows = begun.channels, slice(grid.early, None)
     signals = out.together(*keys)[rows]
     loss, weights, nuisances = judge(
         Signals(grid.t[rows].numpy(), keys, signals.detach().numpy(), None)
     )
-    gradient = torch.autograd.grad(
-        signals, run.inputs, torch.from_numpy(weights), allow_unused=True
-    )
+    gradient = torch.autograd.grad(signals, inputs, torch.from_numpy(weights), allow_unused=True)
     by = np.array([0.0 if g is None else float(g) for g in gradient])
     return Misfit(loss, by, nuisances)

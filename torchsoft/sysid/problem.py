@@ -3,10 +3,10 @@
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchsoft.display import Shown, amount, suggestion
 from torchsoft.physics.extensions import extensions
@@ -23,7 +23,7 @@ from torchsoft.sysid.prediction import (
     readout,
     set_parameters,
 )
-from torchsoft.sysid.recording import Array, Recording, extended
+from torchsoft.sysid.recording import Array, Mask, Recording, extended
 from torchsoft.sysid.runs import Job, Runner, Vary
 from torchsoft.sysid.unknowns import (
     NUISANCES,
@@ -43,13 +43,14 @@ StepsByName = float | Mapping[str, Frozen]
 
 class Residuals(NamedTuple):
     """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of
-    the priors; their Jacobian J (m, n) by the coordinates (zero where not free); and failed runs by
-    recording. With a failed run, r and J are infinite. |r|^2 / 2 is the negative log posterior
-    density up to a constant."""
+    the priors; their Jacobian J (m, n) by the coordinates (zero where not free); failed runs by
+    recording, and the frozen steps of the others. With a failed run, r and J are infinite, and
+    there are no steps. |r|^2 / 2 is the negative log posterior density up to a constant."""
 
     r: Array
     J: Array
     failed: dict[str, FailedRun]
+    steps: Mapping[str, Frozen] = MappingProxyType({})
 
     @property
     def reason(self) -> str:
@@ -136,10 +137,14 @@ class Problem(Shown):
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], sensors: dict[str, Sensor],
-        unknowns: dict[str, Unknown], noise: Mapping[str, Autoregression] | None = None,
-        variations: Sequence[Variation] = (), held: Collection[str] = (),
-    ) -> None:  # fmt: skip
+        self,
+        recordings: Sequence[Recording],
+        sensors: dict[str, Sensor],
+        unknowns: dict[str, Unknown],
+        noise: Mapping[str, Autoregression] | None = None,
+        variations: Sequence[Variation] = (),
+        held: Collection[str] = (),
+    ) -> None:
         names = [recording.name for recording in recordings]
         sampled = {channel for recording in recordings for channel in recording.samples}
         rigs = [recording.rig for recording in recordings]
@@ -190,27 +195,25 @@ class Problem(Shown):
     def check_saturated(self) -> None:
         """Raises `ValueError` for saturated samples with coloured noise, whose likelihood is
         intractable."""
-        for recording in self.recordings:
-            for channel, sensor in self.sensors.items():
-                coloured = sensor.colour == "ar" or channel in self.noise
-                if (
-                    coloured
-                    and channel in recording.samples
-                    and sensor.saturated(recording.samples[channel][1]).any()
-                ):
-                    raise ValueError(
-                        f"sensors.{channel}: in `{recording.name}` samples are at its `low` or "
-                        "`high`, which cannot go "
-                        'together with noise of `colour = "ar"`; declare it "white", or record '
-                        "within the range"
-                    )
+        for recording, channel, sensor in self.measured():
+            coloured = sensor.colour == "ar" or channel in self.noise
+            if coloured and sensor.saturated(recording.samples[channel][1]).any():
+                raise ValueError(
+                    f"sensors.{channel}: in `{recording.name}` samples are at its `low` or `high`, "
+                    'which cannot go together with noise of `colour = "ar"`; declare it "white", '
+                    "or record within the range"
+                )
 
     def with_noise(self, noise: Mapping[str, Autoregression]) -> "Problem":
         """The same problem with other noise, by channel."""
         return Problem(
-            self.recordings, self.sensors, self.unknowns, noise, [*self.variations.values()],
+            self.recordings,
+            self.sensors,
+            self.unknowns,
+            noise,
+            [*self.variations.values()],
             self.held,
-        )  # fmt: skip
+        )
 
     @property
     def varying(self) -> dict[str, Vary]:
@@ -232,8 +235,9 @@ class Problem(Shown):
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         free = [one for one in self.coordinates.all if one.kind == "parameter" and not one.fixed]
-        rows = [(one.label, f"{one.low:.4g} to {one.high:.4g}, from {one.nominal:.4g}")
-                for one in free]  # fmt: skip
+        rows = [
+            (one.label, f"{one.low:.4g} to {one.high:.4g}, from {one.nominal:.4g}") for one in free
+        ]
         rows += [
             (name, f"measured to {amount(one.noise, self.unit(name))}")
             for name, one in self.sensors.items()
@@ -244,15 +248,20 @@ class Problem(Shown):
     def names(self) -> tuple[str, ...]:
         return tuple(recording.name for recording in self.recordings)
 
-    def samples(self, which: Sequence[str] | None = None) -> int:
+    def measured(
+        self, which: Collection[str] | None = None
+    ) -> Iterator[tuple[Recording, str, Sensor]]:
+        """Recordings, by default all, with each channel that counts and its sensor, in the order of
+        residuals."""
+        for recording in self.recordings:
+            if which is None or recording.name in which:
+                for channel, sensor in self.sensors.items():
+                    if channel in recording.samples:
+                        yield recording, channel, sensor
+
+    def samples(self, which: Collection[str] | None = None) -> int:
         """Number of samples that count in some recordings, by default all."""
-        return sum(
-            len(t)
-            for recording in self.recordings
-            if which is None or recording.name in which
-            for channel, (t, _) in recording.samples.items()
-            if channel in self.sensors
-        )
+        return sum(len(one.samples[channel][0]) for one, channel, _ in self.measured(which))
 
     def values(self, x: Array, k: int) -> dict[str, float]:
         """Values of the unknowns of the rig and of the start in recording k."""
@@ -262,12 +271,11 @@ class Problem(Shown):
     def readouts(self, x: Array, k: int) -> dict[str, Readout]:
         """Readouts of the sensors with samples in recording k, at x (n,)."""
         recording, out = self.recordings[k], {}
-        for channel, sensor in self.sensors.items():
-            if channel in recording.samples:
-                at = self.coordinates.nuisances(x, channel, recording.name)
-                span = float(recording.times[0]), float(recording.times[-1])
-                values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
-                out[channel] = readout(recording.rig, channel, sensor, values, span)
+        span = float(recording.times[0]), float(recording.times[-1])
+        for _, channel, sensor in self.measured([recording.name]):
+            at = self.coordinates.nuisances(x, channel, recording.name)
+            values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
+            out[channel] = readout(recording.rig, channel, sensor, values, span)
         return out
 
     def unit(self, channel: str) -> str:
@@ -279,16 +287,17 @@ class Problem(Shown):
         x: Array,
         which: Sequence[str],
         steps: StepsByName,
-        free: NDArray[np.bool_] | None,
+        free: Mask | None,
         adjoint: bool = False,
     ) -> list[Job]:
         """One run for each recording; with `free`, differentiated by the parameters that depend on
         free coordinates (n,)."""
         c, out, varying = self.coordinates, [], self.varying
         varied = tuple(
-            (one.name, amount) for i, one in enumerate(c.all)
+            (one.name, amount)
+            for i, one in enumerate(c.all)
             if one.name in varying and (amount := one.to_value(x[i])) != 0.0
-        )  # fmt: skip
+        )
         for k, recording in enumerate(self.recordings):
             if recording.name not in which:
                 continue
@@ -311,39 +320,17 @@ class Problem(Shown):
         x: Array,
         which: Sequence[str],
         steps: StepsByName,
-        free: NDArray[np.bool_] | None = None,
+        free: Mask | None = None,
     ) -> Residuals:
         """Residuals of some recordings at x (n,), with the Jacobian's columns of `free`
-        coordinates, those of variations by differences. On frozen steps they are smooth in x."""
-        at, runs, jobs = self._at(runner, x, which, steps, free)
-        return self._with_differences(runner, at, jobs, runs, x, which, steps, free)
+        coordinates, and the steps of their runs, on which residuals are smooth in x.
 
-    def _at(
-        self,
-        runner: Runner,
-        x: Array,
-        which: Sequence[str],
-        steps: StepsByName,
-        free: NDArray[np.bool_] | None,
-    ) -> tuple[Residuals, list[Any], list[Job]]:
-        """`residuals` without the columns of variations, with the runs and their jobs."""
+        Columns of variations are differences: a run with another amount, or the same run read in
+        another way.
+        """
         jobs = self.jobs(x, which, steps, free)
         runs = runner.run(jobs)
-        return self.gather(x, jobs, runs), runs, jobs
-
-    def _with_differences(
-        self,
-        runner: Runner,
-        at: Residuals,
-        jobs: Sequence[Job],
-        runs: Sequence[Any],
-        x: Array,
-        which: Sequence[str],
-        steps: StepsByName,
-        free: NDArray[np.bool_] | None,
-    ) -> Residuals:
-        """Residuals at x with the columns of free variations: each is a run with another amount,
-        or the same `runs` read in another way."""
+        at = self.gather(x, jobs, runs)
         if free is None or at.failed:
             return at
         for i in np.flatnonzero(free):
@@ -352,50 +339,29 @@ class Problem(Shown):
                 continue
             step = self.variations[one.name].amount / (one.high - one.low)
             moved = x + step * np.eye(len(x))[i]
-            if self.variations[one.name].vary is None:
-                there = self.gather(moved, jobs, runs)
-            else:
+            others, rerun = jobs, runs
+            if self.variations[one.name].vary is not None:
                 others = self.jobs(moved, which, steps, None)
-                there = self.gather(moved, others, runner.run(others))
+                rerun = runner.run(others)
+            there = self.gather(moved, others, rerun)
             if there.failed:
                 return there._replace(J=np.full_like(at.J, np.inf))
             at.J[:, i] = (there.r - at.r) / step
         return at
 
-    def freeze(
-        self,
-        runner: Runner,
-        x: Array,
-        which: Sequence[str],
-        rtol: float,
-        free: NDArray[np.bool_] | None = None,
-    ) -> tuple[Residuals, dict[str, Frozen]]:
-        """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; no steps
-        where a run fails."""
-        at, runs, jobs = self._at(runner, x, which, rtol, free)
-        names = [self.recordings[job.recording].name for job in jobs]
-        if at.failed:
-            return at, {}
-        steps = {name: Frozen(run.knots) for name, run in zip(names, runs)}
-        return self._with_differences(runner, at, jobs, runs, x, which, steps, free), steps
-
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
         """Residuals at x (n,) from the results of jobs."""
-        failed = {
-            self.recordings[job.recording].name: got
-            for job, got in zip(jobs, results)
-            if isinstance(got, FailedRun)
-        }
-        if failed:
-            m = self.samples([self.recordings[job.recording].name for job in jobs]) + len(
-                self.coordinates.priors
-            )
+        named = {self.recordings[job.recording].name: got for job, got in zip(jobs, results)}
+        if failed := {k: got for k, got in named.items() if isinstance(got, FailedRun)}:
+            m = self.samples([*named]) + len(self.coordinates.priors)
             return Residuals(np.full(m, np.inf), np.full((m, len(x)), np.inf), failed)
         parts = [self._compare(x, job, got) for job, got in zip(jobs, results)]
-        parts.append(self._priors(x))
-        return Residuals(
-            np.concatenate([r for r, _ in parts]), np.concatenate([J for _, J in parts]), {}
-        )
+        r, J = (np.concatenate(some) for some in zip(*parts, self._priors(x)))
+        steps = {
+            name: job.steps if isinstance(job.steps, Frozen) else Frozen(got.knots)
+            for job, (name, got) in zip(jobs, named.items())
+        }
+        return Residuals(r, J, {}, steps)
 
     def _priors(self, x: Array) -> tuple[Array, Array]:
         """Residuals of the priors, and their Jacobian."""
@@ -427,9 +393,10 @@ class Problem(Shown):
         recording = self.recordings[job.recording]
         signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
         amounts = [
-            (one.read, c.to_value(x[i])) for i, c in enumerate(self.coordinates.all)
+            (one.read, c.to_value(x[i]))
+            for i, c in enumerate(self.coordinates.all)
             if (one := self.variations.get(c.name)) is not None and one.read is not None
-        ]  # fmt: skip
+        ]
         for channel, one in self.readouts(x, job.recording).items():
             t, measured = recording.samples[channel]
             for read, size in amounts:
@@ -444,7 +411,7 @@ class Problem(Shown):
         x: Array,
         which: Sequence[str],
         steps: StepsByName,
-        free: NDArray[np.bool_],
+        free: Mask,
     ) -> tuple[float, Array, dict[str, FailedRun]]:
         """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a
         run fails."""

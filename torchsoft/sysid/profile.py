@@ -2,18 +2,17 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import NamedTuple, Self
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
 from torchsoft.display import hidden, suggestion
 from torchsoft.parallel import parallel_map, single_threaded
-from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton
+from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.result import IdentificationResult
@@ -24,118 +23,29 @@ CHOSEN_ANEW = 1.0
 optimum."""
 
 
-class Optimum:
-    """End x (n,) of a fit of the recordings `which` (by default all), with the steps that `rtol`
-    chooses there. `free` (n,) is the mask of fitted coordinates. `variance` is the factor of the
-    noise's variance over the stated one, which widens profiles. `workers` threads may evaluate it
-    side by side.
+def optimum(problem: Problem, answer: IdentificationResult, workers: int = 1) -> Fit:
+    """The end of the identification of `problem`, with its estimated noise and the factor on its
+    variance by which intervals were widened; for profiles and posteriors, which `workers` threads
+    evaluate side by side.
 
-    Raises `Unreachable` where x cannot be simulated.
+    Raises `ValueError` for another problem's answer, or one of a robust loss, which is no
+    likelihood, and `Unreachable` where the end cannot be simulated.
     """
-
-    def __init__(
-        self, problem: Problem, x: Array, *, rtol: float, which: Sequence[str] | None = None,
-        free: NDArray[np.bool_] | None = None, variance: float = 1.0, workers: int = 1,
-    ) -> None:  # fmt: skip
-        self.problem, self.x, self.rtol, self.variance, self.workers = (
-            problem,
-            np.array(x, float),
-            rtol,
-            variance,
-            workers,
+    last, labels = answer.stages[-1], problem.coordinates.labels
+    if [one.label for one in answer.coordinates] != list(labels):
+        raise ValueError(
+            "this answer belongs to another problem: it does not have the same coordinates"
         )
-        self.which = tuple(problem.names if which is None else which)
-        self.free = problem.coordinates.free if free is None else free
-        self.runner = Runner(problem.recordings)
-        self.at, self.steps = problem.freeze(self.runner, self.x, self.which, rtol, self.free)
-        if self.at.failed:
-            raise Unreachable(self.at.failed)
-        self.square = float(self.at.r @ self.at.r)
-
-    @classmethod
-    def of(cls, problem: Problem, answer: IdentificationResult, workers: int = 1) -> Self:
-        """The end of the identification of `problem`, with its estimated noise. Raises `ValueError`
-        for another problem's answer, or one of a robust loss, which is no likelihood."""
-        last, labels = answer.stages[-1], problem.coordinates.labels
-        if [one.label for one in answer.coordinates] != list(labels):
-            raise ValueError(
-                "this answer belongs to another problem: it does not have the same coordinates"
-            )
-        if answer.made_by["loss"] != "linear":
-            raise ValueError(
-                f"the loss `{answer.made_by['loss']}` is no likelihood, so there is no profile and "
-                "no posterior; identify with loss = 'linear'"
-            )
-        noise = {one.channel: one.model for one in answer.noise}
-        return cls(
-            problem.with_noise(noise) if noise else problem, np.array(answer.x), rtol=last["rtol"],
-            which=last["recordings"], free=np.isin(labels, last["free"]),
-            variance=max(1.0, answer.chi2), workers=workers,
-        )  # fmt: skip
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Labels of the free coordinates."""
-        return tuple(one.label for one in self.problem.coordinates.within(self.free))
-
-    @property
-    def J(self) -> Array:
-        """Jacobian (m, free coordinates) at x."""
-        return self.at.J[:, self.free]
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the free coordinates, by the Fisher matrix at x."""
-        return fisher(self.J)[0]
-
-    def sd(self, i: int) -> float:
-        """Standard deviation of coordinate i, widened like its profile."""
-        inner = int(np.flatnonzero(np.flatnonzero(self.free) == i)[0])
-        return float(np.sqrt(self.covariance[inner, inner] * self.variance))
-
-    @property
-    def bounds(self) -> tuple[Array, Array]:
-        """Bounds of the free coordinates."""
-        low, high = self.problem.coordinates.bounds
-        return low[self.free], high[self.free]
-
-    def place(self, z: Array) -> Array:
-        """x (n,) with other free coordinates z."""
-        x = self.x.copy()
-        x[self.free] = z
-        return x
-
-    def values(self, z: Array) -> Array:
-        """Free coordinates z (..., free coordinates) in physical units."""
-        mine = self.problem.coordinates.within(self.free)
-        return np.stack(
-            [np.vectorize(c.to_value, [float])(z[..., i]) for i, c in enumerate(mine)], -1
+    if answer.made_by["loss"] != "linear":
+        raise ValueError(
+            f"the loss `{answer.made_by['loss']}` is no likelihood, so there is no profile and "
+            "no posterior; identify with loss = 'linear'"
         )
-
-    def residuals(self, x: Array, derivatives: bool = False) -> Residuals:
-        """Residuals at x (n,), on the steps of the optimum."""
-        return self.problem.residuals(
-            self.runner, x, self.which, self.steps, self.free if derivatives else None
-        )
-
-    def misfit(self, x: Array) -> tuple[float, Array, str]:
-        """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; infinite,
-        with the reason, where a run fails."""
-        value, gradient, failed = self.problem.misfit(
-            self.runner, x, self.which, self.steps, self.free
-        )
-        return value, gradient[self.free], next((one.reason for one in failed.values()), "")
-
-    def off(self, x: Array) -> float:
-        """Change of |r|^2 at x (n,) by steps chosen there, in place of the optimum's; NaN where a
-        run fails."""
-        frozen = self.residuals(x)
-        fresh, _ = self.problem.freeze(self.runner, x, self.which, self.rtol)
-        return (
-            float("nan")
-            if fresh.failed or frozen.failed
-            else float(fresh.r @ fresh.r - frozen.r @ frozen.r)
-        )
+    if answer.noise:
+        problem = problem.with_noise({one.channel: one.model for one in answer.noise})
+    stage = Stage("optimum", tuple(last["recordings"]), tuple(last["free"]), last["rtol"])
+    runner, variance = Runner(problem.recordings, workers), max(1.0, answer.chi2)
+    return Fit(problem, runner, np.array(answer.x), stage, variance=variance).begun()
 
 
 # Profiles
@@ -209,10 +119,10 @@ class Side(NamedTuple):
 
 
 def profiles(
-    optimum: Optimum, labels: Sequence[str] | None = None, *, progress: bool = False
+    optimum: Fit, labels: Sequence[str] | None = None, *, progress: bool = False
 ) -> list[Profile]:
-    """Profiles of some coordinates, by default all free ones; all sides are computed side by side
-    in the optimum's threads.
+    """Profiles of some coordinates, by default all free ones, from an `optimum`; all sides are
+    computed side by side in its threads.
 
     Raises `ValueError` for a label that is not a free coordinate's.
     """
@@ -228,7 +138,9 @@ def profiles(
     tasks = [(label, sign) for label in chosen for sign in (-1, 1)]
     with single_threaded():
         work = parallel_map(
-            lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers
+            lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]),
+            len(tasks),
+            optimum.runner.workers,
         )
         done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=hidden(progress)))
     return [
@@ -237,14 +149,19 @@ def profiles(
     ]
 
 
-def walk(o: Optimum, i: int, sign: int) -> Side:
+def sd(o: Fit, i: int) -> float:
+    """Standard deviation of coordinate i, widened like its profile."""
+    return float(o.sd[o.labels.index(o.problem.coordinates.labels[i])] * o.variance**0.5)
+
+
+def walk(o: Fit, i: int, sign: int) -> Side:
     """One side of the profile of coordinate i, from the optimum to the end of the interval."""
     label, (low, high) = (
         o.problem.coordinates.labels[i],
         (float(b[i]) for b in o.problem.coordinates.bounds),
     )
     edge = high if sign > 0 else low
-    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * o.sd(i), (high - low) / 8)
+    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * sd(o, i), (high - low) / 8)
     points, notices, shorter = list[Point](), list[str](), 0
     while here.rise < RISE and len(points) < POINTS:
         if sign * (edge - here.x[i]) <= 1e-9 * (high - low):
@@ -280,23 +197,21 @@ def walk(o: Optimum, i: int, sign: int) -> Side:
     )
 
 
-def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
+def refit(o: Fit, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
     """The optimum of the others with coordinate i at `aim`, started along the tangent of the
     profile; or None with the reason of failure."""
-    others, (low, high) = o.free.copy(), o.problem.coordinates.bounds
-    others[i] = False
-    x = here.x.copy()
+    label, (low, high) = o.problem.coordinates.labels[i], o.problem.coordinates.bounds
+    held = o._replace(stage=replace(o.stage, free=tuple(one for one in o.labels if one != label)))
+    others, x = held.free, here.x.copy()
     if others.any():
         tangent = -np.linalg.lstsq(here.at.J[:, others], here.at.J[:, i], rcond=None)[0]
         x[others] = np.clip(x[others] + tangent * (aim - x[i]), low[others], high[others])
     x[i] = aim
-    at = o.residuals(x, derivatives=True)
+    at = o.residuals(x, jacobian=True)
     if others.any() and not at.failed:
         with suppress(Unreachable):
-            fit = gauss_newton(
-                o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at,
-                evaluations=EVALUATIONS, tolerance=FITTED / max(float(at.r @ at.r), FITTED),
-            )  # fmt: skip
+            close = FITTED / max(float(at.r @ at.r), FITTED)
+            fit = gauss_newton(held._replace(x=x, at=at), EVALUATIONS, close)
             if not fit.converged:
                 return None, "the other coordinates could not be fitted there"
             x, at = fit.x, fit.at
@@ -306,7 +221,7 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
     return Point(x, (float(at.r @ at.r) - o.square) / o.variance, at), ""
 
 
-def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
+def assemble(o: Fit, i: int, below: Side, above: Side) -> Profile:
     """The profile of both sides, with its interval and notices."""
     c = o.problem.coordinates
     one, points = c.all[i], [*below.points[::-1], Point(o.x, 0.0, o.at), *above.points]
@@ -327,13 +242,13 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
         )
         roots = PchipInterpolator(x, zeta).solve(sign * RISE**0.5)
         ends.append(float(roots[(roots >= a) & (roots <= b)][0]))
-        off = o.off(side.points[-1].x)
+        off = o.step_effect(side.points[-1].x)
         if not abs(off) < CHOSEN_ANEW * o.variance:
             notices.append(
                 f"the {name} end of the profile of {one.label} is uncertain: steps chosen anew "
                 f"there change |r|^2 by {off:.2g}; take a tighter tolerance than rtol = {o.rtol:g}"
             )
-    half = RISE**0.5 * o.sd(i)
+    half = RISE**0.5 * sd(o, i)
     wald = o.x[i] - half, o.x[i] + half
     worst = max((abs(e - w) / half for e, w in zip(ends, wald) if e is not None), default=0.0)
     physical = [None if e is None else one.to_value(e) for e in ends]
@@ -347,8 +262,13 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
         )
     every = [k for k in np.flatnonzero(o.free) if k != i]
     return Profile(
-        one.label, one.to_value(o.x[i]), [one.to_value(v) for v in x],
+        one.label,
+        one.to_value(o.x[i]),
+        [one.to_value(v) for v in x],
         [max(float(point.rise), 0.0) for point in points],
         {c.labels[k]: [c.all[k].to_value(point.x[k]) for point in points] for k in every},
-        (physical[0], physical[1]), straight, o.variance, list(dict.fromkeys(notices)),
-    )  # fmt: skip
+        (physical[0], physical[1]),
+        straight,
+        o.variance,
+        list(dict.fromkeys(notices)),
+    )

@@ -25,6 +25,7 @@ from torchsoft.solve.trajectory import Touch, units
 from torchsoft.sysid.initial_state import Begin, Start, StartCoordinate
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 BETWEEN = 1e-3
 """Spacing [s] of the simulated regular grid where samples are interpolated (an unknown delay) or

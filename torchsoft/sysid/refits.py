@@ -1,19 +1,16 @@
 """Variations of a problem by one wrong assumption: effects on the residuals, and repeated fits."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchsoft.sysid.assumptions import AMOUNTS, FAULT_BOUNDS, Variation
-from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
-from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, Stage, default_plan, run_plan
-from torchsoft.sysid.prediction import Frozen
-from torchsoft.sysid.problem import Problem, Residuals, check_possible
+from torchsoft.sysid.fit import Fit, Stage, Unreachable
+from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, continued, default_plan
+from torchsoft.sysid.problem import Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
-from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Unknown
 
 REFITS, ROUGH = 20, 1e-3
@@ -36,42 +33,23 @@ TOGETHER = 4
 """Most suspects that explain a misfit between them."""
 
 
-class End(NamedTuple):
-    """End of a fit: coordinates x (n,), residuals there, mask `free` (n,), fitted recordings,
-    residuals and steps of runs by the tolerance `rtol` of variations, the runner, and the tolerance
-    `finest` of the fit itself."""
-
-    x: Array
-    at: Residuals
-    free: NDArray[np.bool_]
-    which: tuple[str, ...]
-    base: Residuals
-    steps: Mapping[str, Frozen]
-    rtol: float
-    runner: Runner
-    finest: float
-
-    @property
-    def far(self) -> bool:
-        """Whether the misfit is so large that tests to first order at this end are void."""
-        return float(np.mean(self.base.r**2)) > FAR
+def coarsened(fit: Fit) -> Fit:
+    """The end of a fit with a run for each recording by the tolerance of variations: `USUAL`, or
+    its own, if such runs fail. Its `check` has the tolerance of the fit, and the residuals by which
+    assumptions are tested. One whose steps could not be checked stays on them."""
+    if fit.check.bias is None:
+        return fit._replace(at=fit.check.finer)
+    usual = max(fit.rtol, USUAL)
+    base = fit.residuals(steps=usual)
+    if base.failed and usual > fit.rtol:
+        usual = fit.rtol
+        base = fit.residuals(steps=usual)
+    return fit.by(usual)._replace(at=base)
 
 
-def ended(
-    problem: Problem, runner: Runner, x: Array, at: Residuals, free: NDArray[np.bool_],
-    which: Sequence[str], rtol: float, own: Mapping[str, Frozen] | None = None,
-) -> End:  # fmt: skip
-    """The end of a fit with the tolerance `rtol`, with a run for each recording by the tolerance of
-    the variations: `USUAL`, or that of the fit, if such runs fail; or `at` on its `own` steps,
-    where these are given."""
-    if own is not None:
-        return End(x, at, free, tuple(which), at, own, rtol, runner, rtol)
-    usual = max(rtol, USUAL)
-    base, steps = problem.freeze(runner, x, which, usual)
-    if base.failed and usual > rtol:
-        usual = rtol
-        base, steps = problem.freeze(runner, x, which, rtol)
-    return End(x, at, free, tuple(which), base, steps, usual, runner, rtol)
+def far_off(end: Fit) -> bool:
+    """Whether the misfit is so large that tests to first order at this end are void."""
+    return end.chi2 > FAR
 
 
 def assuming(problem: Problem, some: Sequence[Variation], free: bool) -> Problem:
@@ -95,8 +73,11 @@ def assuming(problem: Problem, some: Sequence[Variation], free: bool) -> Problem
             unknowns[one.parameter] = Unknown(nominal=one.nominal, low=low, high=high, scale=scale)
         elif one.fault is not None:
             channel, kind = one.fault
-            scales = {"bias": sensors[channel].noise, "drift": sensors[channel].noise,
-                      "clock": 1.0 / longest}  # fmt: skip
+            scales = {
+                "bias": sensors[channel].noise,
+                "drift": sensors[channel].noise,
+                "clock": 1.0 / longest,
+            }
             most = FAULT_BOUNDS[kind] * scales.get(kind, 1.0)
             sensors[channel] = sensors[channel].model_copy(update={kind: most})
     more = [*problem.variations.values(), *(one for one in some if one.vary or one.read)]
@@ -131,28 +112,25 @@ Column = tuple[Variation, Array | None, str]
 """A variation with the change of the residuals (m,) by its amount, or None and the reason."""
 
 
-def exact_columns(
-    problem: Problem, end: End, taken: Sequence[Variation]
-) -> tuple[list[Column], Array | None]:
+def exact_columns(end: Fit, taken: Sequence[Variation]) -> tuple[list[Column], Array | None]:
     """Columns of parameters, of extensions of the rigs, of faults of sensors and of other readings,
-    and the Jacobian (m, n) of the free coordinates on the same steps: all from one run for each
+    and the Jacobian (m, n) of the fitted coordinates on the same steps: all from one run for each
     recording. Empty where it fails."""
     mine, out = [one for one in taken if one.vary is None], list[Column]()
-    if not mine or end.base.failed:
+    if not mine or end.at.failed:
         return out, None
     try:
-        wide = assuming(problem, mine, free=False)
+        wide = assuming(end.problem, mine, free=False)
     except ValueError:
-        why = {one.name: impossible(problem, one) for one in mine}
+        why = {one.name: impossible(end.problem, one) for one in mine}
         out += [(one, None, why[one.name]) for one in mine if why[one.name]]
         mine = [one for one in mine if not why[one.name]]
-        wide = assuming(problem, mine, free=False)
+        wide = assuming(end.problem, mine, free=False)
     c = wide.coordinates
-    x = c.begun(dict(zip(problem.coordinates.labels, end.x)))
-    own = [c.labels.index(one.label) for one in problem.coordinates.within(end.free)]
-    free = np.isin(c.labels, [one.label for one in mine])
-    free[own] = True
-    at = wide.residuals(wide.runner(end.runner), x, end.which, end.steps, free)
+    own = [c.labels.index(label) for label in end.labels]
+    free = np.isin(c.labels, [*end.labels, *(one.label for one in mine)])
+    x = c.begun(end.by_label)
+    at = wide.residuals(wide.runner(end.runner), x, end.which, end.at.steps, free)
     if at.failed:
         return [], None
     for one in mine:
@@ -171,37 +149,33 @@ def impossible(problem: Problem, one: Variation) -> str:
     return ""
 
 
-def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
+def difference(end: Fit, one: Variation) -> tuple[Array | None, str]:
     """Change of the residuals (m,) by a variation of runs, on the same steps, or None and the
     reason."""
-    if end.base.failed:
+    if end.at.failed:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
-    other = assuming(problem, [one], free=False)
+    other = assuming(end.problem, [one], free=False)
     c = other.coordinates
-    x, i = c.begun(dict(zip(problem.coordinates.labels, end.x))), c.labels.index(one.label)
+    x, i = c.begun(end.by_label), c.labels.index(one.label)
     x[i] = c.all[i].to_x(one.amount)
-    got = other.residuals(other.runner(end.runner), x, end.which, end.steps)
-    if got.failed:
-        return None, got.reason
-    return got.r - end.base.r, ""
+    got = other.residuals(other.runner(end.runner), x, end.which, end.at.steps)
+    return (None, got.reason) if got.failed else (got.r - end.at.r, "")
 
 
-class Joint(NamedTuple):
-    """A fit with many suspects as unknowns: coordinates by label, the final sum of squares, and the
-    fraction of the misfit, with all of them as stated, that each suspect alone explains to first
-    order there, by name; and the suspects that explain nearly all of it between them, if a few
-    do."""
+def under(end: Fit, other: Problem, x: Array) -> Fit:
+    """The begin at x (n,) of the fit of a problem under assumptions, with the coordinates of the
+    fit that has ended, and its own."""
+    known, c = end.by_label, other.coordinates
+    free = [
+        label
+        for label, own in zip(c.labels, c.free)
+        if label in end.labels or (own and label not in known)
+    ]
+    stage = Stage("once more", end.which, tuple(free), end.rtol, REFITS, ROUGH)
+    return Fit(other, other.runner(end.runner), x, stage, loss=end.loss, notify=end.notify)
 
-    at: Mapping[str, float]
-    left: float
-    parts: Mapping[str, float]
-    together: Sequence[str] = ()
 
-
-def joint_fit(
-    problem: Problem, end: End, suspects: Sequence[Variation], enough: float, loss: Loss,
-    notify: Notify,
-) -> Joint | None:  # fmt: skip
+def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | None:
     """The fit with all suspects that are parameters or faults of sensors as unknowns; None where
     there are none. It starts at the end of the first fit and, if the sum of squares stays above
     `enough`, also at the start of that fit.
@@ -210,45 +184,54 @@ def joint_fit(
     suspects wrongly. The joint fit ends near it, where they rank them rightly. If the joint fit
     does not explain the data, none of its suspects does alone.
     """
-    other, tried = problem, list[Variation]()
+    other = end.problem
     for one in suspects:
         with suppress(ValueError):
             if one.parameter or one.fault is not None:
-                other, tried = assuming(other, [one], free=True), [*tried, one]
-    if not tried:
+                other = assuming(other, [one], free=True)
+    if other is end.problem:
         return None
-    c, free = other.coordinates, freed(problem, other, end)
-    labels = tuple(one.label for one in c.within(free))
-    plan = [
-        Stage(f"joint by rtol = {rtol:g}", end.which, labels, rtol, ALL, ROUGH)
-        for rtol in (LOOSE, end.rtol)
-    ]
-    at, fits = dict(zip(problem.coordinates.labels, end.x)), list[Fit]()
-    runner = other.runner(end.runner)
-    for x in (c.begun(at), c.start):
-        with suppress(Unreachable):
-            fits.append(run_plan(other, runner, plan, x, loss=loss, notify=notify).fit)
-            if float(fits[-1].at.r @ fits[-1].at.r) <= enough:
-                break
-    if not fits:
-        return None
-    fit = min(fits, key=lambda fit: fit.chi2)
-    J, columns = fit.at.J, [c.labels.index(one.label) for one in tried]
-    Q, _ = np.linalg.qr(J[:, np.isin(c.labels, problem.coordinates.labels) & free])
+    c, fits = other.coordinates, list[Fit]()
+    for x in (c.begun(end.by_label), c.start):
+        begin = under(end, other, x)
+        stage = replace(begin.stage, evaluations=ALL)
+        fit = continued(
+            begin,
+            *(
+                replace(stage, name=f"joint by rtol = {rtol:g}", rtol=rtol)
+                for rtol in (LOOSE, end.rtol)
+            ),
+        )
+        fits += [fit] if fit is not None else []
+        if fits and fits[-1].square <= enough:
+            break
+    return min(fits, key=lambda fit: fit.chi2, default=None)
+
+
+def shares(
+    end: Fit, joint: Fit, suspects: Sequence[Variation]
+) -> tuple[dict[str, float], list[str]]:
+    """The fraction of the misfit, with all suspects of a joint fit as stated, that each alone
+    explains to first order there, by name; and those that explain nearly all of it between them, if
+    a few do."""
+    c, J = joint.problem.coordinates, joint.at.J
+    tried = {one.name: c.labels.index(one.label) for one in suspects if one.label in c.labels}
+    own = np.isin(c.labels, end.problem.coordinates.labels) & joint.free
+    Q, _ = np.linalg.qr(J[:, own])
 
     def across(d: Array) -> Array:
         """Component (m,) orthogonal to the Jacobian of the first fit's coordinates."""
         return d - Q @ (Q.T @ d)
 
-    stated = across(fit.at.r - J[:, columns] @ (fit.x - c.start)[columns])
-    left, effects = float(fit.at.r @ fit.at.r), dict[str, Array]()
-    misfit = max(float(stated @ stated) - left, 1e-300)
-    for one, k in zip(tried, columns):
+    columns = [*tried.values()]
+    stated = across(joint.at.r - J[:, columns] @ (joint.x - c.start)[columns])
+    effects = dict[str, Array]()
+    misfit = max(float(stated @ stated) - joint.square, 1e-300)
+    for name, k in tried.items():
         d = across(J[:, k])
-        effects[one.name] = d / max(float(np.linalg.norm(d)), 1e-150)
+        effects[name] = d / max(float(np.linalg.norm(d)), 1e-150)
     parts = {name: float(d @ stated) ** 2 / misfit for name, d in effects.items()}
-    together = fewest(effects, stated, left + (1 - NEARLY) * misfit)
-    return Joint(dict(zip(c.labels, fit.x.tolist())), left, parts, together)
+    return parts, fewest(effects, stated, joint.square + (1 - NEARLY) * misfit)
 
 
 def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
@@ -273,63 +256,29 @@ def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
     return out
 
 
-def freed(problem: Problem, other: Problem, end: End) -> NDArray[np.bool_]:
-    """Mask of the free coordinates of a problem under assumptions: those of the fit, and its
-    own."""
-    fitted, c = dict(zip(problem.coordinates.labels, end.free)), other.coordinates
-    return np.array([bool(fitted.get(label, own)) for label, own in zip(c.labels, c.free)])
-
-
-class Refit(NamedTuple):
-    """A repeated fit: the problem, its end, and the mask of free coordinates."""
-
-    problem: Problem
-    fit: Fit
-    free: NDArray[np.bool_]
-
-    def of(self, label: str) -> float:
-        """Final value of a coordinate."""
-        return float(self.fit.x[self.problem.coordinates.labels.index(label)])
-
-
-def refit(
-    problem: Problem, end: End, tried: Sequence[Variation], loss: Loss, notify: Notify,
-    joint: Joint | None = None,
-) -> Refit | None:  # fmt: skip
+def refit(end: Fit, tried: Sequence[Variation], near: Fit | None = None) -> Fit | None:
     """The fit with some assumptions varied, or with all as stated, on its own steps; None where it
     cannot begin.
 
-    It starts at the end of the fit, or of a joint fit; ratios at a bound are scanned again over
-    their whole range. Without a joint fit, and with a misfit above `FAR`, variations other than of
-    a sensor also start where the first fit did, and the better end counts.
+    It starts at the end of the fit, or of one `near`; ratios at a bound are scanned again over
+    their whole range. Without another, and with a misfit above `FAR`, variations other than of a
+    sensor also start where the first fit did, and the better end counts.
     """
     try:
-        other = assuming(problem, tried, free=True)
+        other = assuming(end.problem, tried, free=True)
     except ValueError:
         return None
-    c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
-    if joint is not None:
-        at |= {label: joint.at[label] for label in c.labels if label in joint.at}
-    x = begun(other, tried, at)
-    free = freed(problem, other, end)
-    stuck = [one for one in c.within(free & c.at_bound(x)) if one.ratio_to]
+    c = other.coordinates
+    begin = under(end, other, begun(other, tried, end.by_label | (near.by_label if near else {})))
+    stuck = [one for one in c.within(begin.free & c.at_bound(begin.x)) if one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-    labels = tuple(one.label for one in c.within(free))
-    runner = other.runner(end.runner)
-
-    def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
-        """The fit of the last stage, nothing where one fails."""
+    fits = [continued(begin, replace(begin.stage, scanned=scans))]
+    if any(one.kind != "sensor" for one in tried) and far_off(end) and near is None:
         with suppress(Unreachable):
-            yield run_plan(other, runner, plan, x, loss=loss, notify=notify).fit
-
-    once = Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)
-    fits = [*carried_out([once], x)]
-    if any(one.kind != "sensor" for one in tried) and end.far and joint is None:
-        with suppress(Unreachable):
-            plan = default_plan(other, runner, end.rtol, end.which)
-            if set(plan[-1].free) == set(labels):
-                fits += carried_out(plan, begun(other, tried, {}))
-    if not tried and not fits:  # it stays where it ended
-        chi2 = float(np.mean(end.base.r**2))
-        fits = [Fit(end.x, chi2, 0, False, end.steps, end.base._replace(J=end.at.J))]
-    return Refit(other, min(fits, key=lambda fit: fit.chi2), free) if fits else None
+            plan = default_plan(other, begin.runner, end.rtol, end.which)
+            if set(plan[-1].free) == set(begin.stage.free):
+                fits.append(continued(begin._replace(x=begun(other, tried, {})), *plan))
+    done = [fit for fit in fits if fit is not None]
+    if not tried and not done:  # it stays where it ended
+        return end._replace(at=end.at._replace(J=end.check.finer.J), converged=False)
+    return min(done, key=lambda fit: fit.chi2, default=None)

@@ -104,10 +104,14 @@ def estimates(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
         if e.value is not None and e.ci95 is not None:
             found = [grouped(e.value), " … ".join(map(grouped, e.ci95))]
         return [
-            e.name, ("", e.recording or ""), *found, "" if e.unit == "1" else e.unit,
-            "" if e.start is None else grouped(e.start), prior(e),
+            e.name,
+            ("", e.recording or ""),
+            *found,
+            "" if e.unit == "1" else e.unit,
+            "" if e.start is None else grouped(e.start),
+            prior(e),
             ("weak", "at a bound") if e.at_bound else "",
-        ]  # fmt: skip
+        ]
 
     return {
         caption: [row(e) for e in sorted(group, key=lambda e: e.name if e.recording else "")]
@@ -220,10 +224,16 @@ def traces(
         for one in problem.readings(x, job, run):
             out.append(
                 Trace(
-                    recording.name, one.channel, recording.units[one.channel], one.t, one.measured,
-                    one.expected, one.r, problem.whitened(recording, one.channel, one.r),
+                    recording.name,
+                    one.channel,
+                    recording.units[one.channel],
+                    one.t,
+                    one.measured,
+                    one.expected,
+                    one.r,
+                    problem.whitened(recording, one.channel, one.r),
                 )
-            )  # fmt: skip
+            )
     return out, failures
 
 
@@ -247,17 +257,29 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
     parameters = [e for e in result.estimates if e.kind == "parameter"]
     weak = [direction_name(d) for d in result.directions if not d.identifiable]
     counts = {
-        "simulations": "simulations", "jacobians": "Jacobians", "gradients": "gradients",
+        "simulations": "simulations",
+        "jacobians": "Jacobians",
+        "gradients": "gradients",
         "remembered": "of them read from the checkpoint",
-    }  # fmt: skip
+    }
     return PAGES.get_template("report.html").render(
-        result=result, png=png, kept=kept, cell=cell, failures=failures, traces=traces, moved=MOVED,
+        result=result,
+        png=png,
+        kept=kept,
+        cell=cell,
+        failures=failures,
+        traces=traces,
+        moved=MOVED,
         fitted=", ".join(one.name for one in result.recordings if one.fitted),
         notices=list(dict.fromkeys(result.notices)),
-        estimates=estimates(result), estimates_figure=estimates_figure(parameters),
+        estimates=estimates(result),
+        estimates_figure=estimates_figure(parameters),
         ratios=[
-            f"{e.label} not identifiable" if e.value is None
-            else f"{e.label} {e.value / e.start:.3g} times its start" for e in parameters if e.start
+            f"{e.label} not identifiable"
+            if e.value is None
+            else f"{e.label} {e.value / e.start:.3g} times its start"
+            for e in parameters
+            if e.start
         ],
         contributions=contributions(result) if len(result.contributions) > 1 else [],
         sources=[one.source or "priors" for one in result.contributions],
@@ -265,34 +287,59 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             *(one.sentence for one in result.combinations),
             *(f"{name} may change without a trace in the data" for name in weak),
         ],
-        spectrum_figure=spectrum_figure(result), correlation_figure=correlation_figure(result),
+        spectrum_figure=spectrum_figure(result),
+        correlation_figure=correlation_figure(result),
         spectrum=[
             f"{direction_name(d)}: standard deviation {d.sd:.2g}"
-            f"{'' if d.identifiable else ', not identifiable'}" for d in result.directions
+            f"{'' if d.identifiable else ', not identifiable'}"
+            for d in result.directions
         ],
         strong=correlations(result),
         **assumptions(result),
         residuals=[
-            [one.recording, one.channel, f"{one.rms:.2f}", grouped(one.lag1, 2),
-             f"{one.p_white:.2g}", noise_of(noise.get(one.channel))] for one in result.residuals
+            [
+                one.recording,
+                one.channel,
+                f"{one.rms:.2f}",
+                grouped(one.lag1, 2),
+                f"{one.p_white:.2g}",
+                noise_of(noise.get(one.channel)),
+            ]
+            for one in result.residuals
         ],
         heldout=[
             [r, c, f"{100 * v:.3g} %"]
-            for r, channels in result.heldout.items() for c, v in channels.items()
+            for r, channels in result.heldout.items()
+            for c, v in channels.items()
         ],
         stages=[
-            [s["name"], ", ".join(s["free"]), f"{s['rtol']:g}", f"{s['evaluations']}",
-             f"{s['chi2']:.4g}", "yes" if s["converged"] else "no", f"{s['wall_s']:.1f} s"]
+            [
+                s["name"],
+                ", ".join(s["free"]),
+                f"{s['rtol']:g}",
+                f"{s['evaluations']}",
+                f"{s['chi2']:.4g}",
+                "yes" if s["converged"] else "no",
+                f"{s['wall_s']:.1f} s",
+            ]
             for s in result.stages
         ],
         runs=[f"{result.cost[k]:.0f} {name}" for k, name in counts.items() if result.cost[k]],
         recordings=[
-            [one.name, "fitted" if one.fitted else "held out", f"{one.duration:.4g} s",
-             str(one.samples), one.rig, one.start, ("", one.fingerprint[:12])]
+            [
+                one.name,
+                "fitted" if one.fitted else "held out",
+                f"{one.duration:.4g} s",
+                str(one.samples),
+                one.rig,
+                one.start,
+                ("", one.fingerprint[:12]),
+            ]
             for one in result.recordings
         ],
         definitions={
-            "method": f"{by['method']}, loss {by['loss']}", "tolerance": f"{by['rtol']:g}",
+            "method": f"{by['method']}, loss {by['loss']}",
+            "tolerance": f"{by['rtol']:g}",
             "seed": str(by["seed"]),
             "sensors": ", ".join(
                 f"{k} ± {s.noise:g} {units.get(k, '')}" for k, s in result.sensors.items()
@@ -302,4 +349,4 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             "written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         },
         decided=json.dumps(by, indent=1, ensure_ascii=False),
-    )  # fmt: skip
+    )

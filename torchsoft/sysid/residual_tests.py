@@ -76,38 +76,22 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
     from the prediction stay.
     """
     out, at = [], 0
-    for recording in problem.recordings:
-        for channel, sensor in problem.sensors.items() if recording.name in which else ():
-            if channel not in recording.samples:
+    for recording, channel, sensor in problem.measured(which):
+        t, measured = recording.samples[channel]
+        rows, noise = at + np.arange(len(t)), problem.noise.get(channel)
+        at += len(t)
+        raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
+        reading = predicted(sensor, measured, raw)
+        saturated = int(sensor.saturated(measured).sum())
+        if saturated:
+            ends = (reading + sign * CLEAR * sensor.sd for sign in (-1, 1))
+            near = np.logical_or(*map(sensor.saturated, ends))
+            kept = ~near | (np.abs(raw) > CLEAR)
+            if kept.sum() < FEWEST:
                 continue
-            t, measured = recording.samples[channel]
-            rows, noise = at + np.arange(len(t)), problem.noise.get(channel)
-            at += len(t)
-            raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
-            reading = predicted(sensor, measured, raw)
-            saturated = int(sensor.saturated(measured).sum())
-            if saturated:
-                near = sensor.saturated(reading - CLEAR * sensor.sd) | sensor.saturated(
-                    reading + CLEAR * sensor.sd
-                )
-                kept = ~near | (np.abs(raw) > CLEAR)
-                if kept.sum() < FEWEST:
-                    continue
-                t, rows, raw, reading = t[kept], rows[kept], raw[kept], reading[kept]
-            whitened = partial(problem.whitened, recording, channel)
-            out.append(
-                Part(
-                    recording.name,
-                    channel,
-                    t,
-                    rows,
-                    raw,
-                    reading,
-                    noise,
-                    whitened,
-                    saturated,
-                )
-            )
+            t, rows, raw, reading = t[kept], rows[kept], raw[kept], reading[kept]
+        whitened = partial(problem.whitened, recording, channel)
+        out.append(Part(recording.name, channel, t, rows, raw, reading, noise, whitened, saturated))
     return out
 
 
@@ -171,9 +155,10 @@ def systematic(verdicts: Sequence[Verdict]) -> list[Verdict]:
     coloured, follow the motion, or belong together."""
     kinds = ("white", "motion", "channels")
     found = [
-        one for one in verdicts
+        one
+        for one in verdicts
         if one.alarming and (one.test in kinds or (one.test == "level" and one.size > 1))
-    ]  # fmt: skip
+    ]
     return sorted(found, key=lambda one: one.p)
 
 
@@ -311,10 +296,12 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
     out, t = [], part.t
     y = CubicSpline(t, part.reading)
     own = {
-        "an offset": np.ones(len(t)), "a drift": t - t.mean(),
+        "an offset": np.ones(len(t)),
+        "a drift": t - t.mean(),
         "the reading itself, as an error of its gain would be": y(t),
-        "its rate, as a delay would be": y(t, 1), "its acceleration": y(t, 2),
-    }  # fmt: skip
+        "its rate, as a delay would be": y(t, 1),
+        "its acceleration": y(t, 2),
+    }
     others = {}
     for other in beside:
         if (

@@ -7,7 +7,7 @@ content tells a damaged file.
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
@@ -32,11 +32,10 @@ from torchsoft.sysid.estimate import (
     Direction,
     Estimate,
 )
-from torchsoft.sysid.fit import Combination, combinations
+from torchsoft.sysid.fit import Combination, Fit, combinations
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
-from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.sensitivity import AssumptionTest
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
@@ -106,11 +105,11 @@ def undetermined(values: Mapping[str, float]) -> str:
     return f"not identifiable from the data, and so only where the search ended: {listed}"
 
 
-def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[RecordedRig]:
-    """Every recording with its rig, at x (n,)."""
-    out = list[RecordedRig]()
+def recorded_rigs(fit: Fit) -> list[RecordedRig]:
+    """Every recording with its rig, at the end of a fit."""
+    out, problem = list[RecordedRig](), fit.problem
     for k, recording in enumerate(problem.recordings):
-        values, rig = problem.values(x, k), recording.rig
+        values, rig = problem.values(fit.x, k), recording.rig
         files = list[str]()  # beside the rig file, which an answer does not hold
         files_renamed(dict(rig.tables or {}), lambda name, files=files: files.append(name) or name)
         tables = None if rig.tables is None or files else dict(rig.tables)
@@ -118,10 +117,18 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
         began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
         start = line(str(recording.start), 300)
         one = RecordedRig(
-            recording.name, recording.name in fitted, recording.fingerprint,
-            problem.samples([recording.name]), recording.duration, start, type(rig).__qualname__,
-            rig.description(), tables, identified, began,
-        )  # fmt: skip
+            recording.name,
+            recording.name in fit.which,
+            recording.fingerprint,
+            problem.samples([recording.name]),
+            recording.duration,
+            start,
+            type(rig).__qualname__,
+            rig.description(),
+            tables,
+            identified,
+            began,
+        )
         out.append(one)
     return out
 
@@ -336,8 +343,11 @@ class IdentificationResult(Shown):
         whole("count", count, 1)
         one = self.recorded(recording)
         determined = self._warn_unidentifiable(one)
-        mine = [(i, c) for i, c in enumerate(self.coordinates)
-                if c.kind == "parameter" and c.recording in (None, one.name)]  # fmt: skip
+        mine = [
+            (i, c)
+            for i, c in enumerate(self.coordinates)
+            if c.kind == "parameter" and c.recording in (None, one.name)
+        ]
         free = [i for i, c in mine if c.name in determined]
         if not free:
             raise ValueError("no parameter is identifiable, so that there is nothing to draw")
@@ -362,10 +372,13 @@ class IdentificationResult(Shown):
         ]
         identifiable, named = {e.name for e in mine if e.identifiable}, {e.name for e in mine}
         weak = {
-            c.name: one.identified[c.name] for c in self.coordinates
-            if c.kind == "parameter" and c.recording in (None, one.name)
-            and c.name not in identifiable and (c.name in named or not self.unknowns[c.name].fixed)
-        }  # fmt: skip
+            c.name: one.identified[c.name]
+            for c in self.coordinates
+            if c.kind == "parameter"
+            and c.recording in (None, one.name)
+            and c.name not in identifiable
+            and (c.name in named or not self.unknowns[c.name].fixed)
+        }
         if weak:
             warnings.warn(undetermined(weak), stacklevel=3)
         return identifiable
@@ -479,12 +492,13 @@ BLURRED = 0.1
 reported in its place."""
 
 
-def seen_together(problem: Problem, free: NDArray[np.bool_], C: Array) -> list[Combination]:
-    """Products of powers of parameters that the data determine better than each of them."""
-    mine = [
-        i
-        for i, one in enumerate(problem.coordinates.all)
-        if free[i] and one.kind == "parameter" and one.scale == "log"
-    ]
-    labels = [problem.coordinates.labels[i] for i in mine]
-    return combinations(labels, C[np.ix_(mine, mine)], BLURRED) if len(mine) > 1 else []
+def seen_together(fit: Fit, C: Array) -> list[Combination]:
+    """Products of powers of parameters that the data determine better than each of them, by the
+    covariance C (n, n) of all coordinates."""
+    mine = {
+        one.label: i
+        for i, one in enumerate(fit.problem.coordinates.all)
+        if fit.free[i] and one.kind == "parameter" and one.scale == "log"
+    }
+    at = [*mine.values()]
+    return combinations([*mine], C[np.ix_(at, at)], BLURRED) if len(mine) > 1 else []

@@ -199,9 +199,12 @@ class Runner:
     folder `journal`. `variations` of recordings are those that jobs name."""
 
     def __init__(
-        self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None,
+        self,
+        recordings: Sequence[Recording],
+        workers: int = 1,
+        journal: Path | None = None,
         variations: Mapping[str, Vary] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if workers < 1:
             raise ValueError(f"`workers` must be positive, but is {workers}")
         self.variations = dict(variations or {})
@@ -341,9 +344,12 @@ def between(recording: Recording, job: Job) -> Grid:
 
 
 def simulated(
-    recording: Recording, begun: RunContext, job: Job,
-    start: Callable[[], tuple[Tensor, Tensor]] | None = None, grid: Grid | None = None,
-) -> Any:  # fmt: skip
+    recording: Recording,
+    begun: RunContext,
+    job: Job,
+    start: Callable[[], tuple[Tensor, Tensor]] | None = None,
+    grid: Grid | None = None,
+) -> Any:
     """A `Prediction`, a `Misfit`, or a `FailedRun`, with a rig that no other thread uses; `start`
     computes the initial state. The grid is the recording's own unless another is given."""
     grid = recording.grid(job.interpolated) if grid is None else grid

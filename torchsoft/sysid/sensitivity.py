@@ -20,18 +20,16 @@ from tqdm import tqdm
 
 from torchsoft.display import hidden
 from torchsoft.sysid.assumptions import AMOUNTS, FAULTS, Assumption, Variation, assumptions
-from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
-from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.fit import Fit, fisher, shift, standard_deviations
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import (
     NEARLY,
-    End,
-    Joint,
-    Refit,
     difference,
     exact_columns,
+    far_off,
     joint_fit,
     refit,
+    shares,
 )
 from torchsoft.sysid.residual_tests import Verdict, judge_residuals, parts, systematic
 from torchsoft.tables import Number, plain
@@ -215,19 +213,17 @@ class Checked(NamedTuple):
 
     def widening(self) -> Array:
         """Part (n, n) of that covariance due to the constants of the computation."""
-        return self.covariance() - fisher(self.J)[0]
+        plain = fisher(self.J)[0]
+        return self.covariance() - plain if self.columns.size else np.zeros_like(plain)
 
 
-def check_assumptions(
-    problem: Problem, end: End, *, doubtful: bool = False, explain: bool = False,
-    loss: Loss = "linear", progress: bool = False,
-) -> Checked:  # fmt: skip
-    """Tests of the assumptions at the end of a fit, to first order.
+def check_assumptions(end: Fit, *, doubtful: bool = False, explain: bool = False) -> Checked:
+    """Tests of the assumptions at the end of a fit, `refits.coarsened`, to first order.
 
-    With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other,
-    until one explains the misfit: a test to first order says little where a fit has run far off.
+    With `explain` a `doubtful` fit is repeated without one assumption after the other, until one
+    explains the misfit: a test to first order says little where a fit has run far off.
     """
-    candidates, explained = list[Variation](), False
+    candidates, problem = list[Variation](), end.problem
     recordings = [recording for recording in problem.recordings if recording.name in end.which]
     c = problem.coordinates
     faults = [f"{one.kind} of {one.name}" for one in c.all if one.kind in FAULTS]
@@ -236,8 +232,8 @@ def check_assumptions(
     untried = [one.name for one in taken if one.vary is not None]
     # such as of pads that creep longer than the lead of a run
     with warnings.catch_warnings(action="ignore"):
-        exact, J = exact_columns(problem, end, taken)
-    judge = Judge(problem, end, end.at.J[:, end.free] if J is None else J, loss != "linear")
+        exact, J = exact_columns(end, taken)
+    judge = Judge(end, J)
     try:
         for one, d, reason in exact:
             if d is None or d.any():
@@ -245,37 +241,40 @@ def check_assumptions(
         for one in taken:
             if one.vary is None:
                 continue
-            d, reason = difference(problem, end, one)
+            d, reason = difference(end, one)
             checks[one.name] = judge.first_order(one, d, reason)
             if d is not None and one.kind == "numerical":
                 columns.append(d)
             untried.remove(one.name)
         explained = judge.explained(checks.values())
-        if doubtful and not end.base.failed:
-            look = rivals if explained else doubted
-            candidates = look(taken, checks)
+        if doubtful and not end.at.failed:
+            candidates = (rivals if explained else doubted)(taken, checks)
         if explain and candidates:
             untried = [f"a new fit with another {one.name}" for one in candidates]
-            exact = end._replace(rtol=end.finest) if explained else end  # rivals differ by little
-            for one in new_fits(problem, exact, candidates, loss, judge, checks, progress):
+            near = end.by(judge.finest) if explained else end  # rivals differ by little
+            for one in new_fits(near, candidates, judge, checks):
                 untried.remove(f"a new fit with another {one.name}")
             untried, candidates = [], []
     except KeyboardInterrupt:  # the fit is done: what was tried is kept
         candidates = []
-    rows = np.stack(columns, 1) if columns else np.zeros((len(end.at.r), 0))
+    rows = np.stack(columns, 1) if columns else np.zeros((len(judge.r), 0))
     names = tuple(one.name for one in candidates)
     sd = dict(zip(judge.labels, judge.sd.tolist()))
     done = Checked(
-        [*checks.values()], rows, judge.J, tuple(untried), names,
-        as_stated=tuple(judge.alarms(judge.r, judge.J)), sd=sd,
-    )  # fmt: skip
+        [*checks.values()],
+        rows,
+        judge.J,
+        tuple(untried),
+        names,
+        as_stated=tuple(judge.alarms(judge.r, judge.J)),
+        sd=sd,
+    )
     return compared(done, judge)
 
 
 def new_fits(
-    problem: Problem, end: End, candidates: Sequence[Variation], loss: Loss, judge: "Judge",
-    checks: dict[str, AssumptionTest], progress: bool,
-) -> Iterator[Variation]:  # fmt: skip
+    end: Fit, candidates: Sequence[Variation], judge: "Judge", checks: dict[str, AssumptionTest]
+) -> Iterator[Variation]:
     """Repeat the fit with one suspect after the other, and replace its test in `checks`.
 
     Sensors that explain the misfit by one kind of fault come first, in one fit. Once one suspect
@@ -283,33 +282,35 @@ def new_fits(
     out, too, once a law leaves less than `RIVAL` of the misfit that all numbers together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
-    bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(progress))
+    bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
     with warnings.catch_warnings(action="ignore"), bar:
-
-        def notify(chi2: float) -> None:
-            bar.set_postfix_str(f"chi2 = {chi2:.4g}")
-
-        if end.far:
+        end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
+        far = far_off(end)
+        if far:
             bar.set_description("new fit with all suspects unknown at once")
-            joint = joint_fit(problem, end, candidates, judge.explained_chi2, loss, notify)
-        explains = joint is not None and joint.left <= judge.explained_chi2
-        bounded = dict[str, float]()
+            joint = joint_fit(end, candidates, judge.explained_chi2)
+        explains = joint is not None and joint.square <= judge.explained_chi2
+        bounded, together = dict[str, float](), list[str]()
         if joint is not None:  # where it leaves much, no number of it explains the data alone
-            gains |= {name: explains * judge.square * part for name, part in joint.parts.items()}
+            parts, together = shares(end, joint, candidates)
+            gains |= {name: explains * judge.square * part for name, part in parts.items()}
             if not explains:
-                bounded = dict.fromkeys(joint.parts, RIVAL * judge.misfit(joint.left))
-        blind = end.far and not explains  # gains to first order say little
-        order = [[one] for one in sorted(
-            candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name])
-        )]  # fmt: skip
-        if joint is not None and explains and len(joint.together) > 1:
-            several = [one for one in candidates if one.name in joint.together]
+                bounded = dict.fromkeys(parts, RIVAL * judge.misfit(joint.square))
+        blind = far and not explains  # gains to first order say little
+        order = [
+            [one]
+            for one in sorted(
+                candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name])
+            )
+        ]
+        if explains and len(together) > 1:
+            several = [one for one in candidates if one.name in together]
             if len({one.fault and one.fault[1] for one in several} - {None}) == 1:
                 order.insert(0, several)
         bar.set_description("new fit with all assumptions")
-        as_stated = refit(problem, end, (), loss, notify)
+        as_stated = refit(end, ())
         bar.update()
-        enough, ends = 0.0, dict[str, tuple[list[Variation], Refit]]()
+        enough, ends = 0.0, dict[str, tuple[list[Variation], Fit]]()
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
@@ -319,15 +320,14 @@ def new_fits(
                 continue
             bar.set_description(plain(f"new fit with another {name} ({number} of {len(order)})"))
             tried = [one.within(checks[one.name].favoured) for one in some]
-            other = refit(problem, end, tried, loss, notify, joint if explains else None)
+            other = refit(end, tried, joint if explains else None)
             if other is not None and as_stated is not None:
-                found = [
-                    judge.fit(changed, other, as_stated, checks[one.name])
-                    for one, changed in zip(some, tried)
-                ]
-                if all(one.refitted for one in found):
-                    checks[name], ends[name] = judge.together(name, found), (tried, other)
-                    least = min(least, judge.misfit(found[0].left))
+                found = judge.together(
+                    name, other, as_stated, tried, [checks[one.name] for one in some]
+                )
+                if found.refitted:
+                    checks[name], ends[name] = found, (tried, other)
+                    least = min(least, judge.misfit(found.left))
             bar.update()
             if len(some) == 1:
                 yield some[0]
@@ -335,18 +335,16 @@ def new_fits(
                 enough = max(enough, RIVAL * gain)
         best = max(
             (name for name in ends if checks[name].suspected),
-            key=lambda name: (checks[name].passed, checks[name].gain), default="",
-        )  # fmt: skip
-        if best and as_stated is not None and not checks[best].passed and end.rtol > end.finest:
+            key=lambda name: (checks[name].passed, checks[name].gain),
+            default="",
+        )
+        if best and as_stated is not None and not checks[best].passed and end.rtol > judge.finest:
             bar.set_description(plain(f"new fit with another {best}, by finer steps"))
             tried, coarse = ends[best]
-            at = Joint(dict(zip(coarse.problem.coordinates.labels, coarse.fit.x)), 0.0, {})
-            fine = end._replace(rtol=end.finest)
-            other = refit(problem, fine, tried, loss, notify, at)
+            other = refit(end.by(judge.finest), tried, coarse)
             if other is not None:
                 linear = [replace(checks[one.name], refitted=False) for one in tried]
-                found = [judge.fit(one, other, as_stated, c) for one, c in zip(tried, linear)]
-                checks[best] = judge.together(best, found)
+                checks[best] = judge.together(best, other, as_stated, tried, linear)
 
 
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
@@ -379,9 +377,11 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
     some = [one for one in favoured if one.passed] or favoured
     rest = max(1.0, min(one.left for one in some) / judge.dof)
     amplitudes = [
-        one.amount if one.kind == "several"
-        else float(not one.refitted or one.kind in ("known", "sensor")) for one in some
-    ]  # fmt: skip
+        one.amount
+        if one.kind == "several"
+        else float(not one.refitted or one.kind in ("known", "sensor"))
+        for one in some
+    ]
     left = np.array([one.left for one in some])
     score = left / rest + np.log(judge.dof) * np.array(amplitudes)
     odds = np.exp(-0.5 * (score - score.min()))
@@ -394,17 +394,15 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
 class Judge:
     """Tests of variations at the end of a fit."""
 
-    def __init__(self, problem: Problem, end: End, J: Array, robust: bool = False) -> None:
-        """J (m, n) is the Jacobian of the free coordinates on the steps of the variations."""
-        self.problem, self.robust = problem, robust
-        self.end, self.r, self.J = end, end.at.r, J
+    def __init__(self, end: Fit, J: Array | None = None) -> None:
+        """J (m, n) is the Jacobian of the fitted coordinates on the steps of the variations, by
+        default that of the check."""
+        self.end, self.finest, self.r = end, end.check.rtol, end.check.finer.r
+        self.J = end.check.finer.J[:, end.free] if J is None else J
         self.Q, _ = np.linalg.qr(self.J)
-        self.sd = standard_deviations(self.J)
-        self.coordinates = problem.coordinates.within(end.free)
-        self.labels = [one.label for one in self.coordinates]
+        self.sd, self.labels = standard_deviations(self.J), end.labels
         self.columns, self.ends = dict[str, Array](), dict[str, tuple[Array, Array]]()
-        self.parts = parts(problem, self.r, end.which)
-        self.places = [part.rows for part in self.parts]
+        self.places = [part.rows for part in parts(end.problem, self.r, end.which)]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
         misfit = self.misfit(self.square)
@@ -417,8 +415,8 @@ class Judge:
 
     def alarms(self, r: Array, J: Array) -> list[Verdict]:
         """What a wrong model would leave in residuals r (m,) with their Jacobian J (m, n)."""
-        left = parts(self.problem, r, self.end.which)
-        return systematic(judge_residuals(left, r, J, robust=self.robust))
+        left = parts(self.end.problem, r, self.end.which)
+        return systematic(judge_residuals(left, r, J, robust=self.end.loss != "linear"))
 
     def explained(self, checks: Iterable[AssumptionTest]) -> bool:
         """Whether with a suspected variation nothing is left."""
@@ -429,9 +427,18 @@ class Judge:
         return self.explained([one]) or (one.refitted and one.left < self.explained_chi2)
 
     def made(
-        self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
-        favoured_sd: float, rest: float, after: Array, before: Array, refitted: bool = False,
-    ) -> AssumptionTest:  # fmt: skip
+        self,
+        one: Assumption,
+        moves: Array,
+        gain: float,
+        left: float,
+        favoured: float,
+        favoured_sd: float,
+        rest: float,
+        after: Array,
+        before: Array,
+        refitted: bool = False,
+    ) -> AssumptionTest:
         """The test of a variation that turns residuals `before` (m,) into `after`, with a sum of
         squares `left`, and a misfit `rest` per sample."""
         by_label = dict(zip(self.labels, moves.tolist()))
@@ -439,13 +446,21 @@ class Judge:
             1.0 if refitted else favoured / one.amount
         )
         under = {
-            c.label: c.to_value(v) for c, v in zip(self.coordinates, x.clip(-700, 700).tolist())
+            c.label: c.to_value(v) for c, v in zip(self.end.coordinates, x.clip(-700, 700).tolist())
         }
         return assumption_test(
-            one, moves=by_label, gain=gain, left=left, favoured=favoured, favoured_sd=favoured_sd,
-            significance=gain / rest, pattern=pattern_of(self.places, after, before),
-            refitted=refitted, value=one.nominal + favoured / one.amount * one.step, under=under,
-        )  # fmt: skip
+            one,
+            moves=by_label,
+            gain=gain,
+            left=left,
+            favoured=favoured,
+            favoured_sd=favoured_sd,
+            significance=gain / rest,
+            pattern=pattern_of(self.places, after, before),
+            refitted=refitted,
+            value=one.nominal + favoured / one.amount * one.step,
+            under=under,
+        )
 
     def first_order(self, one: Assumption, d: Array | None, reason: str) -> AssumptionTest:
         """Test of a variation that adds the column d (m,) to the residuals, or that could not be
@@ -481,46 +496,60 @@ class Judge:
         return replace(test, detectable=EVIDENT**0.5 * sd)
 
     def fit(
-        self, one: Variation, again: Refit, as_stated: Refit, linear: AssumptionTest
+        self, one: Variation, again: Fit, as_stated: Fit, linear: AssumptionTest
     ) -> AssumptionTest:
         """Test by a repeated fit with the variation, compared with a repeated fit as stated; the
         test to first order, where the new fit gains less and has not converged."""
-        at, before = again.fit.at, as_stated.fit.at
-        gain = float(before.r @ before.r - at.r @ at.r)
-        if gain <= linear.gain and not again.fit.converged:
+        left, gain = again.square, as_stated.square - again.square
+        if gain <= linear.gain and not again.converged:
             return linear
-        left = float(at.r @ at.r)
         rest = max(1.0, left / self.dof)
-        moves = np.array([again.of(label) for label in self.labels]) - self.end.x[self.end.free]
+        moves = np.array([again.by_label[k] for k in self.labels]) - self.end.x[self.end.free]
         favoured, sd = one.amount, (rest / max(gain, 1e-300)) ** 0.5 * abs(one.amount)
         if one.kind in ("known", "sensor"):
-            c, free = again.problem.coordinates, again.free
-            k = c.labels.index(one.label)
-            mine = c.all[k]
-            value, slope = mine.to_value(again.fit.x[k]), mine.slope(again.fit.x[k])
-            place = int(np.flatnonzero(free).tolist().index(k))
-            own = rest**0.5 * float(standard_deviations(at.J[:, free])[place]) * slope
+            place = again.labels.index(one.label)
+            mine, x = again.coordinates[place], again.by_label[one.label]
+            own = rest**0.5 * float(again.sd[place]) * mine.slope(x)
             by_amount = one.vary is not None or one.read is not None
             nominal, scale = (0.0, 1.0) if by_amount else (one.nominal, one.amount / one.step)
-            favoured, sd = (value - nominal) * scale, own * scale
-        self.ends[one.name] = at.r, at.J[:, again.free]
-        test = self.made(one, moves / self.sd, gain, left, favoured, sd, rest, at.r, before.r, True)
+            favoured, sd = (mine.to_value(x) - nominal) * scale, own * scale
+        self.ends[one.name] = again.at.r, again.J
+        test = self.made(
+            one, moves / self.sd, gain, left, favoured, sd, rest, again.at.r, as_stated.at.r, True
+        )
         return replace(
-            test, amount=linear.amount, step=linear.step, detectable=linear.detectable,
+            test,
+            amount=linear.amount,
+            step=linear.step,
+            detectable=linear.detectable,
             passed=not self.alarms(*self.ends[one.name]),
-        )  # fmt: skip
+        )
 
-    def together(self, name: str, found: Sequence[AssumptionTest]) -> AssumptionTest:
-        """The test of one or several variations in one new fit, from the test of each in that
-        fit."""
+    def together(
+        self,
+        name: str,
+        again: Fit,
+        as_stated: Fit,
+        tried: Sequence[Variation],
+        linear: Sequence[AssumptionTest],
+    ) -> AssumptionTest:
+        """Test of one or several variations by one repeated fit; it is `refitted` only where that
+        of each is."""
+        found = [self.fit(one, again, as_stated, c) for one, c in zip(tried, linear)]
         if len(found) == 1:
             return found[0]
-        self.ends[name] = self.ends[found[0].name]
+        self.ends[name] = again.at.r, again.J
         return replace(
-            found[0], name=name, kind="several", parameter="", amount=float(len(found)), unit="",
+            found[0],
+            name=name,
+            kind="several",
+            parameter="",
+            amount=float(len(found)),
+            unit="",
+            refitted=all(one.refitted for one in found),
             stated=" and ".join(one.stated for one in found),
             otherwise=" and".join(one.found for one in found),
-        )  # fmt: skip
+        )
 
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]
@@ -539,8 +568,9 @@ class Judge:
         while left and len(out) < BESIDES:
             Q = np.linalg.qr(J)[0]
             tests = [self.column(one, self.columns[one.name], Q, r) for one in left]
-            found = max((one for one in tests if one.suspected), key=lambda one: one.gain,
-                        default=None)  # fmt: skip
+            found = max(
+                (one for one in tests if one.suspected), key=lambda one: one.gain, default=None
+            )
             if found is None:
                 break
             out.append(found)

@@ -126,22 +126,28 @@ def unseen(checked: Checked) -> list[str]:
         if c.kind not in ("known", "sensor") or c.unchecked or c.suspected or abs(move) < 1.0:
             continue
         if c.detectable <= AMOUNTS * c.amount:
-            hidden.append((
-                abs(move),
-                f"{c.name}: {size:.2g} {c.unit}".rstrip() + " more or less than stated would not "
-                f"be seen, and moves {label} by {abs(move):.2g} standard deviations",
-            ))  # fmt: skip
+            hidden.append(
+                (
+                    abs(move),
+                    f"{c.name}: {size:.2g} {c.unit}".rstrip()
+                    + " more or less than stated would not "
+                    f"be seen, and moves {label} by {abs(move):.2g} standard deviations",
+                )
+            )
         else:
             part = 100 * c.moves[label] * checked.sd[label]
-            priced.append((
-                abs(move),
-                f"{label} takes {c.name} as exact: {c.amount:.2g} {c.unit}".rstrip()
-                + f" of it is {part:+.2g} % of {label}",
-            ))  # fmt: skip
+            priced.append(
+                (
+                    abs(move),
+                    f"{label} takes {c.name} as exact: {c.amount:.2g} {c.unit}".rstrip()
+                    + f" of it is {part:+.2g} % of {label}",
+                )
+            )
     return [
-        sentence for some in (hidden, priced)
+        sentence
+        for some in (hidden, priced)
         for _, sentence in sorted(some, key=lambda row: -row[0])[:WORST]
-    ]  # fmt: skip
+    ]
 
 
 def contradictions(

@@ -27,9 +27,8 @@ def good_sensors(rig: Rig) -> dict[str, Sensor]:
     1 N.mm."""
     known = units(rig)
     return {
-        name: Sensor(noise=NOISE[known[name]])
-        for name in measurable(rig) if known[name] in NOISE
-    }  # fmt: skip
+        name: Sensor(noise=NOISE[known[name]]) for name in measurable(rig) if known[name] in NOISE
+    }
 
 
 RTOL = 1e-6
@@ -37,10 +36,17 @@ RTOL = 1e-6
 
 
 def record(
-    name: str, planned: BuiltRig, truth: Mapping[str, float] | Rig,
-    sensors: Mapping[str, Sensor], *, start: Start | None = None, rate: float = 200.0,
-    rtol: float = RTOL, noise: float = 1.0, seed: int | np.random.Generator = 0,
-) -> Recording:  # fmt: skip
+    name: str,
+    planned: BuiltRig,
+    truth: Mapping[str, float] | Rig,
+    sensors: Mapping[str, Sensor],
+    *,
+    start: Start | None = None,
+    rate: float = 200.0,
+    rtol: float = RTOL,
+    noise: float = 1.0,
+    seed: int | np.random.Generator = 0,
+) -> Recording:
     """A synthetic recording of a rig with the parameters of the `truth`, which follows the motion
     `planned`.
 

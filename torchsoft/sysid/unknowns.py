@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self, TypeVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from torchsoft.display import suggestion
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
-from torchsoft.sysid.recording import REACH, Array, Recording
+from torchsoft.sysid.recording import REACH, Array, Mask, Recording
 from torchsoft.tables import Table, line, shown
 
 T = TypeVar("T")
@@ -141,7 +140,7 @@ class Sensor(Table):
         """Standard deviation [unit] of noise and quantisation together."""
         return math.hypot(self.noise, self.resolution / math.sqrt(12))
 
-    def saturated(self, y: Array) -> NDArray[np.bool_]:
+    def saturated(self, y: Array) -> Mask:
         """Mask of samples y (k,) [unit] at an end of the range or beyond."""
         low, high = (
             -math.inf if self.low is None else self.low,
@@ -473,17 +472,17 @@ class Coordinates:
         """Vector x (n,) with the `known` entries by label, and the nominal values elsewhere."""
         return np.array([known.get(label, own) for label, own in zip(self.labels, self.start)])
 
-    def within(self, mask: NDArray[np.bool_]) -> list[Coordinate]:
+    def within(self, mask: Mask) -> list[Coordinate]:
         """The coordinates of a mask (n,)."""
         return [one for one, is_in in zip(self.all, mask) if is_in]
 
-    def at_bound(self, x: Array) -> NDArray[np.bool_]:
+    def at_bound(self, x: Array) -> Mask:
         """Mask of coordinates (n,) within `AT_BOUND` of a bound."""
         low, high = self.bounds
         return np.minimum(x - low, high - x) < AT_BOUND * (high - low)
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Mask:
         return np.array([not c.fixed for c in self.all], bool)
 
     def values(self, x: Array, recording: str, given: Mapping[str, float]) -> dict[str, float]:
