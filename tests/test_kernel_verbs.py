@@ -23,7 +23,7 @@ from torchsoft.solve.kernel import (
     stage,
     tangent,
 )
-from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, LANES, room
+from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, LANES, scratch
 from torchsoft.solve.kernel.invoke import call_linearise
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
@@ -83,10 +83,10 @@ def first_stage(name: str) -> Stage:
     t = torch.tensor([0.0, 10 * STEP], dtype=torch.float64)
     with torch.no_grad():
         *_, _ = stepper.integrate(y0, t, segments, float("inf"))
-    tape, out_tape = stepper.tapes(segments[-1])
-    s, size = stepper.system, stepper.layout.size
+    tape, out_tape = segments[-1].tapes
+    s, size = stepper.compiled.system, stepper.layout.size
     return Stage(
-        s, room("Work", s, size, columns=2), tape, out_tape, segments[-1].signals, size,
+        s, scratch("Work", s, size, columns=2), tape, out_tape, segments[-1].stages, size,
         GAMMA * STEP,
     )  # fmt: skip
 
@@ -185,7 +185,7 @@ def test_the_adjoint_of_a_stage_is_its_tangent_transposed(name, felt):
     s, size, m = now.s, now.size, 2
     tape, row, a = (now.out_tape, 0, INSTANT) if felt else (now.tape, 1, now.a)
     signals = now.signals[row]
-    z, back = room("Tangents", s, size, columns=m), room("Cotangents", s, size)
+    z, back = scratch("Tangents", s, size, columns=m), scratch("Cotangents", s, size)
     scale = np.maximum(abs(tape.y[row]), 1e-6)
     start, dp = (
         scale[:, None] * ANY.normal(size=(size, m)),

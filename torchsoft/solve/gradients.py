@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsoft.parallel import parallel_map, released_turn
-from torchsoft.solve.kernel.arrays import Backward, Forward, room
+from torchsoft.solve.kernel.arrays import Backward, Forward
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
-from torchsoft.solve.stepper import ImplicitStepper, stage_times
+from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.trajectory import Sums
 
 # Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in
@@ -76,8 +76,8 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
     inputs: list[Tensor] = []
     for run in differentiated:
         stepper = run.stepper
-        times = [stage_times(segment.plan) for segment in run.segments or []]
-        signals = stepper.signals_at(torch.cat([*times, run.t - stepper.origin]))
+        times = [segment.plan.stage_times.ravel() for segment in run.segments or []]
+        signals = stepper.signals_at(np.concatenate([*times, run.t.numpy() - stepper.origin]))
         at_stages, at_outputs = signals[: -len(run.t)], signals[-len(run.t) :]
         inputs += [run.y0, stepper.compiled.p, at_stages, at_outputs]
     flat = iter(_Solutions.apply(differentiated, threads, *inputs) if differentiated else ())
@@ -138,22 +138,23 @@ def run_adjoint(
                 f"the cotangent of output {np.argwhere(~np.isfinite(bar))[0][0]} is not finite"
             )
     carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
-    signals_bar = [np.zeros(segment.signals.shape) for segment in run.segments or []]
-    outputs_bar = np.zeros((len(run.t), *signals_bar[0].shape[1:]))
-    for number in range(len(signals_bar) - 1, -1, -1):
-        segment = (run.segments or [])[number]
-        plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system
+    segments, outputs_bar = run.segments or [], np.zeros((len(run.t), *run.out.signals.shape[1:]))
+    signals_bar = [np.zeros_like(segment.stages) for segment in segments]
+    room = stepper.compiled.model.take(stepper.compiled.numbers)
+    for segment, own_bar in zip(reversed(segments), reversed(signals_bar)):
+        plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
         failed, here = np.zeros(1, np.int64), segment.rows
         sweep = Backward(
-            s, room("Work", s, size, columns=1), room("Cotangents", s, size), tape,
-            plan.h, segment.signals, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
-            rows[here], felt[here], outputs_bar[here], carried, p_bar, signals_bar[number], failed,
+            room.system, room.work, room.of("Cotangents"), tape,
+            plan.h, segment.stages, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
+            rows[here], felt[here], outputs_bar[here], carried, p_bar, own_bar, failed,
         )  # fmt: skip
         with released_turn():
             call("backward", sweep)
         if failed[0] >= 0:
             time = stepper.origin + plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
+    stepper.compiled.model.give(room)
     parts = carried, p_bar, np.concatenate(signals_bar), outputs_bar
     return tuple(torch.from_numpy(part) for part in parts)  # pyright: ignore[reportReturnType]
 
@@ -219,14 +220,15 @@ def iterate(
     dp[:, : len(wrt)] = directions(stepper.compiled.p, wrt)
     kept, felt = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
     segments: list[Segment] = []
+    room = stepper.compiled.model.take(stepper.compiled.numbers)
+    work, tangents = (room.of(kind, columns=n) for kind in ("Work", "Tangents"))
     for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop(0)
-            plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system
+            plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
             rows = np.empty((len(plan.out_step), size, n))
-            work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
             sweep = Forward(
-                s, work, tangents, tape, plan.h, segment.signals, plan.out_step,
+                room.system, work, tangents, tape, plan.h, segment.stages, plan.out_step,
                 plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, rows,
                 felt[segment.rows],
             )  # fmt: skip
@@ -234,3 +236,4 @@ def iterate(
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(kept), torch.from_numpy(felt), out
+    stepper.compiled.model.give(room)

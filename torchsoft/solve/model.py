@@ -9,7 +9,7 @@ import threading
 import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +47,7 @@ from torchsoft.solve.kernel.arrays import (
     Points,
     Sources,
     recorded_size,
-    room,
+    scratch,
     system,
 )
 from torchsoft.solve.kernel.table import Array, Index, layout
@@ -64,7 +64,7 @@ from torchsoft.solve.laws import (
     weight_law,
 )
 from torchsoft.solve.progress import Integrals
-from torchsoft.solve.steps import ErrorParts
+from torchsoft.solve.steps import CHUNK, ErrorParts, Followed
 from torchsoft.solve.structure import Copies, Structure, lasting, structure_of
 
 NOMINAL = 1e-3
@@ -81,13 +81,21 @@ KEPT = 8
 """Models that are kept."""
 
 
-class Room(NamedTuple):
-    """Arrays that one run at a time works in: a system with a vector of parameters of its own, and
-    the kernels' scratch."""
+class Room:
+    """What one run at a time computes in: the arrays of a rig with a vector of parameters of its
+    own, scratch for the kernels, and a chunk of steps (starts, lengths, signals)."""
 
-    system: Any
-    work: Any
-    step: Any
+    def __init__(self, system: Any, state: int, integrals: int, signals: int) -> None:
+        self.system, self._state = system, state
+        self._known = dict[str, tuple[dict[str, int], Any]]()
+        self.work, self.step = self.of("Work", columns=1), self.of("Step", integrals=integrals)
+        self.chunk = np.zeros(CHUNK), np.zeros(CHUNK), np.zeros((CHUNK, 2, signals, 2))
+
+    def of(self, kind: str, **sizes: int) -> Any:
+        """Scratch of a kind, the last one again where that had the same sizes."""
+        if kind not in self._known or self._known[kind][0] != sizes:
+            self._known[kind] = sizes, scratch(kind, self.system, self._state, **sizes)
+        return self._known[kind][1]
 
 
 class Model:
@@ -112,6 +120,7 @@ class Model:
         self._read(values)
         self._idle: list[Room] = []
         self.last: tuple[Array, Tensor, dict[str, float]] | None = None
+        self.motion: tuple[Any, Followed] | None = None
 
     def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
         return b"".join([values[i].detach().numpy().tobytes() for i in self._geometric])
@@ -169,7 +178,7 @@ class Model:
         sizes = [one.shape.size() for one in rig.bodies.values() if one.shape is not None]
         self.smallest = min(sizes, default=np.inf)
         none = self.system(np.zeros(len(self._index)))
-        self.no_tape = room("Tape", none, self.layout.size, stages=0, cap=0)
+        self.no_tape = scratch("Tape", none, self.layout.size, stages=0, cap=0)
         self.widths = (
             self.layout.size, len(self.integrals.names), recorded_size(none),
             int(none.nodal_dof_start[-1]),
@@ -202,12 +211,9 @@ class Model:
         try:
             found = self._idle.pop()
         except IndexError:
-            own = self.system(p.copy())
-            work, size = room("Work", own, self.layout.size, columns=1), len(self.integrals.names)
-            return Room(own, work, room("Step", own, self.layout.size, integrals=size))
+            sizes = *self.widths[:2], len(self.signals) + self.fixed
+            return Room(self.system(p.copy()), *sizes)
         found.system.p[:] = p
-        for part in (found.work.V, found.work.u_dot, found.work.rate):
-            part.fill(0.0)
         return found
 
     def give(self, used: Room) -> None:

@@ -133,10 +133,8 @@ class TorchdiffeqSolver:
             y_bars[sample], *cotangents = run_adjoint(run, outputs, None)
             if parameters:
                 with torch.enable_grad():
-                    made_of = (
-                        again.compiled.p,
-                        again.signals([segment.plan for segment in segments]),
-                    )
+                    times = np.concatenate([one.plan.stage_times.ravel() for one in segments])
+                    made_of = again.compiled.p, again.signals_at(times)
                     value = torch.cat(
                         [(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]
                     ).sum()

@@ -260,8 +260,8 @@ def backward(r: Any) -> None:
     place.
 
     outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; where
-    recorded_bar (outputs, recorded) of the forces there is not zero, they receive its share.
-    Without steps the one output is the start. signals and signals_bar are (stages, signals, 2),
+    recorded_bar (outputs, recorded) of the forces there is not zero, they receive its share. The
+    start is an output of step -1. signals and signals_bar are (stages, signals, 2),
     those of the outputs (outputs, signals, 2). failed receives -1, or the step at which a cotangent
     stopped being finite.
     """
@@ -273,9 +273,6 @@ def backward(r: Any) -> None:
     held, first_bar, start_bar = z.state[0], z.state[1], z.state[2]
     for i in range(out_step.size):
         output_adjoint(r, i)
-    if h.size == 0:
-        for i in range(y_bar.size):
-            y_bar[i] += outputs_bar[0, i]
     for step in range(h.size - 1, -1, -1):
         a = GAMMA * h[step]
         first_bar[:], start_bar[:] = 0.0, 0.0
@@ -298,3 +295,6 @@ def backward(r: Any) -> None:
         if not np.isfinite(y_bar.sum()):
             r.failed[0] = step
             return
+    if row >= 0:  # the start
+        for i in range(y_bar.size):
+            y_bar[i] += outputs_bar[row, i]

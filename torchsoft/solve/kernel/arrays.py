@@ -222,15 +222,10 @@ class Signals(NamedTuple):
 
 
 NO_SIGNALS = Signals(
-    np.zeros(1, np.int64),
-    np.zeros(0, np.int64),
-    np.zeros(0),
-    np.zeros(0),
-    np.zeros((0, 1)),
-    0,
+    np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros((0, 1)), 0,
     np.zeros(1),
-)
-"""Reference of given steps: none."""
+)  # fmt: skip
+"""No pieces."""
 
 
 @table
@@ -244,17 +239,6 @@ class Errors(NamedTuple):
     atol: Array
     size: Array
     origin: Array
-
-
-NO_ERRORS = Errors(
-    np.zeros(0, np.int64),
-    np.zeros(0, np.int64),
-    np.zeros(0, np.int64),
-    np.zeros(0),
-    np.zeros(0),
-    np.zeros(0),
-)
-"""Tolerances of given steps: none."""
 
 
 SCRATCH: dict[str, dict[str, str]] = {
@@ -442,12 +426,12 @@ class Run(NamedTuple):
     out: Outputs
     tape: Annotated[Any, Tape]
     given: int
+    begin: int
     y: Array
     k: Array
     clock: Array
     stops: Array
     t_out: Array
-    row: int
     rtol: float
     longest: float
     shortest: float
@@ -527,7 +511,7 @@ def recorded_size(s: Any) -> int:
     return 2 * len(s.point_X) + 3 * len(s.pad_base) + len(s.body_free)
 
 
-def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
+def scratch(kind: str, s: Any, state: int, **sizes: int) -> Any:
     """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those
     that it does not decide."""
     states, nodes = int(s.contact_states.max(initial=1)), int(s.pad_node_start[-1])
@@ -564,8 +548,3 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         grouped = constants.reshape(sizes["groups"], LANES, constants.shape[1])
         made["element_x"][:, 2 * CORNERS :] = grouped.swapaxes(1, 2)
     return KINDS[kind](**made)
-
-
-def first_rows(tape: Any, rows: int) -> Any:
-    """The beginning of a tape, of a run that ended early."""
-    return Tape(*(part if len(part) == rows else part[:rows].copy() for part in tape))

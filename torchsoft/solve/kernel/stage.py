@@ -73,7 +73,7 @@ def solve_stage(
     drive(s, w, y, signals, a)
     for pad in range(count):
         pads.begin(s, w, pad, y, a)
-    if w.travelled[0] > w.travelled[1]:
+    if not w.travelled[0] <= w.travelled[1]:  # also where they are no numbers yet
         scan(s, w, y, margin)
     for pad in range(count):
         pads.displace(s, w, pad, y, w.low[pad], w.high[pad])

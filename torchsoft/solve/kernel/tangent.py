@@ -272,15 +272,16 @@ def read(r: Any, i: int) -> None:
 def forward(r: Any) -> None:
     """Carry the tangent dy (size, m) through the steps h of a tape, in place; dys (outputs, size,
     m) receives it at the parts out_part of the steps out_step, dsums (outputs, sums, m)
-    those of the sums of forces, `Sums`. Without steps the one output is the start."""
+    those of the sums of forces, `Sums`. The start is an output of step -1."""
     s, w, z, tape, h, signals = r.s, r.w, r.z, r.tape, r.h, r.signals
     out_step, out_part, dy, dp, dys = r.out_step, r.out_part, r.dy, r.dp, r.dys
     m, row, before, first = dy.shape[1], 0, z.before, z.first
-    if h.size == 0:
+    if out_step.size > 0 and out_step[0] < 0:  # the start
         put(dy, dys[0])
-        if r.out_tape.count.shape[0] > 0:
+        if r.out_tape.y.shape[0] > 0:
             pads.find_spans(s, r.out_tape.y[0], dy, z.span)
         read(r, 0)
+        row = 1
     for step in range(h.size):
         a = GAMMA * h[step]
         if step % RESCAN == 0:
