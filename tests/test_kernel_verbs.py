@@ -83,7 +83,9 @@ def first_stage(name: str) -> Stage:
     t = torch.tensor([0.0, 10 * STEP], dtype=torch.float64)
     with torch.no_grad():
         *_, _ = stepper.integrate(y0, t, segments, float("inf"))
-    tape, out_tape = segments[-1].tapes
+    tapes = segments[-1].tapes
+    assert tapes is not None
+    tape, out_tape = tapes
     s, size = stepper.compiled.system, stepper.layout.size
     return Stage(
         s, scratch("Work", s, size, columns=2), tape, out_tape, segments[-1].stages, size,
@@ -118,8 +120,7 @@ def test_the_block_of_a_pad_is_that_of_dense_algebra(name):
     free = len(s.body_coordinate)
     for pad in range(len(s.pad_base)):
         Rv, r = np.zeros((free, free)), np.zeros((free, 1))
-        pads.relation(s, w, pad, now.tape.y[1], now.a)
-        contacts.assemble(s, w, pad, now.a, Rv)
+        pads.assemble(s, w, pad, now.tape.y[1], now.a, Rv)
         n, at = 2 * w.counts[pad], s.pad_point_start[pad]
         active = w.active[at : at + w.actives[pad]]
         assert n > 0
@@ -136,11 +137,9 @@ def test_the_block_of_a_pad_is_that_of_dense_algebra(name):
         columns = s.pad_columns[pad]
         Hc, Rf = w.Hc[:n, :columns].copy(), w.Rf[:columns, :n].copy()
         b, own = ANY.normal(size=n), s.pad_column[pad] >= 0
-        X = np.zeros((n, free + 2))
-        X[:, 0], X[:, 1 : 1 + columns] = b, Hc
-        before = Rv.copy()
-        linear.solve_dense(w.A, X, n, 1 + columns)
-        contacts.eliminate(s, w, pad, 1, X, r, Rv)
+        first, before = 2 * s.pad_node_start[pad], Rv.copy()
+        w.X[first : first + n, 0] = b
+        contacts.eliminate(s, w, pad, 1, r, Rv)
         number = s.pad_column[pad][own]
         schur, load = np.zeros((free, free)), np.zeros(free)
         schur[np.ix_(own, own)] = (Rf @ np.linalg.solve(A, Hc))[np.ix_(number, number)]

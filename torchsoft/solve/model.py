@@ -65,7 +65,7 @@ from torchsoft.solve.laws import (
 )
 from torchsoft.solve.progress import Integrals
 from torchsoft.solve.steps import CHUNK, ErrorParts, Followed
-from torchsoft.solve.structure import Copies, Structure, lasting, structure_of
+from torchsoft.solve.structure import Copies, Structure, structure_of
 
 NOMINAL = 1e-3
 """Stage length a h [s] at which slip laws of users are tried."""
@@ -77,8 +77,8 @@ method."""
 NEGLIGIBLE = 1e-9
 """Nodal force [N] below which a node counts as unloaded."""
 
-KEPT = 8
-"""Models that are kept."""
+KEPT, KEPT_BYTES = 8, 5e7
+"""Most models that are kept, and arrays of theirs [bytes] beyond the last one's."""
 
 
 class Room:
@@ -115,7 +115,7 @@ class Model:
         self.derived = derived(modules)
         self.judged = [i for i, one in enumerate(modules) if hasattr(one, "well_posed")]
         self.shared = structure.known
-        self._key, self._geometric = lasting(structure.key), geometric(modules, structure)
+        self._key, self._geometric = structure.key, geometric(modules, structure)
         self._geometry = self._geometry_of(values)
         self._read(values)
         self._idle: list[Room] = []
@@ -168,6 +168,7 @@ class Model:
         self._pads = self._make_pads()
         parts = self._bodies, self._make_sources(), self._pads, self._make_condensed()
         self._parts = *parts, self._make_nodal(), *self._make_contacts()
+        self.bytes = sum(np.asarray(one).nbytes for part in self._parts for one in part)
         self.index = torch.tensor(self._index, dtype=torch.int64)
         self.nodal = {name: 2 * pad.nodes for name, pad in rig.pads.items() if pad.nodal}
         points = [2 * count for count in rig.point_counts.values()]
@@ -191,14 +192,11 @@ class Model:
         for name, here in self.condensed.items():
             i = [*self.rig.pads].index(name)
             at, n = own.chain_at[i], own.branches[i]
-            z = y[:, here]
-            size = z.shape[1] // n
-            zeta = np.einsum("b,tbs->ts", p[at : at + n], z.reshape(len(y), n, size))
-            loaded = np.abs(zeta).max(0) > NEGLIGIBLE
-            dofs = np.flatnonzero(loaded.reshape(-1, 2).any(1))
-            dofs = (2 * dofs[:, None] + np.arange(2)).ravel()
-            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(size, size)
-            u = p[at + 2 * n] * (zeta[:, dofs] @ C[dofs[:, None], dofs])
+            zeta = p[at : at + n] @ y[:, here].reshape(len(y), n, -1)
+            loaded = np.flatnonzero(np.abs(zeta).max(0) > NEGLIGIBLE) // 2 * 2
+            span = slice(*loaded[[0, -1]] + [0, 2]) if len(loaded) else slice(0)
+            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(2 * (zeta.shape[1:]))
+            u = p[at + 2 * n] * (zeta[:, span] @ C[span, span])
             out[name] = float(np.sqrt((u.reshape(len(y), -1, 2) ** 2).sum(-1).max(initial=0.0)))
         return out
 
@@ -539,6 +537,8 @@ def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
             _kept.remove(found)
         if found.shared and (not _kept or found is not _kept[0]):
             _kept.appendleft(found)
+            while len(_kept) > 1 and sum(one.bytes for one in _kept) > KEPT_BYTES:
+                _kept.pop()
     return found
 
 

@@ -73,7 +73,7 @@ class Segment(NamedTuple):
     def stages(self) -> Array:
         """Signals at the stages (stages, signals, 2)."""
         signals = self.plan.signals
-        return signals.reshape(-1, *signals.shape[2:])
+        return signals.reshape(2 * len(signals), *signals.shape[2:])
 
 
 class Integrals:

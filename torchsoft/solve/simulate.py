@@ -33,7 +33,6 @@ from torchsoft.solve.gradients import (
 )
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.solve.steps import check_times
 from torchsoft.solve.system import Reading
 from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory, channels, units
 
@@ -151,8 +150,7 @@ def prepare(
         differentiable=gradient == "forward"
         or (gradient == "discrete" and torch.is_grad_enabled()),
     )
-    check_times(t, step)
-    stepper.check_start(start)
+    stepper.check(start, t)
     felt = _channels_of_touch(rig, touch)
     return Task(
         stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid, felt, rig

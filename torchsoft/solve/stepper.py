@@ -59,6 +59,12 @@ METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
 
 
+def carry_out(run: Any) -> None:
+    """Make a compiled call of a run."""
+    with released_turn():
+        call("run", run)
+
+
 class ImplicitStepper:
     """SDIRK2 on one rig and reference as they are now: L-stable, second order, stiffly accurate.
 
@@ -119,6 +125,8 @@ class ImplicitStepper:
         self.origin = 0.0
         self._motion: Followed | None = None
         self._cap, self._shortest = 64, SHORTEST
+        limits = Limits(self.tolerance, self.max_iterations, self.window)
+        self._limits: Any = limits, limits._replace(max_iterations=START_ITERATIONS)
 
     def along(self, knots: Array) -> "ImplicitStepper":
         """The same with the steps between `knots` [s]."""
@@ -154,8 +162,10 @@ class ImplicitStepper:
         """The signals at one moment, to see whether they carry a graph."""
         return self.compiled.signals(torch.zeros(1, dtype=torch.float64), self.reference)
 
-    def check_start(self, y0: Tensor) -> None:
-        """Raises `ValueError` unless y0 is one finite state of this rig."""
+    def check(self, y0: Tensor, t: Tensor) -> None:
+        """Raises `ValueError` unless a run can go from y0, one finite state of this rig, through
+        the times t."""
+        check_times(t, self.step)
         check_array("y0", y0)
         self.layout.check(y0)
         if y0.ndim != 1:
@@ -167,21 +177,26 @@ class ImplicitStepper:
             first = np.flatnonzero(~finite)[0]
             raise ValueError(f"`y0` must be finite, but component {first} is not")
 
-    @torch.no_grad()
-    def integrate(
+    def integrate(self, y0: Tensor, t: Tensor, *how: Any, **more: Any) -> Iterator[Progress]:
+        """The `course` from y0 through t with the calls made."""
+        for one in self.course(y0, t, *how, **more):
+            if isinstance(one, Progress):
+                yield one
+            else:
+                carry_out(one)
+
+    def course(
         self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None,
         tape_bytes: float = 0.0, outputs_too: bool = True,
-    ) -> Iterator[Progress]:  # fmt: skip
-        """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every
-        compiled call.
+    ) -> Iterator[Any]:  # fmt: skip
+        """Step from y0 (size,) through t (T,), yielding the arguments of every compiled call that
+        is to be made, and after it the same growing `Progress`.
 
         The last yield is the complete run. With `segments` given, the data of the derivatives are
         appended to it, tapes for as long as they take less than `tape_bytes`, of the outputs only
-        where the forces there are to be differentiated. Raises `SimulationFailed`, and `ValueError`
-        for a start that is not finite.
+        where the forces there are to be differentiated. Start and times are those that `check` lets
+        pass. Raises `SimulationFailed`.
         """
-        self.check_start(y0)
-        check_times(t, self.step)
         self.origin, times = float(t[0]), t.numpy() - float(t[0])
         self.followed = self._motion or self.compiled.followed(self.reference, self.origin)
         self._shortest = min(SHORTEST, PART * times[-1])
@@ -193,9 +208,10 @@ class ImplicitStepper:
         while todo:
             plan, halvings = todo.pop()
             before = tuple(part.copy() for part in now.stands) if segments is not None else ()
-            counts, tapes = self._call(now, plan, table)
+            call, tapes = self._call(now, plan, table)
+            yield call
             self.followed.check()
-            steps, done, status, solves, refused, failed, which = counts
+            steps, done, status, solves, refused, failed, which = table.counts.tolist()
             if not out.rows and not np.isfinite(out.signals[0]).all():
                 self.signals_at(np.zeros(1))  # which raises
             rows = slice(out.rows, out.rows + done)
@@ -209,7 +225,7 @@ class ImplicitStepper:
             elif status == NEWTON_FAILED and given and out.rows and halvings < HALVINGS:
                 out.failed += 1
                 room.work.u_dot[:], room.work.rate[:] = 0.0, 0.0
-                ends = np.searchsorted(plan.out_step, steps, side="right")
+                ends = int(np.searchsorted(plan.out_step, steps, side="right"))
                 todo.append((plan.left(steps + 1, ends), halvings))
                 half = plan.taken(steps + 1, ends).left(steps, done).halved()
                 todo += [(one, halvings + 1) for one in self._followed_by([half], out, out.rows)]
@@ -249,6 +265,7 @@ class ImplicitStepper:
         plans[0] = plans[0]._replace(out_step=start[0], out_part=start[1])
         return self._followed_by(plans, out, 0)[::-1]
 
+    @torch.no_grad()
     def _followed_by(self, plans: Sequence[Plan], out: Progress, row: int) -> list[Plan]:
         """Plans with the signals at their stages; those at their outputs go to rows from `row`
         on."""
@@ -268,18 +285,14 @@ class ImplicitStepper:
         errors = self.compiled.model.errors.of(now.y, self.atol, self.compiled.units)
         clock = np.array([0.0, min(FIRST, times[-1]), 1.0])
         integrals = np.zeros(now.out.integrals.shape[1])
-        iterations = self.max_iterations, START_ITERATIONS
-        limits = (Limits(self.tolerance, most, self.window) for most in iterations)
         return Run(
-            room.system, room.work, room.step, followed.arrays, errors, *limits, None, None, given,
-            False, now.y, np.zeros(size), clock, stops, times, self.rtol, self.longest,
+            room.system, room.work, room.step, followed.arrays, errors, *self._limits, None, None,
+            given, False, now.y, np.zeros(size), clock, stops, times, self.rtol, self.longest,
             self._shortest, integrals, *room.chunk, np.zeros(7, np.int64),
         )  # fmt: skip
 
-    def _call(
-        self, now: RunState, plan: Plan, table: Any
-    ) -> tuple[list[int], tuple[Any, Any] | None]:
-        """One call of the compiled run, which goes on with its rows: its counts, and the tapes of
+    def _call(self, now: RunState, plan: Plan, table: Any) -> tuple[Any, tuple[Any, Any] | None]:
+        """Arguments of one call of the compiled run, which goes on with its rows, and the tapes of
         its stages and outputs with `taping`."""
         model, done, count = self.compiled.model, now.out.rows, len(plan.out_step)
         y, integrals, recorded, rate, signals, stored = now.out.part(slice(done, done + count))
@@ -292,13 +305,11 @@ class ImplicitStepper:
             if now.outputs_too:
                 out_tape = out_tape._replace(y=y)
         rows = plan.out_step, plan.out_part, signals, y, integrals, recorded, rate, stored, out_tape
-        arguments = table._replace(
+        call = table._replace(
             out=Outputs(*rows), tape=tape, begin=count > 0 and plan.out_step[0] < 0,
             t_out=table.t_out[done:], starts=plan.starts, h=plan.h, signals=plan.signals,
         )  # fmt: skip
-        with released_turn():
-            call("run", arguments)
-        return table.counts.tolist(), (tape, out_tape) if now.taping else None
+        return call, (tape, out_tape) if now.taping else None
 
     def _progress(self, rows: int) -> Progress:
         """Room for so many outputs."""
@@ -319,7 +330,9 @@ class ImplicitStepper:
         while status == TAPE_FULL:
             for part, value in zip(now.stands, segment.before):
                 part[:] = value
-            (_, _, status, *_), tapes = self._call(now, segment.plan, table)
+            call, tapes = self._call(now, segment.plan, table)
+            carry_out(call)
+            status = table.counts[2]
             self._cap *= 2 if status == TAPE_FULL else 1
         assert tapes is not None
         return tapes

@@ -297,7 +297,7 @@ class Followed:
             return self
         out, room = copy(self), np.zeros_like(self._pieces.room)
         out.arrays = self._pieces._replace(at=self._pieces.at - origin, room=room)
-        out.stops = np.unique(np.concatenate([np.zeros(0), *self._stops])) - origin
+        out.stops = np.concatenate([np.zeros(0), *self._stops]) - origin
         return out
 
     def on_lines(

@@ -24,7 +24,7 @@ from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.model import Model, computed, model_of, prepared_shapes
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.steps import Followed, own_units
-from torchsoft.solve.structure import Copies, Structure, copied, described, lasting
+from torchsoft.solve.structure import Copies, Structure, copied, described
 
 
 @contextmanager
@@ -142,7 +142,7 @@ class Compiled:
         since = lambda t: self.signals(t, reference.since(origin))
         found = Followed(reference, self.model.signals, fixed, since)
         if structure.known and found.known:
-            self.model.motion = lasting(key), found
+            self.model.motion = key, found
         return found.since(origin)
 
     @independent()

@@ -101,6 +101,9 @@ class TorchdiffeqSolver:
         samples = self.y0.reshape(-1, self.y0.shape[-1])
         runs: list[Any] = [None] * len(samples)
 
+        for sample in samples:
+            self.stepper.check(sample.detach(), t)
+
         def run(i: int) -> Solved:
             return deque(march(copy(self.stepper), samples[i], t), maxlen=1)[0]
 

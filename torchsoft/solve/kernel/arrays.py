@@ -329,9 +329,9 @@ SCRATCH: dict[str, dict[str, str]] = {
         "pads 3": "wrenches",
         "points rows": "out",
         "rows": "weights",
-        "6": "by",
+        "8": "by moved",  # by rates and by positions of a point
         "8 lanes": "element",
-        "4 state": "state",
+        "3 state": "state",
     },
     "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
         "rows": "weights",
