@@ -311,8 +311,9 @@ class Dynamics:
         self, stepper: ImplicitStepper, t: Tensor, y: Tensor
     ) -> Generator[Any, None, RunOutcome]:
         """A run by tolerances without a graph."""
-        out, began, task = None, perf_counter(), Task(stepper, t, y, "none", (), None, False, ())
-        outcome = lambda: RunOutcome(
+        task, began = Task(stepper, t, y, "none", (), None, False, ()), perf_counter()
+        out: Any = None
+        made = lambda: RunOutcome(
             task, Solved(stepper, y, t, out, None), None, perf_counter() - began
         )
         try:
@@ -322,9 +323,9 @@ class Dynamics:
                 else:
                     yield one
         except SimulationFailed as failure:
-            failure.trajectory = outcome().trajectory() if out is not None else None
+            failure.trajectory = out and made().trajectory()
             raise
-        return outcome()
+        return made()
 
 
 def finished(steps: Generator[Any, None, T]) -> T:

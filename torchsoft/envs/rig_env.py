@@ -318,7 +318,8 @@ class RigVectorEnv(SyncVectorEnv):
 
     def step(self, actions: Any) -> Any:
         """Step all environments, as gymnasium's `SyncVectorEnv` does."""
-        every, mode, over = self.envs, self.autoreset_mode, []
+        every: Any = self.envs
+        mode, over = self.autoreset_mode, list[int]()
         if mode is AutoresetMode.NEXT_STEP:
             over = np.flatnonzero(self._autoreset_envs).tolist()
         todo = enumerate(iterate(self.action_space, actions))

@@ -527,7 +527,10 @@ _finding = threading.RLock()
 
 
 def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
-    """The model of a rig with these parameters, made where there is none."""
+    """The model of a rig with these parameters: the last one of this reading of its structure, one
+    that is kept, or one that is made."""
+    if (last := structure.model) is not None and last.shared and last.alike(values):
+        return last
     with _finding:
         kept = _kept if structure.known else ()
         found = next((one for one in kept if one.serves(structure, values)), None)
@@ -539,6 +542,7 @@ def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
             _kept.appendleft(found)
             while len(_kept) > 1 and sum(one.bytes for one in _kept) > KEPT_BYTES:
                 _kept.pop()
+    structure.model = found
     return found
 
 

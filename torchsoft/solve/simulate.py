@@ -33,7 +33,7 @@ from torchsoft.solve.gradients import (
 )
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.solve.system import Reading
+from torchsoft.solve.structure import Structure
 from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory, channels, units
 
 Route = Literal["none", "discrete", "forward"]
@@ -119,11 +119,11 @@ def prepare(
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
-    touch: Sequence[str] = (), reading: Reading | None = None,
+    touch: Sequence[str] = (), structure: Structure | None = None,
     values: Mapping[int, Tensor] | None = None,
 ) -> Task:  # fmt: skip
     """Checks the arguments of `simulate`, and takes `values` in the place of some parameters of
-    the rig of a `reading`, by their id; raises its `ValueError`s."""
+    the rig of a `structure`, by their id; raises its `ValueError`s."""
     t = tensor("t", t)
     start = tensor("y0", y0)
     knots, dy0 = (
@@ -145,7 +145,7 @@ def prepare(
         atol=0.1 * positive("rtol", rtol) if atol is None else atol,
         knots=knots,
         tolerance=tolerance,
-        reading=reading,
+        structure=structure,
         values=values,
         differentiable=gradient == "forward"
         or (gradient == "discrete" and torch.is_grad_enabled()),

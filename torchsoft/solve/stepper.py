@@ -39,7 +39,8 @@ from torchsoft.solve.steps import (
     equal_steps,
     given_steps,
 )
-from torchsoft.solve.system import Compiled, Reading
+from torchsoft.solve.structure import Structure
+from torchsoft.solve.system import Compiled
 
 HALVINGS = 6
 """Most halvings of a step that Newton does not solve before the run fails."""
@@ -91,7 +92,7 @@ class ImplicitStepper:
         rtol: float = 1e-3, atol: float = 1e-4, knots: Tensor | None = None,
         tolerance: float = 1e-9, max_iterations: int = 40, window: float = 2e-3,
         longest: float = LONGEST, landing: bool = False,
-        reading: Reading | None = None, values: Mapping[int, Tensor] | None = None,
+        structure: Structure | None = None, values: Mapping[int, Tensor] | None = None,
         differentiable: bool = True,
     ) -> None:  # fmt: skip
         if not isinstance(rig, Rig):
@@ -113,7 +114,7 @@ class ImplicitStepper:
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
         self.knots = None if knots is None else check_knots(knots)
         self.compiled = Compiled(
-            rig, reference, reading=reading, values=values, differentiable=differentiable
+            rig, reference, structure=structure, values=values, differentiable=differentiable
         )
         self.rig, self.reference = self.compiled.rig, self.compiled.reference
         if self.tolerance < (least := SMALLEST_TOLERANCE * self.compiled.units["force"]):
@@ -126,7 +127,7 @@ class ImplicitStepper:
         self._motion: Followed | None = None
         self._cap, self._shortest = 64, SHORTEST
         limits = Limits(self.tolerance, self.max_iterations, self.window)
-        self._limits: Any = limits, limits._replace(max_iterations=START_ITERATIONS)
+        self._limits: tuple[Any, Any] = limits, limits._replace(max_iterations=START_ITERATIONS)
 
     def along(self, knots: Array) -> "ImplicitStepper":
         """The same with the steps between `knots` [s]."""
@@ -284,11 +285,11 @@ class ImplicitStepper:
         stops = stops[(stops > 0.0) & (stops <= times[-1])]
         errors = self.compiled.model.errors.of(now.y, self.atol, self.compiled.units)
         clock = np.array([0.0, min(FIRST, times[-1]), 1.0])
-        integrals = np.zeros(now.out.integrals.shape[1])
+        integrals, (starts, h, signals) = np.zeros(now.out.integrals.shape[1]), room.chunk
         return Run(
             room.system, room.work, room.step, followed.arrays, errors, *self._limits, None, None,
             given, False, now.y, np.zeros(size), clock, stops, times, self.rtol, self.longest,
-            self._shortest, integrals, *room.chunk, np.zeros(7, np.int64),
+            self._shortest, integrals, starts, h, signals, np.zeros(7, np.int64),
         )  # fmt: skip
 
     def _call(self, now: RunState, plan: Plan, table: Any) -> tuple[Any, tuple[Any, Any] | None]:

@@ -21,7 +21,7 @@ from torchsoft.solve.kernel import arrays
 from torchsoft.solve.kernel.arrays import Limits, scratch
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.model import Model, computed, model_of, prepared_shapes
+from torchsoft.solve.model import computed, model_of, prepared_shapes
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.steps import Followed, own_units
 from torchsoft.solve.structure import Copies, Structure, copied, described
@@ -35,26 +35,6 @@ def independent() -> Iterator[None]:
         yield
 
 
-class Reading:
-    """What runs of one rig share that begin together: its structure, as it is now."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.structure, self.model = Structure(rig), None
-        self._owned: dict[int, tuple[Reference, frozenset[int]]] = {}
-
-    def model_of(self, values: Sequence[Tensor]) -> Model:
-        """The model of the rig with these parameters."""
-        if self.model is None or not (self.model.shared and self.model.alike(values)):
-            self.model = model_of(self.structure, values)
-        return self.model
-
-    def touches(self, values: Mapping[int, Tensor], reference: Reference) -> bool:
-        """Whether values take the place of parameters of a reference."""
-        if id(reference) not in self._owned:
-            self._owned[id(reference)] = reference, frozenset(map(id, reference.parameters()))
-        return not self._owned[id(reference)][1].isdisjoint(values)
-
-
 class Compiled:
     """A rig at one moment, with `values` in the place of some parameters, by their id: `rig`, a
     copy; its `model`; the vector of its parameters, as `numbers` and as `p`, with its graph where
@@ -64,13 +44,12 @@ class Compiled:
     """
 
     def __init__(
-        self, rig: Rig, reference: Reference | None = None, *, reading: Reading | None = None,
+        self, rig: Rig, reference: Reference | None = None, *, structure: Structure | None = None,
         values: Mapping[int, Tensor] | None = None, differentiable: bool = True,
     ) -> None:  # fmt: skip
         check_place()
         values = values or {}
-        reading = reading or Reading(rig)
-        structure = reading.structure
+        structure = structure or Structure(rig)
         given = [values.get(id(x), x) for x in structure.parameters]
         differentiable = differentiable or not structure.known  # whose gradients are judged
         followed = rig.reference if reference is None else reference
@@ -80,10 +59,11 @@ class Compiled:
         with torch.inference_mode(False), torch.set_grad_enabled(differentiable), apart:
             theta, mine = taken(structure.parameters, given, differentiable)
             own = [mine[id(x)] for x in structure.parameters]
-            self.model = model = reading.model_of(own)
+            self.model = model = model_of(structure, own)
             modules = model.copies.made(own)
             self.rig: Rig = modules[0]
-            change = lambda one: differentiable or (values and reading.touches(values, one))
+            touched = lambda one: not values.keys().isdisjoint(map(id, one.parameters()))
+            change = lambda one: differentiable or (values and touched(one))
             self.reference = copy_of(followed, mine, values) if change(followed) else followed
             self.rig._modules["reference"] = (
                 self.reference if followed is rig.reference
