@@ -166,3 +166,12 @@ def test_a_room_of_no_numbers_is_as_good_as_new():
             part.fill(float("nan"))
     used.work.q[-3:] = ground
     assert same(simulate(rig, T, y0=y0, rtol=1e-4), expected)
+
+
+def test_constants_of_elements_follow_the_buffers_of_their_pad():
+    pad = coarse(pad__inertial=True).pads["L"]
+    before = pad.constants
+    turned = coarse(pad__inertial=True).pads["L"]
+    turned.axes.neg_()
+    assert (turned.constants[:, :8] == -before[:, :8]).all()
+    assert (pad.constants == before).all()

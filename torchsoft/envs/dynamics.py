@@ -1,10 +1,9 @@
 """A rig under actions at a control rate, in torch: from a state and an action to the next state, an
 observation and a reward, all differentiable."""
 
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from time import perf_counter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from scipy import sparse
@@ -16,14 +15,11 @@ from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.namespace import measurable
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
-from torchsoft.solve.gradients import TAPE_BYTES, Solved, attached
-from torchsoft.solve.progress import Progress, SimulationFailed
+from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
-from torchsoft.solve.stepper import ImplicitStepper, carry_out
+from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.steps import check_knots
 from torchsoft.solve.trajectory import Touch, Trajectory, channels
-
-T = TypeVar("T")
 
 Ranges = Mapping[str, tuple[float, float]]
 """Lower and upper bound by name, in SI units."""
@@ -182,7 +178,7 @@ class Dynamics:
         self._set = [self.rig.signals.index(name) for name in set_by]
         lines = torch.zeros(len(set_by), 2, dtype=torch.float64)
         self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
-        rows = attached([finished(self._run(t, self._y0, None)).solved])[0]
+        rows = attached([self._run(t, self._y0, None).solved])[0]
         there = -1 if self.start else 0
         with torch.no_grad():
             now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
@@ -195,19 +191,13 @@ class Dynamics:
         """The transition from a moment to the next control time, with an action (actions,) in [-1,
         1]; `knots` are the frozen steps of another run. There is no graph under `torch.no_grad()`.
         Raises `ValueError` for an action out of range, and `SimulationFailed`."""
-        return finished(self.stepping(now, action, knots))
-
-    def stepping(
-        self, now: Moment, action: Tensor, knots: Tensor | None = None
-    ) -> Generator[Any, None, Transition]:
-        """`step` that yields the arguments of the compiled calls that are to be made."""
         self.check_action(action)
         begin = self.start + now.steps * self.interval
         end = self.start + (now.steps + 1) * self.interval
         t = torch.linspace(begin, end, self.samples + 1, dtype=torch.float64)
         before, after = (self._low + self._half * (1 + a) for a in (now.action, action))
         both = torch.stack((before, after), -1)
-        outcome = yield from self._run(t, now.y, torch.cat((both, self._disturbed(now))), knots)
+        outcome = self._run(t, now.y, torch.cat((both, self._disturbed(now))), knots)
         rows = attached([outcome.solved])[0]
         moment = now._replace(
             y=rows.y[-1], action=action, steps=now.steps + 1, recorded=rows.recorded[-1]
@@ -229,7 +219,7 @@ class Dynamics:
         held = self._low + self._half * (1 + now.action)
         held = torch.cat((held, self._disturbed(now)[:, 0]))[:, None].expand(-1, 2)
         with torch.no_grad():
-            return finished(self._run(t, now.y, held)).trajectory()
+            return self._run(t, now.y, held).trajectory()
 
     def distance(self, now: Moment) -> Tensor:
         """Distances of the goal's coordinates from their targets, over their scales."""
@@ -288,7 +278,7 @@ class Dynamics:
 
     def _run(
         self, t: Tensor, y: Tensor, values: Tensor | None, knots: Tensor | None = None
-    ) -> Generator[Any, None, RunOutcome]:
+    ) -> RunOutcome:
         """A run with lines between `values` (signals, 2) for signals set by actions or
         disturbances, or by the rig's own motion."""
         if self._stepper is None:
@@ -298,7 +288,6 @@ class Dynamics:
             times = t.numpy()
             motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
             stepper = stepper.moving(motion, times[0])
-            return (yield from self._called(stepper, t, y))
         elif values is not None:
             stepper = stepper.following(self._following(t[[0, -1]], values))
         else:
@@ -306,35 +295,6 @@ class Dynamics:
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)
-
-    def _called(
-        self, stepper: ImplicitStepper, t: Tensor, y: Tensor
-    ) -> Generator[Any, None, RunOutcome]:
-        """A run by tolerances without a graph."""
-        task, began = Task(stepper, t, y, "none", (), None, False, ()), perf_counter()
-        out: Any = None
-        made = lambda: RunOutcome(
-            task, Solved(stepper, y, t, out, None), None, perf_counter() - began
-        )
-        try:
-            for one in stepper.course(y, t):
-                if isinstance(one, Progress):
-                    out = one
-                else:
-                    yield one
-        except SimulationFailed as failure:
-            failure.trajectory = out and made().trajectory()
-            raise
-        return made()
-
-
-def finished(steps: Generator[Any, None, T]) -> T:
-    """The result of something that yields compiled calls, with the calls made."""
-    while True:
-        try:
-            carry_out(next(steps))
-        except StopIteration as end:
-            return end.value
 
 
 def check_names(field: str, given: Iterable[str], known: Iterable[str], listed: str) -> None:

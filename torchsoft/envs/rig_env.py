@@ -2,8 +2,7 @@
 
 import math
 import warnings
-from collections import deque
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -29,7 +28,6 @@ from torchsoft.envs.dynamics import (
     TargetPose,
     check_names,
     checked,
-    finished,
 )
 from torchsoft.parallel import cores, executor, parallel_map
 from torchsoft.physics.arguments import number, whole
@@ -38,7 +36,6 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.stepper import carry_out
 from torchsoft.solve.trajectory import Trajectory
 
 Mode = Literal["rgb_array", "human"]
@@ -225,18 +222,13 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Apply an action over one control interval. Raises `ValueError` for an action that is not
         finite or out of [-1, 1], and before `reset`."""
-        return finished(self.stepping(action))
-
-    def stepping(self, action: NDArray[np.float32]) -> Generator[Any, None, Any]:
-        """`step` without a graph that yields the arguments of the compiled calls that are to be
-        made."""
         now, dynamics = self.moment, self.dynamics
         if now is None or self._over:
             raise ValueError("the episode is over, or has not begun; call `reset` first")
         command = torch.as_tensor(np.asarray(action), dtype=torch.float64)
         dynamics.check_action(command)
         try:
-            done = yield from dynamics.stepping(now, command)
+            done = dynamics.step(now, command)
         except (SimulationFailed, np.linalg.LinAlgError) as failure:
             self._over = True
             info = self._info(now) | {"failure": str(failure)}
@@ -298,11 +290,11 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 class RigVectorEnv(SyncVectorEnv):
-    """Environments whose compiled runs and resets go side by side in `threads` threads, by default
-    one for each core. Results do not depend on the number of threads.
+    """Environments whose steps and resets run in `threads` threads, by default one for each core.
+    Results do not depend on the number of threads.
 
-    What a step computes in Python one thread does for all environments; where that counts,
-    gymnasium's `AsyncVectorEnv` takes processes.
+    Only one thread at a time computes in Python, which is about half of a short step; where that
+    counts, gymnasium's `AsyncVectorEnv` takes processes.
     """
 
     def __init__(
@@ -318,38 +310,27 @@ class RigVectorEnv(SyncVectorEnv):
 
     def step(self, actions: Any) -> Any:
         """Step all environments, as gymnasium's `SyncVectorEnv` does."""
-        every: Any = self.envs
-        mode, over = self.autoreset_mode, list[int]()
-        if mode is AutoresetMode.NEXT_STEP:
-            over = np.flatnonzero(self._autoreset_envs).tolist()
-        todo = enumerate(iterate(self.action_space, actions))
-        stepped = self._together({i: every[i].stepping(a) for i, a in todo if i not in over})
-        if mode is AutoresetMode.SAME_STEP:
-            over = [i for i, (_, _, ended, truncated, _) in stepped.items() if ended or truncated]
-        reset = lambda k: every[over[k]].reset()
-        begun = {over[k]: x for k, x in parallel_map(reset, len(over), turns=True, pool=self._pool)}
+        every, todo = self.envs, list(iterate(self.action_space, actions))
+        again = self.autoreset_mode is AutoresetMode.NEXT_STEP
+
+        def work(i: int) -> _Done:
+            if again and self._autoreset_envs[i]:
+                return _Done(None, every[i].reset())
+            stepped = every[i].step(todo[i])
+            over = (stepped[2] or stepped[3]) and self.autoreset_mode is AutoresetMode.SAME_STEP
+            return _Done(stepped, every[i].reset() if over else None)
+
+        def share(k: int) -> dict[int, _Done]:
+            return {i: work(i) for i in range(k, len(every), self._threads)}
+
+        done: dict[int, _Done] = {}
+        for _, some in parallel_map(share, self._threads, turns=True, pool=self._pool):
+            done |= some
         try:
-            done = [_Done(stepped.get(i), begun.get(i)) for i in range(len(every))]
-            self.envs = done  # pyright: ignore[reportAttributeAccessIssue]
+            self.envs = [done[i] for i in range(len(every))]  # pyright: ignore[reportAttributeAccessIssue]
             return super().step(actions)
         finally:
             self.envs = every
-
-    @torch.no_grad()
-    def _together(self, running: dict[int, Generator[Any, None, Any]]) -> dict[int, Any]:
-        """Results of steps, their compiled calls made side by side."""
-        done: dict[int, Any] = {}
-        while running:
-            calls = list[Any]()
-            for i, steps in [*running.items()]:
-                try:
-                    calls.append(next(steps))
-                except StopIteration as end:
-                    done[i] = end.value
-                    del running[i]
-            work = lambda k, calls=calls: carry_out(calls[k])
-            deque(parallel_map(work, len(calls), pool=self._pool), 0)
-        return done
 
     def close_extras(self, **options: Any) -> None:
         """End the threads and the environments."""

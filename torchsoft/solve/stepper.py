@@ -60,12 +60,6 @@ METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
 
 
-def carry_out(run: Any) -> None:
-    """Make a compiled call of a run."""
-    with released_turn():
-        call("run", run)
-
-
 class ImplicitStepper:
     """SDIRK2 on one rig and reference as they are now: L-stable, second order, stiffly accurate.
 
@@ -178,20 +172,12 @@ class ImplicitStepper:
             first = np.flatnonzero(~finite)[0]
             raise ValueError(f"`y0` must be finite, but component {first} is not")
 
-    def integrate(self, y0: Tensor, t: Tensor, *how: Any, **more: Any) -> Iterator[Progress]:
-        """The `course` from y0 through t with the calls made."""
-        for one in self.course(y0, t, *how, **more):
-            if isinstance(one, Progress):
-                yield one
-            else:
-                carry_out(one)
-
-    def course(
+    def integrate(
         self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None,
         tape_bytes: float = 0.0, outputs_too: bool = True,
-    ) -> Iterator[Any]:  # fmt: skip
-        """Step from y0 (size,) through t (T,), yielding the arguments of every compiled call that
-        is to be made, and after it the same growing `Progress`.
+    ) -> Iterator[Progress]:  # fmt: skip
+        """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every
+        compiled call.
 
         The last yield is the complete run. With `segments` given, the data of the derivatives are
         appended to it, tapes for as long as they take less than `tape_bytes`, of the outputs only
@@ -209,10 +195,9 @@ class ImplicitStepper:
         while todo:
             plan, halvings = todo.pop()
             before = tuple(part.copy() for part in now.stands) if segments is not None else ()
-            call, tapes = self._call(now, plan, table)
-            yield call
+            counts, tapes = self._call(now, plan, table)
             self.followed.check()
-            steps, done, status, solves, refused, failed, which = table.counts.tolist()
+            steps, done, status, solves, refused, failed, which = counts
             if not out.rows and not np.isfinite(out.signals[0]).all():
                 self.signals_at(np.zeros(1))  # which raises
             rows = slice(out.rows, out.rows + done)
@@ -286,14 +271,17 @@ class ImplicitStepper:
         errors = self.compiled.model.errors.of(now.y, self.atol, self.compiled.units)
         clock = np.array([0.0, min(FIRST, times[-1]), 1.0])
         integrals, (starts, h, signals) = np.zeros(now.out.integrals.shape[1]), room.chunk
+        nothing: Any = None
         return Run(
-            room.system, room.work, room.step, followed.arrays, errors, *self._limits, None, None,
-            given, False, now.y, np.zeros(size), clock, stops, times, self.rtol, self.longest,
-            self._shortest, integrals, starts, h, signals, np.zeros(7, np.int64),
+            room.system, room.work, room.step, followed.arrays, errors, *self._limits, nothing,
+            nothing, given, False, now.y, np.zeros(size), clock, stops, times, self.rtol,
+            self.longest, self._shortest, integrals, starts, h, signals, np.zeros(7, np.int64),
         )  # fmt: skip
 
-    def _call(self, now: RunState, plan: Plan, table: Any) -> tuple[Any, tuple[Any, Any] | None]:
-        """Arguments of one call of the compiled run, which goes on with its rows, and the tapes of
+    def _call(
+        self, now: RunState, plan: Plan, table: Any
+    ) -> tuple[list[int], tuple[Any, Any] | None]:
+        """One call of the compiled run, which goes on with its rows: its counts, and the tapes of
         its stages and outputs with `taping`."""
         model, done, count = self.compiled.model, now.out.rows, len(plan.out_step)
         y, integrals, recorded, rate, signals, stored = now.out.part(slice(done, done + count))
@@ -306,11 +294,13 @@ class ImplicitStepper:
             if now.outputs_too:
                 out_tape = out_tape._replace(y=y)
         rows = plan.out_step, plan.out_part, signals, y, integrals, recorded, rate, stored, out_tape
-        call = table._replace(
+        arguments = table._replace(
             out=Outputs(*rows), tape=tape, begin=count > 0 and plan.out_step[0] < 0,
             t_out=table.t_out[done:], starts=plan.starts, h=plan.h, signals=plan.signals,
         )  # fmt: skip
-        return call, (tape, out_tape) if now.taping else None
+        with released_turn():
+            call("run", arguments)
+        return table.counts.tolist(), (tape, out_tape) if now.taping else None
 
     def _progress(self, rows: int) -> Progress:
         """Room for so many outputs."""
@@ -331,9 +321,7 @@ class ImplicitStepper:
         while status == TAPE_FULL:
             for part, value in zip(now.stands, segment.before):
                 part[:] = value
-            call, tapes = self._call(now, segment.plan, table)
-            carry_out(call)
-            status = table.counts[2]
+            (_, _, status, *_), tapes = self._call(now, segment.plan, table)
             self._cap *= 2 if status == TAPE_FULL else 1
         assert tapes is not None
         return tapes
