@@ -41,14 +41,15 @@ class Rows(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """A run, finished or growing: its inputs, its results, and its segments where a gradient is
-    needed."""
+    """A run, finished or growing: its inputs, its results, its segments where a gradient is needed,
+    and the derivatives of states and of sums of forces where those are asked for."""
 
     stepper: ImplicitStepper
     y0: Tensor
     t: Tensor
     out: Progress
     segments: list[Segment] | None
+    slopes: tuple[Tensor, Tensor] | None = None
 
     @property
     def rows(self) -> Rows:
@@ -208,11 +209,11 @@ def directions(value: Tensor, wrt: Sequence[Tensor]) -> Array:
 def iterate(
     stepper: ImplicitStepper, y0: Tensor, t: Tensor, wrt: Sequence[Tensor], dy0: Tensor | None,
     columns: list[int], sums: Sums,
-) -> Iterator[tuple[Tensor, Tensor, Progress]]:  # fmt: skip
-    """Derivatives (T, components, n) of the states by the scalar tensors `wrt`, and those of
-    sums of forces (T, sums, n), as the run grows; `columns` are the components of the state that
-    are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its columns
-    beyond those of `wrt` are directions of the start alone."""
+) -> Iterator[Solved]:  # fmt: skip
+    """The run with derivatives (T, components, n) of the states by the scalar tensors `wrt`, and
+    those of sums of forces (T, sums, n), as it grows; `columns` are the components of the state
+    that are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its
+    columns beyond those of `wrt` are directions of the start alone."""
     size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wrt))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
@@ -235,5 +236,6 @@ def iterate(
             with released_turn():
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
-        yield torch.from_numpy(kept), torch.from_numpy(felt), out
+        slopes = torch.from_numpy(kept), torch.from_numpy(felt)
+        yield Solved(stepper, y0, t, out, None, slopes)
     stepper.compiled.model.give(room)

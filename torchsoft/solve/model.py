@@ -155,7 +155,8 @@ class Model:
         self.layout, self.integrals, self.signals = rig.layout, Integrals(rig), rig.signals
         slices = self.layout.slices
         self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
-        self.fixed, self.errors = len(rig.fixed_values), ErrorParts(rig)
+        self.followed = len(rig.signals) + len(rig.fixed_values)
+        self.errors = ErrorParts(rig)
         self._known: dict[tuple[int, int], LawSet] = {}
         self._shapes, self._index = prepared_shapes(rig), list[int]()
         self._made = computed(rig, self._shapes)
@@ -209,8 +210,7 @@ class Model:
         try:
             found = self._idle.pop()
         except IndexError:
-            sizes = *self.widths[:2], len(self.signals) + self.fixed
-            return Room(self.system(p.copy()), *sizes)
+            return Room(self.system(p.copy()), *self.widths[:2], self.followed)
         found.system.p[:] = p
         return found
 

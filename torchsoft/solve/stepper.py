@@ -306,7 +306,7 @@ class ImplicitStepper:
         """Room for so many outputs."""
         widths = self.compiled.model.widths
         y, integrals, recorded, rate = (np.zeros((rows, width)) for width in widths)
-        signals = np.zeros((rows, self.compiled.signal_count, 2))
+        signals = np.zeros((rows, self.compiled.model.followed, 2))
         return Progress(y, integrals, recorded, rate, signals, np.zeros(rows), origin=self.origin)
 
     def tapes(self, segment: Segment, room: Any) -> tuple[Any, Any]:

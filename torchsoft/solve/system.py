@@ -107,11 +107,6 @@ class Compiled:
         """The rig's arrays."""
         return self.model.system(self.numbers.copy())
 
-    @property
-    def signal_count(self) -> int:
-        """Number of signals of the kernels, fixed coordinates included."""
-        return len(self.model.signals) + self.model.fixed
-
     def followed(self, reference: Reference, origin: float) -> Followed:
         """A reference as the kernels evaluate it, with time counted from `origin` [s]."""
         fixed = [float(one.detach()) for one in self.rig.fixed_values]
@@ -216,7 +211,7 @@ class Rates:
         self._system, self._limits = compiled.system, LIMITS
         self._work = scratch("Work", self._system, compiled.layout.size, columns=1)
         self._followed = compiled.followed(compiled.reference, 0.0)
-        self._signals = np.zeros((1, compiled.signal_count, 2))
+        self._signals = np.zeros((1, compiled.model.followed, 2))
         self._powers, self._wrenches = (
             np.zeros(len(compiled.model.integrals.names)),
             np.zeros((len(rig.pads), 3)),

@@ -80,6 +80,9 @@ class TorchdiffeqSolver:
             "atol",
             "knots",
             "landing",
+            "structure",
+            "values",
+            "differentiable",
         }
         if strange := set(options) - known:
             raise ValueError(
