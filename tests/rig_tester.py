@@ -105,8 +105,10 @@ def assert_compiled_is_the_module(start: Start, seed: int, h: float = 2e-4) -> N
     stepper = ImplicitStepper(rig, step=h, tolerance=NEWTON)
     *_, last = stepper.integrate(y, f64(0.0, h), segments, float("inf"))
     assert last.steps == 1
+    tapes = segments[-1].tapes
+    assert tapes is not None
     star, a, end = (
-        torch.from_numpy(stepper.tapes(segments[-1])[0].y),
+        torch.from_numpy(tapes[0].y),
         GAMMA * h,
         torch.from_numpy(last.y[-1]),
     )

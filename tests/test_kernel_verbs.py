@@ -23,7 +23,7 @@ from torchsoft.solve.kernel import (
     stage,
     tangent,
 )
-from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, LANES, room
+from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, LANES, scratch
 from torchsoft.solve.kernel.invoke import call_linearise
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
@@ -83,10 +83,12 @@ def first_stage(name: str) -> Stage:
     t = torch.tensor([0.0, 10 * STEP], dtype=torch.float64)
     with torch.no_grad():
         *_, _ = stepper.integrate(y0, t, segments, float("inf"))
-    tape, out_tape = stepper.tapes(segments[-1])
-    s, size = stepper.system, stepper.layout.size
+    tapes = segments[-1].tapes
+    assert tapes is not None
+    tape, out_tape = tapes
+    s, size = stepper.compiled.system, stepper.layout.size
     return Stage(
-        s, room("Work", s, size, columns=2), tape, out_tape, segments[-1].signals, size,
+        s, scratch("Work", s, size, columns=2), tape, out_tape, segments[-1].stages, size,
         GAMMA * STEP,
     )  # fmt: skip
 
@@ -118,8 +120,7 @@ def test_the_block_of_a_pad_is_that_of_dense_algebra(name):
     free = len(s.body_coordinate)
     for pad in range(len(s.pad_base)):
         Rv, r = np.zeros((free, free)), np.zeros((free, 1))
-        pads.relation(s, w, pad, now.tape.y[1], now.a)
-        contacts.assemble(s, w, pad, now.a, Rv)
+        pads.assemble(s, w, pad, now.tape.y[1], now.a, Rv)
         n, at = 2 * w.counts[pad], s.pad_point_start[pad]
         active = w.active[at : at + w.actives[pad]]
         assert n > 0
@@ -136,11 +137,9 @@ def test_the_block_of_a_pad_is_that_of_dense_algebra(name):
         columns = s.pad_columns[pad]
         Hc, Rf = w.Hc[:n, :columns].copy(), w.Rf[:columns, :n].copy()
         b, own = ANY.normal(size=n), s.pad_column[pad] >= 0
-        X = np.zeros((n, free + 2))
-        X[:, 0], X[:, 1 : 1 + columns] = b, Hc
-        before = Rv.copy()
-        linear.solve_dense(w.A, X, n, 1 + columns)
-        contacts.eliminate(s, w, pad, 1, X, r, Rv)
+        first, before = 2 * s.pad_node_start[pad], Rv.copy()
+        w.X[first : first + n, 0] = b
+        contacts.eliminate(s, w, pad, 1, r, Rv)
         number = s.pad_column[pad][own]
         schur, load = np.zeros((free, free)), np.zeros(free)
         schur[np.ix_(own, own)] = (Rf @ np.linalg.solve(A, Hc))[np.ix_(number, number)]
@@ -185,7 +184,7 @@ def test_the_adjoint_of_a_stage_is_its_tangent_transposed(name, felt):
     s, size, m = now.s, now.size, 2
     tape, row, a = (now.out_tape, 0, INSTANT) if felt else (now.tape, 1, now.a)
     signals = now.signals[row]
-    z, back = room("Tangents", s, size, columns=m), room("Cotangents", s, size)
+    z, back = scratch("Tangents", s, size, columns=m), scratch("Cotangents", s, size)
     scale = np.maximum(abs(tape.y[row]), 1e-6)
     start, dp = (
         scale[:, None] * ANY.normal(size=(size, m)),

@@ -10,6 +10,7 @@ from conftest import coarse, f64, grasped, still, times
 
 from torchsoft import Trajectory, hold, simulate, simulate_batch
 from torchsoft.envs import reorient
+from torchsoft.solve import model as models
 from torchsoft.solve.model import forget
 from torchsoft.solve.structure import Structure, structure_of
 from torchsoft.solve.system import Compiled
@@ -138,3 +139,39 @@ def test_a_step_in_the_room_of_another_is_that_of_a_graph():
         assert torch.equal(done.knots, graph.knots)
         assert same(done.outcome.trajectory(), graph.outcome.trajectory())
         now = done.moment
+
+
+def test_models_are_kept_up_to_so_many_bytes(monkeypatch):
+    """The last one always."""
+    forget()
+    one, other = coarse(), coarse(pad__elements_x=24)
+    first = Compiled(one).model
+    assert Compiled(one).model is first
+    monkeypatch.setattr(models, "KEPT_BYTES", first.bytes)
+    second = Compiled(other).model
+    assert Compiled(other).model is second
+    assert Compiled(one).model is not first
+
+
+def test_a_room_of_no_numbers_is_as_good_as_new():
+    """Newton's scratch may be what a failure left: the run ends, with the same bits."""
+    rig = coarse()
+    y0 = grasped(rig, (0.05, 0.0))
+    expected = simulate(rig, T, y0=y0, rtol=1e-4)
+    model = Compiled(rig).model
+    used = model._idle[-1]
+    ground = used.work.q[-3:].copy()
+    for part in (*used.work, *used.step):
+        if part.dtype == float:
+            part.fill(float("nan"))
+    used.work.q[-3:] = ground
+    assert same(simulate(rig, T, y0=y0, rtol=1e-4), expected)
+
+
+def test_constants_of_elements_follow_the_buffers_of_their_pad():
+    pad = coarse(pad__inertial=True).pads["L"]
+    before = pad.constants
+    turned = coarse(pad__inertial=True).pads["L"]
+    turned.axes.neg_()
+    assert (turned.constants[:, :8] == -before[:, :8]).all()
+    assert (pad.constants == before).all()

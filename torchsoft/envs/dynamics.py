@@ -3,7 +3,6 @@ observation and a reward, all differentiable."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import torch
@@ -16,9 +15,9 @@ from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.namespace import measurable
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
-from torchsoft.solve.gradients import TAPE_BYTES, Solved, attached
+from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
-from torchsoft.solve.stepper import ImplicitStepper, Repeated
+from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.steps import check_knots
 from torchsoft.solve.trajectory import Touch, Trajectory, channels
 
@@ -173,7 +172,7 @@ class Dynamics:
         `SimulationFailed`."""
         with torch.enable_grad():  # a step may be differentiated, whatever is done here
             task = prepare(self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver)
-        self._stepper, self._idle = task.stepper, list[Repeated]()
+        self._stepper = task.stepper
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         set_by = [*self.actions, *self.disturbances]
         self._set = [self.rig.signals.index(name) for name in set_by]
@@ -289,8 +288,6 @@ class Dynamics:
             times = t.numpy()
             motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
             stepper = stepper.moving(motion, times[0])
-            if len(t) == self.samples + 1:
-                return self._again(stepper, t, y)
         elif values is not None:
             stepper = stepper.following(self._following(t[[0, -1]], values))
         else:
@@ -298,22 +295,6 @@ class Dynamics:
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)
-
-    def _again(self, stepper: ImplicitStepper, t: Tensor, y: Tensor) -> RunOutcome:
-        """A run between two control times, in the room of an earlier one."""
-        began, task = perf_counter(), Task(stepper, t, y, "none", (), None, False, ())
-        try:
-            room = self._idle.pop()
-        except IndexError:
-            room = Repeated(stepper, len(t), stepper.followed)
-        out, failure = room.run(stepper, y.numpy(), t.numpy())
-        if failure is None:
-            self._idle.append(room)
-        done = RunOutcome(task, Solved(stepper, y, t, out, None), None, perf_counter() - began)
-        if failure is not None:
-            failure.trajectory = done.trajectory() if out.rows else None
-            raise failure
-        return done
 
 
 def check_names(field: str, given: Iterable[str], known: Iterable[str], listed: str) -> None:

@@ -147,11 +147,10 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _checked_held(self, held: Sequence[str]) -> dict[str, list[slice]]:
         """Recorded forces of the contacts of each body in `held`."""
-        rig, at, slices = self.dynamics.rig, 0, dict[str, list[slice]]()
-        for contact in rig.contacts.values():
-            size = 2 * len(rig.pads[contact.pad].point_nodes)
-            slices.setdefault(contact.body, []).append(slice(at, at + size, 2))
-            at += size
+        rig, slices = self.dynamics.rig, dict[str, list[slice]]()
+        ends = np.cumsum([0, *rig.point_counts.values()]) * 2
+        for contact, first, last in zip(rig.contacts.values(), ends, ends[1:]):
+            slices.setdefault(contact.body, []).append(slice(first, last, 2))
         names = [held] if isinstance(held, str) else held
         check_names("held", names, slices, "there are")
         return {body: slices[body] for body in names}
@@ -253,7 +252,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             if not low <= x <= high:
                 return f"{name} = {x:.4g} left its bounds, {low:g} to {high:g}"
         for body, slices in self.held.items():
-            if not any(bool((now.recorded[at] > 0).any()) for at in slices):
+            if not any((now.recorded.numpy()[at] > 0).any() for at in slices):
                 return f"{body} was dropped: no contact touches it"
         return ""
 
@@ -263,7 +262,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _info(self, now: Moment) -> dict[str, Any]:
         goal = {}
         if self.dynamics.goal is not None:
-            goal = {"distance": float(self.dynamics.distance(now).norm())}
+            goal = {"distance": math.hypot(*self.dynamics.distance(now).tolist())}
         return {"time": self.dynamics.start + now.steps * self.dynamics.interval} | goal
 
     def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -330,10 +330,16 @@ class Pad(nn.Module):
         dofs = np.stack((2 * node, 2 * node + 1), -1).reshape(len(node), 8)
         return np.where(dofs < 0, -1, dofs)
 
-    @cached_property
+    @property
     def constants(self) -> Array:
         """Constants of every element (elements, 45) in the base's frame."""
-        return element_constants(self.placed(self.mesh.nodes)[self.mesh.elements])
+        return constants_of(self.placed(self.mesh.nodes)[self.mesh.elements].tobytes())
+
+
+@lru_cache(maxsize=8)
+def constants_of(corners: bytes) -> Array:
+    """Constants of elements with corners (elements, 4, 2) [m]."""
+    return element_constants(np.frombuffer(corners).reshape(-1, 4, 2))
 
 
 def shape_functions(nodes: Any, shares: Array, count: int) -> Array:

@@ -22,7 +22,7 @@ from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RunOutcome, prepare, run
-from torchsoft.solve.system import Reading
+from torchsoft.solve.structure import Structure
 from torchsoft.solve.trajectory import Trajectory
 
 
@@ -179,8 +179,8 @@ def simulate_batch(
         min(count, cores() if threads is None else whole("threads", threads, 1)),
     )
     budget = TAPE_BYTES / count
-    readings = {
-        id(rig): Reading(rig)
+    structures = {
+        id(rig): Structure(rig)
         for rig in {id(one["rig"]): one["rig"] for one in runs}.values()
         if isinstance(rig, Rig)
     }
@@ -188,8 +188,8 @@ def simulate_batch(
     def work(i: int) -> RunOutcome | Trajectory | Exception:
         try:
             own = _own(runs[i]["rig"], parameters or {}, i)
-            reading = readings.get(id(runs[i]["rig"]))
-            task = prepare(**runs[i], reading=reading, values=own, **options)
+            structure = structures.get(id(runs[i]["rig"]))
+            task = prepare(**runs[i], structure=structure, values=own, **options)
             outcome = run(task, budget, explained=False)
             return outcome.trajectory() if outcome.solved.segments is None else outcome
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchsoft.parallel import parallel_map, released_turn
 from torchsoft.physics.state import Layout
-from torchsoft.solve.kernel.arrays import Backward, Forward, room
+from torchsoft.solve.kernel.arrays import Backward, Forward
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
-from torchsoft.solve.stepper import ImplicitStepper, stage_times
+from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.trajectory import Sums
 
 # Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in
@@ -73,14 +73,15 @@ class Rows(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """A run, finished or growing: its inputs, its results, and its segments where a gradient is
-    needed."""
+    """A run, finished or growing: its inputs, its results, its segments where a gradient is needed,
+    and the derivatives of states and of sums of forces where those are asked for."""
 
     stepper: ImplicitStepper
     y0: Tensor
     t: Tensor
     out: Progress
     segments: list[Segment] | None
+    slopes: tuple[Tensor, Tensor] | None = None
 
     @property
     def rows(self) -> Rows:
@@ -108,8 +109,8 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
     inputs: list[Tensor] = []
     for run in differentiated:
         stepper = run.stepper
-        times = [stage_times(segment.plan) for segment in run.segments or []]
-        signals = stepper.signals_at(torch.cat([*times, run.t - stepper.origin]))
+        times = [segment.plan.stage_times.ravel() for segment in run.segments or []]
+        signals = stepper.signals_at(np.concatenate([*times, run.t.numpy() - stepper.origin]))
         at_stages, at_outputs = signals[: -len(run.t)], signals[-len(run.t) :]
         inputs += [run.y0, stepper.compiled.p, at_stages, at_outputs]
     flat = iter(_Solutions.apply(differentiated, threads, *inputs) if differentiated else ())
@@ -173,22 +174,23 @@ def run_adjoint(
     own = float((np.abs(rows) @ sizes).sum())
     own += float(np.abs(felt).sum()) * float(np.abs(run.out.recorded).max(initial=SMALL))
     carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
-    signals_bar = [np.zeros(segment.signals.shape) for segment in run.segments or []]
-    outputs_bar = np.zeros((len(run.t), *signals_bar[0].shape[1:]))
-    for number in range(len(signals_bar) - 1, -1, -1):
-        segment = (run.segments or [])[number]
-        plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system
+    segments, outputs_bar = run.segments or [], np.zeros((len(run.t), *run.out.signals.shape[1:]))
+    signals_bar = [np.zeros_like(segment.stages) for segment in segments]
+    room = stepper.compiled.model.take(stepper.compiled.numbers)
+    for segment, own_bar in zip(reversed(segments), reversed(signals_bar)):
+        plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
         failed, here = np.zeros(1, np.int64), segment.rows
         sweep = Backward(
-            s, room("Work", s, size, columns=1), room("Cotangents", s, size), tape,
-            plan.h, segment.signals, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
-            rows[here], felt[here], outputs_bar[here], carried, p_bar, signals_bar[number], failed,
+            room.system, room.work, room.of("Cotangents"), tape,
+            plan.h, segment.stages, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
+            rows[here], felt[here], outputs_bar[here], carried, p_bar, own_bar, failed,
         )  # fmt: skip
         with released_turn():
             call("backward", sweep)
         if failed[0] >= 0:
             time = stepper.origin + plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
+    stepper.compiled.model.give(room)
     if own > 0:
         by_parameters = np.abs(p_bar * stepper.compiled.p.detach().numpy()).max(initial=0.0)
         warn_of_amplified(max(np.abs(carried * sizes).max(), by_parameters) / own)
@@ -245,11 +247,11 @@ def directions(value: Tensor, wrt: Sequence[Tensor]) -> Array:
 def iterate(
     stepper: ImplicitStepper, y0: Tensor, t: Tensor, wrt: Sequence[Tensor], dy0: Tensor | None,
     columns: list[int], sums: Sums,
-) -> Iterator[tuple[Tensor, Tensor, Progress]]:  # fmt: skip
-    """Derivatives (T, components, n) of the states by the scalar tensors `wrt`, and those of
-    sums of forces (T, sums, n), as the run grows; `columns` are the components of the state that
-    are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its columns
-    beyond those of `wrt` are directions of the start alone."""
+) -> Iterator[Solved]:  # fmt: skip
+    """The run with derivatives (T, components, n) of the states by the scalar tensors `wrt`, and
+    those of sums of forces (T, sums, n), as it grows; `columns` are the components of the state
+    that are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its
+    columns beyond those of `wrt` are directions of the start alone."""
     size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wrt))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
@@ -257,21 +259,24 @@ def iterate(
     dp[:, : len(wrt)] = directions(stepper.compiled.p, wrt)
     kept, felt = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
     segments: list[Segment] = []
+    room = stepper.compiled.model.take(stepper.compiled.numbers)
+    work, tangents = (room.of(kind, columns=n) for kind in ("Work", "Tangents"))
     for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop(0)
-            plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system
+            plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
             rows = np.empty((len(plan.out_step), size, n))
-            work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
             sweep = Forward(
-                s, work, tangents, tape, plan.h, segment.signals, plan.out_step,
+                room.system, work, tangents, tape, plan.h, segment.stages, plan.out_step,
                 plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, rows,
                 felt[segment.rows],
             )  # fmt: skip
             with released_turn():
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
-        yield torch.from_numpy(kept), torch.from_numpy(felt), out
+        slopes = torch.from_numpy(kept), torch.from_numpy(felt)
+        yield Solved(stepper, y0, t, out, None, slopes)
+    stepper.compiled.model.give(room)
     rigid = [k for k, column in enumerate(columns) if column in set(stepper.layout.rigid)]
     own = np.array([float(p.detach()) for p in wrt])
     moved = np.abs(kept[:, rigid, : len(wrt)] * own).max((0, 2), initial=0.0)

@@ -9,7 +9,7 @@ import threading
 import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +47,7 @@ from torchsoft.solve.kernel.arrays import (
     Points,
     Sources,
     recorded_size,
-    room,
+    scratch,
     system,
 )
 from torchsoft.solve.kernel.table import Array, Index, layout
@@ -64,8 +64,8 @@ from torchsoft.solve.laws import (
     weight_law,
 )
 from torchsoft.solve.progress import Integrals
-from torchsoft.solve.steps import ErrorParts
-from torchsoft.solve.structure import Copies, Structure, lasting, structure_of
+from torchsoft.solve.steps import CHUNK, ErrorParts, Followed
+from torchsoft.solve.structure import Copies, Structure, structure_of
 
 NOMINAL = 1e-3
 """Stage length a h [s] at which slip laws of users are tried."""
@@ -77,17 +77,25 @@ method."""
 NEGLIGIBLE = 1e-9
 """Nodal force [N] below which a node counts as unloaded."""
 
-KEPT = 8
-"""Models that are kept."""
+KEPT, KEPT_BYTES = 8, 5e7
+"""Most models that are kept, and arrays of theirs [bytes] beyond the last one's."""
 
 
-class Room(NamedTuple):
-    """Arrays that one run at a time works in: a system with a vector of parameters of its own, and
-    the kernels' scratch."""
+class Room:
+    """What one run at a time computes in: the arrays of a rig with a vector of parameters of its
+    own, scratch for the kernels, and a chunk of steps (starts, lengths, signals)."""
 
-    system: Any
-    work: Any
-    step: Any
+    def __init__(self, system: Any, state: int, integrals: int, signals: int) -> None:
+        self.system, self._state = system, state
+        self._known = dict[str, tuple[dict[str, int], Any]]()
+        self.work, self.step = self.of("Work", columns=1), self.of("Step", integrals=integrals)
+        self.chunk = np.zeros(CHUNK), np.zeros(CHUNK), np.zeros((CHUNK, 2, signals, 2))
+
+    def of(self, kind: str, **sizes: int) -> Any:
+        """Scratch of a kind, the last one again where that had the same sizes."""
+        if kind not in self._known or self._known[kind][0] != sizes:
+            self._known[kind] = sizes, scratch(kind, self.system, self._state, **sizes)
+        return self._known[kind][1]
 
 
 class Model:
@@ -107,11 +115,12 @@ class Model:
         self.derived = derived(modules)
         self.judged = [i for i, one in enumerate(modules) if hasattr(one, "well_posed")]
         self.shared = structure.known
-        self._key, self._geometric = lasting(structure.key), geometric(modules, structure)
+        self._key, self._geometric = structure.key, geometric(modules, structure)
         self._geometry = self._geometry_of(values)
         self._read(values)
         self._idle: list[Room] = []
         self.last: tuple[Array, Tensor, dict[str, float]] | None = None
+        self.motion: tuple[Any, Followed] | None = None
 
     def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
         return b"".join([values[i].detach().numpy().tobytes() for i in self._geometric])
@@ -146,7 +155,8 @@ class Model:
         self.layout, self.integrals, self.signals = rig.layout, Integrals(rig), rig.signals
         slices = self.layout.slices
         self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
-        self.fixed, self.errors = len(rig.fixed_values), ErrorParts(rig)
+        self.followed = len(rig.signals) + len(rig.fixed_values)
+        self.errors = ErrorParts(rig)
         self._known: dict[tuple[int, int], LawSet] = {}
         self._shapes, self._index = prepared_shapes(rig), list[int]()
         self._made = computed(rig, self._shapes)
@@ -159,6 +169,7 @@ class Model:
         self._pads = self._make_pads()
         parts = self._bodies, self._make_sources(), self._pads, self._make_condensed()
         self._parts = *parts, self._make_nodal(), *self._make_contacts()
+        self.bytes = sum(np.asarray(one).nbytes for part in self._parts for one in part)
         self.index = torch.tensor(self._index, dtype=torch.int64)
         self.nodal = {
             name: 2 * pad.fields * pad.nodes for name, pad in rig.pads.items() if pad.nodal
@@ -171,7 +182,7 @@ class Model:
         sizes = [one.shape.size() for one in rig.bodies.values() if one.shape is not None]
         self.smallest = min(sizes, default=np.inf)
         none = self.system(np.zeros(len(self._index)))
-        self.no_tape = room("Tape", none, self.layout.size, stages=0, cap=0)
+        self.no_tape = scratch("Tape", none, self.layout.size, stages=0, cap=0)
         self.widths = (
             self.layout.size, len(self.integrals.names), recorded_size(none),
             int(none.nodal_dof_start[-1]),
@@ -184,14 +195,11 @@ class Model:
         for name, here in self.condensed.items():
             i = [*self.rig.pads].index(name)
             at, n = own.chain_at[i], own.branches[i]
-            z = y[:, here]
-            size = z.shape[1] // n
-            zeta = np.einsum("b,tbs->ts", p[at : at + n], z.reshape(len(y), n, size))
-            loaded = np.abs(zeta).max(0) > NEGLIGIBLE
-            dofs = np.flatnonzero(loaded.reshape(-1, 2).any(1))
-            dofs = (2 * dofs[:, None] + np.arange(2)).ravel()
-            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(size, size)
-            u = p[at + 2 * n] * (zeta[:, dofs] @ C[dofs[:, None], dofs])
+            zeta = p[at : at + n] @ y[:, here].reshape(len(y), n, -1)
+            loaded = np.flatnonzero(np.abs(zeta).max(0) > NEGLIGIBLE) // 2 * 2
+            span = slice(*loaded[[0, -1]] + [0, 2]) if len(loaded) else slice(0)
+            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(2 * (zeta.shape[1:]))
+            u = p[at + 2 * n] * (zeta[:, span] @ C[span, span])
             out[name] = float(np.sqrt((u.reshape(len(y), -1, 2) ** 2).sum(-1).max(initial=0.0)))
         return out
 
@@ -204,12 +212,8 @@ class Model:
         try:
             found = self._idle.pop()
         except IndexError:
-            own = self.system(p.copy())
-            work, size = room("Work", own, self.layout.size, columns=1), len(self.integrals.names)
-            return Room(own, work, room("Step", own, self.layout.size, integrals=size))
+            return Room(self.system(p.copy()), *self.widths[:2], self.followed)
         found.system.p[:] = p
-        for part in (found.work.V, found.work.u_dot, found.work.rate):
-            part.fill(0.0)
         return found
 
     def give(self, used: Room) -> None:
@@ -543,7 +547,10 @@ _finding = threading.RLock()
 
 
 def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
-    """The model of a rig with these parameters, made where there is none."""
+    """The model of a rig with these parameters: the last one of this reading of its structure, one
+    that is kept, or one that is made."""
+    if (last := structure.model) is not None and last.shared and last.alike(values):
+        return last
     with _finding:
         kept = _kept if structure.known else ()
         found = next((one for one in kept if one.serves(structure, values)), None)
@@ -553,6 +560,9 @@ def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
             _kept.remove(found)
         if found.shared and (not _kept or found is not _kept[0]):
             _kept.appendleft(found)
+            while len(_kept) > 1 and sum(one.bytes for one in _kept) > KEPT_BYTES:
+                _kept.pop()
+    structure.model = found
     return found
 
 

@@ -1,12 +1,12 @@
 """State and results of a run of the stepper, chunk by chunk, and its failures."""
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.kernel.arrays import first_rows
+from torchsoft.solve.kernel.arrays import Tape
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.steps import Plan
 
@@ -36,7 +36,7 @@ class Progress:
     rate: Array
     signals: Array
     stored: Array
-    rows: int = 1
+    rows: int = 0
     steps: int = 0
     solves: int = 0
     failed: int = 0
@@ -45,15 +45,10 @@ class Progress:
     end: float = 0.0
     origin: float = 0.0
 
-    @property
-    def arrays(self) -> tuple[Array, ...]:
-        """Rows of the outputs: states, integrals, forces, rates, signals, energies."""
-        return self.y, self.integrals, self.recorded, self.rate, self.signals, self.stored
-
-    def apart(self) -> "Progress":
-        """The same with rows of its own."""
-        own = ("y", "integrals", "recorded", "rate", "signals", "stored")
-        return replace(self, **{name: getattr(self, name).copy() for name in own})
+    def part(self, rows: slice) -> tuple[Array, ...]:
+        """Some rows of the outputs: states, integrals, forces, rates, signals, energies."""
+        every = self.y, self.integrals, self.recorded, self.rate, self.signals, self.stored
+        return tuple(part[rows] for part in every)
 
     @property
     def knots(self) -> Array:
@@ -63,21 +58,22 @@ class Progress:
         return since if self.origin == 0 else np.unique(self.origin + since)
 
 
-@dataclass
-class Segment:
-    """One chunk of a taped run, or its start, which has no steps: where it began, the signals at
-    its stages and outputs, and the tapes of both, or None where they are to be made again when
+class Segment(NamedTuple):
+    """One chunk of a taped run: its steps, its rows of the outputs and their signals, where it
+    began, and the tapes of its stages and outputs, or None where they are to be made again when
     needed."""
 
     plan: Plan
-    signals: Array
-    at_outputs: Array
-    y: Array
-    V: Array
-    u_dot: Array
-    rate: Array
     rows: slice
+    at_outputs: Array
+    before: tuple[Array, ...]
     tapes: tuple[Any, Any] | None
+
+    @property
+    def stages(self) -> Array:
+        """Signals at the stages (stages, signals, 2)."""
+        signals = self.plan.signals
+        return signals.reshape(2 * len(signals), *signals.shape[2:])
 
 
 class Integrals:
@@ -99,14 +95,11 @@ class Integrals:
 
 @dataclass
 class RunState:
-    """A run in progress: the state, the rig's arrays, Newton's scratch, the last step, the
-    integrals, and where its results go."""
+    """A run in progress: its room and the state in it, where its results go, and the segments of a
+    taped run."""
 
+    room: Any
     y: Array
-    system: Any
-    work: Any
-    step: Any
-    integrals: Array
     out: Progress
     segments: list[Segment] | None
     tape_bytes: float
@@ -118,32 +111,25 @@ class RunState:
         return self.segments is not None and self.taped < self.tape_bytes
 
     @property
-    def _kept(self) -> tuple[Array, ...]:
-        """Where the run stands: state, Newton's guesses, integrals."""
-        return self.y, self.work.V, self.work.u_dot, self.work.rate, self.integrals
-
-    def copy(self) -> tuple[Array, ...]:
-        return tuple(part.copy() for part in self._kept)
-
-    def back(self, before: tuple[Array, ...]) -> None:
-        for part, value in zip(self._kept, before):
-            part[:] = value
+    def stands(self) -> tuple[Array, ...]:
+        """Where the run stands: state and Newton's guesses."""
+        work = self.room.work
+        return self.y, work.V, work.u_dot, work.rate
 
     def keep(
-        self, plan: Plan, signals: Array, at_outputs: Array,
-        before: tuple[Array, ...], rows: slice, tapes: tuple[Any, Any] | None,
-    ) -> None:  # fmt: skip
+        self, plan: Plan, rows: slice, before: tuple[Array, ...], tapes: tuple[Any, Any] | None
+    ) -> None:
         """Note the steps that were taken, and the tape of their derivatives."""
         if len(plan.h) > 0:
-            self.out.starts.append(plan.starts)
+            self.out.starts.append(plan.starts.copy())
             self.out.end = float(plan.starts[-1] + plan.h[-1])
-        elif len(plan.out_step) == 0:
-            return
-        if self.segments is not None:
-            kept = None
+        if self.segments is not None and (len(plan.h) or len(plan.out_step)):
             if tapes is not None:
-                counts = 2 * len(plan.h), len(plan.out_step) if self.outputs_too else 0
-                kept = first_rows(tapes[0], counts[0]), first_rows(tapes[1], counts[1])
-                self.taped += sum(x.nbytes for tape in kept for x in tape)
-            y, V, u_dot, rate, _ = before
-            self.segments.append(Segment(plan, signals, at_outputs, y, V, u_dot, rate, rows, kept))
+                counts = 2 * len(plan.h), len(plan.out_step)
+                tapes = tuple(  # pyright: ignore[reportAssignmentType]
+                    Tape(*(x if len(x) <= n else x[:n].copy() for x in tape))
+                    for tape, n in zip(tapes, counts)
+                )
+                self.taped += sum(x.nbytes for tape in tapes for x in tape)
+            at = self.out.signals[rows]
+            self.segments.append(Segment(plan, rows, at, before, tapes))

@@ -33,8 +33,7 @@ from torchsoft.solve.gradients import (
 )
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.solve.steps import check_times
-from torchsoft.solve.system import Reading
+from torchsoft.solve.structure import Structure
 from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory, channels, units
 
 Route = Literal["none", "discrete", "forward"]
@@ -120,11 +119,11 @@ def prepare(
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
-    touch: Sequence[str] = (), reading: Reading | None = None,
+    touch: Sequence[str] = (), structure: Structure | None = None,
     values: Mapping[int, Tensor] | None = None,
 ) -> Task:  # fmt: skip
     """Checks the arguments of `simulate`, and takes `values` in the place of some parameters of
-    the rig of a `reading`, by their id; raises its `ValueError`s."""
+    the rig of a `structure`, by their id; raises its `ValueError`s."""
     t = tensor("t", t)
     start = tensor("y0", y0)
     knots, dy0 = (
@@ -146,13 +145,12 @@ def prepare(
         atol=0.1 * positive("rtol", rtol) if atol is None else atol,
         knots=knots,
         tolerance=tolerance,
-        reading=reading,
+        structure=structure,
         values=values,
         differentiable=gradient == "forward"
         or (gradient == "discrete" and torch.is_grad_enabled()),
     )
-    check_times(t, step)
-    stepper.check_start(start)
+    stepper.check(start, t)
     felt = _channels_of_touch(rig, touch)
     return Task(
         stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid, felt, rig
@@ -160,18 +158,34 @@ def prepare(
 
 
 class RunOutcome(NamedTuple):
-    """A finished run: the states with the tape to differentiate them, sensitivities of states and
-    of sums of forces where asked for, and its time [s]."""
+    """A finished run, with the tape to differentiate it, and its time [s]."""
 
     task: Task
     solved: Solved
-    slopes: tuple[Tensor, Tensor] | None
     wall: float
 
     def trajectory(self, rows: Rows | None = None) -> Trajectory:
-        """The trajectory of the rows, by default with the adjoint of this run behind them."""
+        """The trajectory of the rows that the stepper has finished, by default with the adjoint of
+        this run behind them. What is made of them is made when it is asked for; at once where code
+        of users makes it, which may do otherwise later."""
+        task, out, slopes = self.task, self.solved.out, self.solved.slopes
         rows = attached([self.solved])[0] if rows is None else rows
-        return gather(self.task, rows, self.solved.out, self.wall, self.slopes)
+        stepper, count = task.stepper, out.rows
+        model, (y, felt) = stepper.compiled.model, (part[:count] for part in rows)
+        rest, touch = _Rest(stepper, task.t[:count], y, felt, out), Touch(stepper.rig)
+        own: dict[str, Any] = {"sensitivities": None, "touch_sensitivities": {}}
+        if slopes is not None:
+            of_touch = touch.slopes(task.touch, slopes[1][:count], felt).unbind(1)
+            own = {"sensitivities": slopes[0][:count]}
+            own["touch_sensitivities"] = dict(zip(task.touch, of_touch))
+        made = Trajectory.later(
+            rest, t=rest.t, y=y, recorded=felt, touch=touch, layout=model.layout, wrt=task.wrt,
+            stats=Stats(out.steps, out.solves, out.failed, out.refused, self.wall),
+            rig=task.rig or stepper.rig, **own,
+        )  # fmt: skip
+        if not model.shared or not stepper.followed.known:
+            made.complete()
+        return made
 
 
 def run(
@@ -195,8 +209,8 @@ def run(
         with torch.set_grad_enabled(
             task.gradient == "forward" or (task.gradient == "discrete" and torch.is_grad_enabled())
         ):
-            for solved, slopes in _rows(task, tape_bytes):
-                done = RunOutcome(task, solved, slopes, clock.perf_counter() - began)
+            for solved in _growing(task, tape_bytes):
+                done = RunOutcome(task, solved, clock.perf_counter() - began)
                 if bar is not None and not bar.disable:
                     bar.n = float(t[solved.out.rows - 1] - t[0])
                     bar.refresh()
@@ -263,13 +277,11 @@ def _channels_of_touch(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
     return expanded
 
 
-def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor, Tensor] | None]]:
+def _growing(task: Task, tape_bytes: float) -> Iterator[Solved]:
     """The growing run."""
     stepper, wrt, dy0 = task.stepper, task.wrt, task.dy0
     if task.gradient != "forward":
-        for solved in march(stepper, task.y0, task.t, tape_bytes):
-            yield solved, None
-        return
+        return march(stepper, task.y0, task.t, tape_bytes)
     leaves = [stepper.rig.parameter(name) for name in wrt]
     for name, value in zip(wrt, leaves):
         if value.ndim or not value.requires_grad:
@@ -286,8 +298,7 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor,
             raise ValueError("`dy0` must be finite, but has a component that is not")
     kept = stepper.layout.rigid if task.rigid else list(range(size))
     sums = Touch(stepper.rig).sums(task.touch)
-    for dy, felt, out in iterate(stepper, task.y0, task.t, leaves, dy0, kept, sums):
-        yield Solved(stepper, task.y0, task.t, out, None), (dy, felt)
+    return iterate(stepper, task.y0, task.t, leaves, dy0, kept, sums)
 
 
 def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
@@ -302,32 +313,6 @@ def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> Sim
     out = SimulationFailed(reason, failure.time)
     out.trajectory = trajectory
     return out
-
-
-def gather(
-    task: Task, rows: Rows, out: Progress, wall: float,
-    slopes: tuple[Tensor, Tensor] | None = None,
-) -> Trajectory:  # fmt: skip
-    """The trajectory of the rows that the stepper has finished, which carry the gradient, if any is
-    wanted. What is made of them is made when it is asked for; at once where code of users makes it,
-    which may do otherwise later."""
-    stepper, count = task.stepper, out.rows
-    model, (y, felt) = stepper.compiled.model, (part[:count] for part in rows)
-    rest = _Rest(stepper, task.t[:count], y, felt, out)
-    touch = Touch(stepper.rig)
-    own: dict[str, Any] = {"sensitivities": None, "touch_sensitivities": {}}
-    if slopes is not None:
-        of_touch = touch.slopes(task.touch, slopes[1][:count], felt).unbind(1)
-        own = {"sensitivities": slopes[0][:count]}
-        own["touch_sensitivities"] = dict(zip(task.touch, of_touch))
-    made = Trajectory.later(
-        rest, t=rest.t, y=y, recorded=felt, touch=touch, layout=model.layout, wrt=task.wrt,
-        stats=Stats(out.steps, out.solves, out.failed, out.refused, wall),
-        rig=task.rig or stepper.rig, **own,
-    )  # fmt: skip
-    if not model.shared or not stepper.followed.known:
-        made.complete()
-    return made
 
 
 class _Rest:

@@ -8,15 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.physics.motion import Reference, evaluate
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
-from torchsoft.solve.kernel.arrays import NO_SIGNALS, Errors, Signals
-from torchsoft.solve.kernel.table import Array
+from torchsoft.solve.kernel.arrays import GAMMA, NO_SIGNALS, Errors, Signals
+from torchsoft.solve.kernel.table import Array, Index
 
 # The steps of a run: equal ones between output times, or those that tolerances chose, and where
 # the outputs lie in them.
@@ -28,42 +27,44 @@ CHUNK = 500
 
 class Plan(NamedTuple):
     """Steps taken in one compiled call: their starts, counted from the run's, and lengths h [s],
-    and per output its step and the part of it (0 to 1)."""
+    per output its step and the part of it (0 to 1), the start being one of step -1, and the signals
+    (steps, 2, signals, 2) at their stages."""
 
-    starts: NDArray[np.float64]
-    h: NDArray[np.float64]
-    out_step: NDArray[np.int64]
-    out_part: NDArray[np.float64]
+    starts: Array
+    h: Array
+    out_step: Index
+    out_part: Array
+    signals: Array = np.zeros((0, 2, 0, 2))
 
-    def part(self, first: int, end: int) -> "Plan":
-        """Steps from `first` up to `end`, without it."""
-        rows = (self.out_step >= first) & (self.out_step < end)
+    def taken(self, steps: int, outputs: int) -> "Plan":
+        """The first steps, with the first outputs."""
+        starts, h, step, part, signals = self
+        return Plan(starts[:steps], h[:steps], step[:outputs], part[:outputs], signals[:steps])
+
+    def left(self, steps: int, outputs: int) -> "Plan":
+        """What is left without the first steps and the first outputs."""
+        starts, h, step, part, signals = self
+        step = step[outputs:] - steps
+        return Plan(starts[steps:], h[steps:], step, part[outputs:], signals[steps:])
+
+    def halved(self) -> "Plan":
+        """Of a single step: two of half the length."""
+        half, later = 0.5 * self.h[0], self.out_part > 0.5
         return Plan(
-            self.starts[first:end],
-            self.h[first:end],
-            self.out_step[rows] - first,
-            self.out_part[rows],
-        )
-
-    def halved(self, step: int) -> "Plan":
-        """One of the steps, as two of half the length."""
-        begin, h, parts = (
-            self.starts[step],
-            0.5 * self.h[step],
-            self.out_part[self.out_step == step],
-        )
-        later = parts > 0.5
-        return Plan(
-            np.array([begin, begin + h]),
-            np.array([h, h]),
-            later.astype(np.int64),
-            np.where(later, 2 * parts - 1, 2 * parts),
-        )
+            np.array([self.starts[0], self.starts[0] + half]), np.array([half, half]),
+            later.astype(np.int64), np.where(later, 2 * self.out_part - 1, 2 * self.out_part),
+        )  # fmt: skip
 
     @property
-    def output_times(self) -> NDArray[np.float64]:
+    def stage_times(self) -> Array:
+        """Times of the stages (steps, 2) since the run's start [s]."""
+        return self.starts[:, None] + self.h[:, None] * np.array([GAMMA, 1.0])
+
+    @property
+    def output_times(self) -> Array:
         """Times of the outputs since the run's start [s]."""
-        return self.starts[self.out_step] + self.out_part * self.h[self.out_step]
+        step = np.maximum(self.out_step, 0)
+        return self.starts[step] + self.out_part * self.h[step]
 
 
 LONGEST = 0.1
@@ -125,9 +126,17 @@ def check_times(t: Tensor, step: float | None = None) -> None:
         )
 
 
+def chunks(starts: Array, h: Array, out_step: Index, out_part: Array) -> Iterator[Plan]:
+    """A plan, CHUNK steps at a time."""
+    whole = Plan(starts, h, out_step, out_part)
+    for k in range(0, len(h), CHUNK):
+        first, last = np.searchsorted(out_step, (k, k + CHUNK))
+        yield whole.taken(k + CHUNK, last).left(k, first)
+
+
 def equal_steps(t: Tensor, step: float) -> Iterator[Plan]:
-    """Cut the intervals between the times t (T,) [s] into equal steps no longer than `step` [s],
-    CHUNK at a time; the steps of one plan have one length."""
+    """Cut the intervals between the times t (T,) [s] into equal steps no longer than `step` [s];
+    the steps of one plan have one length."""
     times = t.numpy() - t.numpy()[0]
     spans = np.diff(times)
     counts = np.maximum(1, np.ceil(spans / step * (1 - 1e-9))).astype(int)
@@ -135,16 +144,11 @@ def equal_steps(t: Tensor, step: float) -> Iterator[Plan]:
     changes = (np.diff(counts) != 0) | (np.abs(np.diff(sizes)) > 1e-9 * sizes[:-1])
     for equal in np.split(np.arange(len(spans)), np.flatnonzero(changes) + 1):
         n, h = int(counts[equal[0]]), float(sizes[equal[0]])
-        starts = (times[equal, None] + h * np.arange(n)).ravel()
-        for k in range(0, len(starts), CHUNK):
-            here = starts[k : k + CHUNK]
-            ends = np.flatnonzero((np.arange(k, k + len(here)) + 1) % n == 0)
-            yield Plan(
-                np.asarray(here, np.float64), np.full(len(here), h), ends, np.ones(len(ends))
-            )
+        starts, ends = (times[equal, None] + h * np.arange(n)).ravel(), np.arange(1, len(equal) + 1)
+        yield from chunks(starts, np.full(len(starts), h), n * ends - 1, np.ones(len(equal)))
 
 
-def check_knots(knots: Tensor) -> NDArray[np.float64]:
+def check_knots(knots: Tensor) -> Array:
     """The ends of given steps (steps + 1,) [s]. Raises `ValueError` unless they are two or more,
     finite and increasing."""
     check_array("knots", knots)
@@ -161,9 +165,8 @@ def check_knots(knots: Tensor) -> NDArray[np.float64]:
     return np.ascontiguousarray(knots.detach().numpy())
 
 
-def given_steps(t: Tensor, knots: NDArray[np.float64]) -> Iterator[Plan]:
-    """The steps between `knots` (n + 1,) [s], of another run, with outputs at t (T,); CHUNK at a
-    time.
+def given_steps(t: Tensor, knots: Array) -> Iterator[Plan]:
+    """The steps between `knots` (n + 1,) [s], of another run, with outputs at t (T,).
 
     Raises `ValueError` unless they cover t from its first time on.
     """
@@ -178,9 +181,7 @@ def given_steps(t: Tensor, knots: NDArray[np.float64]) -> Iterator[Plan]:
     at = np.minimum(np.searchsorted(knots, times[1:], side="left"), len(h)) - 1
     parts = (times[1:] - knots[at]) / h[at]
     parts = np.where(parts > 1.0 - 1e-9, 1.0, parts)
-    whole = Plan(knots[:-1], h, at, parts)
-    for k in range(0, len(h), CHUNK):
-        yield whole.part(k, min(k + CHUNK, len(h)))
+    return chunks(knots[:-1], h, at, parts)
 
 
 # Data of a rig for step-size control: groups of errors with their units, and the reference's
@@ -296,7 +297,7 @@ class Followed:
             return self
         out, room = copy(self), np.zeros_like(self._pieces.room)
         out.arrays = self._pieces._replace(at=self._pieces.at - origin, room=room)
-        out.stops = np.unique(np.concatenate([np.zeros(0), *self._stops])) - origin
+        out.stops = np.concatenate([np.zeros(0), *self._stops]) - origin
         return out
 
     def on_lines(

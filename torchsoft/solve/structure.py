@@ -10,7 +10,6 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchsoft.physics.graph import Graph
@@ -32,40 +31,20 @@ class Unknown(Exception):
     """Something that does not say all of itself."""
 
 
-class Numbers:
-    """An array, equal to one of the same numbers."""
-
-    def __init__(self, array: NDArray[Any]) -> None:
-        self.array = array
-
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Numbers) and self.array.dtype == other.array.dtype
-            and np.array_equal(self.array, other.array)
-        )  # fmt: skip
-
-    def __hash__(self) -> int:
-        return hash(self.array.shape)
-
-
-def lasting(value: Any) -> Any:
-    """A key whose arrays nobody else can change."""
-    if isinstance(value, Numbers):
-        return Numbers(value.array.copy())
-    return tuple([lasting(one) for one in value]) if type(value) is tuple else value
-
-
 class Structure:
     """Modules of a part, each once, its parameters' tensors in their order, and a `key` that is
     equal for equal structures, until something changes. `known` is False where that is not certain:
     for code that is neither this package's nor torch's, hooks, other attributes than numbers, text,
-    arrays and functions of this package. Such a part is like no other, nor like itself later."""
+    arrays and functions of this package. Such a part is like no other, nor like itself later. The
+    last `model` that was found for it stays with it."""
+
+    model: Any
 
     def __init__(self, part: nn.Module) -> None:
         self.modules: list[nn.Module] = []
         self.children: list[dict[str, int | None]] = []
         self.parameters: list[Tensor] = []
-        self.known = True
+        self.known, self.model = True, None
         self._key: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._visit(part)
@@ -81,16 +60,15 @@ class Structure:
         self.modules.append(module)
         self.children.append(children)
         own, kind = module.__dict__, type(module)
-        idle, numbers, known = _traits(kind)
+        names, numbers, known = _traits(kind, tuple(own))
         key = self._key
-        key.append((kind, kind.forward, *[getattr(kind, name) for name in numbers]))
-        if not known or any(own.get(hooks) for hooks in HOOKS):
+        key.append((kind, kind.forward, names, *[getattr(kind, name) for name in numbers]))
+        if not known or any(map(own.get, HOOKS)):
             self.known = False
         try:
-            for name, value in own.items():
-                if name[0] != "_" and name not in idle:
-                    key.append(name)
-                    key.append(value if type(value) in PLAIN else described(value))
+            for name in names:
+                value = own[name]
+                key.append(value if type(value) in PLAIN else described(value))
             for name, value in own["_buffers"].items():
                 key.append((name, None if value is None else described(value)))
         except Unknown:
@@ -101,22 +79,29 @@ class Structure:
             if value is not None:
                 self.parameters.append(value)
         for name, child in own["_modules"].items():
-            if name not in idle:
+            if name not in _idle(kind):
                 children[name] = None if child is None else self._visit(child)
         key.append(tuple(children.items()))
         return number
 
 
 @cache
-def _traits(kind: type) -> tuple[frozenset[str], tuple[str, ...], bool]:
-    """Names of attributes that decide nothing, names of the numbers of a class, and whether its
-    objects say all of themselves."""
+def _idle(kind: type) -> frozenset[str]:
+    """Names of attributes that decide nothing."""
     bases = [base for base in kind.__mro__ if base not in (nn.Module, object)]
     idle = frozenset().union(*(names for base, names in IDLE.items() if issubclass(kind, base)))
-    cached = {k for base in bases for k, v in vars(base).items() if isinstance(v, cached_property)}
+    every = (item for base in bases for item in vars(base).items())
+    return idle | {name for name, value in every if isinstance(value, cached_property)}
+
+
+@cache
+def _traits(kind: type, own: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Names of attributes, of its `own`, that decide something, names of the numbers of a class,
+    and whether its objects say all of themselves."""
+    bases = [base for base in kind.__mro__ if base not in (nn.Module, object)]
     numbers = {k: 0 for base in bases for k, v in vars(base).items() if isinstance(v, int | float)}
-    known = kind.__module__.startswith(OWN)
-    return idle | cached, tuple(numbers), known
+    names = tuple(name for name in own if name[0] != "_" and name not in _idle(kind))
+    return names, tuple(numbers), kind.__module__.startswith(OWN)
 
 
 def described(value: Any) -> Any:
@@ -129,7 +114,7 @@ def described(value: Any) -> Any:
         except (TypeError, RuntimeError):
             raise Unknown from None
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return Numbers(value)
+        return value.dtype.str, value.shape, value.tobytes()
     if type(value) in (tuple, list):
         return tuple([described(one) for one in value])
     if type(value) is dict:
@@ -194,9 +179,9 @@ class Copies:
 
 
 def structure_of(part: object) -> Any:
-    """Key of the structure of a part, hashable and lasting; None where it is not known."""
+    """Key of the structure of a part, hashable; None where it is not known."""
     found = Structure(part) if isinstance(part, nn.Module) else None
-    return lasting(found.key) if found is not None and found.known else None
+    return found.key if found is not None and found.known else None
 
 
 def copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:

@@ -5,7 +5,7 @@ where a derivative is wanted the vector keeps its graph, and so gradients reach 
 values were made of.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from typing import Any
@@ -18,13 +18,13 @@ from torchsoft.physics.motion import Reference, polynomial
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_place, check_values, ordinary
 from torchsoft.solve.kernel import arrays
-from torchsoft.solve.kernel.arrays import Limits, room
+from torchsoft.solve.kernel.arrays import Limits, scratch
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.model import Model, computed, model_of, prepared_shapes
+from torchsoft.solve.model import computed, model_of, prepared_shapes
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.steps import Followed, own_units
-from torchsoft.solve.structure import Copies, Structure, copied
+from torchsoft.solve.structure import Copies, Structure, copied, described
 
 
 @contextmanager
@@ -33,40 +33,6 @@ def independent() -> Iterator[None]:
     reach them."""
     with torch.autograd.graph.saved_tensors_hooks(lambda x: x.detach().clone(), lambda x: x):
         yield
-
-
-class Reading:
-    """What runs of one rig share that begin together: its structure and its references, as they are
-    now."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.structure, self.model = Structure(rig), None
-        self._motions: dict[Any, tuple[Reference, Followed]] = {}
-        self._owned: dict[int, tuple[Reference, frozenset[int]]] = {}
-
-    def model_of(self, values: Sequence[Tensor]) -> Model:
-        """The model of the rig with these parameters."""
-        if self.model is None or not (self.model.shared and self.model.alike(values)):
-            self.model = model_of(self.structure, values)
-        return self.model
-
-    def touches(self, values: Mapping[int, Tensor], reference: Reference) -> bool:
-        """Whether values take the place of parameters of a reference."""
-        if id(reference) not in self._owned:
-            self._owned[id(reference)] = reference, frozenset(map(id, reference.parameters()))
-        return not self._owned[id(reference)][1].isdisjoint(values)
-
-    def motion(
-        self, reference: Reference, fixed: Sequence[float], make: Callable[[], Followed]
-    ) -> Followed:
-        """A reference as the kernels evaluate it, made once where it consists of pieces."""
-        key = id(reference), *fixed
-        if key not in self._motions:
-            made = make()
-            if not made.known:
-                return made
-            self._motions[key] = reference, made
-        return self._motions[key][1]
 
 
 class Compiled:
@@ -78,13 +44,12 @@ class Compiled:
     """
 
     def __init__(
-        self, rig: Rig, reference: Reference | None = None, *, reading: Reading | None = None,
+        self, rig: Rig, reference: Reference | None = None, *, structure: Structure | None = None,
         values: Mapping[int, Tensor] | None = None, differentiable: bool = True,
     ) -> None:  # fmt: skip
         check_place()
-        shared, values = reading, values or {}
-        reading = reading or Reading(rig)
-        structure = reading.structure
+        values = values or {}
+        structure = structure or Structure(rig)
         given = [values.get(id(x), x) for x in structure.parameters]
         differentiable = differentiable or not structure.known  # whose gradients are judged
         followed = rig.reference if reference is None else reference
@@ -94,10 +59,11 @@ class Compiled:
         with torch.inference_mode(False), torch.set_grad_enabled(differentiable), apart:
             theta, mine = taken(structure.parameters, given, differentiable)
             own = [mine[id(x)] for x in structure.parameters]
-            self.model = model = reading.model_of(own)
+            self.model = model = model_of(structure, own)
             modules = model.copies.made(own)
             self.rig: Rig = modules[0]
-            change = lambda one: differentiable or (values and reading.touches(values, one))
+            touched = lambda one: not values.keys().isdisjoint(map(id, one.parameters()))
+            change = lambda one: differentiable or (values and touched(one))
             self.reference = copy_of(followed, mine, values) if change(followed) else followed
             self.rig._modules["reference"] = (
                 self.reference if followed is rig.reference
@@ -106,7 +72,6 @@ class Compiled:
             )  # fmt: skip
             self._evaluate(modules, theta)
         self.layout = model.layout
-        self._shared = shared if self.reference is followed else None
 
     def _evaluate(self, modules: Sequence[Any], theta: Tensor) -> None:
         """Find the vector of parameters; the last one again for the same values without a graph."""
@@ -142,18 +107,17 @@ class Compiled:
         """The rig's arrays."""
         return self.model.system(self.numbers.copy())
 
-    @property
-    def signal_count(self) -> int:
-        """Number of signals of the kernels, fixed coordinates included."""
-        return len(self.model.signals) + self.model.fixed
-
     def followed(self, reference: Reference, origin: float) -> Followed:
         """A reference as the kernels evaluate it, with time counted from `origin` [s]."""
         fixed = [float(one.detach()) for one in self.rig.fixed_values]
+        structure = Structure(reference)
+        key = structure.key, *map(described, structure.parameters), *fixed
+        if structure.known and self.model.motion is not None and self.model.motion[0] == key:
+            return self.model.motion[1].since(origin)
         since = lambda t: self.signals(t, reference.since(origin))
-        make = lambda: Followed(reference, self.model.signals, fixed, since)
-        shared = self._shared
-        found = make() if shared is None else shared.motion(reference, fixed, make)
+        found = Followed(reference, self.model.signals, fixed, since)
+        if structure.known and found.known:
+            self.model.motion = key, found
         return found.since(origin)
 
     @independent()
@@ -245,9 +209,9 @@ class Rates:
                 "the rates of inertial pads are not compiled for single states; use `rig.forward`"
             )
         self._system, self._limits = compiled.system, LIMITS
-        self._work = room("Work", self._system, compiled.layout.size, columns=1)
+        self._work = scratch("Work", self._system, compiled.layout.size, columns=1)
         self._followed = compiled.followed(compiled.reference, 0.0)
-        self._signals = np.zeros((1, compiled.signal_count, 2))
+        self._signals = np.zeros((1, compiled.model.followed, 2))
         self._powers, self._wrenches = (
             np.zeros(len(compiled.model.integrals.names)),
             np.zeros((len(rig.pads), 3)),

@@ -80,6 +80,9 @@ class TorchdiffeqSolver:
             "atol",
             "knots",
             "landing",
+            "structure",
+            "values",
+            "differentiable",
         }
         if strange := set(options) - known:
             raise ValueError(
@@ -100,6 +103,9 @@ class TorchdiffeqSolver:
             return self._augmented(t, self.adjoint_params)
         samples = self.y0.reshape(-1, self.y0.shape[-1])
         runs: list[Any] = [None] * len(samples)
+
+        for sample in samples:
+            self.stepper.check(sample.detach(), t)
 
         def run(i: int) -> Solved:
             return deque(march(copy(self.stepper), samples[i], t), maxlen=1)[0]
@@ -133,10 +139,8 @@ class TorchdiffeqSolver:
             y_bars[sample], *cotangents = run_adjoint(run, outputs, None)
             if parameters:
                 with torch.enable_grad():
-                    made_of = (
-                        again.compiled.p,
-                        again.signals([segment.plan for segment in segments]),
-                    )
+                    times = np.concatenate([one.plan.stage_times.ravel() for one in segments])
+                    made_of = again.compiled.p, again.signals_at(times)
                     value = torch.cat(
                         [(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]
                     ).sum()

@@ -137,7 +137,8 @@ class Trajectory(Shown):
     def __getitem__(self, channel: str) -> Tensor:
         """A channel (T,), by its name or a short one. Raises `KeyError` naming those that are
         there."""
-        channel = self.setup.short.get(channel, channel)
+        if channel not in self.channels:
+            channel = self.setup.short.get(channel, channel)
         if channel in self.channels:
             return self.channels[channel]
         touch = self.touch
@@ -148,7 +149,8 @@ class Trajectory(Shown):
         raise KeyError(f"the run has no channel `{channel}`; {known}, and of touch {more}")
 
     def __contains__(self, channel: object) -> bool:
-        channel = self.setup.short.get(str(channel), channel)
+        if channel not in self.channels:
+            channel = self.setup.short.get(str(channel), channel)
         return channel in self.channels or (self.touch is not None and channel in self.touch)
 
     def __iter__(self) -> Iterator[str]:

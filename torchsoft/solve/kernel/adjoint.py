@@ -72,45 +72,26 @@ def stage_adjoint(
     """Turn the cotangent y_bar (size,) of a stage's end into that of its y*, in place; add to p_bar
     and signals_bar. forces_bar (recorded,) are those of its forces, or empty."""
     free, count, y, felt = s.body_coordinate.size, s.pad_base.size, tape.y[row], forces_bar.size > 0
-    contacts.restore(s, w, tape, row, a, felt)
-    put(tape.rate[row], w.rate)
-    for pad in range(s.pad_base.size):
-        pads.relinearise(s, w, pad, tape.y[row], a)
-    seed(s, w, z, tape, row, a, y_bar, p_bar, forces_bar)
     Rv, matrix, nu, V_bar = w.Rv, z.matrix, z.nu, z.V_bar
+    pads.restore(s, w, tape, row, a, felt)
+    seed(s, w, z, tape, row, a, y_bar, p_bar, forces_bar)
     balance(s, w, y, signals, a, w.r, Rv)
-    matrix[:] = 0.0
+    matrix[:], nu[:], z.q[:], z.V[:] = 0.0, 0.0, 0.0, 0.0
     for i in range(free):
         V_bar[i] = y_bar[s.body_V_start + i] + a * y_bar[s.body_q_start + i]
     for pad in range(count):
-        pads.relation(s, w, pad, y, a)
-        contacts.assemble(s, w, pad, a, Rv)
-        pads.couple(s, w, pad, Rv)
-        first, n, column = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad]
-        X, columns = w.X[2 * first : 2 * (first + n)], s.pad_columns[pad]
-        pads.pull_forces(s, w, z, pad, y_bar, a, X, V_bar, felt)
-        for i in range(2 * n):
-            for j in range(columns):
-                X[i, 1 + j] = w.Rf[j, i]
-            for j in range(i):
-                w.A[i, j], w.A[j, i] = w.A[j, i], w.A[i, j]
-        solve_dense(w.A, X, 2 * n, 1 + columns)
-        for i in range(free):
-            if column[i] < 0:
-                continue
-            for m in range(2 * n):
-                V_bar[i] += w.Hc[m, column[i]] * X[m, 0]
-                for j in range(free):
-                    if column[j] >= 0:
-                        matrix[i, j] -= w.Hc[m, column[i]] * X[m, 1 + column[j]]
+        pads.assemble(s, w, pad, y, a, Rv)
+        pads.pull_forces(s, w, z, pad, y_bar, a, V_bar, felt)
+        contacts.transpose(s, w, pad)
+        contacts.eliminate(s, w, pad, 1, nu, matrix)
     for i in range(free):
-        nu[i, 0] = V_bar[i]
+        nu[i, 0] = -nu[i, 0] - V_bar[i]
         for j in range(free):
-            matrix[i, j] -= Rv[j, i]
+            matrix[i, j] += Rv[j, i]
     solve_dense(matrix, nu, free, 1)
 
-    z.q[:], z.V[:] = 0.0, 0.0
     for pad in range(count):
+        contacts.load_nodes(s, w, pad, 1, nu)
         pull_points(s, w, z, pad, a, y_bar, p_bar, felt)
         pull_faded(s, w, z, pad, y, y_bar, a, p_bar)
         pads.pull_state(s, w, z, pad, y, y_bar, a, nu, z.V, p_bar)
@@ -124,13 +105,7 @@ def pull_points(
     """Cotangents of the nodal rates and displacements of a pad (z.rate, z.u), of coordinates and
     velocities (z.q, z.V), of points' states and of parameters, through the laws of its touching
     points."""
-    first, column, at = s.pad_node_start[pad], s.pad_column[pad], s.pad_point_start[pad]
-    n, by, weights = w.counts[pad], z.by, z.weights
-    X = w.X[2 * first : 2 * (first + n)]
-    for i in range(2 * n):
-        for j in range(column.size):
-            if column[j] >= 0:
-                X[i, 0] += X[i, 1 + column[j]] * z.nu[j, 0]
+    at, X, rate, position = s.pad_point_start[pad], w.X[2 * s.pad_node_start[pad] :], z.by, z.moved
     z.rate[w.low[pad] : w.high[pad]], z.u[w.low[pad] : w.high[pad]] = 0.0, 0.0
     for c in range(s.contact_pad.size):
         if s.contact_pad[c] == pad:
@@ -142,36 +117,30 @@ def pull_points(
                     z.q[s.contact_coordinate[c, j]] += w.by_pair[c, 6 + row, j] * force
     for i in range(at, at + w.actives[pad]):
         k = w.active[i]
-        c = s.point_contact[k]
-        rows, H, S = contacts.outputs(s, c, felt), w.H[i], w.S[i]
+        c, weights = s.point_contact[k], z.out[k]
+        own, coordinate = bounds(s.contact_p_start, c), s.contact_coordinate[c]
+        for j in range(2):
+            if s.point_N[k, j] != 0.0:
+                slot = 2 * w.slot[s.point_node[k, j]]
+                add(s.point_N[k, j], X[slot : slot + 2, 0], weights[:2])
         for row in range(6):
             number = s.contact_number[c, row]
-            by[row] = z.nu[number, 0] if number >= 0 else 0.0
-        put(z.out[k], weights)
-        for j in range(2):
-            for r in range(2 if s.point_N[k, j] != 0.0 else 0):
-                weights[r] += s.point_N[k, j] * X[2 * w.slot[s.point_node[k, j]] + r, 0]
-        for row in range(6):
-            add(by[row], w.by_pair[c, 6 + row, 12:], weights[:WRENCH])
-        own = bounds(s.contact_p_start, c)
+            if number >= 0:
+                add(z.nu[number, 0], w.by_pair[c, 6 + row, 12:], weights[:WRENCH])
         call_pullback(s.contact_pullback[c], w.x[k], s.p[own], weights, p_bar[own])
-        for m in range(8):
-            position = rate = 0.0
-            for r in range(rows):
-                position += S[r, m] * weights[r]
-                rate += H[r, m] * weights[r]
-            if m < 2:
-                for j in range(2):
-                    z.rate[s.point_node[k, j], m] += s.point_N[k, j] * rate
-                    z.u[s.point_node[k, j], m] += s.point_N[k, j] * position
-            else:
-                coordinate = s.contact_coordinate[c, m - 2]
-                z.q[coordinate] += position
-                z.V[coordinate] += rate - a * position
-        for j in range(s.contact_states[c]):
-            own_state = contacts.state_at(s, k, j)
-            for r in range(rows):
-                y_bar[own_state] += contacts.by_state(s, w, k, r, j) * weights[r]
+        rate[:], position[:] = 0.0, 0.0
+        for r in range(contacts.outputs(s, c, felt)):
+            add(weights[r], w.H[i, r], rate)
+            add(weights[r], w.S[i, r], position)
+            for j in range(s.contact_states[c]):
+                by = contacts.by_state(s, w, k, r, j)
+                y_bar[contacts.state_at(s, k, j)] += by * weights[r]
+        for j in range(2):
+            add(s.point_N[k, j], rate, z.rate[s.point_node[k, j]])
+            add(s.point_N[k, j], position, z.u[s.point_node[k, j]])
+        for o in range(6):
+            z.q[coordinate[o]] += position[2 + o]
+            z.V[coordinate[o]] += rate[2 + o] - a * position[2 + o]
 
 
 @compiled
@@ -240,7 +209,7 @@ def pull_bodies(
 def output_adjoint(r: Any, i: int) -> None:
     """Add to the cotangents of output i's state, parameters and signals the share of its forces:
     the adjoint of the stage of no length that gives them."""
-    bar, state = r.recorded_bar[i], r.z.state[3]
+    bar, state = r.recorded_bar[i], r.z.state[0]
     some = False
     for j in range(bar.size):
         some |= bar[j] != 0.0
@@ -250,8 +219,7 @@ def output_adjoint(r: Any, i: int) -> None:
             r.s, r.w, r.z, r.out_tape, i, INSTANT, r.out_signals[i], state, r.p_bar,
             r.out_signals_bar[i], bar,
         )  # fmt: skip
-        for j in range(state.size):
-            r.outputs_bar[i, j] += state[j]
+        add(1.0, state, r.outputs_bar[i])
 
 
 @compiled
@@ -260,41 +228,36 @@ def backward(r: Any) -> None:
     place.
 
     outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; where
-    recorded_bar (outputs, recorded) of the forces there is not zero, they receive its share.
-    Without steps the one output is the start. signals and signals_bar are (stages, signals, 2),
+    recorded_bar (outputs, recorded) of the forces there is not zero, they receive its share. The
+    start is an output of step -1. signals and signals_bar are (stages, signals, 2),
     those of the outputs (outputs, signals, 2). failed receives -1, or the step at which a cotangent
     stopped being finite.
     """
     s, w, z, tape, h, signals, none = r.s, r.w, r.z, r.tape, r.h, r.signals, r.z.by[:0]
-    out_step, out_part, outputs_bar = r.out_step, r.out_part, r.outputs_bar
-    y_bar, p_bar, signals_bar = r.y_bar, r.p_bar, r.signals_bar
+    y_bar, p_bar, signals_bar, row = r.y_bar, r.p_bar, r.signals_bar, r.out_step.size - 1
+    first_bar, start_bar = z.state[1], z.state[2]
     r.failed[0] = -1
-    row = out_step.size - 1
-    held, first_bar, start_bar = z.state[0], z.state[1], z.state[2]
-    for i in range(out_step.size):
+    for i in range(r.out_step.size):
         output_adjoint(r, i)
-    if h.size == 0:
-        for i in range(y_bar.size):
-            y_bar[i] += outputs_bar[0, i]
     for step in range(h.size - 1, -1, -1):
         a = GAMMA * h[step]
         first_bar[:], start_bar[:] = 0.0, 0.0
-        while row >= 0 and out_step[row] == step:
-            at_start, at_first, at_end = dense_states(out_part[row])
-            for i in range(y_bar.size):
-                y_bar[i] += at_end * outputs_bar[row, i]
-                first_bar[i] += at_first * outputs_bar[row, i]
-                start_bar[i] += at_start * outputs_bar[row, i]
+        while row >= 0 and r.out_step[row] == step:
+            at_start, at_first, at_end = dense_states(r.out_part[row])
+            add(at_end, r.outputs_bar[row], y_bar)
+            add(at_first, r.outputs_bar[row], first_bar)
+            add(at_start, r.outputs_bar[row], start_bar)
             row -= 1
         k = 2 * step + 1
         stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], none)
-        for i in range(y_bar.size):
-            held[i] = (1.0 - MIX) * y_bar[i] + start_bar[i]
-            y_bar[i] = MIX * y_bar[i] + first_bar[i]
+        add(1.0 - MIX, y_bar, start_bar)
+        add(MIX, y_bar, first_bar)
         k = 2 * step
-        stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], none)
-        for i in range(y_bar.size):
-            y_bar[i] += held[i]
+        stage_adjoint(s, w, z, tape, k, a, signals[k], first_bar, p_bar, signals_bar[k], none)
+        put(start_bar, y_bar)
+        add(1.0, first_bar, y_bar)
         if not np.isfinite(y_bar.sum()):
             r.failed[0] = step
             return
+    if row >= 0:  # the start
+        add(1.0, r.outputs_bar[row], y_bar)

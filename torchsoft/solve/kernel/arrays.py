@@ -223,15 +223,10 @@ class Signals(NamedTuple):
 
 
 NO_SIGNALS = Signals(
-    np.zeros(1, np.int64),
-    np.zeros(0, np.int64),
-    np.zeros(0),
-    np.zeros(0),
-    np.zeros((0, 1)),
-    0,
+    np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros((0, 1)), 0,
     np.zeros(1),
-)
-"""Reference of given steps: none."""
+)  # fmt: skip
+"""No pieces."""
 
 
 @table
@@ -245,17 +240,6 @@ class Errors(NamedTuple):
     atol: Array
     size: Array
     origin: Array
-
-
-NO_ERRORS = Errors(
-    np.zeros(0, np.int64),
-    np.zeros(0, np.int64),
-    np.zeros(0, np.int64),
-    np.zeros(0),
-    np.zeros(0),
-    np.zeros(0),
-)
-"""Tolerances of given steps: none."""
 
 
 SCRATCH: dict[str, dict[str, str]] = {
@@ -346,9 +330,9 @@ SCRATCH: dict[str, dict[str, str]] = {
         "pads 3": "wrenches",
         "points rows": "out",
         "rows": "weights",
-        "6": "by",
+        "8": "by moved",  # by rates and by positions of a point
         "corners lanes": "element",
-        "4 state": "state",
+        "3 state": "state",
     },
     "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
         "rows": "weights",
@@ -443,12 +427,12 @@ class Run(NamedTuple):
     out: Outputs
     tape: Annotated[Any, Tape]
     given: int
+    begin: int
     y: Array
     k: Array
     clock: Array
     stops: Array
     t_out: Array
-    row: int
     rtol: float
     longest: float
     shortest: float
@@ -528,7 +512,7 @@ def recorded_size(s: Any) -> int:
     return 2 * len(s.point_X) + 3 * len(s.pad_base) + len(s.body_free)
 
 
-def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
+def scratch(kind: str, s: Any, state: int, **sizes: int) -> Any:
     """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those
     that it does not decide."""
     states, nodes = int(s.contact_states.max(initial=1)), int(s.pad_node_start[-1])
@@ -566,8 +550,3 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         grouped = constants.reshape(sizes["groups"], LANES, constants.shape[1])
         made["element_x"][:, 2 * corners :] = grouped.swapaxes(1, 2)
     return KINDS[kind](**made)
-
-
-def first_rows(tape: Any, rows: int) -> Any:
-    """The beginning of a tape, of a run that ended early."""
-    return Tape(*(part if len(part) == rows else part[:rows].copy() for part in tape))

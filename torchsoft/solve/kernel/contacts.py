@@ -20,7 +20,7 @@ from typing import Any
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import MOTION, WRENCH
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
-from torchsoft.solve.kernel.linear import add, bounds, put
+from torchsoft.solve.kernel.linear import add, bounds, put, solve_dense
 from torchsoft.solve.kernel.table import Array
 
 
@@ -294,10 +294,16 @@ def residual(s: Any, w: Any, pad: int, r: Array) -> None:
 
 
 @compiled
-def eliminate(s: Any, w: Any, pad: int, m: int, X: Array, r: Array, Rv: Array) -> None:
-    """Put the pad's forces X = A^-1 (b | Hc), m right-hand sides, into the bodies' equations r
-    (free, m) and Rv."""
-    column, n = s.pad_column[pad], w.counts[pad]
+def eliminate(s: Any, w: Any, pad: int, m: int, r: Array, Rv: Array) -> None:
+    """Solve a pad's block for its forces, A^-1 (b | Hc) in w.X with m right-hand sides b, and put
+    them into the bodies' equations r (free, m) and Rv."""
+    column, columns = s.pad_column[pad], s.pad_columns[pad]
+    first, n = s.pad_node_start[pad], w.counts[pad]
+    X = w.X[2 * first : 2 * (first + n)]
+    for i in range(2 * n):
+        for j in range(columns):
+            X[i, m + j] = w.Hc[i, j]
+    solve_dense(w.A, X, 2 * n, m + columns)
     for number in range(column.size):
         if column[number] < 0:
             continue
@@ -307,6 +313,29 @@ def eliminate(s: Any, w: Any, pad: int, m: int, X: Array, r: Array, Rv: Array) -
             for other in range(column.size):
                 if column[other] >= 0:
                     Rv[number, other] += line[i] * X[i, m + column[other]]
+
+
+@compiled
+def transpose(s: Any, w: Any, pad: int) -> None:
+    """Exchange A and Hc of a pad's block with the transposes of A and Rf."""
+    n = 2 * w.counts[pad]
+    for i in range(n):
+        for j in range(i):
+            w.A[i, j], w.A[j, i] = w.A[j, i], w.A[i, j]
+        for j in range(s.pad_columns[pad]):
+            w.Hc[i, j], w.Rf[j, i] = w.Rf[j, i], w.Hc[i, j]
+
+
+@compiled
+def load_nodes(s: Any, w: Any, pad: int, m: int, dV: Array) -> None:
+    """Add to the forces of the first m columns of w.X, after `eliminate`, their change with the
+    velocities dV (free, m)."""
+    first = s.pad_node_start[pad]
+    X = w.X[2 * first : 2 * (first + w.counts[pad])]
+    for number in range(dV.shape[0]):
+        column = s.pad_column[pad, number]
+        for i in range(X.shape[0] if column >= 0 else 0):
+            add(X[i, m + column], dV[number], X[i, :m])
 
 
 @compiled

@@ -1,7 +1,7 @@
 """Blocks of pads behind one set of operations; the kind of a pad decides who does them.
 
 A pad is to its contacts one affine relation at every iterate, u' = free + P F - D dV_base, whatever
-its material: `begin` and `displace` a stage, `evaluate` what a trial leaves, make the `relation`,
+its material: `begin` and `displace` a stage, `evaluate` what a trial leaves, `assemble` its block,
 `propose` and `move`, `finish`; `push_...` and `pull_...` are the tangent's and the adjoint's.
 """
 
@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled, condensed, nodal
+from torchsoft.solve.kernel import compiled, condensed, contacts, nodal
 from torchsoft.solve.kernel.arrays import CONDENSED
-from torchsoft.solve.kernel.contacts import outputs
-from torchsoft.solve.kernel.linear import add
+from torchsoft.solve.kernel.linear import add, put
 from torchsoft.solve.kernel.table import Array
 
 
@@ -50,26 +49,26 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
 
 
 @compiled
-def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """The mobility between the touched nodes, w.P, and the rates without contact, w.free."""
+def assemble(s: Any, w: Any, pad: int, y: Array, a: float, Rv: Array) -> None:
+    """The block of a pad, with its mobility between the touched nodes, w.P, its rates without
+    contact, w.free, and the effects of its inertia."""
     if s.pad_kind[pad] == CONDENSED:
         condensed.relation(s, w, pad, a)
     else:
         nodal.relation(s, w, pad, y, a)
-
-
-@compiled
-def relinearise(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """Derivatives of a pad's material where a stage from y ended."""
-    if s.pad_kind[pad] != CONDENSED:
-        nodal.relinearise(s, w, pad, y, a)
-
-
-@compiled
-def couple(s: Any, w: Any, pad: int, Rv: Array) -> None:
-    """Effects of a pad's inertia on the assembled block."""
+    contacts.assemble(s, w, pad, a, Rv)
     if nodal.inertial(s, pad):
         nodal.couple(s, w, pad, Rv)
+
+
+@compiled
+def restore(s: Any, w: Any, tape: Any, row: int, a: float, felt: bool) -> None:
+    """A stage from the tape, with the derivatives of the pads' materials where it ended."""
+    contacts.restore(s, w, tape, row, a, felt)
+    put(tape.rate[row], w.rate)
+    for pad in range(s.pad_base.size):
+        if s.pad_kind[pad] != CONDENSED:
+            nodal.relinearise(s, w, pad, tape.y[row], a)
 
 
 @compiled
@@ -152,13 +151,10 @@ def push(
 @compiled
 def push_rates(s: Any, w: Any, z: Any, pad: int, a: float, m: int) -> None:
     """Tangents of the nodal forces, in w.X, and of the touched nodes' rates less z.v, z.own_rate,
-    from Newton's solution in w.X and z.V."""
-    first, n, column = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad]
+    from the solution in w.X and z.V."""
+    first, n = s.pad_node_start[pad], w.counts[pad]
     X = w.X[2 * first : 2 * (first + n)]
-    for number in range(column.size):
-        if column[number] >= 0:
-            for i in range(2 * n):
-                add(X[i, m + column[number]], z.V[number], X[i, :m])
+    contacts.load_nodes(s, w, pad, m, z.V)
     z.own_rate[:n] = 0.0
     if s.pad_kind[pad] == CONDENSED:
         condensed.push_rates(s, w, z, pad, a, X)
@@ -179,27 +175,28 @@ def push_state(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, 
 
 @compiled
 def pull_forces(
-    s: Any, w: Any, z: Any, pad: int, y_bar: Array, a: float, X: Array, V_bar: Array, felt: bool
+    s: Any, w: Any, z: Any, pad: int, y_bar: Array, a: float, V_bar: Array, felt: bool
 ) -> None:
-    """Cotangents of the touched nodes' forces into X[:, 0], from those of the pad's state and of
-    the law's outputs at the touching points, z.out; those of the velocities are added to V_bar."""
-    at, b = s.pad_point_start[pad], z.surface[0, : 2 * w.counts[pad]]
+    """Cotangents of the touched nodes' forces into the first column of w.X, from those of the pad's
+    state and of the law's outputs at the touching points, z.out; those of the velocities are added
+    to V_bar."""
+    at, b, by = s.pad_point_start[pad], z.surface[0, : 2 * w.counts[pad]], z.by
     b[:] = 0.0
-    for i in range(w.actives[pad]):
-        k = w.active[at + i]
+    for i in range(at, at + w.actives[pad]):
+        k = w.active[i]
         c = s.point_contact[k]
-        for r in range(outputs(s, c, felt)):
-            H, bar = w.H[at + i, r], z.out[k, r]
-            if bar == 0.0:
-                continue
-            for j in range(2):
-                if s.point_N[k, j] != 0.0:
-                    row = 2 * w.slot[s.point_node[k, j]]
-                    b[row] += s.point_N[k, j] * H[0] * bar
-                    b[row + 1] += s.point_N[k, j] * H[1] * bar
-            for row in range(6):
-                if s.contact_number[c, row] >= 0:
-                    V_bar[s.contact_number[c, row]] += H[2 + row] * bar
+        by[:] = 0.0
+        for r in range(contacts.outputs(s, c, felt)):
+            add(z.out[k, r], w.H[i, r], by)
+        for j in range(2):
+            if s.point_N[k, j] != 0.0:
+                row = 2 * w.slot[s.point_node[k, j]]
+                add(s.point_N[k, j], by, b[row : row + 2])
+        for row in range(6):
+            if s.contact_number[c, row] >= 0:
+                V_bar[s.contact_number[c, row]] += by[2 + row]
+    first = s.pad_node_start[pad]
+    X = w.X[2 * first : 2 * (first + w.counts[pad])]
     if s.pad_kind[pad] == CONDENSED:
         condensed.pull_forces(s, w, pad, y_bar, a, b, X)
     else:

@@ -111,6 +111,14 @@ def next_end(t: float, length: float, stops: Array) -> float:
 
 
 @compiled
+def guess(s: Any, w: Any, y: Array) -> None:
+    """Newton's first guess: the velocities of the state."""
+    w.V[:], w.u_dot[:], w.rate[:] = 0.0, 0.0, 0.0
+    for i in range(s.body_coordinate.size):
+        w.V[s.body_coordinate[i]] = y[s.body_V_start + i]
+
+
+@compiled
 def afresh(w: Any) -> None:
     """Forget which points are near and what is held, so that what is made again has the same
     bits."""
@@ -120,34 +128,35 @@ def afresh(w: Any) -> None:
 
 @compiled
 def run(r: Any) -> None:
-    """Take up to h.size steps of the rig's arrays `s`.
+    """Take up to h.size steps of the rig's arrays `s`, with `begin` after the output 0, that of y
+    itself, of step -1.
 
     starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages, and the
     steps and parts of the outputs. With `given` these prescribe the steps. Otherwise they receive
-    the steps taken, from the output `row` on, until the last of t_out; the tolerances choose: clock
-    holds the time, the next step's length and the last step's error, k the rates at y. No step
-    passes a time of `stops`, whose last is t_out's.
+    the steps taken, until the last of t_out; the tolerances choose: clock holds the time, the next
+    step's length and the last step's error, k the rates at y. No step passes a time of `stops`,
+    whose last is t_out's.
 
     `tape` has two rows a step, or none. y, `integrals` and the guesses in w are advanced in place;
-    after a failure they hold the last good step. With no steps the one output is that of y itself;
-    with lengths by tolerances the output 0 is, before any step.
+    after a failure they hold the last good step.
 
     counts receives steps and outputs done, status, linear solves, steps that were refused for their
     error and that Newton did not solve, and the part of the state whose error was largest in the
     last one.
     """
-    s, w, d, y, out, given = r.s, r.w, r.d, r.y, r.out, r.given != 0
+    s, w, d, y, out, given, begin = r.s, r.w, r.d, r.y, r.out, r.given != 0, r.begin != 0
     clock, counts, h, t_out = r.clock, r.counts, r.h, r.t_out
-    steps, row, solves, refused, failed, which = 0, r.row, 0, 0, 0, -1
-    status, begin = CONVERGED, h.size == 0 or (not given and row == 0)
+    steps, row, solves, refused, failed, which, status = 0, 0, 0, 0, 0, -1, CONVERGED
+    afresh(w)
     while (steps < h.size and (given or row < t_out.size)) or begin:
         t, length, end, error, last = clock[0], min(clock[1], r.longest), 0.0, 0.0, row
-        if begin:  # the output at the start, where nothing has moved
-            d.K[:], d.powers[:], now, last = 0.0, 0.0, 0.0, row + 1
-            afresh(w)
+        if begin:  # nothing has moved
+            d.K[:], d.powers[:], now, last = 0.0, 0.0, 0.0, 1
+            guess(s, w, y)
             put(y, d.y)
             put(r.integrals, d.integrals)
             put(w.travelled, d.travelled)
+            out.step[0], out.part[0] = -1, 0.0
             if not given:
                 follow(r.f, t_out[0], t_out[0], out.signals)
         else:
@@ -181,10 +190,8 @@ def run(r: Any) -> None:
         if begin and status != CONVERGED:
             break
         if begin:
-            put(w.k, d.K[0])
-            if not given:
-                put(w.k, r.k)
-                afresh(w)
+            put(w.k, r.k)
+            afresh(w)
             begin, row, solves = False, last, 0
         elif status == CONVERGED:
             if not given:
@@ -210,7 +217,7 @@ def run(r: Any) -> None:
             else:
                 break
             status = CONVERGED
-    counts[0], counts[1], counts[2] = steps, row - r.row, status
+    counts[0], counts[1], counts[2] = steps, row, status
     counts[3], counts[4], counts[5], counts[6] = solves, refused, failed, which
 
 

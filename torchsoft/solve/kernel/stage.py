@@ -73,7 +73,7 @@ def solve_stage(
     drive(s, w, y, signals, a)
     for pad in range(count):
         pads.begin(s, w, pad, y, a)
-    if w.travelled[0] > w.travelled[1]:
+    if not w.travelled[0] <= w.travelled[1]:  # also where they are no numbers yet
         scan(s, w, y, margin)
     for pad in range(count):
         pads.displace(s, w, pad, y, w.low[pad], w.high[pad])
@@ -107,18 +107,10 @@ def solve_stage(
         for pad in range(count):
             contacts.linearise(s, w, pad, a, False)
             contacts.touched_nodes(s, w, pad)
-            pads.relation(s, w, pad, y, a)
-            contacts.assemble(s, w, pad, a, Rv)
+            pads.assemble(s, w, pad, y, a, Rv)
             contacts.residual(s, w, pad, r)
-            pads.couple(s, w, pad, Rv)
             pads.react(s, w, pad, y, a, r)
-            first, n, columns = s.pad_node_start[pad], w.counts[pad], s.pad_columns[pad]
-            X = w.X[2 * first : 2 * (first + n)]
-            for i in range(2 * n):
-                for j in range(columns):
-                    X[i, 1 + j] = w.Hc[i, j]
-            solve_dense(w.A, X, 2 * n, 1 + columns)
-            contacts.eliminate(s, w, pad, 1, X, r, Rv)
+            contacts.eliminate(s, w, pad, 1, r, Rv)
         for i in range(free):
             b[i, 0] = -r[i, 0]
         solve_dense(Rv, b, free, 1)

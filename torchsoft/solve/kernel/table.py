@@ -93,15 +93,6 @@ def _packed(self: Any) -> Any:
     return array("q", words)
 
 
-def change(one: Any, **numbers: float) -> None:
-    """Give some numbers of a table other values for its next calls."""
-    for field in layout(type(one)):
-        if field.name in numbers:
-            value = numbers[field.name]
-            word = struct.unpack("q", struct.pack("d", value))[0] if field.kind is float else value
-            one.packed[field.word] = int(word)
-
-
 def address(one: Any) -> int:
     """Address of the words of a table, valid while the table lives."""
     return one.packed.buffer_info()[0]

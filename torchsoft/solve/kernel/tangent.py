@@ -64,29 +64,60 @@ def push_bodies(
 
 
 @compiled
-def push_point(s: Any, w: Any, z: Any, i: int, k: int, dy: Array, dp: Array, felt: bool) -> None:
-    """Tangents of the outputs of the law at point k, number i of those that touch, before the
-    change of forces and velocities, into z.e[k]."""
-    c, e, moved, v = s.point_contact[k], z.e[k], z.moved, z.at_point
-    own, rows = bounds(s.contact_p_start, c), contacts.outputs(s, c, felt)
-    law_derivatives(z, s.contact_pullback[c], w.x[k], s.p[own], dp[own], rows, e)
-    moved[:], v[:] = 0.0, 0.0
+def gather(s: Any, w: Any, k: int, nodal: Array, slots: bool, bodies: Array, out: Array) -> None:
+    """A quantity of nodes (., 2, m), by their slots or themselves, and of bodies (free, m) as that
+    of point k (8, m)."""
+    out[:] = 0.0
     for j in range(2):
         node, N = s.point_node[k, j], s.point_N[k, j]
         for o in range(2 if N != 0.0 else 0):
-            add(N, z.u[node, o], moved[o])
-            add(N, z.v[node, o], v[o])
+            add(N, nodal[w.slot[node] if slots else node, o], out[o])
     for o in range(6):
-        number = s.contact_number[c, o]
+        number = s.contact_number[s.point_contact[k], o]
         if number >= 0:
-            put(dy[s.body_q_start + number], moved[2 + o])
-    for o in range(rows):
-        for j in range(s.contact_states[c]):
-            add(contacts.by_state(s, w, k, o, j), dy[contacts.state_at(s, k, j)], e[o])
-        for j in range(8):
-            add(w.S[i, o, j], moved[j], e[o])
+            put(bodies[number], out[2 + o])
+
+
+@compiled
+def transform(J: Array, columns: int, x: Array, out: Array) -> None:
+    """Add J x to out (rows, m), of the first columns of J (., 8)."""
+    for o in range(out.shape[0]):
+        for j in range(columns):
+            add(J[o, j], x[j], out[o])
+
+
+@compiled
+def push_points(
+    s: Any, w: Any, z: Any, pad: int, dy: Array, dp: Array, r: Array, felt: bool
+) -> None:
+    """Tangents of the outputs of the law at the touching points of a pad, before the change of
+    forces and velocities, into z.e; those of the nodes' forces into w.X, of loads into r."""
+    at, q, m = s.pad_point_start[pad], s.body_q_start, dy.shape[1]
+    dq, X = dy[q : q + r.shape[0]], w.X[2 * s.pad_node_start[pad] :]
+    X[: 2 * w.counts[pad], :m] = 0.0
+    for c in range(s.contact_pad.size):
+        if s.contact_pad[c] == pad:
+            push_positions(s, w, z, c, dy, felt)
+    for i in range(at, at + w.actives[pad]):
+        k = w.active[i]
+        c = s.point_contact[k]
+        own, e = bounds(s.contact_p_start, c), z.e[k, : contacts.outputs(s, c, felt)]
+        law_derivatives(z, s.contact_pullback[c], w.x[k], s.p[own], dp[own], e.shape[0], e)
+        gather(s, w, k, z.u, False, dq, z.moved)
+        transform(w.S[i], 8, z.moved, e)
+        gather(s, w, k, z.v, False, dq, z.moved)
+        transform(w.H[i], 2, z.moved, e)
+        for o in range(e.shape[0]):
+            for j in range(s.contact_states[c]):
+                add(contacts.by_state(s, w, k, o, j), dy[contacts.state_at(s, k, j)], e[o])
         for j in range(2):
-            add(w.H[i, o, j], v[j], e[o])
+            N, slot = s.point_N[k, j], 2 * w.slot[s.point_node[k, j]]
+            for o in range(2 if N != 0.0 else 0):
+                add(N, e[o], X[slot + o, :m])
+        for o in range(6):
+            number = s.contact_number[c, o]
+            for j in range(WRENCH if number >= 0 else 0):
+                add(w.by_pair[c, 6 + o, 12 + j], e[j], r[number])
 
 
 @compiled
@@ -108,49 +139,21 @@ def stage_tangent(
 ) -> None:  # fmt: skip
     """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place, or if `felt`
     leave it and put those of its forces into z.recorded; dp (parameters, m)."""
-    free, y, m = s.body_coordinate.size, tape.y[row], dy.shape[1]
-    contacts.restore(s, w, tape, row, a, felt)
-    put(tape.rate[row], w.rate)
-    for pad in range(s.pad_base.size):
-        pads.relinearise(s, w, pad, tape.y[row], a)
+    y, m, Rv, r, dV = tape.y[row], dy.shape[1], w.Rv, z.r, z.V
+    pads.restore(s, w, tape, row, a, felt)
     if felt:
         z.recorded[:] = 0.0
-    Rv, r = w.Rv, z.r
     balance(s, w, y, signals, a, w.r, Rv)
     push_bodies(s, w, z, y, a, signals, dy, dp)
     for pad in range(s.pad_base.size):
-        pads.relation(s, w, pad, y, a)
-        contacts.assemble(s, w, pad, a, Rv)
-        pads.couple(s, w, pad, Rv)
+        pads.assemble(s, w, pad, y, a, Rv)
         pads.push(s, w, z, pad, y, dy, dp, a, r)
-        first, n, columns = s.pad_node_start[pad], w.counts[pad], s.pad_columns[pad]
-        at, X = s.pad_point_start[pad], w.X[2 * first : 2 * (first + n)]
-        X[:, :m] = 0.0
-        for c in range(s.contact_pad.size):
-            if s.contact_pad[c] == pad:
-                push_positions(s, w, z, c, dy, felt)
-        for i in range(at, at + w.actives[pad]):
-            k = w.active[i]
-            c, e = s.point_contact[k], z.e[k]
-            push_point(s, w, z, i, k, dy, dp, felt)
-            for j in range(2):
-                N, slot = s.point_N[k, j], 2 * w.slot[s.point_node[k, j]]
-                for o in range(2 if N != 0.0 else 0):
-                    add(N, e[o], X[slot + o, :m])
-            for o in range(6):
-                number = s.contact_number[c, o]
-                for j in range(WRENCH if number >= 0 else 0):
-                    add(w.by_pair[c, 6 + o, 12 + j], e[j], r[number])
-        for i in range(2 * n):
-            for j in range(columns):
-                X[i, m + j] = w.Hc[i, j]
-        solve_dense(w.A, X, 2 * n, m + columns)
-        contacts.eliminate(s, w, pad, m, X, r, Rv)
-    dV = z.V
+        push_points(s, w, z, pad, dy, dp, r, felt)
+        contacts.eliminate(s, w, pad, m, r, Rv)
     dV[:] = 0.0
-    for i in range(free):
+    for i in range(dV.shape[0]):
         add(-1.0, r[i], dV[i])
-    solve_dense(Rv, dV, free, m)
+    solve_dense(Rv, dV, dV.shape[0], m)
 
     for pad in range(s.pad_base.size):
         pads.push_rates(s, w, z, pad, a, m)
@@ -159,7 +162,7 @@ def stage_tangent(
         else:
             push_states(s, w, z, pad, y, a, dy, dp)
             pads.push_state(s, w, z, pad, y, a, dy, dp)
-    for i in range(0 if felt else free):
+    for i in range(0 if felt else dV.shape[0]):
         add(a, dV[i], dy[s.body_q_start + i])
         put(dV[i], dy[s.body_V_start + i])
 
@@ -182,29 +185,16 @@ def push_positions(s: Any, w: Any, z: Any, c: int, dy: Array, felt: bool) -> Non
 
 
 @compiled
-def add_output(s: Any, w: Any, z: Any, k: int, H: Array, factor: float, out: Array) -> None:
-    """Add to `out` (m,) the effect of the nodal rates and the velocities on an output of the law at
-    point k, whose derivatives by them are H (8,)."""
-    for j in range(2):
-        N, slot = s.point_N[k, j], w.slot[s.point_node[k, j]]
-        for o in range(2 if N != 0.0 else 0):
-            add(factor * N * H[o], z.own_rate[slot, o], out)
-    for o in range(6):
-        number = s.contact_number[s.point_contact[k], o]
-        if number >= 0:
-            add(factor * H[2 + o], z.V[number], out)
-
-
-@compiled
 def feel(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array) -> None:
     """Tangents of a pad's forces into z.recorded, whose loads hold the part at the same forces."""
     at, wrench = s.pad_point_start[pad], 2 * s.point_contact.size + 3 * pad
     into = z.recorded
     for i in range(at, at + w.actives[pad]):
         k = w.active[i]
-        e, c = z.e[k], s.point_contact[k]
-        for o in range(contacts.outputs(s, c, True)):
-            add_output(s, w, z, k, w.H[i, o], 1.0, e[o])
+        c = s.point_contact[k]
+        e = z.e[k, : contacts.outputs(s, c, True)]
+        gather(s, w, k, z.own_rate, True, z.V, z.moved)
+        transform(w.H[i], 8, z.moved, e)
         forces = WRENCH + s.contact_states[c]
         put(e[forces], into[2 * k])
         put(e[forces + 1], into[2 * k + 1])
@@ -224,10 +214,11 @@ def push_states(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
     at, i = s.pad_point_start[pad], s.pad_point_start[pad]
     for k in range(at, s.pad_point_start[pad + 1]):
         if i < at + w.actives[pad] and w.active[i] == k:
-            for o in range(s.contact_states[s.point_contact[k]]):
-                own = dy[contacts.state_at(s, k, o)]
-                add(a, z.e[k, WRENCH + o], own)
-                add_output(s, w, z, k, w.H[i, WRENCH + o], a, own)
+            e = z.e[k, WRENCH : WRENCH + s.contact_states[s.point_contact[k]]]
+            gather(s, w, k, z.own_rate, True, z.V, z.moved)
+            transform(w.H[i, WRENCH:], 8, z.moved, e)
+            for o in range(e.shape[0]):
+                add(a, e[o], dy[contacts.state_at(s, k, o)])
             i += 1
             continue
         some = not contacts.rests(s, k, y)
@@ -272,32 +263,33 @@ def read(r: Any, i: int) -> None:
 def forward(r: Any) -> None:
     """Carry the tangent dy (size, m) through the steps h of a tape, in place; dys (outputs, size,
     m) receives it at the parts out_part of the steps out_step, dsums (outputs, sums, m)
-    those of the sums of forces, `Sums`. Without steps the one output is the start."""
+    those of the sums of forces, `Sums`. The start is an output of step -1."""
     s, w, z, tape, h, signals = r.s, r.w, r.z, r.tape, r.h, r.signals
-    out_step, out_part, dy, dp, dys = r.out_step, r.out_part, r.dy, r.dp, r.dys
-    m, row, before, first = dy.shape[1], 0, z.before, z.first
-    if h.size == 0:
+    out_step, dy, dp, dys, row = r.out_step, r.dy, r.dp, r.dys, 0
+    if out_step.size > 0 and out_step[0] < 0:  # the start
         put(dy, dys[0])
-        if r.out_tape.count.shape[0] > 0:
+        if r.out_tape.y.shape[0] > 0:
             pads.find_spans(s, r.out_tape.y[0], dy, z.span)
         read(r, 0)
+        row = 1
     for step in range(h.size):
         a = GAMMA * h[step]
         if step % RESCAN == 0:
             pads.find_spans(s, tape.y[2 * step], dy, z.span)
-        put(dy, before)
+        put(dy, z.before)
         stage_tangent(s, w, z, tape, 2 * step, a, signals[2 * step], dy, dp, False)
-        put(dy, first)
-        for i in range(dy.shape[0]):
-            for k in range(m):
-                dy[i, k] = before[i, k] + MIX * (dy[i, k] - before[i, k])
+        put(dy, z.first)
+        mix(1.0 - MIX, z.before, MIX, z.first, 0.0, dy, dy)
         stage_tangent(s, w, z, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp, False)
         while row < out_step.size and out_step[row] == step:
-            at_start, at_first, at_end = dense_states(out_part[row])
-            for i in range(dy.shape[0]):
-                for k in range(m):
-                    dys[row, i, k] = (
-                        at_start * before[i, k] + at_first * first[i, k] + at_end * dy[i, k]
-                    )
+            at_start, at_first, at_end = dense_states(r.out_part[row])
+            mix(at_start, z.before, at_first, z.first, at_end, dy, dys[row])
             read(r, row)
             row += 1
+
+
+@compiled
+def mix(a: float, x: Array, b: float, y: Array, c: float, z: Array, out: Array) -> None:
+    """a x + b y + c z into an array of their shape."""
+    for i in range(out.size):
+        out.flat[i] = a * x.flat[i] + b * y.flat[i] + c * z.flat[i]
