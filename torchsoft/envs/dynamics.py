@@ -195,13 +195,14 @@ class Dynamics:
         begin = self.start + now.steps * self.interval
         end = self.start + (now.steps + 1) * self.interval
         t = torch.linspace(begin, end, self.samples + 1, dtype=torch.float64)
-        before, after = (self._low + self._half * (1 + a) for a in (now.action, action))
-        both = torch.stack((before, after), -1)
+        both = torch.stack((now.action, action))
+        both = (self._low + self._half * (1 + both)).mT
         outcome = self._run(t, now.y, torch.cat((both, self._disturbed(now))), knots)
         rows = attached([outcome.solved])[0]
         moment = now._replace(
             y=rows.y[-1], action=action, steps=now.steps + 1, recorded=rows.recorded[-1]
         )
+        distance = self.distance(moment)
         if self.reward is not None:
             given = self.reward(outcome.trajectory(rows), action)
             value = torch.as_tensor(given, dtype=torch.float64)
@@ -209,9 +210,11 @@ class Dynamics:
                 raise ValueError(f"`reward` must give one finite number, but gives {given!r}")
         else:
             assert self.goal is not None
-            value = 1 / (1 + self.distance(moment).square().sum())
-            value = value - self.goal.changes * (action - now.action).square().sum()
-        return Transition(moment, self._seen(moment, outcome.solved.stepper), value, outcome)
+            change = action - now.action
+            value = (1 + distance.dot(distance)).reciprocal()
+            value = value - self.goal.changes * change.dot(change)
+        seen = self._seen(moment, distance, outcome.solved.stepper)
+        return Transition(moment, seen, value, outcome)
 
     def look(self, now: Moment) -> Trajectory:
         """A short run from a moment, whose first sample is that moment."""
@@ -227,9 +230,9 @@ class Dynamics:
 
     def observe(self, now: Moment) -> Tensor:
         """The observation (n,) at a moment to which the rig's own motion led."""
-        return self._seen(now, None)
+        return self._seen(now, self.distance(now), None)
 
-    def _seen(self, now: Moment, stepper: ImplicitStepper | None) -> Tensor:
+    def _seen(self, now: Moment, distance: Tensor, stepper: ImplicitStepper | None) -> Tensor:
         """The observation at a moment to which the motion of a stepper led, or the rig's own."""
         y, rig = now.y, self.rig
         parts = [y[self._state], self._sums @ now.recorded[: self._sums.shape[1]]]
@@ -242,7 +245,7 @@ class Dynamics:
                 x = self._touch[name].value(now.recorded[None])[0] if touch else named[name]
                 parts.append(x[None])
         seen = (torch.cat(parts)[self._order] - self._origin) / self._span - 1
-        return torch.cat((seen, self.distance(now), now.action))
+        return torch.cat((seen, distance, now.action))
 
     def check_action(self, action: Tensor) -> None:
         """Raises `ValueError` for an action of another shape, not finite, or out of [-1, 1]."""

@@ -7,6 +7,7 @@ annotations of the tuple are the only declaration; the builder reads the same on
 
 import struct
 from array import array
+from ctypes import addressof, c_char
 from functools import cache, cached_property
 from typing import (
     Annotated,
@@ -85,12 +86,20 @@ def _packed(self: Any) -> Any:
                     f"`{name}` of {type(self).__name__} must be a C-contiguous array of {kind} "
                     f"with {ndim} dimensions, not of {value.dtype} with {value.ndim}"
                 )
-            words += (value.__array_interface__["data"][0], *value.shape)
+            words += (place(value), *value.shape)
         elif kind is float:
             words.append(struct.unpack("q", struct.pack("d", value))[0])
         else:
             words.append(int(value) if kind is int else address(value))
     return array("q", words)
+
+
+def place(numbers: Any) -> int:
+    """Address of an array's numbers, in a tenth of the time of numpy's attributes where they may be
+    written to; 0 where there are none."""
+    if numbers.size and numbers.flags.writeable:
+        return addressof(c_char.from_buffer(numbers))
+    return numbers.__array_interface__["data"][0] if numbers.size else 0
 
 
 def address(one: Any) -> int:
