@@ -24,6 +24,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import llvmlite.binding as llvm
+from platformdirs import user_cache_path
 from tqdm import tqdm
 
 from torchsoft.files import replacing
@@ -95,9 +96,7 @@ def folders(name: str) -> list[Path]:
         return [Path(chosen) / name]
     out = [HERE / "objects" / name]
     with suppress(RuntimeError):  # a user without a home
-        out.append(
-            Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchsoft" / name
-        )
+        out.append(user_cache_path("torchsoft") / name)
     return out
 
 
