@@ -73,7 +73,7 @@ def first_touch(e: Estimate, body: str) -> tuple[str, float, float] | None:
     moves, found = np.array([table.start.v_x, table.start.v_y]), list[tuple[float, float, str]]()
     for key, gap in gaps.items():
         surface = scene.surface(key)
-        v, g = -(moves @ surface.normal), -(pulled @ surface.normal)
+        v, g = (-float(one @ surface.normal) for one in (moves, pulled))
         under = v**2 + 2 * g * gap
         if under <= 0 or under**0.5 + v <= 0:  # it stops before, or goes away
             continue
