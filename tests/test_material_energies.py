@@ -119,6 +119,39 @@ def test_the_command_writes_a_material_that_rig_files_take(tmp_path, capsys):
     assert (out / "fit.png").stat().st_size > 1000
 
 
+def relaxation(path):
+    """A relaxation test of a rubber with two terms, a third and a sixth of its relaxed modulus."""
+    t = np.geomspace(1e-3, 100, 200)
+    modulus = 5e5 * (1 + np.exp(-t / 0.1) / 3 + np.exp(-t / 4.0) / 6)
+    rows = "\n".join(f"{a!r},{b!r}" for a, b in zip(t.tolist(), (1e-6 * modulus).tolist()))
+    path.write_text(f"t [s],modulus [MPa]\n{rows}\n")
+    return path
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_a_relaxation_test_beside_pulls_gives_branches(fast, tmp_path, capsys):
+    """Relative to the relaxed energy, which pulls that were fast tell 1.5 times too high."""
+    pull = table(tmp_path / "tension.csv", "tension", TRUE["neo_hookean"])
+    out, over_time = tmp_path / "out", relaxation(tmp_path / "relaxation.csv")
+    ask = ["material", "fit", str(pull), "--test", "tension", "--energy", "neo_hookean"]
+    ask += ["--relaxation", str(over_time), "--nu", "0.49", "--out", str(out)]
+    assert main([*ask, *["--fast"] * fast]) == 0
+    assert f"count as {'fast' if fast else 'slow'}" in capsys.readouterr().out
+    file = RigFile.ready("paper").override(
+        {"materials.rubber": {"kind": "file", "file": str(out / "material.toml")}}
+    )
+    made = file.assemble().pads["L"].material
+    assert isinstance(made, NeoHookean)
+    E = 6e5 / (1.5 if fast else 1.0)
+    assert made.E.item() == pytest.approx(E, rel=1e-6)
+    found = sorted([x.item() for x in pair] for pair in made.relaxation())
+    assert np.array(found) == pytest.approx(np.array([[1 / 6, 4.0], [1 / 3, 0.1]]), rel=1e-3)
+    assert made.tau.item() < 0.01
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["relaxation"]["file"] == "relaxation.csv"
+    assert {"E", "E_1", "tau_2"} <= summary["coefficients"].keys()
+
+
 def test_refusals_of_the_command(tmp_path, capsys):
     one = str(table(tmp_path / "tension.csv", "tension", TRUE["yeoh"]))
     out = ["--out", str(tmp_path / "out")]
@@ -126,6 +159,8 @@ def test_refusals_of_the_command(tmp_path, capsys):
         (["--test", "tension", "--also", "shear=x.csv", "--range", "0", "1"], "--also is of"),
         (["--test", "tension", "--energy", "yeoh", "--also", "x.csv"], "must be TEST=FILE"),
         (["--test", "planar", "--range", "0", "1"], "say --energy neo_hookean"),
+        (["--test", "tension", "--energy", "yeoh", "--fast"], "say which, --relaxation FILE"),
+        (["--test", "tension", "--relaxation", "x.csv", "--range", "0", "1"], "is of energies"),
     ):
         assert main(["material", "fit", one, *more, *out]) != 0
         assert said in capsys.readouterr().err

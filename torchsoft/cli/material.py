@@ -21,7 +21,8 @@ nominal and along the one direction of the test; or `t` with `modulus` or `compl
 strain or a stress put on at t = 0 and held; a frequency sweep `frequency` with `storage_modulus`
 and `loss_modulus`, or `storage_shear_modulus` and `loss_shear_modulus`, or `tan_delta` as the
 second; a pull without `t`, of which --range says the strains that its modulus is of, or --energy
-the strain energy that it is to have, with --also for further tables. Or a deck,
+the strain energy that it is to have, with --also for further tables and --relaxation for its
+branches. Or a deck,
 FILE.inp, with *VISCOELASTIC, TIME=PRONY. The whole history counts: ramps need not be cut off.
 
 A relaxation test and a sweep give a relaxation series (prony), a creep test a generalised Kelvin
@@ -57,6 +58,14 @@ def add_commands(commands: Any) -> None:
         "--also", action="append", default=[], metavar="TEST=FILE",
         help="a further table of the same columns for the energy, as shear=FILE.csv; again for "
         "others",
+    )  # fmt: skip
+    one.add_argument(
+        "--relaxation", metavar="FILE",
+        help="a relaxation test whose series are the branches of the energy",
+    )  # fmt: skip
+    one.add_argument(
+        "--fast", action="store_true",
+        help="the tables of the energy were fast against that series, and not slow",
     )  # fmt: skip
     one.add_argument(
         "--true", action="store_true",
@@ -140,8 +149,8 @@ TIMELESS = ("kelvin_voigt", *ENERGIES)
 """Kinds of materials whose tests tell no time."""
 
 OPTIONS = (
-    "test", "energy", "also", "true", "terms", *SIZES, "range", "column", "ignore", "unit", "name",
-    *ASSUMED,
+    "test", "energy", "also", "relaxation", "fast", "true", "terms", *SIZES, "range", "column",
+    "ignore", "unit", "name", *ASSUMED,
 )  # fmt: skip
 """Options that say how a file is read."""
 
@@ -151,7 +160,7 @@ def deck(options: argparse.Namespace) -> "Deck":
     from torchsoft.materials.deck import read_deck
     from torchsoft.materials.measured import PRESSURE
 
-    for name in ("test", "energy", "also", "true", "terms", *SIZES, "range", "column", "ignore"):
+    for name in (one for one in OPTIONS if one not in ("unit", "name", *ASSUMED)):
         if getattr(options, name):
             raise ValueError(f"{options.file}: a deck needs no --{name}")
     if options.unit is None:
@@ -182,8 +191,9 @@ def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus | EnergyFit
     test = read(options.file, test=options.test, **given)
     if options.energy is not None:
         return energy(options, test, given)
-    if options.also:
-        raise ValueError("--also is of energies: say which, --energy yeoh")
+    for name in ("also", "relaxation", "fast"):
+        if getattr(options, name):
+            raise ValueError(f"--{name} is of energies: say which, --energy yeoh")
     if not isinstance(test, Pull):
         return fit(test, terms=options.terms)
     if options.terms is not None:
@@ -194,7 +204,8 @@ def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus | EnergyFit
 def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "EnergyFit":
     """The strain energy of a table and of those of --also. Raises `ValueError`."""
     from torchsoft.materials.energies import fit_energy
-    from torchsoft.materials.measured import Pull, read
+    from torchsoft.materials.fit import fit
+    from torchsoft.materials.measured import Measured, Pull, read
 
     if not isinstance(test, Pull):
         raise ValueError(
@@ -207,7 +218,15 @@ def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "En
         other = read(file, test=name, **given)
         assert isinstance(other, Pull)
         pulls.append(other)
-    return fit_energy(pulls, options.energy, nu=given["nu"], terms=options.terms)
+    found = fit_energy(pulls, options.energy, nu=given["nu"], terms=options.terms)
+    if options.relaxation is None:
+        if options.fast:
+            raise ValueError("--fast is against a relaxation test: say which, --relaxation FILE")
+        return found
+    given |= {"whole": False, "true": False}
+    over_time = read(options.relaxation, test="relaxation", **given)
+    assert isinstance(over_time, Measured)
+    return found.relaxing(fit(over_time), options.fast)
 
 
 def list_presets(options: argparse.Namespace) -> int:

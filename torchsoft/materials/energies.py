@@ -3,7 +3,7 @@ dW / d(stretch) of the incompressible material, in every table at once.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,8 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torchsoft.materials.fit import UNSURE
-from torchsoft.materials.measured import Array, Pull
+from torchsoft.materials.fit import UNSURE, Fit
+from torchsoft.materials.measured import Array, Pull, instant_time
 from torchsoft.physics.hyperelastic import KINDS, Hyperelastic
 
 NAMES: Mapping[str, tuple[str, ...]] = {
@@ -34,7 +34,8 @@ do not go further."""
 @dataclass(frozen=True)
 class EnergyFit:
     """An energy fitted to `pulls`, one or more tables: `values` of its coefficients with their
-    standard deviations `sd`; the `fitted` nominal stress, table by table."""
+    standard deviations `sd`, those of branches behind them; the `fitted` nominal stress, table by
+    table; the `relaxation` test's series that the branches are of, if any."""
 
     pulls: tuple[Pull, ...]
     kind: str
@@ -42,6 +43,7 @@ class EnergyFit:
     sd: Mapping[str, float]
     fitted: tuple[Array, ...]
     notices: tuple[str, ...]
+    relaxation: Fit | None = None
 
     @property
     def measured(self) -> Pull:
@@ -55,12 +57,45 @@ class EnergyFit:
         return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
     def table(self) -> dict[str, Any]:
-        """The arguments of the material's constructor that the tests tell."""
-        return arguments(self.kind, list(self.values.values()))
+        """The arguments of the material's constructor that the tests tell, and with branches a tau
+        that is small beside their times."""
+        values, count = list(self.values.values()), self.relaxation.terms if self.relaxation else 0
+        own = arguments(self.kind, values[: len(values) - 2 * count])
+        if not count:
+            return own
+        moduli, times = values[-2 * count : -count], values[-count:]
+        return own | {"moduli": moduli, "times": times, "tau": instant_time(times)}
 
-    def material(self, *, nu: float, rho: float, depth: float, tau: float) -> Hyperelastic:
-        """The material, with stated values where these tests have no information."""
-        return made(self.kind, self.table(), nu=nu, rho=rho, depth=depth, tau=tau)
+    def relaxing(self, series: Fit, fast: bool) -> "EnergyFit":
+        """The energy with the branches of a relaxation test: strengths over its relaxed modulus,
+        and times. Pulls that were `fast` against them tell the energy at first, which is that of
+        the relaxed material times 1 + the sum of these strengths, others the relaxed one."""
+        count, E = series.terms, series.values["E"]
+        shares = {f"E_{k}": series.values[f"E_{k}"] / E for k in range(1, count + 1)}
+        part = 1 / (1 + sum(shares.values())) if fast else 1.0
+        scaled = lambda of: {k: x if k.startswith("alpha") else part * x for k, x in of.items()}
+        values, sd = scaled(self.values), scaled(self.sd)
+        table = arguments(self.kind, list(values.values()))
+        relaxed = made(self.kind, table, nu=0.45, rho=1e3, tau=1.0, depth=1.0).E.item()
+        times = [f"tau_{k}" for k in range(1, count + 1)]
+        values |= {name: relaxed * share for name, share in shares.items()}
+        sd |= {name: relaxed * series.sd[name] / E for name in shares}
+        values |= {name: series.values[name] for name in times}
+        sd |= {name: series.sd[name] for name in times}
+        said = (
+            f"fast against the times of {series.measured.path.name}, so that they tell 1 + the sum "
+            "of its strengths over its relaxed modulus times the relaxed energy, which is written"
+            if fast
+            else f"slow against the times of {series.measured.path.name}, so that they tell the "
+            "relaxed energy"
+        )
+        own = (*self.notices[:-1], f"the pulls count as {said}", *series.notices)
+        return replace(self, values=values, sd=sd, notices=own, relaxation=series)
+
+    def material(self, **others: float) -> Hyperelastic:
+        """The material, with stated values of nu, rho, depth, and without branches tau, of which
+        these tests have no information."""
+        return made(self.kind, self.table(), **others)
 
 
 def arguments(kind: str, values: Sequence[float]) -> dict[str, Any]:

@@ -34,6 +34,7 @@ UNITS = {
     "mu": "Pa",
     "alpha": "1",
     "tau": "s",
+    "times": "s",
     "tau_instant": "s",
     "nu": "1",
     "rho": "kg/m3",
@@ -74,8 +75,10 @@ def toml(found: Found, assumed: Mapping[str, float]) -> str:
     path, test = source(found)
     key = path.stem if re.fullmatch(r"[A-Za-z0-9_-]+", path.stem) else json.dumps(path.stem)
     rows = [f"[materials.{key}]", f'kind = "{found.kind}"']
-    for argument, value in found.table().items():
+    table = found.table()
+    for argument, value in table.items():
         note = ", small: the instantaneous spring's" if argument == "tau_instant" else ""
+        note = ", small beside the times" if argument == "tau" and "times" in table else note
         rows.append(toml_row(argument, value, f"[{UNITS[argument]}]{note}"))
     rows += [
         toml_row(name, value, f"[{UNITS[name]}] not of this {test}: assumed")
@@ -117,7 +120,12 @@ def method(found: Found) -> dict[str, object]:
             "residual_rms": found.rms, "residual_of": "of the largest",
         }  # fmt: skip
     if isinstance(found, EnergyFit):
-        return {
+        series, over_time = found.relaxation, dict[str, object]()
+        if series is not None:
+            path = series.measured.path
+            file = {"file": path.name, "sha256": sha256(path.read_bytes()).hexdigest()}
+            over_time["relaxation"] = file | method(series)
+        return over_time | {
             "method": "least squares of the nominal stress of an incompressible specimen",
             "tables": [
                 {"file": p.path.name, "test": p.test, "rows": len(p.strain),
