@@ -593,3 +593,38 @@ def test_a_run_that_ends_where_it_begins_has_its_summary(folder, tmp_path):
     numbers = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert numbers["simulated_s"] == 0.0
     assert "`disc` was lost: it left the space over the pad `upper`" in numbers["stopped"]
+
+
+# A friction law of a Python file
+
+LAW = """import torch
+
+def coulomb(E, F_N, R):
+    return torch.clamp(E - 0.5 * F_N, min=0.0) / R
+"""
+
+
+def of_a_file(folder: Path, law: str = "coulomb") -> RigFile:
+    (folder / "law.py").write_text(LAW)
+    tree = RigFile.ready("drop").model_dump(mode="json", exclude_unset=True)
+    tree["laws"]["dry"]["friction"] = {"kind": "python", "file": "law.py", "law": law}
+    return RigFile.from_tree(tree, folder)
+
+
+def test_a_law_of_a_python_file_is_run_where_the_user_says_so(tmp_path, monkeypatch):
+    """It gives what the same law given in Python does; without a word of the user it is not run."""
+    file = of_a_file(tmp_path)
+    monkeypatch.delenv("TORCHSOFT_RUN_CODE", raising=False)
+    with pytest.raises(ValueError, match=r"laws.dry.friction.file: .*TORCHSOFT_RUN_CODE=1"):
+        file.build()
+    monkeypatch.setenv("TORCHSOFT_RUN_CODE", "1")
+    found = file.override({"outputs.duration": 0.1, "outputs.snapshots": []}).build().run(rtol=1e-3)
+    given = RigFile.ready("drop").override({"outputs.duration": 0.1, "outputs.snapshots": []})
+    expected = given.build({"laws.dry.friction": file.build().rig.contacts["ground"].law.friction})
+    assert torch.equal(found["theta_ellipse"], expected.run(rtol=1e-3)["theta_ellipse"])
+    for law, name in (("none", "no function"), ("torch", "no function")):
+        with pytest.raises(ValueError, match=f"laws.dry.friction.law: .*{name}"):
+            of_a_file(tmp_path, law).build()
+    (tmp_path / "law.py").unlink()
+    with pytest.raises(ValueError, match="is not a Python file"):
+        file.build()

@@ -122,10 +122,12 @@ class PartTable(Group):
 
     def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
         """Arguments of the constructor by name; `folder` is the base of relative file names."""
-        given = ((name, getattr(self, name)) for name in signature(self.part).parameters)
-        return tuple(
-            (name, one.build(folder) if isinstance(one, PartTable) else one) for name, one in given
-        )
+        given = {name: getattr(self, name) for name in signature(self.part).parameters}
+        for name, one in given.items():
+            if isinstance(one, PartTable):
+                with at_field(name):
+                    given[name] = one.build(folder)
+        return tuple(given.items())
 
     def build(self, folder: Path) -> Any:
         """The part, with valid parameters. Raises `ValueError`."""
@@ -133,7 +135,8 @@ class PartTable(Group):
 
     @model_validator(mode="after")
     def _is_sound(self) -> Self:
-        if "file" not in type(self).model_fields:
+        tables = (self, *(getattr(self, name) for name in type(self).model_fields))
+        if not any("file" in getattr(type(one), "model_fields", ()) for one in tables):
             self.build(Path())
         return self
 

@@ -1,8 +1,11 @@
 """Bodies with their shapes, materials, pads, laws and contacts of a rig file. Another kind is one
 more entry of its union."""
 
+import os
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from importlib.util import module_from_spec, spec_from_file_location
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -448,6 +451,37 @@ else:
     ]
 
 
+TRUST = "TORCHSOFT_RUN_CODE"
+"""Environment variable that is 1 where rig files may run the Python files that they name."""
+
+
+class CodeTable(PartTable):
+    """A friction law of your own: a function, a module, or its class, of a Python file."""
+
+    kind: Literal["python"] = "python"
+    file: str = Field(description="the Python file, from the folder of this one; it is run")
+    law: str = Field(description="name of the law in it")
+
+    def build(self, folder: Path) -> Any:
+        path = folder / self.file
+        with at_field("file"):
+            if os.environ.get(TRUST) != "1":
+                raise ValueError(
+                    f"{path} is a program, which may do all that you may; read it, and set "
+                    f"{TRUST}=1 to run it"
+                )
+            spec = spec_from_file_location(f"torchsoft_rig_{path.stem}", path)
+            if spec is None or spec.loader is None or not path.is_file():
+                raise ValueError(f"{path} is not a Python file")
+            module = module_from_spec(spec)
+            sys.modules[spec.name] = module  # for pickle
+            spec.loader.exec_module(module)
+        with at_field("law"):
+            if not callable(found := getattr(module, self.law, None)):
+                raise ValueError(f"{path} has no function or module called `{line(self.law, 80)}`")
+            return found() if isinstance(found, type) else found
+
+
 STIFFER = 10.0
 """Spring "auto" over the plane-strain stiffness of a pad's surface on the length of one contact
 point (assumed): springs then take about one per cent of the give of a contact of ten points."""
@@ -513,6 +547,7 @@ else:
             table_of(SmoothSlip, "smooth"),
             table_of(Coulomb, "coulomb"),
             table_of(RateAndState, "rate_and_state"),
+            CodeTable,
         ),
         **{
             name: Annotated[signature(SoftContact).parameters[name].annotation, OrAuto()]
