@@ -64,10 +64,8 @@ class FiniteDifferences(Problem):
         steps: StepsByName,
         free: NDArray[np.bool_] | None = None,
     ) -> Residuals:
-        if free is None:
-            return super().residuals(runner, x, which, steps)
-        if isinstance(steps, float):  # the same for all of them
-            steps = super().residuals(runner, x, which, steps).steps
+        if free is None or isinstance(steps, float):  # each would choose its own
+            return super().residuals(runner, x, which, steps, free)
         inside = x + DIFFERENCE <= self.coordinates.bounds[1]
         step = np.where(inside, DIFFERENCE, -DIFFERENCE)
         moved = [x, *(x + step[i] * np.eye(len(x))[i] for i in np.flatnonzero(free))]

@@ -31,7 +31,7 @@ FLOWS = {
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
-        initial_state recording unknowns prediction noise runs assumptions problem first_samples
+        initial_state recording unknowns noise prediction runs assumptions problem first_samples
         synthetic fit plan prechecks
         residual_tests colour refits sensitivity suspects estimate result profile
         posterior identification compare

@@ -12,6 +12,7 @@ r.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -144,43 +145,48 @@ class Autoregression:
         only order 1 has a meaning, as phi to the power of the time between samples over `spacing`.
         Raises `ValueError` for higher orders there.
         """
-        k, regular = positions(t, self.spacing)
-        m, p = len(t), self.order
-        if p == 0:
-            return sparse.csr_array(sparse.diags_array(np.full(m, 1 / self.scale)))
-        if not regular and (p > 1 or self.phi[0] < 0):
-            raise ValueError(
-                f"noise of order {p} is known every {self.spacing:g} s only, but the samples are "
-                "not on such a grid"
+        return whitener(self, np.asarray(t, np.float64).tobytes())
+
+
+@lru_cache(maxsize=256)
+def whitener(noise: Autoregression, times: bytes) -> sparse.csr_array:
+    """`Autoregression.whitener`, made once for the same samples."""
+    t = np.frombuffer(times)
+    k, regular = positions(t, noise.spacing)
+    m, p = len(t), noise.order
+    if p == 0:
+        return sparse.csr_array(sparse.diags_array(np.full(m, 1 / noise.scale)))
+    if not regular and (p > 1 or noise.phi[0] < 0):
+        raise ValueError(
+            f"noise of order {p} is known every {noise.spacing:g} s only, but the samples are "
+            "not on such a grid"
+        )
+    if not regular:
+        rho = noise.phi[0] ** np.diff(k)
+        sd = noise.sd * np.sqrt(np.concatenate(([1.0], 1 - rho**2)))
+        below: Any = (0, -1)
+        return sparse.csr_array(sparse.diags_array([1 / sd, -rho / sd[1:]], offsets=below))
+    grid = k.astype(int)
+    first = pasts(grid, p)
+    length = np.arange(m) - first + 1
+    own = (length == p + 1) & (grid - grid[first] == p)  # those whose past is the last p samples
+    values, known = np.tile(np.append(-np.array(noise.phi[::-1]), 1.0) / noise.scale, (m, 1)), {}
+    gamma, rows = noise.autocovariance(grid[-1] + 1), list[Array](values)
+    for i in np.flatnonzero(~own):
+        lags = grid[i] - grid[first[i] : i + 1]
+        key = lags.tobytes()
+        if key not in known:
+            K = gamma[np.abs(np.subtract.outer(lags, lags))]
+            past = (
+                linalg.solve(K[:-1, :-1], K[:-1, -1], assume_a="pos")
+                if len(lags) > 1
+                else np.zeros(0)
             )
-        if not regular:
-            rho = self.phi[0] ** np.diff(k)
-            sd = self.sd * np.sqrt(np.concatenate(([1.0], 1 - rho**2)))
-            below: Any = (0, -1)
-            return sparse.csr_array(sparse.diags_array([1 / sd, -rho / sd[1:]], offsets=below))
-        grid = k.astype(int)
-        first = pasts(grid, p)
-        length = np.arange(m) - first + 1
-        own = (length == p + 1) & (
-            grid - grid[first] == p
-        )  # those whose past is the last p samples
-        values, known = np.tile(np.append(-np.array(self.phi[::-1]), 1.0) / self.scale, (m, 1)), {}
-        gamma, rows = self.autocovariance(grid[-1] + 1), list[Array](values)
-        for i in np.flatnonzero(~own):
-            lags = grid[i] - grid[first[i] : i + 1]
-            key = lags.tobytes()
-            if key not in known:
-                K = gamma[np.abs(np.subtract.outer(lags, lags))]
-                past = (
-                    linalg.solve(K[:-1, :-1], K[:-1, -1], assume_a="pos")
-                    if len(lags) > 1
-                    else np.zeros(0)
-                )
-                known[key] = np.append(-past, 1.0) / np.sqrt(K[-1, -1] - K[-1, :-1] @ past)
-            rows[i] = known[key]
-        ends = np.concatenate(([0], np.cumsum(length)))
-        columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], length)
-        return sparse.csr_array((np.concatenate(rows), columns, ends), (m, m))
+            known[key] = np.append(-past, 1.0) / np.sqrt(K[-1, -1] - K[-1, :-1] @ past)
+        rows[i] = known[key]
+    ends = np.concatenate(([0], np.cumsum(length)))
+    columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], length)
+    return sparse.csr_array((np.concatenate(rows), columns, ends), (m, m))
 
 
 def pasts(grid: NDArray[np.int_], p: int) -> NDArray[np.int_]:

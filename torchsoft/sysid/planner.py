@@ -181,12 +181,6 @@ class Planner:
         self._others = Runner(problem.recordings, workers)
         self._known: dict[bytes, Array] = {}
         self._idle: list[RunContext] = []
-        samples = self.recording.samples
-        self._pulls = [
-            problem.noise[ch].whitener(samples[ch][0]) if ch in problem.noise else None
-            for ch in problem.sensors
-            if ch in samples
-        ]
         self.cost = Counter({"runs": 0, "gradients": 0})
 
     def recorded(self, x: Array) -> Array:
@@ -351,14 +345,10 @@ class Planner:
     def pulled(self, x: Array, signals: Signals, w: Array) -> Array:
         """Weights (G, channels) on the signals, from weights w (m,) on the residuals."""
         out, at = np.zeros(signals.values.shape), 0
-        for one, W in zip(self.problem.readouts(x, self.k).values(), self._pulls):
-            t, measured = self.recording.samples[one.channel]
-            own = w[at : at + len(t)] if W is None else W.T @ w[at : at + len(t)]
-            y, _, _ = one.expected(signals, t)
-            out, at = (
-                out + one.pulled_back(signals, t, one.residuals(y, measured)[1] * own),
-                at + len(t),
-            )
+        for channel, one in self.problem.readouts(x, self.k).items():
+            t, measured = self.recording.samples[channel]
+            out = out + one.adjoint(signals, t, measured, w[at : at + len(t)])[1]
+            at += len(t)
         return out
 
     def overload(self, signals: Signals) -> Array:

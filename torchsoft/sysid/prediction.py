@@ -20,6 +20,7 @@ from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import simulate
 from torchsoft.solve.trajectory import Trajectory, channels
 from torchsoft.sysid.initial_state import PREFIX
+from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.recording import REACH, SAME, Array, Grid, RunContext
 from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
 
@@ -61,6 +62,7 @@ class Readout:
     terms: tuple[Term, ...]
     clock: float = 0.0
     lag: float = 0.0
+    colour: Autoregression | None = None
 
     def expected(
         self, signals: Signals, times: Array
@@ -125,6 +127,22 @@ class Readout:
                     self.gain * term.factor * (v @ spline(self.own_times(times), term.order))
                 )
         return out
+
+    def adjoint(
+        self, signals: Signals, times: Array, measured: Array, w: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Whitened residuals (k,), and derivatives of w' r, with w (k,) by default r itself, by the
+        channels (G, channels) and by the nuisances."""
+        y, _, by = self.expected(signals, times)
+        r, v = self.residuals(y, measured)
+        if self.colour is None:
+            v = v * (r if w is None else w)
+        else:
+            W = self.colour.whitener(times)
+            r = W @ r
+            v = v * (W.T @ (r if w is None else w))
+        on_nuisances = [v @ by[kind] if kind in by else 0.0 for kind in NUISANCES]
+        return r, self.pulled_back(signals, times, v), np.array(on_nuisances)
 
     def own_times(self, times: Array) -> Array:
         """Times (k,) [s] of the readings that the sensor stamps with `times`."""
@@ -197,9 +215,11 @@ def readout(
     sensor: Sensor,
     values: Mapping[Nuisance, float],
     span: tuple[float, float],
+    colour: Autoregression | None = None,
 ) -> Readout:
     """The readout of a sensor with the nuisances' `values`, in a recording over the times `span`
-    [s]. Raises `ValueError` for a nuisance that the channel cannot have."""
+    [s], with noise of a `colour`. Raises `ValueError` for a nuisance that the channel cannot
+    have."""
     at = {kind: values.get(kind, float(kind == "gain")) for kind in NUISANCES}
     c, s = np.cos(at["misalignment"]), np.sin(at["misalignment"])
     if sensor.misalignment > 0:
@@ -230,6 +250,7 @@ def readout(
         tuple(terms),
         at["clock"],
         at["lag"],
+        colour,
     )
 
 

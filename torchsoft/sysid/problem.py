@@ -187,7 +187,6 @@ class Problem(Shown):
             for c in self.coordinates.all
         )
         self.noise = in_full(rigs, noise or {})
-        self._whiteners: dict[tuple[str, str], Any] = {}
         for k in range(len(recordings)):
             self.readouts(self.coordinates.start, k)
         self.check_saturated()
@@ -226,12 +225,8 @@ class Problem(Shown):
 
     def whitened(self, recording: Recording, channel: str, rows: Array) -> Array:
         """Rows (k,) or (k, n) of a channel's samples, whitened."""
-        if channel not in self.noise:
-            return rows
-        key = recording.name, channel
-        if key not in self._whiteners:
-            self._whiteners[key] = self.noise[channel].whitener(recording.samples[channel][0])
-        return self._whiteners[key] @ rows
+        noise = self.noise.get(channel)
+        return rows if noise is None else noise.whitener(recording.samples[channel][0]) @ rows
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         free = [one for one in self.coordinates.all if one.kind == "parameter" and not one.fixed]
@@ -275,7 +270,8 @@ class Problem(Shown):
         for _, channel, sensor in self.measured([recording.name]):
             at = self.coordinates.nuisances(x, channel, recording.name)
             values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
-            out[channel] = readout(recording.rig, channel, sensor, values, span)
+            noise = self.noise.get(channel)
+            out[channel] = readout(recording.rig, channel, sensor, values, span, noise)
         return out
 
     def unit(self, channel: str) -> str:
@@ -305,11 +301,7 @@ class Problem(Shown):
             if free is not None:
                 moved = (c.jacobian(x, recording.name, values)[:, free] != 0).any(1)
                 names = tuple(name for name, moves in zip(c.names, moved) if moves)
-            judged = None
-            if adjoint:
-                judged = tuple(
-                    (one, self.noise.get(one.channel)) for one in self.readouts(x, k).values()
-                )
+            judged = tuple(self.readouts(x, k).values()) if adjoint else None
             mine = steps[recording.name] if isinstance(steps, Mapping) else steps
             out.append(Job(k, values, names, mine, self.interpolated, judged, varied))
         return out

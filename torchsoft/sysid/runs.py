@@ -33,7 +33,6 @@ from torchsoft.files import (
 from torchsoft.parallel import parallel_map, single_threaded
 from torchsoft.solve.kernel.objects import digest
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
     FailedRun,
     Frozen,
@@ -47,7 +46,6 @@ from torchsoft.sysid.prediction import (
     predict,
 )
 from torchsoft.sysid.recording import BETWEEN, Array, Grid, Recording, RunContext
-from torchsoft.sysid.unknowns import NUISANCES
 
 MEANING = (
     "Runs of an identification that is not done; torchsoft removes the .run files in this folder "
@@ -173,7 +171,7 @@ class Job(NamedTuple):
     steps.
 
     `interpolated` requests a grid between the samples; `judged` requests the misfit and its
-    gradient in place of the signals, and holds every sensor's readout and the colour of its noise.
+    gradient in place of the signals, and holds every sensor's readout.
     `varied` are amounts of variations of the recording, by name.
     """
 
@@ -182,7 +180,7 @@ class Job(NamedTuple):
     names: tuple[str, ...]
     steps: Steps
     interpolated: bool = False
-    judged: tuple[tuple[Readout, Autoregression | None], ...] | None = None
+    judged: tuple[Readout, ...] | None = None
     varied: tuple[tuple[str, float], ...] = ()
 
 
@@ -363,25 +361,11 @@ def simulated(
 
 
 def judge(
-    recording: Recording, judged: Sequence[tuple[Readout, Autoregression | None]], signals: Signals
+    recording: Recording, judged: Sequence[Readout], signals: Signals
 ) -> tuple[float, Array, Array]:
     """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the
     nuisances of every readout (readouts, nuisances)."""
-    loss, on_signals, on_nuisances = (
-        0.0,
-        np.zeros(signals.values.shape),
-        np.zeros((len(judged), len(NUISANCES))),
-    )
-    for k, (one, noise) in enumerate(judged):
-        t, measured = recording.samples[one.channel]
-        y, _, by = one.expected(signals, t)
-        r, weight = one.residuals(y, measured)
-        if noise is not None:
-            W = noise.whitener(t)
-            r = W @ r
-            v = weight * (W.T @ r)
-        else:
-            v = weight * r
-        loss, on_signals = loss + 0.5 * float(r @ r), on_signals + one.pulled_back(signals, t, v)
-        on_nuisances[k] = [v @ by[kind] if kind in by else 0.0 for kind in NUISANCES]
-    return loss, on_signals, on_nuisances
+    rows = [one.adjoint(signals, *recording.samples[one.channel]) for one in judged]
+    loss = sum(0.5 * float(r @ r) for r, _, _ in rows)
+    on_signals = sum((part for _, part, _ in rows), np.zeros(signals.values.shape))
+    return loss, on_signals, np.stack([part for _, _, part in rows])

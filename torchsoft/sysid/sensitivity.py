@@ -310,7 +310,7 @@ def new_fits(
         bar.set_description("new fit with all assumptions")
         as_stated = refit(end, ())
         bar.update()
-        enough, ends = 0.0, dict[str, tuple[list[Variation], Fit]]()
+        enough, ends = 0.0, dict[str, list[Variation]]()
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
@@ -326,7 +326,7 @@ def new_fits(
                     name, other, as_stated, tried, [checks[one.name] for one in some]
                 )
                 if found.refitted:
-                    checks[name], ends[name] = found, (tried, other)
+                    checks[name], ends[name] = found, tried
                     least = min(least, judge.misfit(found.left))
             bar.update()
             if len(some) == 1:
@@ -340,8 +340,8 @@ def new_fits(
         )
         if best and as_stated is not None and not checks[best].passed and end.rtol > judge.finest:
             bar.set_description(plain(f"new fit with another {best}, by finer steps"))
-            tried, coarse = ends[best]
-            other = refit(end.by(judge.finest), tried, coarse)
+            tried = ends[best]
+            other = refit(end.by(judge.finest), tried, judge.ends[best])
             if other is not None:
                 linear = [replace(checks[one.name], refitted=False) for one in tried]
                 checks[best] = judge.together(best, other, as_stated, tried, linear)
@@ -401,7 +401,7 @@ class Judge:
         self.J = end.check.finer.J[:, end.free] if J is None else J
         self.Q, _ = np.linalg.qr(self.J)
         self.sd, self.labels = standard_deviations(self.J), end.labels
-        self.columns, self.ends = dict[str, Array](), dict[str, tuple[Array, Array]]()
+        self.columns, self.ends = dict[str, Array](), dict[str, Fit]()
         self.places = [part.rows for part in parts(end.problem, self.r, end.which)]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
@@ -513,7 +513,7 @@ class Judge:
             by_amount = one.vary is not None or one.read is not None
             nominal, scale = (0.0, 1.0) if by_amount else (one.nominal, one.amount / one.step)
             favoured, sd = (mine.to_value(x) - nominal) * scale, own * scale
-        self.ends[one.name] = again.at.r, again.J
+        self.ends[one.name] = again
         test = self.made(
             one, moves / self.sd, gain, left, favoured, sd, rest, again.at.r, as_stated.at.r, True
         )
@@ -522,7 +522,7 @@ class Judge:
             amount=linear.amount,
             step=linear.step,
             detectable=linear.detectable,
-            passed=not self.alarms(*self.ends[one.name]),
+            passed=not self.alarms(again.at.r, again.J),
         )
 
     def together(
@@ -538,7 +538,7 @@ class Judge:
         found = [self.fit(one, again, as_stated, c) for one, c in zip(tried, linear)]
         if len(found) == 1:
             return found[0]
-        self.ends[name] = again.at.r, again.J
+        self.ends[name] = again
         return replace(
             found[0],
             name=name,
@@ -559,7 +559,7 @@ class Judge:
         out: list[AssumptionTest] = []
         r, J = self.r, self.J
         if best.refitted:
-            r, J = self.ends[best.name]
+            r, J = self.ends[best.name].at.r, self.ends[best.name].J
         else:
             J = np.column_stack((J, self.columns[best.name]))
             r = r - J @ shift(J, r)
