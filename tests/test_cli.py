@@ -20,7 +20,7 @@ from test_sysid_measured import CONFIG, EXAMPLE, F_Y, X_C, X_D, Table, scale, wr
 from torchsoft import files
 from torchsoft.cli import main
 from torchsoft.rigs import RigFile
-from torchsoft.solve import stepper
+from torchsoft.solve import model, stepper
 from torchsoft.sysid import Unreachable, runs
 from torchsoft.sysid.measured import load, unreachable
 from torchsoft.sysid.prediction import FailedRun
@@ -374,7 +374,7 @@ def test_a_run_that_is_told_to_end_keeps_what_is_simulated(sign, tmp_path, monke
                 os.kill(os.getpid(), sign)
 
     monkeypatch.setattr(stepper.ImplicitStepper, "integrate", told)
-    monkeypatch.setattr(stepper, "CHUNK", 50)
+    monkeypatch.setattr(model, "CHUNK", 50)
     assert main(["run", str(file), "--out", str(tmp_path / "out")]) == 130
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["stopped"] == "interrupted"

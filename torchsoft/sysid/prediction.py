@@ -438,7 +438,7 @@ def drifting(
     ends = np.searchsorted(knots, np.linspace(drift.first, drift.last, PIECES + 1)[1:-1])
     values, slopes = list[Array](), list[Array]()
     for first, last in pairwise(np.unique([0, *ends, len(knots) - 1]).tolist()):
-        middle = 0.5 * (knots[first] + knots[last])
+        middle = 0.5 * float(knots[first] + knots[last])
         set_parameters(rig, {k: value * drift.factor(k, middle) for k, value in stated.items()})
         scale = np.array([drift.factor(name, middle) for name in names])
         end = t[-1] if last == len(knots) - 1 else knots[last]
@@ -450,7 +450,7 @@ def drifting(
             **choice(Frozen(knots[first : last + 1])),
         )  # fmt: skip
         rows = np.isin(out.t.numpy(), t if first == 0 else own)
-        values.append(out.together(*keys)[rows].detach().numpy())
+        values.append(out.together(*keys).detach().numpy()[rows])
         y = out.y[-1].detach()
         if out.sensitivities is not None:
             slopes.append(derivatives(rig, out, keys)[rows] * scale)
