@@ -14,9 +14,11 @@ from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.assumptions import (
     COORDINATES,
     assumptions,
+    at_finite_strain,
     late_effort,
     lifted,
     limited_effort,
+    linear_pads,
     off_centre,
     pushed,
     read_across,
@@ -38,9 +40,10 @@ def run_of(recording: Recording) -> Prediction:
 
 
 @cache
-def strokes() -> Recording:
+def strokes(kind: str = "kelvin_voigt") -> Recording:
     motion = stroked(travel=8e-3, stroke_time=0.15, duration=0.4, grasp=0.15, since=0.2)
-    return record("strokes", excited(motion, PAPER.override(COARSE)), {E: 0.9e6}, SENSORS)
+    file = PAPER.override({**COARSE, "materials.rubber.kind": kind})
+    return record("strokes", excited(motion, file), {E: 0.9e6}, SENSORS)
 
 
 @cache
@@ -270,3 +273,19 @@ def test_derivatives_of_a_run_that_drifts():
         ]
         slope = (ends[1] - ends[0]) / (2e-6 * at[name])
         np.testing.assert_allclose(got.derivatives[..., k], slope, atol=1e-5 * np.abs(slope).max())
+
+
+def test_linear_pads_at_finite_strain_are_those_of_a_neo_hookean_file():
+    """With the same names of numbers, of which both pads have one."""
+    made = at_finite_strain(strokes())
+    assert made is not None
+    built = replace(strokes("neo_hookean"), start=strokes().start)
+    built.rig.reference = strokes().rig.reference
+    assert made.parameters == built.parameters
+    assert not linear_pads(made.rig)
+    grid = made.grid(False)
+    one, other = (predict(r.begin(), {E: 0.8e6}, grid, (), 1e-3) for r in (made, built))
+    assert (one.signals == other.signals).all()
+    linear = predict(strokes().begin(), {E: 0.8e6}, grid, (), 1e-3)
+    y = strokes().channels.index("effort_y")
+    assert one.signals[-1, y] / linear.signals[-1, y] > 1.03

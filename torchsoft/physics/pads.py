@@ -115,6 +115,10 @@ class Pad(nn.Module):
         linear = material.linear() if isinstance(material, Hyperelastic) else material
         return self._again(self.mesh, linear, False, self.points)
 
+    def made_of(self, material: Material) -> "Pad":
+        """The same pad of another material."""
+        return self._again(self.mesh, material, self.inertial, self.points)
+
     def reshaped(self, mesh: Mesh, origin: Array, turn: float = 0.0) -> "Pad":
         """The same pad on another mesh, its origin (2,) [m] elsewhere, and turned further [rad]."""
         return self._again(mesh, self.material, self.inertial, self.points, origin, turn)

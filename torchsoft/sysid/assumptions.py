@@ -18,6 +18,8 @@ from torch import Tensor, nn
 
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.extensions import extensions
+from torchsoft.physics.hyperelastic import NeoHookean
+from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
 from torchsoft.physics.names import effort_channel, rate_channel
@@ -259,6 +261,11 @@ def of_laws(recording: Recording) -> Iterator[Variation]:
             "Coulomb friction", "law", 'slip is smooth (friction "smooth")', "it were Coulomb's",
             vary=lambda r, _, run: coulomb(r),
         )  # fmt: skip
+    if linear_pads(recording.rig):
+        yield Variation(
+            "finite strain", "law", "pads are linear", "they were neo-Hookean",
+            vary=lambda r, _, run: at_finite_strain(r),
+        )  # fmt: skip
 
 
 def of_places(recording: Recording, unknown: Collection[str]) -> Iterator[Variation]:
@@ -429,6 +436,29 @@ def coulomb(recording: Recording) -> Recording:
                 law.friction = made.setdefault(id(smooth), new)
 
     return with_rig(recording, change)
+
+
+def linear_pads(rig: Rig) -> list[str]:
+    """Pads that could be neo-Hookean with the same numbers."""
+    return [
+        name
+        for name, pad in rig.pads.items()
+        if type(pad.material) is KelvinVoigt and not pad.inertial and not len(pad.material.added)
+    ]
+
+
+def at_finite_strain(recording: Recording) -> Recording | None:
+    """Replace linear pads by neo-Hookean ones of the same moduli and retardation time; None where
+    the start is a state of the pads as they were."""
+    made = dict[int, NeoHookean]()
+
+    def other(pad: Pad) -> Pad:
+        old = pad.material
+        assert isinstance(old, KelvinVoigt)
+        numbers = (one.item() for one in (old.E, old.nu, old.rho, old.tau, old.depth))
+        return pad.made_of(made.setdefault(id(old), NeoHookean(*numbers)))
+
+    return with_pads(recording, linear_pads(recording.rig), other)
 
 
 def signals_by_name(rig: Rig) -> dict[str, nn.Module]:
