@@ -24,6 +24,7 @@ from torchsoft import (
     Prony,
     Reference,
     Rig,
+    RigFile,
     SmoothSlip,
     SoftContact,
     StandardLinearSolid,
@@ -264,3 +265,15 @@ def test_a_recording_that_begins_before_the_pads_forget_is_named():
 
 def test_every_material_has_a_name_in_files():
     assert {name: type(make()) for name, make in MATERIALS.items()} == dict(LINEAR)
+
+
+@pytest.mark.parametrize("kind", list(MATERIALS))
+def test_a_material_needs_its_modulus(kind, monkeypatch):
+    monkeypatch.setitem(RUBBER, "E", None)
+    with pytest.raises(ValueError, match="must be a number, but is None"):
+        MATERIALS[kind]()
+
+
+def test_an_actuator_of_a_file_pushes_a_coordinate():
+    with pytest.raises(ValueError, match=r"actuators.x.pushes: "):
+        RigFile.ready("paper").override({"actuators.x.pushes": ""})

@@ -63,8 +63,8 @@ class Material(nn.Module):
     def __init__(self, E: Modulus | None, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         """E is None where a material makes it of other numbers."""
         super().__init__()
-        if E is not None:
-            self.E = parameter(E)
+        if E is not None or not isinstance(getattr(type(self), "E", None), property):
+            self.E = parameter(E)  # pyright: ignore[reportArgumentType]
         self.nu, self.rho, self.depth = (parameter(value) for value in (nu, rho, depth))
         self.add_module("added", nn.ModuleList())
 

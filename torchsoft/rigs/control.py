@@ -182,7 +182,9 @@ class ActuatorTable(Group):
     feed-forward. The coordinate q that it measures may be another one, of another body, and of
     another kind: "disc.theta" through "bracket.x"."""
 
-    pushes: str = Field(description='the coordinate that it pushes, such as "bracket.x"')
+    pushes: str = Field(
+        min_length=1, description='the coordinate that it pushes, such as "bracket.x"'
+    )
     measures: str | None = Field(
         default=None,
         description="the coordinate q that it measures; the one that it pushes if not given",
