@@ -266,12 +266,18 @@ def remade(change: Callable[[xr.Dataset, str], xr.Dataset]) -> Callable[[Victim]
     return remake
 
 
+def numbers(data: xr.Dataset, name: str) -> xr.DataArray:
+    """A variable, or zeros in the place of text."""
+    text = data[name].dtype.kind not in "biuf"
+    return xr.zeros_like(data[name], dtype=float) if text else data[name]
+
+
 REMADE: Damages = {
     "missing": remade(lambda data, name: data.drop_vars(name)),
     "renamed": remade(lambda data, name: data.rename({name: f"{name}_"})),
     "in furlong": remade(lambda data, name: data.assign({name: data[name].assign_attrs(units="")})),
-    "infinite": remade(lambda data, name: data.assign({name: data[name] * np.inf})),
-    "huge": remade(lambda data, name: data.assign({name: data[name].where(data[name] < 0, 1e308)})),
+    "infinite": remade(lambda data, name: data.assign({name: numbers(data, name) * np.inf})),
+    "huge": remade(lambda data, name: data.assign({name: numbers(data, name) + 1e308})),
     "text": remade(lambda data, name: data.assign({name: data[name].astype(str)})),
     "reshaped": remade(lambda data, name: data.assign({name: (("i", "k"), np.zeros((3, 2)))})),
 }
