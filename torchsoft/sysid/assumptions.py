@@ -455,8 +455,10 @@ def at_finite_strain(recording: Recording) -> Recording | None:
     def other(pad: Pad) -> Pad:
         old = pad.material
         assert isinstance(old, KelvinVoigt)
-        numbers = (one.item() for one in (old.E, old.nu, old.rho, old.tau, old.depth))
-        return pad.made_of(made.setdefault(id(old), NeoHookean(*numbers)))
+        E, nu, rho, tau, depth = (
+            one.item() for one in (old.E, old.nu, old.rho, old.tau, old.depth)
+        )
+        return pad.made_of(made.setdefault(id(old), NeoHookean(E, nu, rho, tau, depth)))
 
     return with_pads(recording, linear_pads(recording.rig), other)
 
