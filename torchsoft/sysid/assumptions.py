@@ -141,11 +141,13 @@ class Assumption:
 class Variation(Assumption):
     """An assumption with its variation, which is a parameter of the rig, an `extension` of it, a
     `fault` of a channel's sensor, or a function of an amount [unit]: `vary` gives the varied
-    recording, `read` what is added to a channel's samples (k,)."""
+    recording, `read` what is added to a channel's samples (k,). One whose run is `costly` is tested
+    where a fit is doubtful."""
 
     vary: Vary | None = None
     read: Callable[[Recording, str, float], Array] | None = None
     extension: bool = False
+    costly: bool = False
     fault: tuple[str, Any] | None = None
 
     @property
@@ -263,7 +265,7 @@ def of_laws(recording: Recording) -> Iterator[Variation]:
         )  # fmt: skip
     if linear_pads(recording.rig):
         yield Variation(
-            "finite strain", "law", "pads are linear", "they were neo-Hookean",
+            "finite strain", "law", "pads are linear", "they were neo-Hookean", costly=True,
             vary=lambda r, _, run: at_finite_strain(r),
         )  # fmt: skip
 

@@ -227,7 +227,8 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, explain: bool = False
     recordings = [recording for recording in problem.recordings if recording.name in end.which]
     c = problem.coordinates
     faults = [f"{one.kind} of {one.name}" for one in c.all if one.kind in FAULTS]
-    taken = assumptions(recordings, {*c.names, *faults}, problem.sensors)
+    every = assumptions(recordings, {*c.names, *faults}, problem.sensors)
+    taken = [one for one in every if doubtful or not one.costly]
     checks, columns = dict[str, AssumptionTest](), list[Array]()
     untried = [one.name for one in taken if one.vary is not None]
     # such as of pads that creep longer than the lead of a run
