@@ -66,13 +66,14 @@ class _Solved(torch.autograd.Function):
     """A^-1 b (samples, size) of b, each with a factor of its own."""
 
     @staticmethod
-    def forward(ctx: Any, b: Tensor, factors: list[Factor]) -> Tensor:
-        ctx.factors = factors
-        return solved(b, factors)
+    def forward(ctx: Any, b: Tensor, factors: list[Factor], transposed: bool) -> Tensor:
+        ctx.factors, ctx.transposed = factors, transposed
+        return solved(b, factors, transposed)
 
     @staticmethod
-    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return solved(bar, ctx.factors, True), None
+    def backward(ctx: Any, bar: Tensor) -> tuple[Any, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        # differentiable itself, for derivatives along directions
+        return _Solved.apply(bar, ctx.factors, not ctx.transposed), None, None
 
 
 def solved(b: Tensor, factors: list[Factor], transposed: bool = False) -> Tensor:
@@ -149,5 +150,5 @@ class Balance:
         """One iteration from the nodes x (..., nodes, 2) in balance, which gives them their
         derivative; `factors` sample by sample."""
         r = self.residual(x)
-        step: Any = _Solved.apply(r.reshape(len(factors), -1), factors)
+        step: Any = _Solved.apply(r.reshape(len(factors), -1), factors, False)
         return x + step.reshape(r.shape)

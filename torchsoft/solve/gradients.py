@@ -238,9 +238,15 @@ def directions(value: Tensor, wrt: Sequence[Tensor]) -> Array:
         else ()
     )
     if own := [k for k, part in enumerate(pulled) if part is not None and part.requires_grad]:
-        each = [*torch.eye(len(own), dtype=torch.float64)]
-        rows = torch.autograd.grad([pulled[k] for k in own], weights, each, is_grads_batched=True)
-        out[..., own] = rows[0].movedim(0, -1).numpy()
+        each, some = [*torch.eye(len(own), dtype=torch.float64)], [pulled[k] for k in own]
+        keep = {"retain_graph": True}
+        try:
+            (rows,) = torch.autograd.grad(some, weights, each, is_grads_batched=True, **keep)
+        except RuntimeError:  # the solves of nodal pads are LAPACK's, one after the other
+            rows = torch.stack([
+                torch.autograd.grad(some, weights, [*one], **keep)[0] for one in each
+            ])  # fmt: skip
+        out[..., own] = rows.movedim(0, -1).numpy()
     return out
 
 
