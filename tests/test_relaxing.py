@@ -8,6 +8,7 @@ import pytest
 import torch
 from conftest import PAPER, RUBBER, f64, paper
 from scipy.integrate import solve_ivp
+from test_finite_strain import COARSE as WITHOUT
 from torch import Tensor
 
 from torchsoft import (
@@ -237,11 +238,7 @@ NEO = {
     "kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044,
     "moduli": [4.5e5], "times": [0.05],
 }  # fmt: skip
-COARSE = {
-    "materials.rubber": NEO, "pads.L.elements_x": 60, "pads.U.elements_x": 60,
-    "pads.L.elements_y": 2, "pads.U.elements_y": 2,
-    "outputs": {"duration": 0.2, "interval": 5e-3, "snapshots": [0.0], "figures": False},
-}  # fmt: skip
+COARSE = WITHOUT | {"materials.rubber": NEO}
 
 
 @pytest.fixture(scope="module")
