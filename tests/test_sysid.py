@@ -135,7 +135,9 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes, shak
     for name in FOUR:
         e = answer[name]
         assert e.identifiable
-        assert e.value == pytest.approx(TRUTH[name], rel=1e-3)
+        error = np.log(e.value / TRUTH[name]) / e.relative_sd
+        assert error == pytest.approx(e.step_bias_sd, rel=0.1), "what is left is due to the steps"
+        assert abs(error) < 0.03
         assert e.ci95[0] < TRUTH[name] < e.ci95[1]
     assert answer.converged
     assert answer.chi2 < 1e-3
