@@ -93,7 +93,10 @@ class Normal(Related):
     @model_validator(mode="after")
     def _is_ordered(self) -> Self:
         if not self.low < self.high:
-            raise ValueError(f"low = {self.low} should be below high = {self.high}")
+            raise ValueError(
+                f"low = {self.low} should be below high = {self.high}; without bounds of your own "
+                f"they are {WIDTH:g} times sd = {self.sd} from mean = {self.mean}"
+            )
         below, above = self._tails
         if not above - below > SURE:
             raise ValueError(
@@ -116,7 +119,11 @@ class Normal(Related):
 
     def ends(self, where: str) -> dict[str, float]:
         """Both bounds by their names in messages."""
-        return {f"{where}.low": self.low, f"{where}.high": self.high}
+        reach = WIDTH * self.sd
+        cut = self.low == self.mean - reach, self.high == self.mean + reach
+        low = f"{where}: mean - {WIDTH:g} sd" if cut[0] else f"{where}.low"
+        high = f"{where}: mean + {WIDTH:g} sd" if cut[1] else f"{where}.high"
+        return {low: self.low, high: self.high}
 
 
 class Choice(Related):

@@ -376,7 +376,7 @@ class Drawn(NamedTuple):
         def check(tried: Mapping[str, str], alone: bool = False) -> None:
             drawn = {name: ends[name][where] for name, where in tried.items()}
             values = in_ratio(self.file, parameters, middle | drawn)
-            own = {name: values[name] for name in tried} if alone else values
+            own = {name: values[name] for name in self._tied(*tried)} if alone else values
             moves = {place(self.file, name).keys[0] for name in tried} == {"motion"}
             if (reason := self._impossible(own, moves)) is not None:
                 drawn_ends = ", ".join(f"{tried[name]} = {x:g}" for name, x in drawn.items())
@@ -397,6 +397,12 @@ class Drawn(NamedTuple):
             if {one, other} & names and (related or parts):
                 for a, b in itertools.product(extremes(ends[one]), extremes(ends[other])):
                     check({one: a, other: b})
+
+    def _tied(self, *names: str) -> set[str]:
+        """These parameters, the drawn ones that they are ratios to, and the ratios to them."""
+        bases = {self.parameters[name].ratio_to for name in names} & self.parameters.keys()
+        ratios = {name for name, one in self.parameters.items() if one.ratio_to in names}
+        return {*names} | bases | ratios
 
     def _impossible(self, values: Mapping[str, float], moves: bool = False) -> str | None:
         """The reason why the rig file cannot have these values: they are impossible, or change
