@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from test_material_fit import plain, relaxing
 from test_sysid_measured import CONFIG, EXAMPLE, F_Y, X_C, X_D, Table, scale, write

@@ -46,9 +46,11 @@ def test_check_env_passes(monkeypatch):
     assert set(shown) == {(480, 600, 3)}
 
 
-def test_an_episode_is_one_run():
-    """States are handed on: many steps are the one run along the same lines."""
-    env = small(rig=FILE.override(solver={"rtol": 1e-6}))
+@pytest.mark.parametrize("law", [{}, {"actuators.lower_x.Ki": 2e5, "actuators.lower_x.lag": 2e-4}])
+def test_an_episode_is_one_run(law):
+    """States are handed on, those of actuators too: many steps are the one run along the same
+    lines."""
+    env = small(rig=FILE.override(law, solver={"rtol": 1e-6}))
     actions = f64(0.5, -0.3, 0.0, 0.2, 0.1, 1.0, 0.4, -0.5, -1.0).reshape(3, 3)
     actions = actions.float().double()  # as spaces hold them
     env.reset(seed=0)

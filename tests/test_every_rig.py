@@ -31,7 +31,9 @@ from torchsoft import (
     Ellipse,
     FingertipMesh,
     GeneralisedKelvin,
+    Integral,
     KelvinVoigt,
+    Lagging,
     MooneyRivlin,
     NeoHookean,
     Ogden,
@@ -237,6 +239,16 @@ def pd(measures: str = "jaw.x", x_law: nn.Module | None = None) -> dict[str, Act
     }
 
 
+def remembering() -> dict[str, Actuator]:
+    """An integral, after a lag, and a lag alone."""
+    integral = Lagging(Integral(PD(1.2e5, 441.7), 4e6), 3e-3)
+    return {
+        "x": Actuator("jaw.x", "jaw.x", integral, setpoint="x_d"),
+        "y": Actuator("jaw.y", "jaw.y", Lagging(PD(5e4, 441.7), 1e-3), setpoint="y_d",
+                      feed_forward="F"),
+    }  # fmt: skip
+
+
 def feedback(coupling: float = 0.0) -> dict[str, Actuator]:
     gain = [[1.2e5, coupling, 441.7, 0.0], [0.0, 1.2e5, coupling, 441.7]]
     return controller(
@@ -316,6 +328,7 @@ RIGS: dict[str, Callable[[], Start]] = {
     "sampled motion": lambda: grip(motion={"jaw.x": Sampled([0.0, 0.004, 0.008, 0.015],
     [0.0, 1e-3, 3e-3, 3e-3])}), "motion of one's own": lambda: grip(motion={"jaw.x": Wave()}),
     "loops": lambda: loops(pd),
+    "loops that remember": lambda: loops(remembering),
     "loops by feedback": lambda: loops(feedback),
     "loop about the disc": lambda: loops(lambda: pd("disc.x", PD(2e4, 100.0))),
     "saturated loop": lambda: loops(lambda: pd(x_law=Saturated(3.0))),

@@ -11,7 +11,7 @@
 What there is, each with a page of its own in help():
 
 rigs        RigFile, BuiltRig, excite; Rig, Body, Pad, Contact, SoftContact, Actuator, PD,
-            StateFeedback, controller
+            Integral, Lagging, StateFeedback, controller
 meshes      PadMesh, CurvedPadMesh, FingertipMesh, QuadMesh
 materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony; at finite strain NeoHookean,
             MooneyRivlin, Yeoh, Ogden, Hyperelastic (an energy of one's own)

@@ -6,7 +6,16 @@ from .physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLin
 from .physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
 from .physics.motion import Profile, Reference, Sampled, hold
 from .physics.pads import Pad, Taxels
-from .physics.parts import PD, Actuator, Body, Contact, StateFeedback, controller
+from .physics.parts import (
+    PD,
+    Actuator,
+    Body,
+    Contact,
+    Integral,
+    Lagging,
+    StateFeedback,
+    controller,
+)
 from .physics.rate_and_state import RateAndState
 from .physics.rig import Rig
 from .physics.shapes import (
@@ -49,8 +58,10 @@ __all__ = [
     "FingertipMesh",
     "GeneralisedKelvin",
     "Hyperelastic",
+    "Integral",
     "Interrupted",
     "KelvinVoigt",
+    "Lagging",
     "MooneyRivlin",
     "NeoHookean",
     "NoEquilibrium",

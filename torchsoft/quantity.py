@@ -132,6 +132,12 @@ ProportionalGain = Annotated[float, Quantity("N/m, N, N.m/rad", 0.0, 1e12, "prop
 
 DerivativeGain = Annotated[float, Quantity("N.s/m, N.s, N.m.s/rad", 0.0, 1e12, "derivative gain")]
 
+IntegralGain = Annotated[
+    float, Quantity("N/(m.s), N/(rad.s), N.m/(rad.s)", 0.0, 1e12, "integral gain")
+]
+
+Lag = Annotated[float, Quantity("s", 1e-9, 1e3, "time constant of the lag of an effort")]
+
 Gravity = Annotated[float, Quantity("m/s2", 0.0, 1e3, "gravitational acceleration, downwards")]
 
 Time = Annotated[float, Quantity("s", 0.0, 1e5)]

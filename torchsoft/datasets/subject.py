@@ -400,9 +400,9 @@ class Drawn(NamedTuple):
 
     def _tied(self, *names: str) -> set[str]:
         """These parameters, the drawn ones that they are ratios to, and the ratios to them."""
-        bases = {self.parameters[name].ratio_to for name in names} & self.parameters.keys()
+        related = {self.parameters[name].ratio_to for name in names}
         ratios = {name for name, one in self.parameters.items() if one.ratio_to in names}
-        return {*names} | bases | ratios
+        return {*names} | {name for name in self.parameters if name in related} | ratios
 
     def _impossible(self, values: Mapping[str, float], moves: bool = False) -> str | None:
         """The reason why the rig file cannot have these values: they are impossible, or change
@@ -465,7 +465,7 @@ def rounded(rig: Rig, y0: Tensor) -> Tensor:
     """The initial state (size,), rounded."""
     y0 = y0.detach().clone()
     for (part, name), where in rig.layout.slices.items():
-        if part == "friction":  # of any unit
+        if part in ("friction", "control"):  # of any unit
             continue
         forces = part == "pads" and not rig.pads[name].nodal
         y0[where] = (

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes import Shape, parameter
+from torchsoft.physics.state import begin_states, own_states
 from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Ratio, Stiffness
 
 SlipLaw = Callable[..., Any]
@@ -25,23 +26,10 @@ dashpot R [N.s/m] that the slip relieves, each per reference spacing: a function
 in torch operations. The slip must not take more than the effort, R |gamma'| <= E, and all of it
 where nothing presses, R |gamma'| = E at F_N = 0: friction is continuous at touch-down then.
 
-A module with a mapping `states`, of names to `FrictionState`, has states of its own at every point:
+A module with a mapping `states`, of names to `OwnState`, has states of its own at every point:
 it is called with two more arguments, the states z* (..., n) at the stage's start and the stage's
 length a h [s], and gives the slip rate and the rates z' (..., n) of the states, with the values
 z* + a h z' that act at the end of the stage."""
-
-
-class FrictionState(NamedTuple):
-    """State of a friction law at a point: its unit, and the name of the parameter of the law that
-    it begins with."""
-
-    unit: str
-    start: str
-
-
-def friction_states(friction: object) -> dict[str, FrictionState]:
-    """States of a friction law, by name; most have none."""
-    return dict(getattr(friction, "states", {}))
 
 
 def slip_of(
@@ -50,13 +38,10 @@ def slip_of(
 ) -> tuple[Tensor, Tensor | None]:  # fmt: skip
     """Slip rate of a friction law, and the rates of its states, which begin where none are
     given."""
-    states = friction_states(friction)
+    states = own_states(friction)
     if not states:
         return friction(E, F_N, R), None
-    if z is None:
-        begin = torch.stack([getattr(friction, one.start) for one in states.values()])
-        z = begin.expand(*E.shape, len(begin))
-    return friction(E, F_N, R, z, stage)
+    return friction(E, F_N, R, begin_states(friction, E.shape) if z is None else z, stage)
 
 
 STEEPEST = 5.0

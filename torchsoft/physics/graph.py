@@ -18,7 +18,6 @@ from torchsoft.physics.contact import (
     Frame,
     PointLaw,
     cross,
-    friction_states,
     interface_law,
     moving_frame,
     point_place,
@@ -32,7 +31,7 @@ from torchsoft.physics.names import check_names
 from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, weight
 from torchsoft.physics.shapes import Shape, parameter
-from torchsoft.physics.state import Layout, State
+from torchsoft.physics.state import Layout, State, begin_states, own_states
 from torchsoft.physics.validity import Backwards
 from torchsoft.quantity import Gravity
 
@@ -199,18 +198,20 @@ class Graph(nn.Module):
     @property
     def layout(self) -> Layout:
         """Layout of the state vector."""
-        return Layout(
-            pads={name: pad.state_shape for name, pad in self.pads.items()},
-            stretch=self.point_counts,
-            free={
-                name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
-                for name, body in self.bodies.items()
-            },
-            inertial={name: (p.nodes, 2) for name, p in self.pads.items() if p.inertial},
-            friction={
-                name: len(friction_states(one.law.friction)) for name, one in self.contacts.items()
-            },
-        )
+        shapes = {("pads", name): pad.state_shape for name, pad in self.pads.items()}
+        for name, count in self.point_counts.items():
+            shapes["stretch", name] = (count,)
+            if own := own_states(self.contacts[name].law.friction):
+                shapes["friction", name] = len(own), count
+        shapes |= {("rates", name): (p.nodes, 2) for name, p in self.pads.items() if p.inertial}
+        for name, actuator in self.actuators.items():
+            if actuator.states:
+                shapes["control", name] = (len(actuator.states),)
+        free = {
+            name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
+            for name, body in self.bodies.items()
+        }
+        return Layout(free, shapes)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -257,12 +258,16 @@ class Graph(nn.Module):
         those of the reference at t."""
         return self.layout.unpack(y, *self.held(self.follow(t) if signals is None else signals))
 
-    def pack(self, state: State) -> Tensor:
-        """The flat vector (..., size) of a state; states of friction that it lacks are those that
-        they begin with."""
+    def pack(self, state: State, t: float = 0.0) -> Tensor:
+        """The flat vector (..., size) of a state; states of friction and of actuators that it lacks
+        are those that they begin with, at t [s]."""
         friction = {name: self.friction_of(name, state) for name in self.contacts}
         own = {name: both[0] for name, both in friction.items() if both}
-        return self.layout.pack(state._replace(friction=own))
+        control = dict(state.control)
+        if missing := [k for k, one in self.actuators.items() if one.states and k not in control]:
+            signals = self.follow(t).expand(*state.pose[next(iter(self.bodies))].shape[:-1], -1, -1)
+            control |= {k: self.actuator_response(k, state, signals)[2] for k in missing}
+        return self.layout.pack(state._replace(friction=own, control=control))
 
     def base_motion(self, name: str, state: State) -> tuple[Tensor, Tensor]:
         """Pose and velocity (..., 3) of a pad's base."""
@@ -348,7 +353,8 @@ class Graph(nn.Module):
         points = {name: one.law.rates.mT for name, one in graph.interfaces.items()}
         stretch = {name: own[..., 0, :] for name, own in points.items()}
         friction = {name: own[..., 1:, :] for name, own in points.items()}
-        return self.pack(State(pads, stretch, state.velocity, rates, velocity, friction))
+        control = {name: self.actuator_response(name, state, signals)[1] for name in state.control}
+        return self.pack(State(pads, stretch, state.velocity, rates, velocity, friction, control))
 
     def loads(self, graph: Evaluation, effort: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Net forces and moments on the bodies (..., 3) [N, N, N.m], of the net efforts at the
@@ -455,13 +461,11 @@ class Graph(nn.Module):
         """States (..., states, points) of a contact's law of friction, as they begin where `state`
         has none; an empty list for a law without."""
         friction = self.contacts[key].law.friction
-        begin = [getattr(friction, one.start) for one in friction_states(friction).values()]
-        if not begin:
+        if not own_states(friction):
             return []
         if key in state.friction:
             return [state.friction[key]]
-        s = state.stretch[key]
-        return [torch.stack(begin)[:, None].expand(*s.shape[:-1], len(begin), s.shape[-1])]
+        return [begin_states(friction, state.stretch[key].shape).mT]
 
     def point_forces(self, own: Sequence[str], state: State, u: Tensor, u_dot: Tensor) -> Tensor:
         """Sum of the forces of some contacts on the points of their pad (..., points, 2) [N], in
@@ -598,6 +602,15 @@ class Graph(nn.Module):
         return out
 
     def actuator_effort(self, name: str, state: State, signals: Tensor) -> Tensor:
-        """Effort (...) [N or N.m] of an actuator on the coordinate that it pushes."""
-        rows = dict(zip(self.signals, signals.unbind(-2)))
-        return self.actuators[name](self.actuators[name].seen(rows, state, signals.shape[:-2]))
+        """Effort (...) [N or N.m] of an actuator on the coordinate that it pushes; states that it
+        lacks in `state` are those that they begin with."""
+        return self.actuator_response(name, state, signals)[0]
+
+    def actuator_response(
+        self, name: str, state: State, signals: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Effort of an actuator, rates of its states (..., states), and the states themselves."""
+        actuator, rows = self.actuators[name], dict(zip(self.signals, signals.unbind(-2)))
+        x = actuator.seen(rows, state, signals.shape[:-2])
+        z = state.control[name] if name in state.control else actuator.begin(x)
+        return *actuator.response(x, z), z

@@ -27,6 +27,7 @@ OF_PAD = (
     "{}_face",
 )  # fmt: skip
 OF_BODY = "outline_{}", "energy_{}", "energy_{}_spin", "supplied_drive_{}", "{}_outline"
+OF_ACTUATOR = "supplied_control_{}", "control_{}", "{}_control"
 OF_RIG = (
     "energy_normal_springs", "energy_tangential_springs", "dissipated_contact_dashpots",
     "dissipated_slip", "supplied_gravity",
@@ -105,7 +106,7 @@ def arrays(rig: Graph) -> Iterator[tuple[str, str]]:
     touch = [f"{{}}.{key}" for key in ("centre", *FORCES)]
     for kind, parts, keys in (
         ("contact", rig.contacts, OF_CONTACT), ("pad", rig.pads, OF_PAD),
-        ("body", rig.bodies, OF_BODY), ("actuator", rig.actuators, ("supplied_control_{}",)),
+        ("body", rig.bodies, OF_BODY), ("actuator", rig.actuators, OF_ACTUATOR),
         ("contact", rig.contacts, touch), ("taxels", rig.taxels, touch),
         ("pad", rig.pads, ("{}.force_x", "{}.force_y")),
         ("body", rig.bodies, [f"{{}}.{key}" for key in ON_BODY]),

@@ -2,7 +2,7 @@
 laws."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -10,11 +10,13 @@ from torch import Tensor, nn
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
-from torchsoft.physics.state import State
+from torchsoft.physics.state import OwnState, State, begin_states, own_states
 from torchsoft.quantity import (
     DerivativeGain,
     Inertia,
     InertiaRatio,
+    IntegralGain,
+    Lag,
     Mass,
     ProportionalGain,
     Quantity,
@@ -138,6 +140,65 @@ class ReversedPD(PD):
         return feed_forward - self.Kp * (w - q) - self.Kd * (w_dot - q_dot)
 
 
+class Integral(nn.Module):
+    """A law of one loop with integral action: F + Ki times the integral of the error w - q from the
+    start of the run on; of q - w where the gains are `reversed`. Nothing bounds it."""
+
+    states: ClassVar = {"integral": OwnState("q.s")}
+
+    def __init__(self, law: nn.Module, Ki: IntegralGain, *, reversed: bool = False) -> None:
+        super().__init__()
+        self.law, self.Ki, self.sign = law, parameter(Ki), -1.0 if reversed else 1.0
+
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor,
+        z: Tensor, stage: Tensor | float,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        error = self.sign * (w - q)
+        integral = z[..., 0] + stage * error
+        return self.law(w, w_dot, feed_forward, q, q_dot) + self.Ki * integral, error[..., None]
+
+
+class Lagging(nn.Module):
+    """The effort F of a law after a first-order lag, as drives have it: lag F' = law - F. It begins
+    with what the law says of the start."""
+
+    def __init__(self, law: nn.Module, lag: Lag) -> None:
+        super().__init__()
+        self.law, self.lag = law, parameter(lag)
+
+    @property
+    def states(self) -> dict[str, OwnState]:
+        return own_states(self.law) | {"effort": OwnState("F")}
+
+    def begin(self, *seen: Tensor) -> Tensor:
+        """States (..., states) at the start."""
+        own = begun(self.law, seen)
+        return torch.cat((own, respond(self.law, seen, own)[0][..., None]), -1)
+
+    def forward(self, *given: Any) -> tuple[Tensor, Tensor]:
+        *seen, z, stage = given
+        wanted, rates = respond(self.law, seen, z[..., :-1], stage)
+        rate = (wanted - z[..., -1]) / (self.lag + stage)
+        return z[..., -1] + stage * rate, torch.cat((rates, rate[..., None]), -1)
+
+
+def respond(
+    law: Callable[..., Any], seen: Sequence[Tensor], z: Tensor, stage: Tensor | float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Effort of a control law at the end of a stage [s] that begins with its states z (..., n), and
+    their rates."""
+    return law(*seen, z, stage) if own_states(law) else (law(*seen), z)
+
+
+def begun(law: Callable[..., Any], seen: Sequence[Tensor]) -> Tensor:
+    """States (..., n) that a control law begins with: by its method `begin` of what it sees at the
+    start, else by their parameters, else at zero."""
+    if hasattr(law, "begin"):
+        return law.begin(*seen)
+    return begin_states(law, seen[2].shape)
+
+
 class Guide(nn.Module):
     """Resistance of a guide to its coordinate's rate v: F = -friction v / sqrt(v^2 + v_0^2) -
     damping v; dry friction is smooth below the speed v_0."""
@@ -198,9 +259,12 @@ class Actuator(nn.Module):
     torch code: a `PD`, a function, or any module. `setpoint` and `feed_forward` name signals of the
     reference. A law of several coordinates is given `measures` and `setpoint` as sequences of
     names, and sees them along a last dimension; set-points are those of the first coordinates, in
-    their order, and there may be none. Laws with several efforts: `controller`. `elements` are the
-    graph's names of the elements behind it. Raises `ValueError` unless names are given, and for
-    more set-points than coordinates.
+    their order, and there may be none. Laws with several efforts: `controller`. A module with a
+    mapping `states`, of names to `OwnState`, has states of its own, such as an integral: it is
+    called with two more arguments, the states z* (..., n) at the start of a stage and the stage's
+    length a h [s], and gives the effort and the rates z' (..., n), with the values z* + a h z' that
+    act at the end of the stage. `elements` are the graph's names of the elements behind it. Raises
+    `ValueError` unless names are given, and for more set-points than coordinates.
     """
 
     def __init__(
@@ -253,9 +317,13 @@ class Actuator(nn.Module):
         (name,) = self.setpoints
         return name
 
-    def gain_unit(self, rate: bool, number: int = 0) -> str:
-        """Unit of the effort per measured coordinate `number`, or per its rate."""
-        return f"{self.effort_unit}{'.s' if rate else ''}/{coordinate_unit(self.measures[number])}"
+    def gain_unit(self, order: int, number: int = 0) -> str:
+        """Unit of the effort per measured coordinate `number`, or per its derivative of an `order`:
+        1 its rate, -1 its integral."""
+        effort, coordinate = self.effort_unit, coordinate_unit(self.measures[number])
+        return (f"{effort}/{coordinate}", f"{effort}.s/{coordinate}", f"{effort}/({coordinate}.s)")[
+            order
+        ]
 
     @property
     def effort_unit(self) -> str:
@@ -263,8 +331,17 @@ class Actuator(nn.Module):
 
     @property
     def inputs(self) -> int:
-        """Number of inputs of the law."""
+        """Number of signals and coordinates, with their rates, that the law reads."""
         return 2 * (len(self.reads) + len(self.measures))
+
+    @property
+    def states(self) -> dict[str, str]:
+        """States that the law has of its own, with their units."""
+        units = {"q": coordinate_unit(self.measures[0]), "F": self.effort_unit}
+        return {
+            name: ".".join(units.get(part, part) for part in one.unit.split("."))
+            for name, one in own_states(self.law).items()
+        }
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -282,7 +359,19 @@ class Actuator(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Effort (...) of x (..., inputs): every set-point, the feed-forward if there is one and
-        every coordinate, each with its rate."""
+        every coordinate, each with its rate; with the states that the law begins with."""
+        return self.response(x, self.begin(x))[0]
+
+    def response(self, x: Tensor, z: Tensor, stage: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+        """Effort (...) and rates of the law's states (..., states), of x (..., inputs) at the end
+        of a stage [s] that begins with the states z (..., states)."""
+        return respond(self.law, self._arguments(x), z, stage)
+
+    def begin(self, x: Tensor) -> Tensor:
+        """States (..., states) that the law begins with at x (..., inputs)."""
+        return begun(self.law, self._arguments(x))
+
+    def _arguments(self, x: Tensor) -> tuple[Tensor, ...]:
         values, rates = x[..., 0::2], x[..., 1::2]
         goals, read = len(self.setpoints), len(self.reads)
         w, w_dot, q, q_dot = (
@@ -295,7 +384,7 @@ class Actuator(nn.Module):
         if not self.several[1]:
             w, w_dot = w[..., 0], w_dot[..., 0]
         fed = torch.zeros_like(values[..., -1]) if read == goals else values[..., goals]
-        return self.law(w, w_dot, fed, q, q_dot)
+        return w, w_dot, fed, q, q_dot
 
 
 def names_of(field: str, given: str | Sequence[str]) -> tuple[str, ...]:
@@ -358,16 +447,20 @@ class StateFeedback(nn.Module):
         return (desired - actual).flatten(-2) @ self.matrix().mT
 
 
+ORDERS = {"Ki": -1, "Kp": 0, "Kd": 1}
+"""Derivatives of the error, -1 its integral, that gains of a loop belong to."""
+
+
 def gain_unit(law: nn.Module, name: str, users: Sequence[Actuator]) -> str | None:
     """Unit of a gain of a control law by its name in the law, which belongs to some actuators; None
     for another number."""
-    if isinstance(law, PD):
-        return users[0].gain_unit(name == "Kd")
+    if isinstance(law, PD | Integral):
+        return users[0].gain_unit(ORDERS[name])
     if not isinstance(law, StateFeedback):
         return None
     row, column = (int(one) - 1 for one in name.split("_")[-2:])
     rate, number = divmod(column, len(users[row].measures))
-    return users[row].gain_unit(bool(rate), number)
+    return users[row].gain_unit(rate, number)
 
 
 class OneEffort(nn.Module):

@@ -11,8 +11,8 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor, nn
 
-from torchsoft.physics.contact import FrictionState
 from torchsoft.physics.shapes import parameter
+from torchsoft.physics.state import OwnState
 from torchsoft.quantity import FrictionCoefficient, Quantity
 
 ITERATIONS = 9
@@ -36,7 +36,7 @@ class RateAndState(nn.Module):
     the age of all points at the start.
     """
 
-    states: ClassVar = {"theta": FrictionState("s", "theta_0")}
+    states: ClassVar = {"theta": OwnState("s", "theta_0")}
 
     def __init__(
         self,

@@ -1,12 +1,33 @@
 """The state vector of a rig: which component stands where, and how it is taken apart."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+
+class OwnState(NamedTuple):
+    """A state that a law has of its own: its unit, in which q stands for that of the coordinate an
+    actuator measures and F for that of its effort, and the name of the parameter of the law that it
+    begins with; without one it begins at zero."""
+
+    unit: str
+    start: str = ""
+
+
+def own_states(law: object) -> dict[str, OwnState]:
+    """States that a law has of its own, by name; most have none."""
+    return dict(getattr(law, "states", {}))
+
+
+def begin_states(law: object, shape: Sequence[int]) -> Tensor:
+    """States (*shape, states) that a law begins with."""
+    zero = torch.zeros((), dtype=torch.float64)
+    begin = [getattr(law, one.start) if one.start else zero for one in own_states(law).values()]
+    return torch.stack(begin or [zero])[: len(begin)].expand(*shape, len(begin))
 
 
 class State(NamedTuple):
@@ -18,7 +39,8 @@ class State(NamedTuple):
     nodes' own; stretch: of contacts (..., points); pose,
     velocity: of bodies (..., 3), x, y and theta, those that are fixed or driven included; rates:
     velocities of inertial pads' nodes (..., nodes, 2), absolute; friction: of contacts whose law of
-    friction has states of its own (..., states, points).
+    friction has states of its own (..., states, points); control: of actuators whose law has some
+    (..., states).
     """
 
     pads: dict[str, Tensor]
@@ -27,46 +49,54 @@ class State(NamedTuple):
     rates: dict[str, Tensor]
     velocity: dict[str, Tensor]
     friction: Mapping[str, Tensor] = MappingProxyType({})
+    control: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class Layout:
     """Layout of the flat state vector: pads, contacts' stretches and states of friction, free
-    coordinates, pads' velocities, free velocities.
+    coordinates, pads' velocities, free velocities, states of actuators.
 
-    `size` is the vector's length; `slices` and `shapes` are by (part, name), with part one of
-    State's fields; the free coordinates are ("pose", body) and ("velocity", body), `free` their
-    places among (x, y, theta).
+    `shapes` are by (part, name), with part one of State's fields; parts that are not there are left
+    out, and so are those of no component but a body's. The free coordinates are ("pose", body) and
+    ("velocity", body), `free` their places among (x, y, theta). `size` is the vector's length,
+    `slices` the places in it.
     """
 
     def __init__(
-        self, pads: Mapping[str, tuple[int, ...]], stretch: Mapping[str, int],
-        free: Mapping[str, list[int]], inertial: Mapping[str, tuple[int, ...]],
-        friction: Mapping[str, int],
-    ) -> None:  # fmt: skip
+        self, free: Mapping[str, list[int]], shapes: Mapping[tuple[str, str], tuple[int, ...]]
+    ) -> None:
         self.free = {name: list(axes) for name, axes in free.items()}
-        self.shapes: dict[tuple[str, str], tuple[int, ...]] = {}
-        self.shapes |= {("pads", name): shape for name, shape in pads.items()}
-        for name, count in stretch.items():
-            self.shapes["stretch", name] = (count,)
-            if friction.get(name):
-                self.shapes["friction", name] = friction[name], count
-        self.shapes |= {("pose", name): (len(axes),) for name, axes in free.items()}
-        self.shapes |= {("rates", name): shape for name, shape in inertial.items()}
-        self.shapes |= {("velocity", name): (len(axes),) for name, axes in free.items()}
+        of = lambda *parts: {key: shape for key, shape in shapes.items() if key[0] in parts}
+        bodies = lambda part: {(part, name): (len(axes),) for name, axes in self.free.items()}
+        self.shapes: dict[tuple[str, str], tuple[int, ...]] = (
+            of("pads") | of("stretch", "friction") | bodies("pose") | of("rates")
+            | bodies("velocity") | of("control")
+        )  # fmt: skip
         self.slices, self.size = {}, 0
         for key, shape in self.shapes.items():
             self.slices[key] = slice(self.size, self.size + math.prod(shape))
             self.size += math.prod(shape)
 
+    def components(self, *parts: str) -> list[int]:
+        """Components of some parts of the state."""
+        own = (s for (part, _), s in self.slices.items() if part in parts)
+        return [i for s in own for i in range(s.start, s.stop)]
+
     @property
     def rigid(self) -> list[int]:
         """Components of the bodies' free coordinates, then of their rates."""
-        return [
-            i
-            for (part, _), s in self.slices.items()
-            if part in ("pose", "velocity")
-            for i in range(s.start, s.stop)
-        ]
+        return self.components("pose", "velocity")
+
+    @property
+    def measured(self) -> list[int]:
+        """Components that motion and efforts of actuators are made of: `rigid`, and then the states
+        of actuators."""
+        return self.components("pose", "velocity", "control")
+
+    def without_surfaces(self) -> "Layout":
+        """The layout of the components `measured` alone."""
+        own = {key: shape for key, shape in self.shapes.items() if key[0] == "control"}
+        return Layout(self.free, own)
 
     def check(self, y: Tensor) -> None:
         """Raises `ValueError` for another length or dtype than float64."""

@@ -59,9 +59,11 @@ def settled(
     pose: Mapping[str, Tensor],
     velocity: Mapping[str, Tensor],
     stretch: Mapping[str, Tensor],
+    t: float = 0.0,
 ) -> Tensor:
-    """State (size,) with pads settled around bodies at `pose` [m, rad], by body (3,), and
-    contacts whose points are stretched by `stretch` [m], by contact (points,).
+    """State (size,) with pads settled around bodies at `pose` [m, rad], by body (3,), contacts
+    whose points are stretched by `stretch` [m], by contact (points,), and states of actuators that
+    begin at t [s].
 
     The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry the loads of bodies
     that stand still: under a body that rolls at v the pads lag behind by v tau only, whereas pads
@@ -93,7 +95,7 @@ def settled(
     moving = still._replace(velocity=dict(velocity))
     inertial = [name for name, pad in rig.pads.items() if pad.inertial]
     rates = {name: carried_along(rig, name, moving, pads[name]) for name in inertial}
-    return rig.pack(moving._replace(pads=pads, rates=rates))
+    return rig.pack(moving._replace(pads=pads, rates=rates), t)
 
 
 def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, int]) -> None:
@@ -188,11 +190,11 @@ def condensed(rig: Graph) -> Graph:
     )  # fmt: skip
 
 
-def standing(rig: Graph, pose: Mapping[str, Tensor]) -> Tensor:
+def standing(rig: Graph, pose: Mapping[str, Tensor], t: float = 0.0) -> Tensor:
     """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled
-    around them and no point stretched. Differentiable and raises as `settled`."""
+    around them and no point stretched, at t [s]. Differentiable and raises as `settled`."""
     still = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
-    return settled(rig, pose, still, unstretched(rig, ()))
+    return settled(rig, pose, still, unstretched(rig, ()), t)
 
 
 def unstretched(rig: Graph, batch: Sequence[int]) -> dict[str, Tensor]:

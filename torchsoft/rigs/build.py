@@ -18,7 +18,7 @@ from torchsoft.physics.graph import Graph
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.names import check_names
-from torchsoft.physics.parts import COORDINATES, PD, Actuator, coordinate_unit
+from torchsoft.physics.parts import COORDINATES, ORDERS, PD, Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed, warn_of_moments
 from torchsoft.physics.statics import NoEquilibrium, net_loads, resting, standing
@@ -249,13 +249,13 @@ class RigFile(Shown, Group):
             return self.unit(str(way[0]))
         if group == "actuators":
             one = self.actuators[str(way[0])]
-            rate, pushed, measured = way[1] == "Kd", one.pushes, one.measured
+            order, pushed, measured = ORDERS[str(way[1])], one.pushes, one.measured
         else:
             part, _, row, column = way if len(way) == 4 else (*way, 0, 0)
             one = self.controllers[str(part)]
-            rate, number = divmod(int(column), len(one.measures))
+            order, number = divmod(int(column), len(one.measures))
             pushed, measured = one.pushes[int(row)], one.measures[number]
-        return Actuator(measured, pushed, PD(1.0, 1.0), setpoint="w").gain_unit(bool(rate))
+        return Actuator(measured, pushed, PD(1.0, 1.0), setpoint="w").gain_unit(order)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         return f"RigFile: {self.title or 'a rig'}", [

@@ -512,7 +512,7 @@ def overloads(e: Estimate) -> Iterator[Diagnostic]:
             for one in e.rig.contacts.values()
             if body in (one.body, e.rig.pads[one.pad].base)
         }
-        if actuator.feed_forward is None or axis == 2 or not pads:
+        if actuator.feed_forward is None or actuator.Ki or axis == 2 or not pads:
             continue
         effort, time = max(
             (abs(signals(e.rig, time)[actuator.feed_forward]), time) for time in e.knots()

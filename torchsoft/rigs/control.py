@@ -18,8 +18,17 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from torchsoft.files import check_file
-from torchsoft.physics.parts import PD, Actuator, Gains, ReversedPD, StateFeedback, controller
-from torchsoft.quantity import DerivativeGain, ProportionalGain, quantity
+from torchsoft.physics.parts import (
+    PD,
+    Actuator,
+    Gains,
+    Integral,
+    Lagging,
+    ReversedPD,
+    StateFeedback,
+    controller,
+)
+from torchsoft.quantity import DerivativeGain, IntegralGain, Lag, ProportionalGain, quantity
 from torchsoft.rigs.fields import Group, at_field
 from torchsoft.tables import LISTED, line
 
@@ -178,9 +187,10 @@ class Loop(NamedTuple):
 
 
 class ActuatorTable(Group):
-    """An effort on one free coordinate, Kp (w - q) + Kd (w' - q') + network(w, w', q, q') +
-    feed-forward. The coordinate q that it measures may be another one, of another body, and of
-    another kind: "disc.theta" through "bracket.x"."""
+    """An effort on one free coordinate: Kp (w - q) + Kd (w' - q'), Ki times the integral of w - q,
+    network(w, w', q, q') and feed-forward, after a lag if there is one. The coordinate q that it
+    measures may be another one, of another body, and of another kind: "disc.theta" through
+    "bracket.x"."""
 
     pushes: str = Field(
         min_length=1, description='the coordinate that it pushes, such as "bracket.x"'
@@ -198,6 +208,14 @@ class ActuatorTable(Group):
     )
     Kp: ProportionalGain = Field(default=0.0, description="proportional gain")
     Kd: DerivativeGain = Field(default=0.0, description="derivative gain")
+    Ki: IntegralGain = Field(
+        default=0.0, description="integral gain; the integral begins at zero and has no bounds"
+    )
+    lag: Lag | None = Field(
+        default=None,
+        description="time constant of a first-order lag of the whole effort, as drives have it, "
+        "which begins settled; none if not given",
+    )
     reversed: bool = Field(
         default=False,
         description="the gains push the other way, for a q that falls where the pushed coordinate "
@@ -211,16 +229,16 @@ class ActuatorTable(Group):
 
     @model_validator(mode="after")
     def _does_something(self) -> Self:
-        if self.setpoint is None and (self.Kp or self.Kd):
-            raise ValueError("setpoint is missing: the gains Kp and Kd need a motion to follow")
+        if self.setpoint is None and (self.Kp or self.Kd or self.Ki):
+            raise ValueError("setpoint is missing: the gains Kp, Kd and Ki need a motion to follow")
         if self.setpoint is None and self.network is not None:
             raise ValueError(
                 "setpoint is missing: the network is one of a motion w and the coordinate that "
                 "follows it"
             )
-        if self.setpoint is not None and not (self.Kp or self.Kd or self.network):
+        if self.setpoint is not None and not (self.Kp or self.Kd or self.Ki or self.network):
             raise ValueError(
-                "Kp and Kd are both 0, so that the setpoint would have no effect; give a gain, or "
+                "Kp, Kd and Ki are 0, so that the setpoint would have no effect; give a gain, or "
                 "a network"
             )
         if self.setpoint is None and self.feed_forward is None:
@@ -251,6 +269,10 @@ class ActuatorTable(Group):
                     self.Kp, self.Kd, read_network(folder / self.network, LOOP), self.reversed
                 )
             elements = (*elements, "Se: network")
+        if self.Ki:
+            law, elements = Integral(law, self.Ki, reversed=self.reversed), (*elements, "Se: Ki")
+        if self.lag is not None:
+            law, elements = Lagging(law, self.lag), (*elements, "Se: lag")
         return Actuator(
             self.measured, self.pushes, law, setpoint=followed, feed_forward=self.feed_forward,
             elements=elements

@@ -171,6 +171,9 @@ DISPLACEMENT, VELOCITY = 1e-9, 1e-8
 """Perturbations [m or rad], [m/s or rad/s] of the central differences: small against penetrations,
 so that nodes stick."""
 
+CONTROL = 1e-6
+"""Perturbation of a state of an actuator over its size, or over one of its unit."""
+
 NEUTRAL = 0.1
 """Growth rate [1/s] up to which a mode counts as neutral, as the angle of a round body is."""
 
@@ -190,6 +193,8 @@ def linearised(
     for (part, name), where in model.layout.slices.items():
         if part == "friction":
             size[where] = DISPLACEMENT * y[where].abs()
+        elif part == "control":
+            size[where] = CONTROL * y[where].abs().clamp(min=1.0)
         elif (
             part == "pads" and not model.pads[name].nodal
         ):  # forces, counted by the displacement they make

@@ -104,6 +104,9 @@ def add_results(run: Trajectory, add: Add) -> None:
             meaning = f"nodal forces of the pad {key} that have set in, by retardation time"
             where = ("time", f"{key}_branch", *nodes)
             add(f"nodal_force_{key}", where, run.state.pads[key], "N", meaning)
+    for key, value in run.state.control.items():
+        meaning = f"states of the law of the actuator {key}"
+        add(f"control_{key}", ("time", f"{key}_control"), value, "", meaning)
     bodies = ("time", "body", "coordinate")
     for name, values, unit, meaning in (
         ("pose", run.state.pose, "m, m, rad", "x, y and theta of the bodies"),
@@ -244,17 +247,19 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
             pads[name] = torch.cat((pads[name], v), -1)
     rates = by("velocity", [name for name, pad in setup.pads.items() if pad.inertial])
     friction = by("friction_state", [name for name in contacts if f"friction_state_{name}" in data])
-    state = State(pads, by("stretch", contacts), pose, rates, velocity, friction)
-    layout = Layout(
-        {name: tuple(x.shape[1:]) for name, x in pads.items()},
-        {name: x.shape[1] for name, x in state.stretch.items()},
-        {
-            name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
-            for name, body in setup.bodies.items()
-        },
-        {name: tuple(x.shape[1:]) for name, x in rates.items()},
-        {name: x.shape[1] for name, x in friction.items()},
-    )
+    control = by("control", [name for name in setup.actuators if f"control_{name}" in data])
+    state = State(pads, by("stretch", contacts), pose, rates, velocity, friction, control)
+    own = {"pads": pads, "rates": rates, "control": control}
+    shapes = {(part, name): tuple(x.shape[1:]) for part, k in own.items() for name, x in k.items()}
+    for name, s in state.stretch.items():
+        shapes["stretch", name] = tuple(s.shape[1:])
+        if name in friction:
+            shapes["friction", name] = tuple(friction[name].shape[1:])
+    free = {
+        name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
+        for name, body in setup.bodies.items()
+    }
+    layout = Layout(free, shapes)
     return Trajectory(
         t=of("time"), y=layout.pack(state), state=state,
         channels={name: of(name) for name in parts["channels"]},

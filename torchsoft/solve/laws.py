@@ -22,7 +22,6 @@ from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import (
     distance_law,
     free_law,
-    friction_states,
     interface_law,
     relative_motion,
     slip_of,
@@ -33,6 +32,7 @@ from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.shapes import Shape
+from torchsoft.physics.state import own_states
 from torchsoft.physics.validity import tried
 from torchsoft.solve.kernel.arrays import LANES, MOTION, WRENCH
 from torchsoft.solve.structure import copied, structure_of
@@ -165,10 +165,12 @@ def outputs_of(law: Callable[..., Any], x: Tensor) -> Tensor:
     """Outputs of a law of tensors, of an actuator or a shape; the chain of a material."""
     if isinstance(law, Material):
         out = law.chain()
-    elif friction_states(law):
+    elif isinstance(law, Actuator):
+        out = response_of(law, x)
+    elif own_states(law):
         out, _ = slip_of(law, *x.unbind(-1))
     else:
-        out = law(x) if isinstance(law, Actuator | Shape) else law(*x.unbind(-1))
+        out = law(x) if isinstance(law, Shape) else law(*x.unbind(-1))
     parts = out if isinstance(out, tuple) else (out,)
     return torch.cat([part.reshape(-1) for part in parts])
 
@@ -188,14 +190,17 @@ def friction_fault(where: str, slip: Any, R: float) -> str:
 def tried_states(actuator: Actuator) -> Tensor:
     """Inputs (samples, inputs) of an actuator's law at which it is tried."""
     generator = torch.Generator().manual_seed(0)
-    x = torch.randn(8, actuator.inputs, generator=generator, dtype=torch.float64)
-    return x * torch.logspace(-4, 0, 8, dtype=torch.float64)[:, None]
+    inputs = actuator.inputs + len(actuator.states)
+    x = torch.randn(8, inputs, generator=generator, dtype=torch.float64)
+    x = x * torch.logspace(-4, 0, 8, dtype=torch.float64)[:, None]
+    return torch.cat((x, x[:, :1].abs()), -1) if actuator.states else x
 
 
 def actuator_fault(name: str, actuator: Actuator) -> str:
     """`gradient_fault` of an actuator's law."""
     read = (*actuator.reads, *actuator.measures)
     inputs = [x for one in read for x in (one, f"{one}'s rate")]
+    inputs += [*actuator.states, "the stage"] if actuator.states else []
     return gradient_fault(
         f"the law of `actuators.{name}`", actuator, tried_states(actuator), inputs
     )
@@ -215,16 +220,23 @@ def material_fault(pad: str, material: Material) -> str:
     return ""
 
 
-def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
-    effort = actuator(x)
-    if not isinstance(effort, Tensor) or effort.ndim:
-        shown = (
-            f"a tensor of shape {tuple(effort.shape)}"
-            if isinstance(effort, Tensor)
-            else repr(effort)
-        )
-        raise TypeError(f"for one state it gives {shown}")
-    return effort[None]
+def response_of(actuator: Actuator, x: Tensor) -> tuple[Tensor, ...]:
+    """Effort, and rates of states if there are any, of what the law reads and its states with the
+    length of the stage."""
+    n, states = actuator.inputs, len(actuator.states)
+    if not states:
+        return (actuator(x),)
+    return actuator.response(x[..., :n], x[..., n : n + states], x[..., n + states])
+
+
+def _effort(actuator: Actuator, x: Tensor) -> Tensor:
+    parts, shapes = response_of(actuator, x), ((), (len(actuator.states),))
+    for part, shape, what in zip(parts, shapes, ("effort", "rates of its states")):
+        if not isinstance(part, Tensor) or part.shape != shape:
+            tensor = isinstance(part, Tensor)
+            shown = f"a tensor of shape {tuple(part.shape)}" if tensor else repr(part)
+            raise TypeError(f"for one state it gives {shown} for the {what}")
+    return torch.cat([part.reshape(-1) for part in parts])
 
 
 def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]) -> Law:
@@ -235,21 +247,24 @@ def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]
     gives no effort; with its name.
     """
     try:
-        return compiled_law(parameters, _effort, actuator.inputs, 1, actuator.inputs, law=actuator)
+        states, read = len(actuator.states), actuator.inputs
+        size, inputs = read + states + bool(states), read + states
+        return compiled_law(parameters, _effort, size, 1 + states, inputs, law=actuator)
     except UnknownOperation as error:
         raise UnknownOperation(f"`actuators.{name}`: {error}") from error
     except Exception as error:  # any error of user code
         raise TypeError(
             f"the law of `actuators.{name}` must take five tensors (set-point, its rate, "
-            "feed-forward, coordinate, its rate) and return the effort, a tensor of a "
-            f"coordinate's shape, but {type(error).__name__}: {error}"
+            "feed-forward, coordinate, its rate), with states of its own these and the stage's "
+            "length too, and return the effort, a tensor of a coordinate's shape, with states "
+            f"their rates too, but {type(error).__name__}: {error}"
         ) from error
 
 
 def contact_laws(law: Any, shape: Any) -> LawSet:
     """The laws of a contact of `law` on a body of `shape`."""
     _, parameters = as_law(interface_law, {"law": law, "shape": shape})
-    states = 1 + len(friction_states(law.friction))
+    states = 1 + len(own_states(law.friction))
     inputs, rows = MOTION + states + 2, WRENCH + states + 2
     return LawSet(
         compiled_law(parameters, distance_law, inputs, 0, 0, shape=shape),

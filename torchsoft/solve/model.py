@@ -364,7 +364,11 @@ class Model:
             + [rig.coordinate(f"{name}.y") for name in rig.weighted],
             power=[*range(len(every)), *[len(every)] * len(rig.weighted)],
             signal_start=signal_start, signal=signal, coordinate_start=coordinate_start,
-            coordinate=coordinate,
+            coordinate=coordinate, states=[len(one.states) for one in every] + [0] * len(others),
+            y_start=[
+                self.layout.slices["control", name].start if one.states else 0
+                for name, one in rig.actuators.items()
+            ] + [0] * len(others),
         )  # fmt: skip
 
     def _laws(self, name: str, law: SoftContact, shape: Shape) -> LawSet:

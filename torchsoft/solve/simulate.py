@@ -296,7 +296,7 @@ def _growing(task: Task, tape_bytes: float) -> Iterator[Solved]:
             )
         if not bool(torch.isfinite(dy0).all()):
             raise ValueError("`dy0` must be finite, but has a component that is not")
-    kept = stepper.layout.rigid if task.rigid else list(range(size))
+    kept = stepper.layout.measured if task.rigid else list(range(size))
     sums = Touch(stepper.rig).sums(task.touch)
     return iterate(stepper, task.y0, task.t, leaves, dy0, kept, sums)
 

@@ -218,7 +218,11 @@ class ErrorParts:
         layout, found = rig.layout, list[tuple[int, int, bool, str, str]]()
         self._poses = [here for (kind, _), here in layout.slices.items() if kind == "pose"]
         for (kind, name), here in layout.slices.items():
-            if kind == "friction":
+            if kind == "control":
+                units = rig.actuators[name].states.values()
+                dimensions = [DIMENSIONS.get(unit, "own") for unit in units]
+                parts = [(here.start + i, here.start + i + 1, x) for i, x in enumerate(dimensions)]
+            elif kind == "friction":
                 one_by_one = torch.arange(here.start, here.stop)
                 one_by_one = one_by_one.unflatten(0, layout.shapes[kind, name])
                 parts = [(int(row[0]), int(row[-1]) + 1, "own") for row in one_by_one]
@@ -255,10 +259,15 @@ class ErrorParts:
         return Errors(first, last, rate, atol * np.array(unit), np.array(size), origin)
 
 
+DIMENSIONS = {"N": "force", "N.m": "force", "m.s": "length", "rad.s": "angle"}
+"""Units of `atol` of the states of actuators, an integral's over a second, by their own; others are
+judged in units of their start."""
+
 QUANTITIES = {
     "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
     "pose": "the pose of body", "rates": "the nodal velocities of pad",
     "velocity": "the velocity of body", "friction": "the states of friction of contact",
+    "control": "the states of actuator",
 }  # fmt: skip
 """Quantities of the parts of a state, in words."""
 

@@ -157,7 +157,7 @@ class Standing(NamedTuple):
                     pose = resting(
                         rig, pose, self.rests, signals=still, actuators=(), residual=BALANCED
                     )
-                found = rig.unpack(standing(rig, pose))
+                found = rig.unpack(standing(rig, pose, at))
             except NoEquilibrium as error:
                 raise SimulationFailed(f"the run cannot begin there: {error}", at) from None
             moving = {name: velocity[name] for name in found.velocity}
@@ -295,7 +295,7 @@ class MovingStart(NamedTuple):
                 ]
                 stretch[name] = B @ torch.stack([*s, B.new_zeros(())])[:-1]
             try:
-                return settled(rig, *placed(rig, signals, self.bodies, values), stretch)
+                return settled(rig, *placed(rig, signals, self.bodies, values), stretch, at)
             except NoEquilibrium as error:
                 raise SimulationFailed(f"the run cannot begin there: {error}", at) from None
 

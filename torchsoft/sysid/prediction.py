@@ -15,7 +15,6 @@ from torch import Tensor
 from torchsoft.physics.names import effort_channel, rate_channel
 from torchsoft.physics.namespace import measurable
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.state import Layout
 from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import simulate
 from torchsoft.solve.trajectory import Trajectory, channels
@@ -347,18 +346,15 @@ def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
 def by_motion(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
     """Derivatives (T, channels, n) of channels that the bodies' motion determines."""
     assert run.sensitivities is not None
-    bodies, signals = (
-        Layout({}, {}, rig.layout.free, {}, {}),
-        rig.follow(run.t, rig.reference).detach(),
-    )
+    signals = rig.follow(run.t, rig.reference).detach()
     along = [
         torch.zeros((), dtype=torch.float64, requires_grad=True)
         for _ in range(run.sensitivities.shape[-1])
     ]
-    slopes, rigid = run.sensitivities, rig.layout.rigid
-    slopes = slopes[:, rigid] if slopes.shape[1] == run.y.shape[1] else slopes
-    q = run.y[:, rigid].detach() + slopes @ torch.stack(along)
-    known = channels(rig, bodies.unpack(q, *rig.held(signals)), signals)
+    slopes, own = run.sensitivities, rig.layout.measured
+    slopes = slopes[:, own] if slopes.shape[1] == run.y.shape[1] else slopes
+    q = run.y[:, own].detach() + slopes @ torch.stack(along)
+    known = channels(rig, rig.layout.without_surfaces().unpack(q, *rig.held(signals)), signals)
     measured = torch.stack([known[name] for name in names], -1)
     out = directions(measured, along)
     out[..., : len(run.wrt)] += directions(measured, [rig.parameter(name) for name in run.wrt])

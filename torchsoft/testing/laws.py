@@ -20,6 +20,7 @@ from torchsoft.solve.laws import (
     contact_laws,
     friction_fault,
     outputs_of,
+    response_of,
     tried_efforts,
     tried_states,
 )
@@ -72,7 +73,8 @@ def _actuator_faults(name: str, actuator: Actuator) -> Iterator[str]:
     x = tried_states(actuator)
     what = f"the law of `actuators.{name}`"
     with torch.no_grad():
-        together, alone = actuator(x), torch.stack([actuator(row) for row in x])
+        together = response_of(actuator, x)[0]
+        alone = torch.stack([response_of(actuator, row)[0] for row in x])
     if together.shape != alone.shape or not torch.allclose(together, alone, rtol=ALIKE, atol=0.0):
         yield f"{what} gives several states at once other efforts than each of them alone"
     yield from _otherwise(what, actuator, x)

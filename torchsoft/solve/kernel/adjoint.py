@@ -14,7 +14,7 @@ from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, MIX, TINY, WRENCH
 from torchsoft.solve.kernel.invoke import call_pullback
 from torchsoft.solve.kernel.linear import add, bounds, put, solve_dense
 from torchsoft.solve.kernel.nodal import inertial, pull_felt
-from torchsoft.solve.kernel.sources import balance, effort
+from torchsoft.solve.kernel.sources import balance, effort, first_coordinate, first_state
 from torchsoft.solve.kernel.step import dense_states
 from torchsoft.solve.kernel.table import Array
 
@@ -79,6 +79,7 @@ def stage_adjoint(
     matrix[:], nu[:], z.q[:], z.V[:] = 0.0, 0.0, 0.0, 0.0
     for i in range(free):
         V_bar[i] = y_bar[s.body_V_start + i] + a * y_bar[s.body_q_start + i]
+    pull_source_states(s, w, y, a, signals, y_bar, V_bar)
     for pad in range(count):
         pads.assemble(s, w, pad, y, a, Rv)
         pads.pull_forces(s, w, z, pad, y_bar, a, V_bar, felt)
@@ -173,27 +174,57 @@ def pull_faded(
 
 
 @compiled
+def pull_source_states(
+    s: Any, w: Any, y: Array, a: float, signals: Array, y_bar: Array, V_bar: Array
+) -> None:
+    """Add the cotangents of the velocities at the stage's end to V_bar, by those of the sources'
+    states."""
+    for i in range(s.source_pushed.size):
+        states = s.source_states[i]
+        if states == 0:
+            continue
+        effort(s, w, i, y, signals, a)
+        columns = first_state(s, i) + states
+        for o in range(states):
+            n, J = first_coordinate(s, i), w.effort_J[(1 + o) * columns : (2 + o) * columns]
+            bar = a * y_bar[s.source_y_start[i] + o]
+            for k in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
+                number = s.body_free[s.source_coordinate[k]]
+                if number >= 0:
+                    V_bar[number] += (a * J[n] + J[n + 1]) * bar
+                n += 2
+
+
+@compiled
 def pull_bodies(
     s: Any, w: Any, z: Any, y: Array, a: float, signals: Array, y_bar: Array, p_bar: Array,
     signals_bar: Array,
 ) -> None:  # fmt: skip
-    """Cotangents of the bodies' state, their masses, the sources' parameters and the signals."""
-    J, nu = w.effort_J, z.nu
+    """Cotangents of the bodies' state, their masses, the sources' parameters and states, and the
+    signals."""
+    nu = z.nu
     for i in range(s.source_pushed.size):
-        number = s.body_free[s.source_pushed[i]]
-        if number < 0:
+        number, states, bar = s.body_free[s.source_pushed[i]], s.source_states[i], z.weights
+        if number < 0 and states == 0:
             continue
-        effort(s, w, i, signals)
-        own, push, n = bounds(s.source_p_start, i), nu[number], 0
-        call_pullback(s.source_pullback[i], w.effort_x, s.p[own], push, p_bar[own])
-        for k in range(s.source_signal_start[i], s.source_signal_start[i + 1]):
-            signals_bar[s.source_signal[k], 0] += push[0] * J[0, n]
-            signals_bar[s.source_signal[k], 1] += push[0] * J[0, n + 1]
-            n += 2
-        for k in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
-            z.q[s.source_coordinate[k]] += push[0] * J[0, n]
-            z.V[s.source_coordinate[k]] += push[0] * J[0, n + 1]
-            n += 2
+        effort(s, w, i, y, signals, a)
+        own, columns = bounds(s.source_p_start, i), first_state(s, i) + states
+        bar[0] = nu[number, 0] if number >= 0 else 0.0
+        for o in range(states):
+            bar[1 + o] = a * y_bar[s.source_y_start[i] + o]
+        call_pullback(s.source_pullback[i], w.effort_x, s.p[own], bar, p_bar[own])
+        for o in range(1 + states):
+            n, J = 0, w.effort_J[o * columns : (o + 1) * columns]
+            for k in range(s.source_signal_start[i], s.source_signal_start[i + 1]):
+                signals_bar[s.source_signal[k], 0] += bar[o] * J[n]
+                signals_bar[s.source_signal[k], 1] += bar[o] * J[n + 1]
+                n += 2
+            for k in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
+                z.q[s.source_coordinate[k]] += bar[o] * J[n]
+                z.V[s.source_coordinate[k]] += bar[o] * J[n + 1]
+                n += 2
+            for k in range(states):
+                y_bar[s.source_y_start[i] + k] += bar[o] * J[n + k]
     for i in range(s.body_coordinate.size):
         c, mass = s.body_coordinate[i], s.p[s.body_mass_at[i]]
         p_bar[s.body_mass_at[i]] -= nu[i, 0] * (w.V[c] - y[s.body_V_start + i]) / a

@@ -71,7 +71,9 @@ class Bodies(NamedTuple):
 class Sources(NamedTuple):
     """Actuators and weights, each an effort on one coordinate: law addresses, its parameters' ends
     in p, coordinate pushed, power: its number among those that are integrated; the ends of what it
-    reads in signal and in coordinate, each with its rate."""
+    reads in signal and in coordinate, each with its rate; how many states of its own its law has,
+    and y_start of them. The law reads these and the length a h of the stage last, and gives the
+    effort and then their rates."""
 
     linearise: Index
     pullback: Index
@@ -82,6 +84,8 @@ class Sources(NamedTuple):
     signal: Index
     coordinate_start: Index
     coordinate: Index
+    states: Index
+    y_start: Index
 
 
 class Pads(NamedTuple):
@@ -277,9 +281,10 @@ SCRATCH: dict[str, dict[str, str]] = {
         "free free": "Rv",
         "free": "dV",
         "nodes2 columns+free": "X",  # left by Newton's elimination
-        "1": "phi effort",
+        "1": "phi",
         "reads": "effort_x",
-        "1 reads": "effort_J",
+        "efforts": "effort",  # of a source, with the rates of its states
+        "effort_jacobian": "effort_J",
         "free_inputs": "decay_x",
         "free_outputs": "decay",
         "square": "decay_J",
@@ -512,19 +517,28 @@ def recorded_size(s: Any) -> int:
     return 2 * len(s.point_X) + 3 * len(s.pad_base) + len(s.body_free)
 
 
+def columns(s: Any) -> Any:
+    """Numbers of inputs by which the laws of sources are differentiated: what they read, with
+    rates, and their states."""
+    return (
+        2 * (np.diff(s.source_signal_start) + np.diff(s.source_coordinate_start)) + s.source_states
+    )
+
+
 def scratch(kind: str, s: Any, state: int, **sizes: int) -> Any:
     """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those
     that it does not decide."""
     states, nodes = int(s.contact_states.max(initial=1)), int(s.pad_node_start[-1])
+    reads, efforts = 1 + columns(s).max(initial=1), 1 + s.source_states.max(initial=0)
     dofs, band = np.diff(s.nodal_dof_start), 2 * s.nodal_band + 1
     widest, corners = 2 * int(np.diff(s.pad_node_start).max(initial=0)), s.nodal_dof.shape[1]
     sizes |= {
         "state": state, "coordinates": len(s.body_free), "free": len(s.body_coordinate),
         "contacts": len(s.contact_pad), "points": len(s.point_X), "pads": len(s.pad_base),
         "nodes": nodes, "nodes2": 2 * nodes, "condensed": 2 * nodes, "widest": widest,
-        "reads": 2 * int((np.diff(s.source_signal_start)
-                          + np.diff(s.source_coordinate_start)).max(initial=1)),
-        "states": states, "rows": WRENCH + states + 2, "outputs": WRENCH + states + 4,
+        "reads": int(reads), "efforts": int(efforts), "effort_jacobian": int(reads * efforts),
+        "states": states, "rows": max(WRENCH + states + 2, int(efforts)),
+        "outputs": WRENCH + states + 4,
         "inputs": MOTION + states + 2, "jacobian": (WRENCH + states + 2) * (MOTION + states),
         "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
         "lanes": LANES, "groups": int(s.nodal_element_start[-1]) // LANES,

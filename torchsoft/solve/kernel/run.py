@@ -250,11 +250,10 @@ def rates(r: Any) -> None:
     w.travelled[0] = np.inf  # the last state was any other one
     converged, _, _ = solve_near(s, w, r.limits, y, r.signals[0], AT_ONCE, r.powers, r.wrenches)
     put(w.k, out)
+    for i in range(s.source_pushed.size):
+        w.load[s.source_pushed[i]] += effort(s, w, i, y, r.signals[0], AT_ONCE)
     for i in range(s.body_coordinate.size):
         load = w.load[s.body_coordinate[i]]
-        for source in range(s.source_pushed.size):
-            if s.source_pushed[source] == s.body_coordinate[i]:
-                load += effort(s, w, source, r.signals[0])
         out[s.body_V_start + i] = load / s.p[s.body_mass_at[i]]  # (17), (18)
         out[s.body_q_start + i] = y[s.body_V_start + i]
     r.converged[0] = 1 if converged else 0

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, contacts, pads
 from torchsoft.solve.kernel.linear import put, solve_dense
-from torchsoft.solve.kernel.sources import balance
+from torchsoft.solve.kernel.sources import balance, remember
 from torchsoft.solve.kernel.table import Array
 
 SEARCH_AFTER, SHORTEST = 2, 2.0**-10
@@ -127,7 +127,9 @@ def solve_stage(
 
 
 @compiled
-def finish(s: Any, w: Any, y: Array, a: float, powers: Array, wrenches: Array) -> float:
+def finish(
+    s: Any, w: Any, y: Array, signals: Array, a: float, powers: Array, wrenches: Array
+) -> float:
     """All rates of the accepted stage in w.k, what the pads and contacts dissipate in `powers`
     (pads, dashpots, slip) [W], generalised forces in w.load, the force on every pad [N] and its
     moment (Eq. 35) [N.m] in its base's axes. Returns a bound of every surface speed [m/s]."""
@@ -141,6 +143,7 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, wrenches: Array) -
         c = s.body_coordinate[i]
         w.k[s.body_q_start + i] = w.V[c]
         w.k[s.body_V_start + i] = (w.V[c] - y[s.body_V_start + i]) / a
+    remember(s, w, y, signals, a)
     for c in range(s.contact_pad.size):
         rate = w.relative[c, 3:]
         speed = np.hypot(rate[0], rate[1]) + abs(rate[2]) * s.contact_size[c]

@@ -109,7 +109,7 @@ def solve_near(
         converged, count = solve_stage(s, w, limits, y, signals, a, reach)
         solves += count
         if converged:
-            speed = finish(s, w, y, a, powers, wrenches)
+            speed = finish(s, w, y, signals, a, powers, wrenches)
             done = w.travelled[0] + a * speed <= w.travelled[1]
             if not done:  # a point may have come near that was not looked at
                 converged = reach == margin  # one look further must do
@@ -145,7 +145,7 @@ def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
         if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y, 0.0):
             status = TAPE_FULL
             break
-        sources.supply(s, w, signals[stage], powers, s.pad_base.size + 2)
+        sources.supply(s, w, y, signals[stage], a, powers, s.pad_base.size + 2)
         put(w.k, d.K[stage])
         d.speed[stage] = speed
         dt = a if stage == 1 else h - a

@@ -11,7 +11,7 @@ from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, MIX, WRENCH
 from torchsoft.solve.kernel.invoke import call_pullback
 from torchsoft.solve.kernel.linear import add, bounds, put, solve_dense
 from torchsoft.solve.kernel.nodal import inertial, push_felt
-from torchsoft.solve.kernel.sources import balance, effort, first_coordinate
+from torchsoft.solve.kernel.sources import balance, effort, first_coordinate, first_state
 from torchsoft.solve.kernel.step import dense_states
 from torchsoft.solve.kernel.table import Array
 
@@ -51,16 +51,51 @@ def push_bodies(
         number = s.body_free[s.source_pushed[i]]
         if number < 0:
             continue
-        effort(s, w, i, signals)
-        own = bounds(s.source_p_start, i)
-        law_derivatives(z, s.source_pullback[i], w.effort_x, s.p[own], dp[own], 1, z.change)
+        push_source(s, w, z, i, y, a, signals, dy, dp, 1)
         add(1.0, z.change[0], r[number])
-        n = first_coordinate(s, i)
+
+
+@compiled
+def push_source(
+    s: Any, w: Any, z: Any, i: int, y: Array, a: float, signals: Array, dy: Array, dp: Array,
+    rows: int,
+) -> None:  # fmt: skip
+    """Tangents of the effort of source i, and of rates of its states, at the same velocities, into
+    z.change."""
+    effort(s, w, i, y, signals, a)
+    own, columns = bounds(s.source_p_start, i), first_state(s, i) + s.source_states[i]
+    law_derivatives(z, s.source_pullback[i], w.effort_x, s.p[own], dp[own], rows, z.change)
+    for o in range(rows):
+        n, J = first_coordinate(s, i), w.effort_J[o * columns : (o + 1) * columns]
         for j in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
             measured = s.body_free[s.source_coordinate[j]]
             if measured >= 0:
-                add(w.effort_J[0, n], dy[s.body_q_start + measured], r[number])
+                add(J[n], dy[s.body_q_start + measured], z.change[o])
             n += 2
+        for j in range(s.source_states[i]):
+            add(J[n + j], dy[s.source_y_start[i] + j], z.change[o])
+
+
+@compiled
+def push_source_states(
+    s: Any, w: Any, z: Any, y: Array, a: float, signals: Array, dy: Array, dp: Array
+) -> None:
+    """Tangents of the sources' states at the stage's end, by those of its velocities, z.V."""
+    for i in range(s.source_pushed.size):
+        states = s.source_states[i]
+        if states == 0:
+            continue
+        push_source(s, w, z, i, y, a, signals, dy, dp, 1 + states)
+        columns = first_state(s, i) + states
+        for o in range(1, 1 + states):
+            n, J = first_coordinate(s, i), w.effort_J[o * columns : (o + 1) * columns]
+            for j in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
+                measured = s.body_free[s.source_coordinate[j]]
+                if measured >= 0:
+                    add(a * J[n] + J[n + 1], z.V[measured], z.change[o])
+                n += 2
+        for o in range(states):
+            add(a, z.change[1 + o], dy[s.source_y_start[i] + o])
 
 
 @compiled
@@ -162,6 +197,8 @@ def stage_tangent(
         else:
             push_states(s, w, z, pad, y, a, dy, dp)
             pads.push_state(s, w, z, pad, y, a, dy, dp)
+    if not felt:
+        push_source_states(s, w, z, y, a, signals, dy, dp)
     for i in range(0 if felt else dV.shape[0]):
         add(a, dV[i], dy[s.body_q_start + i])
         put(dV[i], dy[s.body_V_start + i])
