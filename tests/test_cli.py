@@ -284,9 +284,9 @@ def test_competing_laws_are_compared(folder, capsys, monkeypatch):
     """The law of the file is compared by the runs of its identification."""
     made, inner = list[str](), runs.simulated
 
-    def simulated(recording: Any, begun: Any, job: Job, start: Any) -> Any:
-        made.append(f"{recording.fingerprint} {job}")
-        return inner(recording, begun, job, start)
+    def simulated(recording: Any, begun: Any, job: Job, *start: Any, **grid: Any) -> Any:
+        made.append(f"{recording.fingerprint} {job} {grid}")
+        return inner(recording, begun, job, *start, **grid)
 
     monkeypatch.setattr(runs, "simulated", simulated)
     law = '{kind = "coulomb", mu_s = 0.8, mu_k = 0.7}'

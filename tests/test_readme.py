@@ -111,6 +111,9 @@ def test_commands_run(page, folder):
     (folder / "relaxation.csv").write_text(f"t [s],strain [%],stress [kPa]\n{rows}")
     pull = "".join(f"{x / 10};{x / 8};23\n" for x in range(120)).replace(".", ",")
     (folder / "pull.csv").write_text(f"Weg;Standardkraft;Temperatur\nmm;N;C\n{pull}")
+    for test, wide in (("tension", lambda x: x - x**-2), ("shear", lambda x: x - 1)):
+        rows = "".join(f"{x / 40},{100 * wide(1 + x / 40)}\n" for x in range(1, 41))
+        (folder / f"{test}.csv").write_text(f"strain [1],stress [kPa]\n{rows}")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     for line in commands(page):
         program, *rest = shlex.split(line, comments=True)

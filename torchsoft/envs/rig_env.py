@@ -252,7 +252,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             if not low <= x <= high:
                 return f"{name} = {x:.4g} left its bounds, {low:g} to {high:g}"
         for body, slices in self.held.items():
-            if not any((now.recorded.numpy()[at] > 0).any() for at in slices):
+            if not any((now.recorded.detach().numpy()[at] > 0).any() for at in slices):
                 return f"{body} was dropped: no contact touches it"
         return ""
 

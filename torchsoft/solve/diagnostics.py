@@ -68,8 +68,9 @@ def missing_energy(ledger: Ledger) -> float:
     return float(np.abs(left).max()) / energy_scale(ledger)
 
 
-def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
-    """Run warnings: sentences on the faults of a finished run with a ledger, by their subject."""
+def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> dict[str, str]:
+    """Run warnings: sentences on the faults of a finished run with a ledger, by their subject; on
+    those of its gradient if it has one, or is said to be `differentiated`."""
     run, ledger, found = trajectory, Ledger.of(trajectory), dict[str, str]()
     scale, part = energy_scale(ledger), missing_energy(ledger)
     if not part <= RESIDUAL:
@@ -94,7 +95,7 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
             "those that it took"
         )
     slips = dict(zip(ledger.names, ledger.dissipated[-1]))["slip"] > 0
-    biased = slips and (run.y.requires_grad or run.sensitivities is not None)
+    biased = slips and (differentiated or run.y.requires_grad or run.sensitivities is not None)
     for name in rig.contacts:
         if bounded := softened(run, rig, name):
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"

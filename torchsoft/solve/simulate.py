@@ -99,6 +99,13 @@ def simulate(
     return trajectory
 
 
+@ungraphed
+@one_torch_thread()
+def unjudged(rig: Rig, t: Numbers, **options: Any) -> Trajectory:
+    """`simulate` without its warnings, for searches whose runs on the way need none."""
+    return run(prepare(rig, t, **options), TAPE_BYTES).trajectory()
+
+
 class Task(NamedTuple):
     """A run that may begin: the arguments of `simulate`, checked. The stepper has a snapshot of the
     `rig`."""

@@ -5,6 +5,7 @@ import platform
 import sys
 import time as clock
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -15,6 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
+from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.colour import (
     WORSE,
     allow_for_colour,
@@ -47,6 +49,7 @@ from torchsoft.sysid.plan import (
     shown,
 )
 from torchsoft.sysid.prechecks import accepted, precheck
+from torchsoft.sysid.prediction import run_doubts
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import coarsened
@@ -182,6 +185,7 @@ def conclude(
         else:
             predicted = nrmse(problem, held.r, list(heldout))
             notices += guesses(problem, x, heldout)
+    notices += run_notices(end)
     notices += notices_on(
         found,
         ordering_constraints(problem),
@@ -258,6 +262,18 @@ def conclude(
         versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
         rigs={recording.name: recording.rig for recording in problem.recordings},
     )
+
+
+def run_notices(end: Fit) -> list[str]:
+    """Warnings of the runs at the end of a fit, each of the first recording that has it."""
+    found = dict[str, str]()
+    for k, recording in enumerate(end.problem.recordings):
+        if recording.name in end.which:
+            with suppress(SimulationFailed):
+                values, grid = end.problem.values(end.x, k), recording.grid(False)
+                for text in run_doubts(recording.begin(), values, grid, end.rtol):
+                    found.setdefault(text, f"the run of recording `{recording.name}`: {text}")
+    return [*found.values()]
 
 
 def tested_assumptions(end: Fit, doubtful: bool, explain: bool) -> Checked:

@@ -15,8 +15,9 @@ from torch import Tensor
 from torchsoft.physics.names import effort_channel, rate_channel
 from torchsoft.physics.namespace import measurable
 from torchsoft.physics.rig import Rig
+from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import directions
-from torchsoft.solve.simulate import simulate
+from torchsoft.solve.simulate import unjudged
 from torchsoft.solve.trajectory import Trajectory, channels
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression
@@ -395,7 +396,7 @@ def predict(
     wrt = tuple(name for name in names if not name.startswith(PREFIX))
     if begun.drift.changes:
         return drifting(begun, grid, names, steps, y0, dy0, wrt, touch)
-    out = simulate(
+    out = unjudged(
         rig,
         grid.t,
         y0=y0,
@@ -417,6 +418,16 @@ def predict(
     )
 
 
+def run_doubts(
+    begun: RunContext, values: Mapping[str, float], grid: Grid, steps: Steps
+) -> list[str]:
+    """Warnings of the run at the end of a fit, which those on the way to it do not give. Raises
+    `SimulationFailed`."""
+    y0, _ = prepared(begun, values, ())
+    run = unjudged(begun.rig, grid.t, y0=y0.detach(), **choice(steps))
+    return list(doubts(run, begun.rig, differentiated=True).values())
+
+
 PIECES = 24
 """Pieces of a run, along each of which a number that drifts is held at its value in the middle."""
 
@@ -429,7 +440,7 @@ def drifting(
     piece after piece, by the frozen steps, or by those that a tolerance chooses without drift."""
     rig, keys, drift, t = begun.rig, begun.channels, begun.drift, grid.t.numpy()
     if not isinstance(steps, Frozen):
-        steps = Frozen(simulate(rig, grid.t, y0=y, **choice(steps)).knots.numpy())
+        steps = Frozen(unjudged(rig, grid.t, y0=y, **choice(steps)).knots.numpy())
     knots, stated = steps.knots, {name: rig.parameter(name).item() for name in drift.changes}
     ends = np.searchsorted(knots, np.linspace(drift.first, drift.last, PIECES + 1)[1:-1])
     values, slopes = list[Array](), list[Array]()
@@ -440,7 +451,7 @@ def drifting(
         end = t[-1] if last == len(knots) - 1 else knots[last]
         own = t[(t > knots[first] + SAME) & (t <= end + SAME)]
         between = [knots[first], *own, *([] if own.size and end - own[-1] <= SAME else [end])]
-        out = simulate(
+        out = unjudged(
             rig, between, y0=y, gradient="forward" if names else "none", wrt=wrt,
             dy0=dy / torch.from_numpy(scale) if names else None, touch=touch,
             **choice(Frozen(knots[first : last + 1])),
@@ -473,7 +484,7 @@ def misfit(
         by = np.einsum("gc,gcn->n", weights, np.array(made.derivatives))
         return Misfit(loss, by, nuisances)
     y0, inputs = prepared(begun, values, names)
-    out = simulate(begun.rig, grid.t, y0=y0, gradient="discrete", **choice(steps))
+    out = unjudged(begun.rig, grid.t, y0=y0, gradient="discrete", **choice(steps))
     keys, rows = begun.channels, slice(grid.early, None)
     signals = out.together(*keys)[rows]
     loss, weights, nuisances = judge(

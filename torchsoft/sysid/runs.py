@@ -225,6 +225,8 @@ class Runner:
         it runs counts here too."""
         out = Runner(recordings, self.workers, self.folder, variations)
         out._parent = self
+        if [*map(id, out.recordings)] == [*map(id, self.recordings)]:
+            out._watched, out._lock = self._watched, self._lock
         return out
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
@@ -278,9 +280,10 @@ class Runner:
             if one is not stated:
                 return run(one, fine, True)
             with self._lock:
-                if repr(fine) not in self._watched:
-                    self._watched = {repr(fine): run(one, fine, True)}
-                return self._watched[repr(fine)]
+                if (found := self._watched.get(repr(fine))) is None:
+                    self._watched.clear()
+                    found = self._watched[repr(fine)] = run(one, fine, True)
+                return found
 
         recording: Recording | None = stated
         try:

@@ -54,6 +54,9 @@ MOST = 12
 RIVAL = 0.3
 """Fraction of the best suspect's gain to first order above which another one is its rival."""
 
+FIRST_ORDER = 3.0
+"""Standard deviations by which estimates may move in a test to first order."""
+
 BESIDES = 3
 """Most effects that are looked for besides the likeliest suspect."""
 
@@ -145,6 +148,19 @@ class AssumptionTest(Assumption):
         size = min(self.detectable, AMOUNTS * self.amount)
         label, move = self.most_moved
         return label, move * size / self.amount, size
+
+    @property
+    def shift(self) -> tuple[str, float]:
+        """Label of the coordinate that moves most under the variation, and by how many of its
+        standard deviations."""
+        label, move = self.most_moved
+        linear = self.kind in ("known", "sensor") and not self.refitted
+        return label, move * self.favoured / self.amount if linear else move
+
+    @property
+    def far(self) -> bool:
+        """Whether estimates under the variation are too far away for a test to first order."""
+        return not self.refitted and abs(self.shift[1]) > FIRST_ORDER
 
     @property
     def most_moved(self) -> tuple[str, float]:
@@ -305,9 +321,8 @@ def new_fits(
             )
         ]
         if explains and len(together) > 1:
-            several = [one for one in candidates if one.name in together]
-            if len({one.fault and one.fault[1] for one in several} - {None}) == 1:
-                order.insert(0, several)
+            alone = {one.name: checks[one.name].gain for one in candidates}
+            order = [*alike(candidates, together, alone), *order]
         bar.set_description("new fit with all assumptions")
         as_stated = refit(end, ())
         bar.update()
@@ -348,6 +363,25 @@ def new_fits(
                 checks[best] = judge.together(best, other, as_stated, tried, linear)
 
 
+def alike(
+    candidates: Sequence[Variation], together: Sequence[str], gains: Mapping[str, float]
+) -> list[list[Variation]]:
+    """The sensors whose faults of one kind explain the misfit `together`, and the same with other
+    kinds that explain as much of it alone: to first order a lag is a delay."""
+    some = [one for one in candidates if one.name in together]
+    kinds = {one.fault and one.fault[1] for one in some}
+    if len(kinds) > 1 or None in kinds:
+        return []
+    others = list[list[Variation]]()
+    for kind in dict.fromkeys(one.fault[1] for one in candidates if one.fault) if some else ():
+        places = [(one.fault[0], kind) for one in some if one.fault]
+        same = [one for place in places for one in candidates if one.fault == place]
+        rated = zip(same, some)
+        if len(same) == len(some) and all(gains[a.name] > RIVAL * gains[b.name] for a, b in rated):
+            others.append(same)
+    return others
+
+
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
     """Suspects for repeated fits, in order of their gain: the first `MOST`, and every law and
     constant of the computation, which may have a run elsewhere though none at the end of the
@@ -360,11 +394,11 @@ def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest])
 
 def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
     """Suspects that the data favour to first order nearly as much as the likeliest one, if there
-    are any: only new fits can tell them apart."""
+    are any: only new fits can tell them apart, or where estimates are under a single one."""
     favoured = [one for one in suspects if one.name in checks and checks[one.name].suspected]
     best = max((checks[one.name].gain for one in favoured), default=0.0)
     near = [one for one in favoured if checks[one.name].gain > RIVAL * best]
-    return near if len(near) > 1 else []
+    return near if len(near) > 1 or any(checks[one.name].far for one in near) else []
 
 
 def compared(checked: Checked, judge: "Judge") -> Checked:

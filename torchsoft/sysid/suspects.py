@@ -156,7 +156,7 @@ def contradictions(
     """A sentence on the suspect with the best odds, and on those that the data cannot tell from it;
     on all of them alike, where tests to first order cannot."""
     best = favoured[0]
-    if candidates:
+    if len(candidates) > 1:
         order = sorted(candidates, key=lambda c: -c.gain)
         listed = "; ".join(f"{c.name} (by {c.gain:.0f})" for c in order[:NAMED])
         more = f"; {len(order) - NAMED} more" * (len(order) > NAMED)
@@ -165,18 +165,15 @@ def contradictions(
             f"sum of squares would fall about as far: {listed}{more}: `explain` compares them by "
             "new fits"
         ]
-    label, move = best.most_moved
+    label, move = best.shift
     text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
-    if best.kind in ("known", "sensor") and not best.refitted:
-        move *= best.favoured / best.amount
     if label:
-        under = ", ".join(
-            f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER]
-        )
-        text += (
-            f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
-            f"{under}"
-        )
+        text += f"; {label} would move by {abs(move):.2g} standard deviations"
+    if label and best.far:
+        text += ", too far for estimates to first order: `explain` fits again"
+    elif label:
+        under = list(best.under.items())[:UNDER]
+        text += f"; estimates under it: {', '.join(f'{name} = {x:.4g}' for name, x in under)}"
     rivals = [c for c in favoured[1:] if c.odds > LIKELY and c.passed]
     if rivals:
         listed = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
