@@ -90,9 +90,16 @@ def test_a_rig_file_has_both_and_a_run_keeps_their_states(tmp_path, lag):
     file = PAPER.override(COARSE | {KI_Y: 1e6, LAG_Y: lag, "actuators.x.lag": 1e-3})
     built = file.build()
     assert file.unit_of(KI_Y) == "N/(m.s)"
-    units = {name: built.rig.quantity(name) for name in (KI_Y, LAG_Y)}
-    assert [one and one.unit for one in units.values()] == ["N/(m.s)", "s"]
+    known = {name: built.rig.quantity(name) for name in (KI_Y, LAG_Y)}
+    assert [one and one.unit for one in known.values()] == ["N/(m.s)", "s"]
     assert built.rig.actuators["y"].states == {"integral": "m.s", "effort": "N"}
+    units = [(one.field, one.name, unit) for one, _, unit in built.rig.layout.groups()]
+    assert units[-3:] == [("control", "x", "N"), ("control", "y", "m.s"), ("control", "y", "N")]
+    assert ("pads", "L", "N") in units
+    assert [unit for field, name, unit in units if (field, name) == ("pose", "disc")] == [
+        "m",
+        "rad",
+    ]
     run = simulate(built.rig, times(0.3, 4), y0=built.y0, rtol=1e-4)
     run.save(tmp_path / "run.nc")
     again = Trajectory.load(tmp_path / "run.nc")

@@ -81,12 +81,11 @@ def test_sizes_of_the_papers_rig():
     """61 surface nodes a pad: forces and stretches, five free coordinates and their rates."""
     layout = coarse().layout
     assert layout.size == 2 * (2 * 61 + 61) + 2 * 5
-    assert layout.shapes["pads", "L"] == (1, 61, 2)
+    assert layout.blocks["pads", "L"].shape == (1, 61, 2)
     assert layout.free == {"disc": [0, 1, 2], "bracket": [0, 1]}
-    inertial = coarse(pad__inertial=True).layout
-    assert (
-        inertial.shapes["pads", "U"] == inertial.shapes["rates", "U"] == (122, 2)
-    )  # two elements high, the base held
+    inertial = coarse(pad__inertial=True).layout.blocks
+    shapes = [inertial[field, "U"].shape for field in ("pads", "rates")]
+    assert shapes == [(122, 2)] * 2  # two elements high, the base held
     assert turning().layout.size == layout.size + 2
 
 

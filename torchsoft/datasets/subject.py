@@ -464,11 +464,8 @@ def split(config: Fields, index: int) -> str:
 def rounded(rig: Rig, y0: Tensor) -> Tensor:
     """The initial state (size,), rounded."""
     y0 = y0.detach().clone()
-    for (part, name), where in rig.layout.slices.items():
-        if part in ("friction", "control"):  # of any unit
-            continue
-        forces = part == "pads" and not rig.pads[name].nodal
-        y0[where] = (
-            torch.round(y0[where], decimals=NODAL_FORCE if forces else POSITION) + 0.0
-        )  # no negative zeros
+    for block, where, own in rig.layout.groups():
+        if block.field not in ("friction", "control"):  # of any unit
+            decimals = NODAL_FORCE if own == "N" else POSITION
+            y0[where] = torch.round(y0[where], decimals=decimals) + 0.0  # no negative zeros
     return y0

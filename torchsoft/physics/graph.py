@@ -31,7 +31,14 @@ from torchsoft.physics.names import check_names
 from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, weight
 from torchsoft.physics.shapes import Shape, parameter
-from torchsoft.physics.state import Layout, State, begin_states, own_states
+from torchsoft.physics.state import (
+    Layout,
+    State,
+    begin_states,
+    body_blocks,
+    own_blocks,
+    own_states,
+)
 from torchsoft.physics.validity import Backwards
 from torchsoft.quantity import Gravity
 
@@ -198,20 +205,15 @@ class Graph(nn.Module):
     @property
     def layout(self) -> Layout:
         """Layout of the state vector."""
-        shapes = {("pads", name): pad.state_shape for name, pad in self.pads.items()}
-        for name, count in self.point_counts.items():
-            shapes["stretch", name] = (count,)
-            if own := own_states(self.contacts[name].law.friction):
-                shapes["friction", name] = len(own), count
-        shapes |= {("rates", name): (p.nodes, 2) for name, p in self.pads.items() if p.inertial}
+        counts, free = self.point_counts, {name: body.free for name, body in self.bodies.items()}
+        blocks = [block for name, pad in self.pads.items() for block in pad.blocks(name)]
+        for name, contact in self.contacts.items():
+            blocks += contact.blocks(name, counts[name])
+        for name, axes in free.items():
+            blocks += body_blocks(name, axes)
         for name, actuator in self.actuators.items():
-            if actuator.states:
-                shapes["control", name] = (len(actuator.states),)
-        free = {
-            name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
-            for name, body in self.bodies.items()
-        }
-        return Layout(free, shapes)
+            blocks += own_blocks("control", name, [*actuator.states.values()])
+        return Layout(free, blocks)
 
     @property
     def signals(self) -> tuple[str, ...]:

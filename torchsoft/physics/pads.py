@@ -34,6 +34,7 @@ from torchsoft.physics.mesh import (
     unit_compliance,
 )
 from torchsoft.physics.shapes import parameter
+from torchsoft.physics.state import StateBlock
 from torchsoft.quantity import Length, Quantity, Ratio, quantities
 
 SAMPLES = 64
@@ -167,6 +168,13 @@ class Pad(nn.Module):
         """Shape of the pad's part of the state: displacements of all fields (nodes, 2 fields), or
         forces that have set in (branches, nodes, 2)."""
         return (self.nodes, 2 * self.fields) if self.nodal else (self.branches, self.nodes, 2)
+
+    def blocks(self, name: str) -> list[StateBlock]:
+        """States of the pad called `name`: forces or displacements, and rates of one with
+        inertia."""
+        own = StateBlock.of("pads", name, self.state_shape, "m" if self.nodal else "N")
+        rates = StateBlock.of("rates", name, (self.nodes, 2), "m/s")
+        return [own, rates] if self.inertial else [own]
 
     @property
     def fields(self) -> int:

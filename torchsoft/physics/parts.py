@@ -10,7 +10,14 @@ from torch import Tensor, nn
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
-from torchsoft.physics.state import OwnState, State, begin_states, own_states
+from torchsoft.physics.state import (
+    OwnState,
+    State,
+    StateBlock,
+    begin_states,
+    own_blocks,
+    own_states,
+)
 from torchsoft.quantity import (
     DerivativeGain,
     Inertia,
@@ -69,6 +76,11 @@ class Body(nn.Module):
                 "a body that may turn needs an `inertia`, or a `shape` to compute it from"
             )
 
+    @property
+    def free(self) -> list[int]:
+        """Free coordinates, numbers among (x, y, theta)."""
+        return [i for i, axis in enumerate(COORDINATES) if self.freedom[axis] == "free"]
+
     @classmethod
     def uniform(cls, shape: Shape, density: float, depth: float, **given: Any) -> Self:
         """A body of uniform `density` [kg/m3] over its `depth` [m]. Its mass is that of the shape
@@ -104,6 +116,12 @@ class Contact(nn.Module):
     def __init__(self, pad: str, body: str, law: SoftContact, *, may_leave: bool = False) -> None:
         super().__init__()
         self.pad, self.body, self.law, self.may_leave = pad, body, law, may_leave
+
+    def blocks(self, name: str, points: int) -> list[StateBlock]:
+        """States of so many contact points: stretches, and those of the law of friction."""
+        units = [one.unit for one in own_states(self.law.friction).values()]
+        stretch = StateBlock.of("stretch", name, (points,), "m")
+        return [stretch, *own_blocks("friction", name, units, (points,))]
 
 
 def coordinate_unit(name: str) -> str:

@@ -1,7 +1,7 @@
 """The state vector of a rig: which component stands where, and how it is taken apart."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -30,6 +30,41 @@ def begin_states(law: object, shape: Sequence[int]) -> Tensor:
     return torch.stack(begin or [zero])[: len(begin)].expand(*shape, len(begin))
 
 
+class StateBlock(NamedTuple):
+    """States of one kind that a part of a rig declares: the field of `State`, the part's name,
+    their shape, and `groups` of components of which errors are judged together, in the order of the
+    flat vector: how many, and their unit."""
+
+    field: str
+    name: str
+    shape: tuple[int, ...]
+    groups: tuple[tuple[int, str], ...]
+
+    @classmethod
+    def of(cls, field: str, name: str, shape: tuple[int, ...], unit: str) -> "StateBlock":
+        """States of one unit, judged together."""
+        return cls(field, name, shape, ((math.prod(shape), unit),))
+
+
+def own_blocks(
+    field: str, name: str, units: Sequence[str], shape: tuple[int, ...] = ()
+) -> list[StateBlock]:
+    """States (states, *shape) of a law, of these units, each judged by itself; none without."""
+    groups = tuple((math.prod(shape), unit) for unit in units)
+    return [StateBlock(field, name, (len(units), *shape), groups)] if units else []
+
+
+def body_blocks(name: str, axes: Sequence[int]) -> list[StateBlock]:
+    """Free coordinates of a body, numbers among (x, y, theta), and their rates."""
+    turns = int(2 in axes)
+    return [
+        StateBlock(
+            field, name, (len(axes),), ((len(axes) - turns, f"m{per}"), (turns, f"rad{per}"))
+        )
+        for field, per in (("pose", ""), ("velocity", "/s"))
+    ]
+
+
 class State(NamedTuple):
     """One state, batch dimensions leading, every part by the name of its pad, contact or body. SI
     units.
@@ -52,30 +87,39 @@ class State(NamedTuple):
     control: Mapping[str, Tensor] = MappingProxyType({})
 
 
+ORDER = {
+    "pads": 0, "stretch": 1, "friction": 1, "pose": 2, "rates": 3, "velocity": 4, "control": 5,
+}  # fmt: skip
+"""Order of the fields of `State` in the flat vector; states of friction follow the stretches of
+their contact."""
+
+
 class Layout:
     """Layout of the flat state vector: pads, contacts' stretches and states of friction, free
     coordinates, pads' velocities, free velocities, states of actuators.
 
-    `shapes` are by (part, name), with part one of State's fields; parts that are not there are left
-    out, and so are those of no component but a body's. The free coordinates are ("pose", body) and
-    ("velocity", body), `free` their places among (x, y, theta). `size` is the vector's length,
-    `slices` the places in it.
+    `blocks` are those that its parts declare, by (field of State, name); the free coordinates are
+    ("pose", body) and ("velocity", body), `free` their places among (x, y, theta). `size` is the
+    vector's length, `slices` the places in it.
     """
 
-    def __init__(
-        self, free: Mapping[str, list[int]], shapes: Mapping[tuple[str, str], tuple[int, ...]]
-    ) -> None:
+    def __init__(self, free: Mapping[str, list[int]], blocks: Iterable[StateBlock]) -> None:
         self.free = {name: list(axes) for name, axes in free.items()}
-        of = lambda *parts: {key: shape for key, shape in shapes.items() if key[0] in parts}
-        bodies = lambda part: {(part, name): (len(axes),) for name, axes in self.free.items()}
-        self.shapes: dict[tuple[str, str], tuple[int, ...]] = (
-            of("pads") | of("stretch", "friction") | bodies("pose") | of("rates")
-            | bodies("velocity") | of("control")
-        )  # fmt: skip
+        ordered = sorted(blocks, key=lambda block: ORDER[block.field])
+        self.blocks = {(block.field, block.name): block for block in ordered}
         self.slices, self.size = {}, 0
-        for key, shape in self.shapes.items():
-            self.slices[key] = slice(self.size, self.size + math.prod(shape))
-            self.size += math.prod(shape)
+        for key, block in self.blocks.items():
+            self.slices[key] = slice(self.size, self.size + math.prod(block.shape))
+            self.size += math.prod(block.shape)
+
+    def groups(self) -> Iterator[tuple[StateBlock, slice, str]]:
+        """Groups of components of one unit, in order."""
+        for key, block in self.blocks.items():
+            first = self.slices[key].start
+            for count, unit in block.groups:
+                if count:
+                    yield block, slice(first, first + count), unit
+                first += count
 
     def components(self, *parts: str) -> list[int]:
         """Components of some parts of the state."""
@@ -95,8 +139,8 @@ class Layout:
 
     def without_surfaces(self) -> "Layout":
         """The layout of the components `measured` alone."""
-        own = {key: shape for key, shape in self.shapes.items() if key[0] == "control"}
-        return Layout(self.free, own)
+        own = ("pose", "velocity", "control")
+        return Layout(self.free, [one for one in self.blocks.values() if one.field in own])
 
     def check(self, y: Tensor) -> None:
         """Raises `ValueError` for another length or dtype than float64."""
@@ -113,8 +157,9 @@ class Layout:
         bodies that are not free."""
         self.check(y)
         parts: dict[str, dict[str, Tensor]] = {name: {} for name in State._fields}
-        for (part, name), shape in self.shapes.items():
-            parts[part][name] = y[..., self.slices[part, name]].reshape((*y.shape[:-1], *shape))
+        for (part, name), block in self.blocks.items():
+            own = y[..., self.slices[part, name]]
+            parts[part][name] = own.reshape((*y.shape[:-1], *block.shape))
         for part, others in (("pose", held), ("velocity", held_rates)):
             for name, axes in self.free.items():
                 own, rows = (
@@ -129,8 +174,8 @@ class Layout:
     def pack(self, state: State) -> Tensor:
         """The flat vector (..., size) of a state; the inverse of `unpack`."""
         rows = []
-        for (part, name), shape in self.shapes.items():
+        for (part, name), block in self.blocks.items():
             value = getattr(state, part)[name]
             value = value[..., self.free[name]] if part in ("pose", "velocity") else value
-            rows.append(value.reshape(*value.shape[: value.ndim - len(shape)], -1))
+            rows.append(value.reshape(*value.shape[: value.ndim - len(block.shape)], -1))
         return torch.cat(rows, -1)

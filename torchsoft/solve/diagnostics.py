@@ -191,16 +191,14 @@ def linearised(
     there; `only` takes some of the components. In plain torch: compiling the kernels would take
     longer."""
     size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
-    for (part, name), where in model.layout.slices.items():
-        if part == "friction":
+    for block, where, unit in model.layout.groups():
+        if block.field == "friction":
             size[where] = DISPLACEMENT * y[where].abs()
-        elif part == "control":
+        elif block.field == "control":
             size[where] = CONTROL * y[where].abs().clamp(min=1.0)
-        elif (
-            part == "pads" and not model.pads[name].nodal
-        ):  # forces, counted by the displacement they make
-            size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
-        elif part in ("rates", "velocity"):
+        elif unit == "N":  # forces, counted by the displacement they make
+            size[where] = DISPLACEMENT / float(model.pads[block.name].compliance().diagonal().max())
+        elif unit.endswith("/s"):
             size[where] = VELOCITY
     which = torch.arange(len(size)) if only is None else torch.tensor(only, dtype=torch.long)
     columns = []

@@ -18,7 +18,7 @@ from torchsoft.files import check_file, replacing, sealed, unsealed
 from torchsoft.physics.mesh import Array, StoredMesh
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.setup import Setup, von_mises
-from torchsoft.physics.state import Layout, State
+from torchsoft.physics.state import Layout, State, StateBlock, body_blocks
 from torchsoft.solve.trajectory import Stats, Trajectory
 from torchsoft.tables import line
 
@@ -249,17 +249,19 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
     friction = by("friction_state", [name for name in contacts if f"friction_state_{name}" in data])
     control = by("control", [name for name in setup.actuators if f"control_{name}" in data])
     state = State(pads, by("stretch", contacts), pose, rates, velocity, friction, control)
-    own = {"pads": pads, "rates": rates, "control": control}
-    shapes = {(part, name): tuple(x.shape[1:]) for part, k in own.items() for name, x in k.items()}
-    for name, s in state.stretch.items():
-        shapes["stretch", name] = tuple(s.shape[1:])
-        if name in friction:
-            shapes["friction", name] = tuple(friction[name].shape[1:])
     free = {
         name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
         for name, body in setup.bodies.items()
     }
-    layout = Layout(free, shapes)
+    blocks = [block for name, axes in free.items() for block in body_blocks(name, axes)]
+    own = [("pads", name, x) for name, x in pads.items()]
+    own += [("rates", name, x) for name, x in rates.items()]
+    for name, s in state.stretch.items():
+        own += [("stretch", name, s)]
+        own += [("friction", name, friction[name])] if name in friction else []
+    own += [("control", name, x) for name, x in control.items()]
+    blocks += [StateBlock.of(field, name, tuple(x.shape[1:]), "") for field, name, x in own]
+    layout = Layout(free, blocks)
     return Trajectory(
         t=of("time"), y=layout.pack(state), state=state,
         channels={name: of(name) for name in parts["channels"]},

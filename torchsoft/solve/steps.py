@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchsoft.physics.motion import Reference, evaluate
-from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.kernel.arrays import GAMMA, NO_SIGNALS, Errors, Signals
@@ -217,27 +216,10 @@ class ErrorParts:
     def __init__(self, rig: Rig) -> None:
         layout, found = rig.layout, list[tuple[int, int, bool, str, str]]()
         self._poses = [here for (kind, _), here in layout.slices.items() if kind == "pose"]
-        for (kind, name), here in layout.slices.items():
-            if kind == "control":
-                units = rig.actuators[name].states.values()
-                dimensions = [DIMENSIONS.get(unit, "own") for unit in units]
-                parts = [(here.start + i, here.start + i + 1, x) for i, x in enumerate(dimensions)]
-            elif kind == "friction":
-                one_by_one = torch.arange(here.start, here.stop)
-                one_by_one = one_by_one.unflatten(0, layout.shapes[kind, name])
-                parts = [(int(row[0]), int(row[-1]) + 1, "own") for row in one_by_one]
-            elif kind in ("pads", "stretch", "rates"):
-                forces = kind == "pads" and not rig.pads[name].nodal
-                parts = [(here.start, here.stop, "force" if forces else "length")]
-            else:
-                turning = "theta" in [COORDINATES[i] for i in layout.free[name]]
-                split = here.stop - turning
-                parts = [(here.start, split, "length"), (split, here.stop, "angle")]
-            rate = kind in ("rates", "velocity")
-            found += [
-                (begin, end, rate, dimension, f"{QUANTITIES[kind]} `{name}`")
-                for begin, end, dimension in parts if end > begin
-            ]  # fmt: skip
+        for block, here, unit in layout.groups():
+            rate, own = block.field in ("rates", "velocity"), QUANTITIES[block.field]
+            dimension = DIMENSIONS.get(unit, "own")
+            found.append((here.start, here.stop, rate, dimension, f"{own} `{block.name}`"))
         self._ends = [(begin, end) for begin, end, *_ in found]
         columns = list(zip(*found)) or [()] * 5
         self._whole = [np.array(numbers, np.int64) for numbers in columns[:3]]
@@ -259,9 +241,12 @@ class ErrorParts:
         return Errors(first, last, rate, atol * np.array(unit), np.array(size), origin)
 
 
-DIMENSIONS = {"N": "force", "N.m": "force", "m.s": "length", "rad.s": "angle"}
-"""Units of `atol` of the states of actuators, an integral's over a second, by their own; others are
-judged in units of their start."""
+DIMENSIONS = {
+    "N": "force", "N.m": "force", "m": "length", "rad": "angle", "m/s": "length", "rad/s": "angle",
+    "m.s": "length", "rad.s": "angle",
+}  # fmt: skip
+"""Units of `atol` by those of states: a rate's is that of the way within a step, an integral's that
+of a second of it. Others are judged in units of their start."""
 
 QUANTITIES = {
     "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
