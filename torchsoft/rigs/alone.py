@@ -11,7 +11,7 @@ from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.statics import NoEquilibrium, resting, standing
 from torchsoft.rigs.course import BALANCED, Estimate
 from torchsoft.rigs.geometry import Scene
-from torchsoft.rigs.gripped import LINEAR, Moment, Rub, turning
+from torchsoft.rigs.gripped import CURE, LINEAR, Moment, Rub, sheared, turning
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 
@@ -109,13 +109,7 @@ def dragged(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             continue  # it rolls
         force = min(way / rub.give, rub.mu * rub.normal)
         cause = f"`{body}` is dragged over it by {1e3 * way:.3g} mm"
-        cure = "move or press less, or take less friction, or a thicker or stiffer pad"
-        if (part := force * rub.give / height) > LINEAR:
-            yield Diagnostic(
-                "warning", f"pads.{name}",
-                f"the strain leaves linear elasticity: {cause}: friction shears it by up to "
-                f"{part:.0%} of its height; {cure}",
-            )  # fmt: skip
+        yield from sheared(name, force * rub.give / height, cause)
         reach = touching[0].reach(body, -normal)
         if not free or force * reach <= rub.normal * rub.width / 2:
             continue
@@ -125,7 +119,7 @@ def dragged(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
                 "warning", f"bodies.{body}",
                 f"`{body}` is dragged over `{name}` by {1e3 * way:.3g} mm: friction tips it onto "
                 f"an edge, which presses the pad in by {part:.0%} of its height under the same "
-                f"load, where strains leave linear elasticity; {cure}",
+                f"load, where strains leave linear elasticity; {CURE}",
             )  # fmt: skip
 
 

@@ -89,21 +89,29 @@ def drags(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             continue  # it rolls
         force = min(way / (one.give + other.give), *(r.mu * r.normal for r in (one, other)))
         cause = f"`{body}` cannot roll, and the pads are moved along it by {1e3 * way:.3g} mm"
-        cure = "move or press less, or take less friction, or a thicker or stiffer pad"
         for key, rub, height in zip(pair, (one, other), heights):
-            if (part := force * rub.give / height) > LINEAR:
-                yield Diagnostic(
-                    "warning", f"pads.{rig.contacts[key].pad}",
-                    f"the strain leaves linear elasticity: {cause}: friction shears it by up to "
-                    f"{part:.0%} of its height; {cure}",
-                )  # fmt: skip
+            yield from sheared(rig.contacts[key].pad, force * rub.give / height, cause)
         if free and any(force * across / 2 > r.normal * r.width / 6 for r in (one, other)):
             yield Diagnostic(
                 "warning", f"bodies.{body}",
                 f"{cause}: friction tilts it onto its edges, and turned as far as they go it "
                 f"is {1e3 * grows:.3g} mm higher, {grows / sum(heights):.0%} of the pads' height, "
-                f"where strains leave linear elasticity; {cure}",
+                f"where strains leave linear elasticity; {CURE}",
             )  # fmt: skip
+
+
+CURE = "move or press less, or take less friction, or a thicker or stiffer pad"
+"""Remedies for a pad that a body is moved over."""
+
+
+def sheared(pad: str, part: float, cause: str) -> Iterator[Diagnostic]:
+    """Warning on a pad that friction shears by a part of its height beyond linear elasticity."""
+    if part > LINEAR:
+        yield Diagnostic(
+            "warning", f"pads.{pad}",
+            f"the strain leaves linear elasticity: {cause}: friction shears it by up to "
+            f"{part:.0%} of its height; {CURE}",
+        )  # fmt: skip
 
 
 def turning(scene: Scene, body: str, n: Array, way: float) -> tuple[float, float]:
