@@ -47,6 +47,10 @@ RATE_TOLERANCE, RATE_ITERATIONS = 1e-13, 30
 it at the most."""
 
 
+class NoRates(RuntimeError):
+    """Newton's iteration found no rates of a massless pad."""
+
+
 class Interface(NamedTuple):
     """One contact at one state: moving frame (world axes), the law at its points, the port's
     transformer, and g', v_T (..., points, 2)."""
@@ -480,7 +484,7 @@ class Graph(nn.Module):
 
     def _rates(self, name: str, own: Sequence[str], state: State, u: Tensor) -> Tensor:
         """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises
-        `RuntimeError` where Newton's method does not converge."""
+        `NoRates` where Newton's method does not converge."""
         pad = self.pads[name]
         law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
         if pad.nodal:
@@ -512,16 +516,16 @@ class Graph(nn.Module):
         try:
             rate, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
         except FloatingPointError:
-            raise RuntimeError(
+            raise NoRates(
                 f"the massless pad `{name}` has no rates in this state; is an element inside out?"
             ) from None
         self._check_rates(name, left)
         return balance.corrected(rate, factors)
 
     def _check_rates(self, name: str, left: float) -> None:
-        """Raises `RuntimeError` for rates of a massless pad with a residual [m/s]."""
+        """Raises `NoRates` for rates of a massless pad with a residual [m/s]."""
         if not left <= 1e3 * RATE_TOLERANCE:
-            raise RuntimeError(
+            raise NoRates(
                 f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s "
                 f"after {RATE_ITERATIONS} iterations; is v_s large enough for the pads' damping to "
                 "balance the fall of friction with slip?"

@@ -209,6 +209,8 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
                     f"`{pushed}` away; start where they touch, or measure {one.pushes}",
                 )  # fmt: skip
         values, moves = modes(rig, moment.y, moment.reference)
+        if not len(values):
+            continue
         fastest = max([fastest, *values[values.imag.abs() > values.real.abs()].imag.abs().tolist()])
         reached = nx.node_connected_component(ties, moves.partition(".")[0])
         growing = complex(values[0])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.energy import SLIPPING
-from torchsoft.physics.graph import Graph
+from torchsoft.physics.graph import Graph, NoRates
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -224,7 +224,8 @@ def modes(rig: Graph, y: Tensor, reference: Reference) -> Modes:
     do.
 
     Away from contact nodal forces and stretches fade by themselves, independently of the rest:
-    those modes are left out. An angle counts by the radius of gyration.
+    those modes are left out. An angle counts by the radius of gyration. There are none where a
+    pad's rates are not to be found.
     """
     state, layout = rig.unpack(y, rig.follow(0.0, reference)), rig.layout
     acting = torch.ones(layout.size, dtype=torch.bool)
@@ -234,9 +235,13 @@ def modes(rig: Graph, y: Tensor, reference: Reference) -> Modes:
         )
     for name in rig.contacts:
         acting[layout.slices["stretch", name]] = rig.penetration(name, state) > 0
+    none = Modes(torch.zeros(0, dtype=torch.complex128), "")
     if not (only := acting.nonzero()[:, 0].tolist()):
-        return Modes(torch.zeros(0, dtype=torch.complex128), "")
-    values, vectors = torch.linalg.eig(linearised(rig, y, reference, only))
+        return none
+    try:
+        values, vectors = torch.linalg.eig(linearised(rig, y, reference, only))
+    except NoRates:
+        return none
     order = values.real.argsort(descending=True)
     most, moves = -1.0, ""
     for name, axes in rig.layout.free.items():
