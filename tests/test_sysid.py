@@ -147,6 +147,17 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes, shak
     assert content["cost"]["jacobians"] > 0
 
 
+def test_runs_on_the_way_of_a_fit_warn_of_nothing_and_its_end_says_it():
+    """Every trial warned of friction that jumps, wherever it was."""
+    law = {"kind": "coulomb", "mu_s": 0.3, "mu_k": 0.2}
+    file = BASE.override({"laws.steel_on_rubber.friction": law})
+    data = record("short", excited(SHORT, file), {E: 0.9e6}, SENSORS)
+    answer = identify(Problem([data], SENSORS, {E: Unknown()}), rtol=1e-3, **TRUSTED)
+    said = [one for one in answer.notices if "leaves such jumps out" in one]
+    assert said
+    assert all(one.startswith("the run of recording `short`: contact `") for one in said)
+
+
 @pytest.mark.parametrize(("level", "stalls"), [(30.0, True), (3.0, False)])
 def test_a_fit_without_headway_ends_where_it_is_and_says_so(level, stalls):
     """A model that cannot follow, and residuals too rough for steps to be of use; not one that is

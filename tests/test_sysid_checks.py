@@ -55,6 +55,7 @@ from torchsoft.sysid.sensitivity import (
     MOST,
     AssumptionTest,
     Checked,
+    alike,
     assumption_test,
     check_assumptions,
     compared,
@@ -293,6 +294,17 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     assert 0.95 < parts[MASS] < 1.05
     assert together == [MASS]
     assert np.exp(found.by_label[E]) == pytest.approx(TRUTH[E], rel=0.01)
+
+
+def test_kinds_of_faults_that_are_alike_to_first_order_are_all_tried():
+    made = lambda kind, name: SimpleNamespace(name=f"{kind} {name}", fault=(name, kind))
+    candidates: Any = [made(kind, name) for kind in ("lag", "delay", "bias") for name in "xy"]
+    gains = {one.name: 1.0 if one.fault[1] == "bias" else 50.0 for one in candidates}
+    names = [[one.name for one in some] for some in alike(candidates, ["lag x", "lag y"], gains)]
+    assert names == [["lag x", "lag y"], ["delay x", "delay y"]]
+    mixed = alike(candidates, ["lag x", "delay y"], gains)
+    assert [[one.name for one in some] for some in mixed] == names
+    assert alike(candidates, ["lag x", "bias y"], gains) == []
 
 
 @pytest.mark.slow

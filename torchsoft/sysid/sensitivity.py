@@ -366,20 +366,20 @@ def new_fits(
 def alike(
     candidates: Sequence[Variation], together: Sequence[str], gains: Mapping[str, float]
 ) -> list[list[Variation]]:
-    """The sensors whose faults of one kind explain the misfit `together`, and the same with other
-    kinds that explain as much of it alone: to first order a lag is a delay."""
+    """The sensors whose faults explain the misfit `together`, with faults of one kind: of every kind
+    that explains about as much of it alone, since to first order a lag is a delay."""
     some = [one for one in candidates if one.name in together]
-    kinds = {one.fault and one.fault[1] for one in some}
-    if len(kinds) > 1 or None in kinds:
+    faults = {one.fault: one for one in candidates if one.fault is not None}
+    if any(one.fault is None for one in some):
         return []
-    others = list[list[Variation]]()
-    for kind in dict.fromkeys(one.fault[1] for one in candidates if one.fault) if some else ():
-        places = [(one.fault[0], kind) for one in some if one.fault]
-        same = [one for place in places for one in candidates if one.fault == place]
-        rated = zip(same, some)
-        if len(same) == len(some) and all(gains[a.name] > RIVAL * gains[b.name] for a, b in rated):
-            others.append(same)
-    return others
+    out = list[list[Variation]]()
+    for kind in dict.fromkeys(kind for _, kind in faults):
+        same = [faults.get((one.fault[0], kind)) for one in some if one.fault]
+        if all(
+            other and gains[other.name] > RIVAL * gains[one.name] for one, other in zip(some, same)
+        ):
+            out.append([one for one in same if one])
+    return out
 
 
 def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
