@@ -304,7 +304,7 @@ def test_kinds_of_faults_that_are_alike_to_first_order_are_all_tried():
     assert names == [["lag x", "lag y"], ["delay x", "delay y"]]
     mixed = alike(candidates, ["lag x", "delay y"], gains)
     assert [[one.name for one in some] for some in mixed] == names
-    assert alike(candidates, ["lag x", "bias y"], gains) == []
+    assert alike(candidates, ["lag x", "bias y"], gains | {"bias y": 400.0}) == []
 
 
 @pytest.mark.slow

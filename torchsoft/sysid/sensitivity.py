@@ -366,7 +366,7 @@ def new_fits(
 def alike(
     candidates: Sequence[Variation], together: Sequence[str], gains: Mapping[str, float]
 ) -> list[list[Variation]]:
-    """The sensors whose faults explain the misfit `together`, with faults of one kind: of every kind
+    """The sensors whose faults explain the misfit `together`, with faults of one kind: of each kind
     that explains about as much of it alone, since to first order a lag is a delay."""
     some = [one for one in candidates if one.name in together]
     faults = {one.fault: one for one in candidates if one.fault is not None}
