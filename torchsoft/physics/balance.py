@@ -66,9 +66,19 @@ class _Solved(torch.autograd.Function):
     """A^-1 b (samples, size) of b, each with a factor of its own."""
 
     @staticmethod
-    def forward(ctx: Any, b: Tensor, factors: list[Factor], transposed: bool) -> Tensor:
-        ctx.factors, ctx.transposed = factors, transposed
+    def forward(b: Tensor, factors: list[Factor], transposed: bool) -> Tensor:
         return solved(b, factors, transposed)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _, ctx.factors, ctx.transposed = inputs
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int, ...], b: Tensor, factors: list[Factor], transposed: bool
+    ) -> tuple[Tensor, int]:
+        each = b.movedim(in_dims[0], 0)
+        return torch.stack([_Solved.apply(one, factors, transposed) for one in each]), 0
 
     @staticmethod
     def backward(ctx: Any, bar: Tensor) -> tuple[Any, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]

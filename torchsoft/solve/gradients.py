@@ -238,14 +238,13 @@ def directions(value: Tensor, wrt: Sequence[Tensor]) -> Array:
         else ()
     )
     if own := [k for k, part in enumerate(pulled) if part is not None and part.requires_grad]:
-        each, some = [*torch.eye(len(own), dtype=torch.float64)], [pulled[k] for k in own]
-        keep = {"retain_graph": True}
-        try:
-            (rows,) = torch.autograd.grad(some, weights, each, is_grads_batched=True, **keep)
-        except RuntimeError:  # the solves of nodal pads are LAPACK's, one after the other
-            rows = torch.stack([
-                torch.autograd.grad(some, weights, [*one], **keep)[0] for one in each
-            ])  # fmt: skip
+        some = [pulled[k] for k in own]
+
+        def pushed(one: Tensor) -> Tensor:
+            (row,) = torch.autograd.grad(some, weights, [*one], retain_graph=True)
+            return row
+
+        rows = torch.func.vmap(pushed)(torch.eye(len(own), dtype=torch.float64))
         out[..., own] = rows.movedim(0, -1).numpy()
     return out
 
