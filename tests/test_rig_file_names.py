@@ -318,3 +318,15 @@ def test_the_start_follows_the_parameters():
     assert (moved - made.y0).abs().max() < 1e-12
     assert slope.item() == pytest.approx((moved - one.y0)[height].item() / 1e-6, rel=1e-4)
     assert 0.9 < slope.item() < 1.1
+
+
+def test_a_source_of_a_number_that_has_its_default_stays():
+    """It was a KeyError, wherever tables of the file were changed."""
+    tables = RigFile.ready("paper").model_dump(exclude_unset=True)
+    del tables["actuators"]["x"]["Kd"]
+    name = "actuators.x.Kd"
+    file = RigFile.from_tree(tables).override(outputs={"duration": 0.5, "snapshots": []})
+    assert name in file.sources
+    changed = file.override({name: 3.0})
+    assert name not in changed.sources
+    assert "actuators.x.Kp" in changed.sources

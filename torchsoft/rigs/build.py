@@ -206,9 +206,8 @@ class RigFile(Shown, Group):
             return not kept or value(name, own) is not None  # one by default is still there
 
         own = self.model_dump(exclude_unset=True)
-        old = {name: value for name, value, _ in entries(self)}
         for name in tree.get("sources", {}).keys() & self.sources.keys():
-            if value(name) != listed(old[name]):
+            if value(name) != value(name, own):
                 tree = tree | {"sources": {k: x for k, x in tree["sources"].items() if k != name}}
         kept = {
             short: full for short, full in tree.get("names", {}).items()
