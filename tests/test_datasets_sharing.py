@@ -304,6 +304,8 @@ def test_exports_that_are_refused(made, data, half, tmp_path, capsys):
     command = ["dataset", "export", str(made[0]), "--to", "the-well", "--out"]
     assert main([*command, str(half)]) == 2
     assert "the set is not empty; name a new folder" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"--to: `mca` is no form; did you mean `mcap`"):
+        export(str(half), "mca", tmp_path / "out")
     with pytest.raises(StoreError, match=r"1 of 2 shards are not finished"):
         export(str(half), "mcap", tmp_path / "out")
 

@@ -64,7 +64,7 @@ def add_commands(commands: Any) -> None:
         own, "export", export, "write a dataset in the form of another project", EXPORT
     )
     one.add_argument("store", help="folder or fsspec URL")
-    one.add_argument("--to", required=True, choices=("the-well", "lerobot", "mcap"))
+    one.add_argument("--to", required=True, metavar="FORM", help="one of these")
     one.add_argument("--out", type=Path, required=True, help="a new folder")
 
 

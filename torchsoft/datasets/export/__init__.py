@@ -17,6 +17,7 @@ from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import Manifest, check_apart, store_errors
 from torchsoft.datasets.reader import Vouched
 from torchsoft.datasets.subject import SPLITS
+from torchsoft.display import suggestion
 from torchsoft.files import make_folder
 
 WRITERS = {"the-well": "the_well", "lerobot": "lerobot", "mcap": "mcap"}
@@ -26,6 +27,8 @@ def export(url: str, to: str, out: Path) -> str:
     """Write the sound trajectories of a finished dataset to a new folder; returns a summary
     sentence. Raises `StoreError` for a dataset that is damaged or unfinished, and `ValueError` for
     one that the format cannot hold, and for a folder that is not empty."""
+    if to not in WRITERS:
+        raise ValueError(f"--to: `{to}` is no form; {suggestion(to, WRITERS)}")
     data, config = Vouched(url).data(chunks=None), Config.model_validate(Manifest.read(url).config)
     sound = np.flatnonzero(data.failed.values == 0)
     if not len(sound):
