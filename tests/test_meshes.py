@@ -454,3 +454,10 @@ def test_files_that_are_no_meshes_are_refused(tmp_path):
         (tmp_path / name).write_text(text, encoding="ascii")
         with pytest.raises(ValueError, match=f"{name} is not a mesh that can be read"):
             QuadMesh.read(tmp_path / name, unit="mm")
+
+
+def test_elements_too_slender_to_be_computed_with_are_refused():
+    """The factorisation of their stiffness failed without a word of the pad."""
+    with pytest.raises(ValueError, match=r"elements of 5e-08 m by 10 m are too slender"):
+        PadMesh(1e-6, 10.0, 20, 1)
+    PadMesh(1.0, 1e-3, 20, 1)

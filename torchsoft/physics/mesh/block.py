@@ -21,6 +21,9 @@ from torchsoft.physics.mesh.mesh import (
 )
 from torchsoft.quantity import Length, Quantity
 
+SLENDER = 1e4
+"""Largest ratio of the sides of an element; the stiffness is lost in rounding near 1e7."""
+
 SIDES = ("base", "left", "right")
 """Edges of a block that may be bonded; the fourth is its face."""
 
@@ -43,6 +46,12 @@ class PadMesh(Mesh):
             positive(name, getattr(self, name))
         for name in ("elements_x", "elements_y"):
             whole(name, getattr(self, name), 1)
+        wide, tall = self.length / self.elements_x, self.height / self.elements_y
+        if not 1 / SLENDER <= wide / tall <= SLENDER:
+            raise ValueError(
+                f"elements of {wide:.3g} m by {tall:.3g} m are too slender to be computed with; "
+                "take a `length` and a `height` nearer to each other, or other numbers of elements"
+            )
 
     @property
     def numbers(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
