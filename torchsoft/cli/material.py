@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchsoft.cli.results import add_command, add_out, say, try_folder
+from torchsoft.materials.kinds import ENERGIES, PULLS
 
 if TYPE_CHECKING:
     from torchsoft.materials.deck import Deck
@@ -143,8 +144,6 @@ def fit_material(options: argparse.Namespace) -> int:
     return 0
 
 
-PULLS = ("tension", "compression", "planar", "biaxial", "shear")
-ENERGIES = ("neo_hookean", "mooney_rivlin", "yeoh", "ogden")
 TIMELESS = ("kelvin_voigt", *ENERGIES)
 """Kinds of materials whose tests tell no time."""
 

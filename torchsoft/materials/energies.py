@@ -12,16 +12,9 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from torchsoft.materials.fit import UNSURE, Fit
+from torchsoft.materials.kinds import ENERGIES
 from torchsoft.materials.measured import Array, Pull, instant_time
 from torchsoft.physics.hyperelastic import KINDS, Hyperelastic
-
-NAMES: Mapping[str, tuple[str, ...]] = {
-    "neo_hookean": ("E",),
-    "mooney_rivlin": ("C10", "C01"),
-    "yeoh": ("C10", "C20", "C30"),
-    "ogden": ("mu", "alpha"),
-}
-"""Energies, and the arguments of their constructors that tests tell."""
 
 EXPONENTS = (2.0, -2.0, 5.0, -5.0, 1.0)
 """Exponents of Ogden's terms that a fit begins from, turned round for each of its beginnings."""
@@ -103,7 +96,7 @@ def arguments(kind: str, values: Sequence[float]) -> dict[str, Any]:
     if kind == "ogden":
         half = len(values) // 2
         return {"mu": list(values[:half]), "alpha": list(values[half:])}
-    return dict(zip(NAMES[kind], values))
+    return dict(zip(ENERGIES[kind], values))
 
 
 def made(kind: str, table: Mapping[str, Any], **others: float) -> Hyperelastic:
@@ -152,7 +145,7 @@ def fit_energy(
     """
     if terms is not None and kind != "ogden":
         raise ValueError(f"`terms` are those of ogden, but the energy is {kind}")
-    count = 2 * (terms or 1) if kind == "ogden" else len(NAMES[kind])
+    count = 2 * (terms or 1) if kind == "ogden" else len(ENERGIES[kind])
     rows = sum(len(pull.strain) for pull in pulls)
     if rows < 2 * count or not 1 <= (terms or 1) <= len(EXPONENTS):
         raise ValueError(f"{rows} rows do not tell {count} coefficients; take fewer terms")
@@ -187,9 +180,9 @@ def fit_energy(
     sd = units * np.sqrt(spread * 2 * best.cost / max(rows - count, 1))
     half = range(1, count // 2 + 1)
     names = (
-        [f"{symbol}_{k}" for symbol in NAMES[kind] for k in half]
+        [f"{symbol}_{k}" for symbol in ENERGIES[kind] for k in half]
         if kind == "ogden"
-        else list(NAMES[kind])
+        else list(ENERGIES[kind])
     )
     own = dict(zip(names, (best.x * units).tolist())), dict(zip(names, sd.tolist()))
     said = tuple(notices(pulls, material(best.x), *own))

@@ -10,27 +10,18 @@ tension or of shear; a pull needs no `t`.
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
+from torchsoft.materials.kinds import PULLS, PullTest, Test
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.material import INSTANT
 
 Array = NDArray[np.float64]
-
-PullTest = Literal["tension", "compression", "planar", "biaxial", "shear"]
-"""Tests of a modulus or a strain energy: along one direction, along one with the width held, along
-two, and simple shear, whose strain is its amount."""
-
-PULLS: tuple[PullTest, ...] = get_args(PullTest)
-
-Test = Literal["relaxation", "creep", "sweep"] | PullTest
-"""The controlled quantity over time: strain, so that the stress relaxes; or stress, so that the
-strain creeps; a sweep over frequencies; or a pull."""
 
 PRESSURE = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "psi": 6894.757293168}
 SWEPT = {"storage_modulus": "loss_modulus", "storage_shear_modulus": "loss_shear_modulus"}
