@@ -294,9 +294,10 @@ def new_fits(
 ) -> Iterator[Variation]:
     """Repeat the fit with one suspect after the other, and replace its test in `checks`.
 
-    Sensors that explain the misfit by one kind of fault come first, in one fit. Once one suspect
-    explains it, or `NEARLY` all of it, those with much smaller gains are left out; numbers are left
-    out, too, once a law leaves less than `RIVAL` of the misfit that all numbers together leave.
+    Sensors that explain the misfit by one kind of fault come first, in one fit, and costly suspects
+    last. Once one suspect explains it, or `NEARLY` all of it, those with much smaller gains are
+    left out, and costly ones; numbers are left out, too, once a law leaves less than `RIVAL` of the
+    misfit that all numbers together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
@@ -317,7 +318,8 @@ def new_fits(
         order = [
             [one]
             for one in sorted(
-                candidates, key=lambda one: (blind and one.kind != "law", -gains[one.name])
+                candidates,
+                key=lambda one: (one.costly, blind and one.kind != "law", -gains[one.name]),
             )
         ]
         if explains and len(together) > 1:
@@ -330,7 +332,7 @@ def new_fits(
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
-            if gain < enough:
+            if gain < enough or (enough and some[0].costly):
                 break
             if name in bounded and least < bounded[name]:
                 continue
