@@ -222,7 +222,8 @@ def above(rig: Graph, pose: Mapping[str, Tensor], body: str) -> float:
                 body, "y",
                 f"{1e3 * (left + right):.3g} mm wide, it falls between points of "
                 f"`{contact.pad}`, which are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; "
-                f"make it larger, or give pads.{contact.pad} more elements or points",
+                f"make its shape larger (a radius), or give pads.{contact.pad} more points or "
+                "elements_x",
             )  # fmt: skip
         heights.append(float(under[:, 1].max()) + below)
     if not heights:
@@ -261,7 +262,7 @@ def upon(rig: Graph, pose: Mapping[str, Tensor], body: str) -> Tensor:
         raise NoPlace(
             body, "y",
             f'"{TOUCH}", but no pad bonded to it comes down upon a body that it has a contact '
-            "with; place it over one, or say at which height it starts",
+            "with; place it over one by x, or say at which height it starts",
         )  # fmt: skip
     if torch.is_grad_enabled():
         at = y.clone().requires_grad_()

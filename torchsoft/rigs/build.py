@@ -130,7 +130,7 @@ class RigFile(Shown, Group):
             return READY / f"{name}.toml"
         if not path.exists():
             raise ValueError(
-                f"{path}: No such file or directory; the ready rigs are {', '.join(ready())}"
+                f"{line(path)}: No such file or directory; the ready rigs are {', '.join(ready())}"
             )
         return path
 

@@ -11,7 +11,7 @@ from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.initial_state import LEAD, SETTLE
 from torchsoft.sysid.planner import RTOL, Optimality
 from torchsoft.sysid.unknowns import Sensor, Unknown
-from torchsoft.tables import LISTED, SEED, Table, from_toml
+from torchsoft.tables import LISTED, SEED, Table, from_toml, line
 
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 File = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -204,7 +204,9 @@ class Config(Table):
         unknown = {full(name): name for name in self.unknowns}
         for law, one in self.compare.items():
             if strange := [name for name in one.without if full(name) not in unknown]:
-                raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
+                raise ValueError(
+                    f"compare.{law}.without: `{line(strange[0], 80)}` is not an unknown"
+                )
         for i, entry in enumerate(self.recordings):
             if strange := [
                 unknown[x] for x in map(full, flattened(entry.settings)) if x in unknown

@@ -374,7 +374,7 @@ def sources(
         where = "heldout" if strange[0] in stated.heldout else "recordings"
         raise ValueError(
             f"{config}, {where}: there is no recording `{line(strange[0], 80)}`; the recordings' "
-            f"names are {', '.join(names)}"
+            f"names are {line(', '.join(names))}"
         )
     if stated.heldout and set(stated.heldout) == set(names):
         raise ValueError(
