@@ -412,7 +412,7 @@ REFUSED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "no such coordinate": ({"actuators__x__pushes": "bracket.z"},
         r"`bracket\.z` is not a coordinate; free ones are disc\.x"),
     "loop without a motion": ({"actuators__x__setpoint": None},
-        r"actuators\.x: setpoint is missing: the gains Kp and Kd need"),
+        r"actuators\.x: setpoint is missing: the gains Kp, Kd and Ki need"),
     "motion that nothing follows": ({"motion__wave": {"kind": "hold"}},
         r"motion\.wave: nothing follows it"),
     "material of nothing": ({"materials__gel": SOFT},

@@ -51,29 +51,26 @@ def push_bodies(
         number = s.body_free[s.source_pushed[i]]
         if number < 0:
             continue
-        push_source(s, w, z, i, y, a, signals, dy, dp, 1)
+        effort(s, w, i, y, signals, a)
+        own = bounds(s.source_p_start, i)
+        law_derivatives(z, s.source_pullback[i], w.effort_x, s.p[own], dp[own], 1, z.change)
         add(1.0, z.change[0], r[number])
+        push_inputs(s, w, i, 0, dy, r[number])
 
 
 @compiled
-def push_source(
-    s: Any, w: Any, z: Any, i: int, y: Array, a: float, signals: Array, dy: Array, dp: Array,
-    rows: int,
-) -> None:  # fmt: skip
-    """Tangents of the effort of source i, and of rates of its states, at the same velocities, into
-    z.change."""
-    effort(s, w, i, y, signals, a)
-    own, columns = bounds(s.source_p_start, i), first_state(s, i) + s.source_states[i]
-    law_derivatives(z, s.source_pullback[i], w.effort_x, s.p[own], dp[own], rows, z.change)
-    for o in range(rows):
-        n, J = first_coordinate(s, i), w.effort_J[o * columns : (o + 1) * columns]
-        for j in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
-            measured = s.body_free[s.source_coordinate[j]]
-            if measured >= 0:
-                add(J[n], dy[s.body_q_start + measured], z.change[o])
-            n += 2
-        for j in range(s.source_states[i]):
-            add(J[n + j], dy[s.source_y_start[i] + j], z.change[o])
+def push_inputs(s: Any, w: Any, i: int, o: int, dy: Array, out: Array) -> None:
+    """Add the tangents (m,) of output o of source i at the same velocities, by coordinates and its
+    states, to out."""
+    n, columns = first_coordinate(s, i), first_state(s, i) + s.source_states[i]
+    J = w.effort_J[o * columns : (o + 1) * columns]
+    for j in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
+        measured = s.body_free[s.source_coordinate[j]]
+        if measured >= 0:
+            add(J[n], dy[s.body_q_start + measured], out)
+        n += 2
+    for j in range(s.source_states[i]):
+        add(J[n + j], dy[s.source_y_start[i] + j], out)
 
 
 @compiled
@@ -85,9 +82,12 @@ def push_source_states(
         states = s.source_states[i]
         if states == 0:
             continue
-        push_source(s, w, z, i, y, a, signals, dy, dp, 1 + states)
-        columns = first_state(s, i) + states
-        for o in range(1, 1 + states):
+        effort(s, w, i, y, signals, a)
+        own, columns = bounds(s.source_p_start, i), first_state(s, i) + states
+        pullback, rows = s.source_pullback[i], 1 + states
+        law_derivatives(z, pullback, w.effort_x, s.p[own], dp[own], rows, z.change)
+        for o in range(1, rows):
+            push_inputs(s, w, i, o, dy, z.change[o])
             n, J = first_coordinate(s, i), w.effort_J[o * columns : (o + 1) * columns]
             for j in range(s.source_coordinate_start[i], s.source_coordinate_start[i + 1]):
                 measured = s.body_free[s.source_coordinate[j]]
