@@ -150,6 +150,8 @@ def test_what_cannot_be_is_refused():
     rig = cart(Wrong())
     with pytest.raises(TypeError, match=r"gives a tensor of shape \(2,\) for the rates of its sta"):
         simulate(rig, times(0.1, 2), y0=rig.state(cart={"x": 0.0}))
+    with pytest.raises(ValueError, match=r"put the lag around it: Lagging\(Integral"):
+        Integral(Lagging(PD(KP, KD), LAG), KI)
     with pytest.raises(ValueError, match="the gains Kp, Kd and Ki need a motion to follow"):
         PAPER.override({"actuators.y.setpoint": None, "actuators.y.Ki": 1.0})
     with pytest.raises(ValueError, match=r"actuators\.y\.lag"):

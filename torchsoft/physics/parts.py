@@ -160,12 +160,18 @@ class ReversedPD(PD):
 
 class Integral(nn.Module):
     """A law of one loop with integral action: F + Ki times the integral of the error w - q from the
-    start of the run on; of q - w where the gains are `reversed`. Nothing bounds it."""
+    start of the run on; of q - w where the gains are `reversed`. Nothing bounds it. Raises
+    `ValueError` for a law that has states of its own."""
 
     states: ClassVar = {"integral": OwnState("q.s")}
 
     def __init__(self, law: nn.Module, Ki: IntegralGain, *, reversed: bool = False) -> None:
         super().__init__()
+        if own_states(law):
+            raise ValueError(
+                "`law` of integral action must have no states of its own; put the lag around it: "
+                "Lagging(Integral(law, Ki), lag)"
+            )
         self.law, self.Ki, self.sign = law, parameter(Ki), -1.0 if reversed else 1.0
 
     def forward(
@@ -212,7 +218,7 @@ def respond(
 def begun(law: Callable[..., Any], seen: Sequence[Tensor]) -> Tensor:
     """States (..., n) that a control law begins with: by its method `begin` of what it sees at the
     start, else by their parameters, else at zero."""
-    if hasattr(law, "begin"):
+    if own_states(law) and hasattr(law, "begin"):
         return law.begin(*seen)
     return begin_states(law, seen[2].shape)
 
