@@ -22,7 +22,7 @@ FLOWS = {
     "physics": """
         arguments mesh shapes state contact rate_and_state material hyperelastic elements pads
         balance multibond parts
-        names motion validity graph energy statics start namespace rig extensions setup .
+        names motion validity graph energy statics start channels namespace rig extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",

@@ -17,9 +17,9 @@ import xarray as xr
 from conftest import PAPER, paper
 
 from torchsoft.csvfile import UNITS
+from torchsoft.physics.channels import measurable
 from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
-from torchsoft.physics.namespace import measurable
 from torchsoft.solve.formats import save
 from torchsoft.sysid import Sensor, record
 from torchsoft.sysid.columns import read_table

@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 from torchsoft import Rig, RigFile, simulate
 from torchsoft.experiment import COARSE, at_the_points, grid, markdown, options, write
-from torchsoft.solve.trajectory import channels
+from torchsoft.physics.channels import Seen, read
 
 NEWTON = 1e-10  # Newton's tolerance of every run here [N].
 
@@ -88,7 +88,7 @@ def states(window: Window) -> Tensor:
 def signals(model: Rig, y: Tensor, t: Tensor) -> Tensor:
     """(T, 10): pose and velocity of the disc, pose of the bracket, control force."""
     follow = model.follow(t)
-    values = channels(model, model.unpack(y, follow), follow)
+    values = read(Seen(model, model.unpack(y, follow), follow))
     return torch.stack([values[name] for name in CHANNELS], -1)
 
 

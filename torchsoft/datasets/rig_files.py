@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.files import check_file
-from torchsoft.physics.energy import stores
+from torchsoft.physics.channels import units
+from torchsoft.physics.energy import Integrals, stores
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.places import Place
 from torchsoft.rigs.places import place as place_in
 from torchsoft.rigs.written import files_renamed
-from torchsoft.solve.progress import Integrals
-from torchsoft.solve.trajectory import units
 from torchsoft.tables import line, read_toml, shown
 
 EMBEDDED = 2e6
@@ -92,7 +91,8 @@ def differs(one: Rig, other: Rig) -> str | None:
             return f"the contact points of pads.{name}"
         if one.pads[name].state_shape != other.pads[name].state_shape:
             return f"the state of pads.{name}"
-    for kind in (units, stores, lambda rig: Integrals(rig).active, lambda rig: rig.layout.free):
+    kinds = units, lambda rig: [*stores(rig)], lambda rig: Integrals(rig).active
+    for kind in (*kinds, lambda rig: rig.layout.free):
         if kind(one) != kind(other):
             return "the coordinates and energies of the rig"
     return None

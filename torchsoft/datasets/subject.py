@@ -24,13 +24,11 @@ from torchsoft.datasets.rig_files import (
     place,
 )
 from torchsoft.datasets.schema import KIND, RUN, SPLIT, Label, Variable
-from torchsoft.physics.energy import stores
-from torchsoft.physics.namespace import declared
+from torchsoft.physics.channels import declared
+from torchsoft.physics.energy import Integrals, stores
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.places import unit
-from torchsoft.solve.progress import Integrals
-from torchsoft.solve.trajectory import channels
 from torchsoft.tables import line, shown
 
 RTOL = 1e-4
@@ -121,14 +119,7 @@ class Subject:
     @cached_property
     def there(self) -> dict[str, Label]:
         """Every channel of the rig."""
-        rig = self.template
-        signals = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
-        state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), signals)
-        moments = {name: torch.zeros((), dtype=torch.float64) for name in rig.pads}
-        with torch.no_grad():
-            known = channels(rig, state, signals, moments)
-        of = {one.name: Label(one.unit, one.meaning) for one in declared(rig)}
-        return {key: of[key] for key in known}
+        return {one.name: Label(one.unit, one.meaning) for one in declared(self.template)}
 
     @property
     def signals(self) -> dict[str, Label]:
@@ -148,11 +139,10 @@ class Subject:
     def energies(self) -> dict[str, tuple[str, tuple[str, ...]]]:
         """Dimension and parts of each kind of energy, by its name in a run."""
         integrals = Integrals(self.template)
-        active = tuple(name for name in integrals.supplied if name in integrals.active)
         return {
-            "stored": ("store", stores(self.template)),
+            "stored": ("store", tuple(stores(self.template))),
             "dissipated": ("resistor", integrals.dissipated),
-            "supplied": ("source", active),
+            "supplied": ("source", integrals.active),
         }
 
     def _nodal(self) -> dict[str, Variable]:

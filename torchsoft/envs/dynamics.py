@@ -11,15 +11,15 @@ from torch import Tensor
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, positive, whole
+from torchsoft.physics.channels import MOMENT, Seen, declared, measurable
 from torchsoft.physics.motion import Lines, Reference
-from torchsoft.physics.namespace import measurable
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
 from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.steps import check_knots
-from torchsoft.solve.trajectory import Touch, Trajectory, channels
+from torchsoft.solve.trajectory import Touch, Trajectory
 
 Ranges = Mapping[str, tuple[float, float]]
 """Lower and upper bound by name, in SI units."""
@@ -133,15 +133,14 @@ class Dynamics:
         """Sort observed channels into entries of the state, sums of recorded forces, and others."""
         rig, self._touch = self.rig, Touch(self.rig)
         at = dict(zip(measurable(rig), rig.layout.rigid))
-        with torch.no_grad():
-            signals = rig.follow(0.0)
-            every = list(channels(rig, rig.unpack(self._y0, signals), signals))
+        every = {one.name: one for one in declared(rig) if one.kind != MOMENT}
         spread = {one: x for name, x in ranges.items() for one in self._touch.expanded([name])}
         checked("observations", spread, [*every, *self._touch], "channels are")
         self._origin, self._span = limits(spread)
         state = [name for name in spread if name in at]
         felt = [name for name in spread if name in self._touch and self._touch[name].over is None]
-        self._other = [name for name in spread if name not in (*state, *felt)]
+        others = [name for name in spread if name not in (*state, *felt)]
+        self._other = {name: every.get(name) for name in others}
         self._state = torch.tensor([at[name] for name in state], dtype=torch.int64)
         start, places, weight = self._touch.sums(felt)
         sums = sparse.csr_array((weight, places, start), (len(felt), places.max(initial=0) + 1))
@@ -239,10 +238,10 @@ class Dynamics:
         if self._other:
             t = torch.tensor(self.start + now.steps * self.interval, dtype=torch.float64)
             signals = rig.follow(t) if stepper is None else stepper.signals_now(t)
-            named = channels(rig, rig.unpack(y, signals), signals)
-            for name in self._other:
-                touch = name not in named
-                x = self._touch[name].value(now.recorded[None])[0] if touch else named[name]
+            seen = Seen(rig, rig.unpack(y, signals), signals)
+            for name, own in self._other.items():
+                touch = own is None
+                x = self._touch[name].value(now.recorded[None])[0] if touch else own.read(seen)
                 parts.append(x[None])
         seen = (torch.cat(parts)[self._order] - self._origin) / self._span - 1
         return torch.cat((seen, distance, now.action))

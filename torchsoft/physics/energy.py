@@ -5,7 +5,8 @@ Dissipated and supplied energies are integrated beside the state by the stepper,
 checked without any stepper.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -18,69 +19,78 @@ from torchsoft.physics.contact import (
 )
 from torchsoft.physics.graph import Evaluation, Graph
 from torchsoft.physics.pads import free_rates, nodal
-from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.state import State
+
+Store = Callable[["AtState"], Tensor]
+"""Function of a rig's state to an energy (...) [J]."""
+
+
+class AtState:
+    """A rig in some states (...), with the displacements of its pads, where they are known already,
+    and the energies [J] of its contacts' springs, normal and tangential."""
+
+    def __init__(self, rig: Graph, state: State, displacement: Mapping[str, Tensor]) -> None:
+        self.rig, self.state, self.displacement = rig, state, displacement
+
+    @cached_property
+    def energies(self) -> tuple[Tensor, Tensor]:
+        rig, zero = self.rig, torch.zeros_like(next(iter(self.state.pose.values()))[..., 0])
+        normal, tangential = zero, zero
+        for name, contact in rig.contacts.items():
+            depth = rig.penetration(name, self.state, self.displacement.get(contact.pad))
+            parts = contact.law.stored(depth, self.state.stretch[name], rig.weight(name))
+            normal, tangential = normal + parts[0].sum(-1), tangential + parts[1].sum(-1)
+        return normal, tangential
+
+
+def stores(rig: Graph) -> dict[str, Store]:
+    """Energies that are stored, by name: strain of every pad, contact springs, kinetic energies of
+    bodies and pads that move freely."""
+
+    def strain(at: AtState, name: str) -> Tensor:
+        known = at.displacement.get(name)
+        return at.rig.pads[name].strain_energy(at.state.pads[name], known)
+
+    def kinetic(at: AtState, name: str, axes: Sequence[int]) -> Tensor:
+        masses, velocity = at.rig.bodies[name].masses, at.state.velocity[name]
+        return sum((0.5 * masses[i] * velocity[..., i] ** 2 for i in axes), velocity.new_zeros(()))
+
+    def inertial(at: AtState, name: str) -> Tensor:
+        masses, rates = at.rig.pads[name].masses(), at.state.rates[name]
+        return 0.5 * (masses[:, None] * rates**2).sum((-2, -1))
+
+    out: dict[str, Store] = {f"strain_{name}": partial(strain, name=name) for name in rig.pads}
+    out["normal_springs"] = lambda at: at.energies[0]
+    out["tangential_springs"] = lambda at: at.energies[1]
+    for name, axes in rig.layout.free.items():
+        for key, own in ((name, [i for i in axes if i < 2]), (f"{name}_spin", [2] * (2 in axes))):
+            if own:
+                out[key] = partial(kinetic, name=name, axes=own)
+    for name, pad in rig.pads.items():
+        if pad.inertial:
+            out[f"kinetic_{name}"] = partial(inertial, name=name)
+    return out
 
 
 def stored(
     rig: Graph, state: State, displacement: Mapping[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
-    """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic
-    energies of bodies and pads that move freely.
-
-    `displacement` are those of the pads, where they are known already.
-    """
-    known = displacement or {}
-    energies = {}
-    for name, pad in rig.pads.items():
-        part = state.pads[name]
-        if pad.nodal:
-            energies[f"strain_{name}"] = pad.strain_energy(part)
-        else:
-            fractions, _ = pad.chain()
-            if len(fractions) == 1:
-                u = known[name] if name in known else rig.displacement(name, state)
-                energies[f"strain_{name}"] = 0.5 * (part[..., 0, :, :] * u).sum((-2, -1))
-            else:
-                z = part.flatten(-2)
-                energies[f"strain_{name}"] = 0.5 * (
-                    fractions * ((z @ pad.compliance()) * z).sum(-1)
-                ).sum(-1)
-    zero = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
-    normal, tangential = zero, zero
-    for name, contact in rig.contacts.items():
-        parts = contact.law.stored(
-            rig.penetration(name, state, known.get(contact.pad)),
-            state.stretch[name],
-            rig.weight(name),
-        )
-        normal, tangential = normal + parts[0].sum(-1), tangential + parts[1].sum(-1)
-    energies["normal_springs"], energies["tangential_springs"] = normal, tangential
-    for name, body in rig.bodies.items():
-        free = [float(body.freedom[axis] == "free") for axis in COORDINATES]
-        kinetic = [
-            0.5 * f * m * state.velocity[name][..., i] ** 2
-            for i, (f, m) in enumerate(zip(free, body.masses))
-        ]
-        if any(free[:2]):
-            energies[name] = kinetic[0] + kinetic[1]
-        if free[2]:
-            energies[f"{name}_spin"] = kinetic[2]
-    for name, pad in rig.pads.items():
-        if pad.inertial:
-            energies[f"kinetic_{name}"] = 0.5 * (
-                pad.masses()[:, None] * state.rates[name] ** 2
-            ).sum((-2, -1))
-    return energies
+    """Stored energies (...) [J]; `displacement` are those of the pads, where they are known
+    already."""
+    at = AtState(rig, state, displacement or {})
+    return {name: energy(at) for name, energy in stores(rig).items()}
 
 
-def stores(rig: Graph) -> tuple[str, ...]:
-    """Names of the energies that `stored` returns, in its order."""
-    names = [f"strain_{name}" for name in rig.pads] + ["normal_springs", "tangential_springs"]
-    for name, axes in rig.layout.free.items():
-        names += [name] * any(axis < 2 for axis in axes) + [f"{name}_spin"] * (2 in axes)
-    names += [f"kinetic_{name}" for name, pad in rig.pads.items() if pad.inertial]
-    return tuple(names)
+class Integrals:
+    """Names of the running integrals [J]: energies dissipated and supplied by element, those
+    supplied that there are in the rig, and the positive part of the sources' work."""
+
+    def __init__(self, rig: Graph) -> None:
+        self.dissipated = (*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip")
+        drives = {f"drive_{k}": "driven" in body.freedom.values() for k, body in rig.bodies.items()}
+        self.supplied = (*(f"control_{name}" for name in rig.actuators), "gravity", *drives)
+        self.names = (*self.dissipated, *self.supplied, "injected")
+        self.active = tuple(name for name in self.supplied if drives.get(name, True))
 
 
 def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]:
@@ -88,16 +98,8 @@ def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]
     powers, dashpots, slip = {}, 0.0, 0.0
     for name, pad in rig.pads.items():
         port = graph.ports[f"pad_{name}"]
-        if pad.nodal:
-            powers[f"pad_{name}"] = pad.dissipation(state.pads[name], graph.pad_rates(name))
-        else:
-            fractions, times = pad.chain()
-            rate = (
-                (port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]
-            ).flatten(-2)
-            powers[f"pad_{name}"] = (
-                fractions * times * ((rate @ pad.compliance()) * rate).sum(-1)
-            ).sum(-1)
+        rates = graph.pad_rates(name) if pad.nodal else port.effort
+        powers[f"pad_{name}"] = pad.dissipation(state.pads[name], rates)
     for interface in graph.interfaces.values():
         dashpots, slip = (
             dashpots + interface.law.dashpots.sum(-1),

@@ -310,22 +310,37 @@ class Pad(nn.Module):
         their rates [m/s]."""
         return self.from_corners(self.element_forces(self.at_corners(u), self.at_corners(rate)))
 
-    def strain_energy(self, u: Tensor) -> Tensor:
-        """Energy (...) [J] of a nodal pad at displacements u (..., nodes, 2 fields) [m]. Its graph
-        is made when it is asked for, some samples at a time: that of a long run would not fit."""
+    def strain_energy(self, part: Tensor, displacement: Tensor | None = None) -> Tensor:
+        """Energy (...) [J] in a state: `part` of a nodal pad are displacements u (..., nodes, 2
+        fields) [m], of a condensed one nodal forces that have set in (..., branches, nodes, 2) [N],
+        with one branch those times the `displacement` (..., nodes, 2), if it is known. The graph of
+        nodal pads is made when it is asked for, some samples at a time: that of a long run would
+        not fit."""
+        if not self.nodal:
+            fractions, _ = self.chain()
+            if displacement is not None and len(fractions) == 1:
+                return 0.5 * (part[..., 0, :, :] * displacement).sum((-2, -1))
+            z = part.flatten(-2)
+            return 0.5 * (fractions * ((z @ self.compliance()) * z).sum(-1)).sum(-1)
 
         def own(u: Tensor) -> Tensor:
             at = self.at_corners(u)
             return element_energy(*self.element_inputs(at, torch.zeros_like(at))).sum(-1)
 
-        parts = u.reshape(-1, *u.shape[-2:]).split(SAMPLES)
-        energy = [checkpoint(own, part, use_reentrant=False) for part in parts]
-        return torch.cat(energy).reshape(u.shape[:-2])
+        parts = part.reshape(-1, *part.shape[-2:]).split(SAMPLES)
+        energy = [checkpoint(own, one, use_reentrant=False) for one in parts]
+        return torch.cat(energy).reshape(part.shape[:-2])
 
-    def dissipation(self, u: Tensor, rate: Tensor) -> Tensor:
-        """Power (...) [W] that a nodal pad takes out."""
-        given = self.element_inputs(self.at_corners(u), self.at_corners(rate))
-        return 2 * element_potential(*given).sum(-1)
+    def dissipation(self, part: Tensor, given: Tensor) -> Tensor:
+        """Power (...) [W] that the pad takes out in a state, as in `strain_energy`; `given` of a
+        nodal pad are rates (..., nodes, 2 fields) [m/s], of a condensed one forces (..., nodes, 2)
+        [N] on its nodes."""
+        if not self.nodal:
+            fractions, times = self.chain()
+            rate = ((given[..., None, :, :] - part) / times[:, None, None]).flatten(-2)
+            return (fractions * times * ((rate @ self.compliance()) * rate).sum(-1)).sum(-1)
+        inputs = self.element_inputs(self.at_corners(part), self.at_corners(given))
+        return 2 * element_potential(*inputs).sum(-1)
 
     @property
     def nodal(self) -> bool:

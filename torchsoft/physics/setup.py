@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
+from torchsoft.physics.channels import declared
 from torchsoft.physics.hyperelastic import Hyperelastic, again, described
 from torchsoft.physics.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
 from torchsoft.physics.mesh.mesh import gradients, strains
 from torchsoft.physics.names import effort_channel
-from torchsoft.physics.namespace import declared
 from torchsoft.physics.pads import Pad, contact_points, shape_functions
 from torchsoft.physics.rig import Rig
 

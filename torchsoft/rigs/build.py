@@ -14,6 +14,7 @@ from torch import nn
 
 from torchsoft.display import Shown, suggestion
 from torchsoft.parallel import single_threaded
+from torchsoft.physics.channels import units
 from torchsoft.physics.graph import Graph
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
@@ -39,7 +40,6 @@ from torchsoft.rigs.parts import (
     TaxelsTable,
 )
 from torchsoft.rigs.places import entries, entry, listed, place, replaced, unit
-from torchsoft.solve.trajectory import units
 from torchsoft.tables import LISTED, InvalidTable, from_toml, line
 
 M = TypeVar("M")

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchsoft.codegen import Law
 from torchsoft.physics.contact import Friction, SoftContact
 from torchsoft.physics.elements import CONSTANTS, CORNERS
+from torchsoft.physics.energy import Integrals
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.pads import Pad
@@ -63,7 +64,6 @@ from torchsoft.solve.laws import (
     shape_fault,
     weight_law,
 )
-from torchsoft.solve.progress import Integrals
 from torchsoft.solve.steps import CHUNK, ErrorParts, Followed
 from torchsoft.solve.structure import Copies, Structure, structure_of
 

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchsoft.physics.rig import Rig
 from torchsoft.solve.kernel.arrays import Tape
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.steps import Plan
@@ -74,23 +73,6 @@ class Segment(NamedTuple):
         """Signals at the stages (stages, signals, 2)."""
         signals = self.plan.signals
         return signals.reshape(2 * len(signals), *signals.shape[2:])
-
-
-class Integrals:
-    """Names of the running integrals [J]: energies dissipated and supplied by element, and the
-    positive part of the sources' work."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.dissipated = (*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip")
-        drives = tuple(f"drive_{name}" for name in rig.bodies)
-        self.supplied = (*(f"control_{name}" for name in rig.actuators), "gravity", *drives)
-        self.names = (*self.dissipated, *self.supplied, "injected")
-        driven = {
-            f"drive_{name}"
-            for name, body in rig.bodies.items()
-            if "driven" in body.freedom.values()
-        }
-        self.active = {name for name in self.supplied if not name.startswith("drive_")} | driven
 
 
 @dataclass

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.arguments import Numbers, positive, tensor
+from torchsoft.physics.channels import Seen, read, units
 from torchsoft.physics.energy import stored
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
@@ -34,7 +35,7 @@ from torchsoft.solve.gradients import (
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.structure import Structure
-from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory, channels, units
+from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory
 
 Route = Literal["none", "discrete", "forward"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`."""
@@ -387,8 +388,7 @@ class _Rest:
 
     @cached_property
     def supplied(self) -> dict[str, Tensor]:
-        names = self._model.integrals
-        return self._integrals(name for name in names.supplied if name in names.active)
+        return self._integrals(self._model.integrals.active)
 
     @cached_property
     def injected(self) -> Tensor:
@@ -407,7 +407,7 @@ class _Rest:
     @cached_property
     def channels(self) -> dict[str, Tensor]:
         moments = dict(zip(self._rig.pads, self._parts[-2][:, 2::3].unbind(-1)))
-        return channels(self._rig, self.state, self._followed, moments)
+        return read(Seen(self._rig, self.state, self._followed, moments))
 
     @cached_property
     def displacement(self) -> dict[str, Tensor]:

@@ -14,9 +14,7 @@ from torch import Tensor
 
 from torchsoft.display import Film, Shown, amount, suggestion
 from torchsoft.physics.energy import contact_states
-from torchsoft.physics.names import FORCES, ON_BODY, effort_channel, rate_channel
-from torchsoft.physics.namespace import declared
-from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.names import FORCES, ON_BODY
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import Layout, State
@@ -341,35 +339,6 @@ class Ledger(NamedTuple):
 def displaced(run: Trajectory, pad: str) -> float:
     """Largest displacement of a pad's nodes [m]."""
     return float(run.displacement[pad].detach().norm(dim=-1).max())
-
-
-def channels(
-    rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor] | None = None
-) -> dict[str, Tensor]:
-    """Every channel of states (...) by its key: coordinates and rates of the bodies, signals,
-    efforts, moments.
-
-    A moment is that of the bonded nodes (Eq. 35), with undeformed arms; the graph's, which a
-    turning base feels and which conserves power, has deformed ones.
-    """
-    out: dict[str, Tensor] = {}
-    for name in rig.bodies:
-        symbol, pose, velocity = rig.symbols[name], state.pose[name], state.velocity[name]
-        keys = [f"{axis}_{symbol}" for axis in COORDINATES]
-        out |= zip(keys, pose.unbind(-1))
-        out |= zip(map(rate_channel, keys), velocity.unbind(-1))
-        if rig.bodies[name].freedom["theta"] == "free":
-            out[f"angular_momentum_{symbol}"] = rig.bodies[name].inertia * velocity[..., 2]
-    for i, name in enumerate(rig.signals):
-        out[name], out[f"{name}_dot"] = signals[..., i, 0], signals[..., i, 1]
-    for name in rig.actuators:
-        out[effort_channel(name)] = rig.actuator_effort(name, state, signals)
-    return out | {f"M_{name}": moment for name, moment in (moments or {}).items()}
-
-
-def units(rig: Rig) -> dict[str, str]:
-    """SI unit of every channel, by its key."""
-    return {one.name: one.unit for one in declared(rig)}
 
 
 # Channels of touch: recorded forces of a run as read by sensors on pads, under them and at

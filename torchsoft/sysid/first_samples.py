@@ -15,8 +15,8 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchsoft.display import suggestion
+from torchsoft.physics.channels import measurable
 from torchsoft.physics.contact import cross, point_place, slip_of
-from torchsoft.physics.namespace import measurable
 from torchsoft.physics.parts import COORDINATES, PD, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import above

@@ -16,14 +16,14 @@ from torch import Tensor
 
 from torchsoft.cost import RUN, Cost, rig_row, rig_step, steps_per_second
 from torchsoft.csvfile import UNITS
+from torchsoft.physics.channels import Seen, measurable, read, units
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
-from torchsoft.physics.namespace import measurable
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import net_loads
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
-from torchsoft.solve.trajectory import Touch, channels, units
+from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.columns import Tables, Vocabulary, read_tables
 from torchsoft.sysid.configuration import Beginning, Column, Config, Entry, Law, Moving, read_config
 from torchsoft.sysid.first_samples import estimate_initial_state
@@ -190,7 +190,7 @@ def check_start(
     assert isinstance(start, Standing)
     with torch.no_grad():
         signals = rig.follow(first)
-        here = channels(rig, rig.unpack(y0, signals), signals)
+        here = read(Seen(rig, rig.unpack(y0, signals), signals))
         # a recording at rest begins with the file's motions, whatever its clock counts from
         stated = own(torch.zeros((), dtype=torch.float64), rig.signals)[:, 0]
     places = {name: [float(value)] for name, value in here.items() if name in made.samples}

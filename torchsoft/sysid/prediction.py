@@ -12,13 +12,13 @@ from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr
 from torch import Tensor
 
+from torchsoft.physics.channels import Seen, measurable, read
 from torchsoft.physics.names import effort_channel, rate_channel
-from torchsoft.physics.namespace import measurable
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import unjudged
-from torchsoft.solve.trajectory import Trajectory, channels
+from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.recording import REACH, SAME, Array, Grid, RunContext
@@ -355,7 +355,8 @@ def by_motion(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
     slopes, own = run.sensitivities, rig.layout.measured
     slopes = slopes[:, own] if slopes.shape[1] == run.y.shape[1] else slopes
     q = run.y[:, own].detach() + slopes @ torch.stack(along)
-    known = channels(rig, rig.layout.without_surfaces().unpack(q, *rig.held(signals)), signals)
+    state = rig.layout.without_surfaces().unpack(q, *rig.held(signals))
+    known = read(Seen(rig, state, signals), names)
     measured = torch.stack([known[name] for name in names], -1)
     out = directions(measured, along)
     out[..., : len(run.wrt)] += directions(measured, [rig.parameter(name) for name in run.wrt])

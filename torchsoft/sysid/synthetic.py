@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from torchsoft.physics.namespace import measurable
+from torchsoft.physics.channels import measurable, units
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import REST
 from torchsoft.rigs.built import BuiltRig
-from torchsoft.solve.trajectory import units
 from torchsoft.sysid.initial_state import Standing, Start
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Grid, Recording
