@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -44,6 +44,18 @@ class StateBlock(NamedTuple):
     def of(cls, field: str, name: str, shape: tuple[int, ...], unit: str) -> "StateBlock":
         """States of one unit, judged together."""
         return cls(field, name, shape, ((math.prod(shape), unit),))
+
+    @classmethod
+    def again(
+        cls, field: str, name: str, shape: Sequence[int], groups: Sequence[Sequence[Any]]
+    ) -> Self:
+        """A block as it stands in a file."""
+        return cls(field, name, tuple(shape), tuple((int(n), str(unit)) for n, unit in groups))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of its components, each once."""
+        return tuple(dict.fromkeys(unit for count, unit in self.groups if count))
 
 
 def own_blocks(

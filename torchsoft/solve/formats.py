@@ -1,7 +1,7 @@
 """Files of runs: NetCDF and HDF5 with units, MCAP logs, and VTK series of the pads."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from torchsoft.files import check_file, replacing, sealed, unsealed
 from torchsoft.physics.mesh import Array, StoredMesh
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.setup import Setup, von_mises
-from torchsoft.physics.state import Layout, State, StateBlock, body_blocks
+from torchsoft.physics.state import Layout, State, StateBlock
 from torchsoft.solve.trajectory import Stats, Trajectory
 from torchsoft.tables import line
 
@@ -36,7 +36,19 @@ MESH = {
 
 PARTS = ("channels", "energy", "dissipated", "supplied")
 
-ABOUT = ("stats", "setup", "wrt", "parts", "touch")
+STATES = {
+    "pads": ("nodal_force_{}", ("{}_branch", "{}_node", "axis"),
+             "nodal forces of the pad {} that have set in, by retardation time"),
+    "stretch": ("stretch_{}", ("{}_point",), "stretch of the momentary springs of the contact {}"),
+    "friction": ("friction_state_{}", ("{}_state", "{}_point"),
+                 "states of the law of friction of the contact {}"),
+    "rates": ("velocity_{}", ("{}_node", "axis"), "velocities of the nodes of the pad {}"),
+    "control": ("control_{}", ("{}_control",), "states of the law of the actuator {}"),
+}  # fmt: skip
+"""Arrays of states by the field of `State`: name, dimensions after time, and meaning. The state of
+a nodal pad is in its `displacement` and `relaxing`, that of bodies in `pose` and `velocity`."""
+
+ABOUT = ("stats", "setup", "wrt", "parts", "touch", "states")
 """What is said about the arrays, in JSON."""
 
 Add = Callable[[str, Sequence[str], Any, str, str], None]
@@ -64,7 +76,7 @@ def to_xarray(run: Trajectory) -> xr.Dataset:
     }  # fmt: skip
     about = {
         "stats": vars(run.stats), "setup": run.setup.plain(), "wrt": list(run.wrt),
-        "touch": list(run.touch_sensitivities),
+        "touch": list(run.touch_sensitivities), "states": [*run.layout.blocks.values()],
         "parts": {part: list(getattr(run, part)) for part in PARTS},
         **run.made_by,
     }  # fmt: skip
@@ -82,31 +94,21 @@ def add_results(run: Trajectory, add: Add) -> None:
         for i, kind in enumerate(("normal", "friction")):
             meaning = f"{kind} force on the pad at the contact {key}"
             add(f"{kind}_force_{key}", points, force[..., i], "N", meaning)
-        meaning = "stretch of the momentary springs"
-        add(f"stretch_{key}", points, run.state.stretch[key], "m", meaning)
-        if key in run.state.friction:
-            own, meaning = ("time", f"{key}_state", f"{key}_point"), "states of the law of friction"
-            add(f"friction_state_{key}", own, run.state.friction[key], "", meaning)
         meaning = "0 separated, 1 sticking, 2 slipping; -1 not known"
         add(f"contact_state_{key}", points, run.contact_state[key], "1", meaning)
     for key, u in run.displacement.items():
         nodes = (f"{key}_node", "axis")
         meaning = f"displacements of the nodes of the pad {key}, in its base's frame"
         add(f"displacement_{key}", ("time", *nodes), u, "m", meaning)
-        if key in run.state.rates:
-            meaning = f"velocities of the nodes of the pad {key}"
-            add(f"velocity_{key}", ("time", *nodes), run.state.rates[key], "m/s", meaning)
-        elif run.setup.pads[key].nodal and run.state.pads[key].shape[-1] > 2:
+        if run.setup.pads[key].nodal and run.state.pads[key].shape[-1] > 2:
             meaning = f"displacements of the relaxing branches of the pad {key}"
             v = run.state.pads[key][..., 2:].unflatten(-1, (-1, 2)).movedim(-2, 1)
             add(f"relaxing_{key}", ("time", f"{key}_branch", *nodes), v, "m", meaning)
-        elif not run.setup.pads[key].nodal:
-            meaning = f"nodal forces of the pad {key} that have set in, by retardation time"
-            where = ("time", f"{key}_branch", *nodes)
-            add(f"nodal_force_{key}", where, run.state.pads[key], "N", meaning)
-    for key, value in run.state.control.items():
-        meaning = f"states of the law of the actuator {key}"
-        add(f"control_{key}", ("time", f"{key}_control"), value, "", meaning)
+    for block in own_states(run.layout, run.setup):
+        name, dims, meaning = STATES[block.field]
+        value, unit = getattr(run.state, block.field)[block.name], ", ".join(block.units)
+        own = [one.format(block.name) for one in (*dims, meaning)]
+        add(name.format(block.name), ("time", *own[:-1]), value, unit, own[-1])
     bodies = ("time", "body", "coordinate")
     for name, values, unit, meaning in (
         ("pose", run.state.pose, "m, m, rad", "x, y and theta of the bodies"),
@@ -126,6 +128,13 @@ def add_results(run: Trajectory, add: Add) -> None:
     for name, value in run.touch_sensitivities.items():
         meaning = f"derivatives of the channel {name} by the unknowns"
         add(f"sensitivities_{name}", ("time", "unknown"), value, "", meaning)
+
+
+def own_states(layout: Layout, setup: Setup) -> Iterator[StateBlock]:
+    """States that have an array of their own."""
+    for block in layout.blocks.values():
+        if block.field in STATES and not (block.field == "pads" and setup.pads[block.name].nodal):
+            yield block
 
 
 def add_setup(setup: Setup, add: Add) -> None:
@@ -214,7 +223,7 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
     def by(prefix: str, names: list[str]) -> dict[str, Tensor]:
         return {name: of(f"{prefix}_{name}") for name in names}
 
-    stats, plain, wrt, parts, touch = (about.pop(name) for name in ABOUT)
+    stats, plain, wrt, parts, touch, states = (about.pop(name) for name in ABOUT)
     words = isinstance(wrt, list) and isinstance(touch, list) and {*map(type, wrt + touch)} <= {str}
     if not words or not all(isinstance(x, int | float) for x in stats.values()):
         raise TypeError("stats, wrt or touch")
@@ -237,33 +246,23 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
         dict(zip(bodies, of(name).unbind(1))) for name in ("pose", "velocity", "loads")
     )
     displacement = by("displacement", list(setup.pads))
-    pads = {
-        name: displacement[name] if pad.nodal else of(f"nodal_force_{name}")
-        for name, pad in setup.pads.items()
-    }
-    for name in pads:
-        if f"relaxing_{name}" in data:
-            v = of(f"relaxing_{name}").movedim(1, -2).flatten(-2)
-            pads[name] = torch.cat((pads[name], v), -1)
-    rates = by("velocity", [name for name, pad in setup.pads.items() if pad.inertial])
-    friction = by("friction_state", [name for name in contacts if f"friction_state_{name}" in data])
-    control = by("control", [name for name in setup.actuators if f"control_{name}" in data])
-    state = State(pads, by("stretch", contacts), pose, rates, velocity, friction, control)
     free = {
         name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
         for name, body in setup.bodies.items()
     }
-    blocks = [block for name, axes in free.items() for block in body_blocks(name, axes)]
-    own = [("pads", name, x) for name, x in pads.items()]
-    own += [("rates", name, x) for name, x in rates.items()]
-    for name, s in state.stretch.items():
-        own += [("stretch", name, s)]
-        own += [("friction", name, friction[name])] if name in friction else []
-    own += [("control", name, x) for name, x in control.items()]
-    blocks += [StateBlock.of(field, name, tuple(x.shape[1:]), "") for field, name, x in own]
-    layout = Layout(free, blocks)
+    layout = Layout(free, (StateBlock.again(*block) for block in states))
+    fields: dict[str, dict[str, Tensor]] = {field: {} for field in State._fields}
+    for block in own_states(layout, setup):
+        fields[block.field][block.name] = of(STATES[block.field][0].format(block.name))
+    for name, pad in setup.pads.items():
+        if pad.nodal:
+            relaxing = f"relaxing_{name}"
+            more = [of(relaxing).movedim(1, -2).flatten(-2)] if relaxing in data else []
+            fields["pads"][name] = torch.cat((displacement[name], *more), -1)
+    state = State(**fields | {"pose": pose, "velocity": velocity})
+    layout.check(y := layout.pack(state))
     return Trajectory(
-        t=of("time"), y=layout.pack(state), state=state,
+        t=of("time"), y=y, state=state,
         channels={name: of(name) for name in parts["channels"]},
         force={
             name: torch.stack([of(f"{kind}_force_{name}") for kind in ("normal", "friction")], -1)
