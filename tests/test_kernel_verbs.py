@@ -67,8 +67,8 @@ def plain(monkeypatch):
 class Stage(NamedTuple):
     """The first stage of a step of a rig from the tape: its arrays, scratch, and length."""
 
-    s: Any
-    w: Any
+    rig: Any
+    work: Any
     tape: Any
     out_tape: Any
     signals: Any
@@ -86,9 +86,9 @@ def first_stage(name: str) -> Stage:
     tapes = segments[-1].tapes
     assert tapes is not None
     tape, out_tape = tapes
-    s, size = stepper.compiled.system, stepper.layout.size
+    rig, size = stepper.compiled.system, stepper.layout.size
     return Stage(
-        s, scratch("Work", s, size, columns=2), tape, out_tape, segments[-1].stages, size,
+        rig, scratch("Work", rig, size, columns=2), tape, out_tape, segments[-1].stages, size,
         GAMMA * STEP,
     )  # fmt: skip
 
@@ -114,33 +114,33 @@ def test_the_block_of_a_pad_is_that_of_dense_algebra(name):
     """A F = b + Hc dV with the points' own derivatives: A = 1 - N^T H_u N P, and elimination is
     that of the whole system."""
     now = first_stage(name)
-    s, w = now.s, now.w
-    contacts.restore(s, w, now.tape, 1, now.a, False)
-    linear.put(now.tape.rate[1], w.rate)
-    free = len(s.body_coordinate)
-    for pad in range(len(s.pad_base)):
+    rig, work = now.rig, now.work
+    contacts.restore(rig, work, now.tape, 1, now.a, False)
+    linear.put(now.tape.rate[1], work.rate)
+    free = len(rig.body_coordinate)
+    for pad in range(len(rig.pad_base)):
         Rv, r = np.zeros((free, free)), np.zeros((free, 1))
-        pads.assemble(s, w, pad, now.tape.y[1], now.a, Rv)
-        n, at = 2 * w.counts[pad], s.pad_point_start[pad]
-        active = w.active[at : at + w.actives[pad]]
+        pads.assemble(rig, work, pad, now.tape.y[1], now.a, Rv)
+        n, at = 2 * work.counts[pad], rig.pad_point_start[pad]
+        active = work.active[at : at + work.actives[pad]]
         assert n > 0
         N = np.zeros((2 * len(active), n))
         H = np.zeros((2 * len(active), 2 * len(active)))
         for i, k in enumerate(active):
             for j in range(2):
-                slot = w.slot[s.point_node[k, j]]
-                N[2 * i : 2 * i + 2, 2 * slot : 2 * slot + 2] += s.point_N[k, j] * np.eye(2)
-            H[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = w.H[at + i, :2, :2]
-        A = np.eye(n) - N.T @ H @ N @ w.P[:n, :n]
-        assert w.A[:n, :n] == pytest.approx(A, rel=1e-11, abs=1e-13)
+                slot = work.slot[rig.point_node[k, j]]
+                N[2 * i : 2 * i + 2, 2 * slot : 2 * slot + 2] += rig.point_N[k, j] * np.eye(2)
+            H[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = work.H[at + i, :2, :2]
+        A = np.eye(n) - N.T @ H @ N @ work.P[:n, :n]
+        assert work.A[:n, :n] == pytest.approx(A, rel=1e-11, abs=1e-13)
 
-        columns = s.pad_columns[pad]
-        Hc, Rf = w.Hc[:n, :columns].copy(), w.Rf[:columns, :n].copy()
-        b, own = ANY.normal(size=n), s.pad_column[pad] >= 0
-        first, before = 2 * s.pad_node_start[pad], Rv.copy()
-        w.X[first : first + n, 0] = b
-        contacts.eliminate(s, w, pad, 1, r, Rv)
-        number = s.pad_column[pad][own]
+        columns = rig.pad_columns[pad]
+        Hc, Rf = work.Hc[:n, :columns].copy(), work.Rf[:columns, :n].copy()
+        b, own = ANY.normal(size=n), rig.pad_column[pad] >= 0
+        first, before = 2 * rig.pad_node_start[pad], Rv.copy()
+        work.X[first : first + n, 0] = b
+        contacts.eliminate(rig, work, pad, 1, r, Rv)
+        number = rig.pad_column[pad][own]
         schur, load = np.zeros((free, free)), np.zeros(free)
         schur[np.ix_(own, own)] = (Rf @ np.linalg.solve(A, Hc))[np.ix_(number, number)]
         load[own] = (Rf @ np.linalg.solve(A, b))[number]
@@ -151,27 +151,27 @@ def test_the_block_of_a_pad_is_that_of_dense_algebra(name):
 def test_a_nodal_pad_is_the_inverse_of_its_own_matrix():
     """P between the touched nodes, from the elements' derivatives assembled densely."""
     now = first_stage("inertial pads")
-    s, w, pad = now.s, now.w, 0
-    contacts.restore(s, w, now.tape, 1, now.a, False)
-    linear.put(now.tape.rate[1], w.rate)
-    nodal.relation(s, w, pad, now.tape.y[1], now.a)
-    dofs = s.nodal_dof_start[1]
-    A = np.diag([nodal.mass_rate(s, pad, i, now.a) for i in range(dofs)])
-    for e in range(s.nodal_element_start[1]):
-        nodal.element_inputs(s, w, pad, e // LANES, now.tape.y[1], now.a)
-        own = s.p[nodal.element_parameters(s, pad)]
+    rig, work, pad = now.rig, now.work, 0
+    contacts.restore(rig, work, now.tape, 1, now.a, False)
+    linear.put(now.tape.rate[1], work.rate)
+    nodal.relation(rig, work, pad, now.tape.y[1], now.a)
+    dofs = rig.nodal_dof_start[1]
+    A = np.diag([nodal.mass_rate(rig, pad, i, now.a) for i in range(dofs)])
+    for e in range(rig.nodal_element_start[1]):
+        nodal.element_inputs(rig, work, pad, e // LANES, now.tape.y[1], now.a)
+        own = rig.p[nodal.element_parameters(rig, pad)]
         four, out = np.zeros((8, 16, LANES)), np.zeros((9, LANES))
-        nodal.call_linearise(s.nodal_linearise[pad], w.element_x[e // LANES], own, out, four)
+        nodal.call_linearise(rig.nodal_linearise[pad], work.element_x[e // LANES], own, out, four)
         J = four[..., e % LANES]
-        held = s.nodal_dof[e] >= 0
-        A[np.ix_(s.nodal_dof[e][held], s.nodal_dof[e][held])] += (now.a * J[:, :8] + J[:, 8:])[
+        held = rig.nodal_dof[e] >= 0
+        A[np.ix_(rig.nodal_dof[e][held], rig.nodal_dof[e][held])] += (now.a * J[:, :8] + J[:, 8:])[
             np.ix_(held, held)
         ]
-    touched = w.touched[: w.counts[pad]]
-    places = s.nodal_surface.reshape(-1, 2)[touched].ravel()
+    touched = work.touched[: work.counts[pad]]
+    places = rig.nodal_surface.reshape(-1, 2)[touched].ravel()
     P = np.linalg.inv(A)[np.ix_(places, places)]
     n = len(places)
-    assert w.P[:n, :n] == pytest.approx(P, rel=1e-9, abs=1e-12 * abs(P).max())
+    assert work.P[:n, :n] == pytest.approx(P, rel=1e-9, abs=1e-12 * abs(P).max())
     assert abs(A - A.T).max() < 1e-12 * abs(A).max()
 
 
@@ -181,24 +181,24 @@ def test_the_adjoint_of_a_stage_is_its_tangent_transposed(name, felt):
     """<bar, push(d)> = <pull(bar), d> for random directions of state and parameters, and for the
     forces of a stage of no length."""
     now = first_stage(name)
-    s, size, m = now.s, now.size, 2
+    rig, size, m = now.rig, now.size, 2
     tape, row, a = (now.out_tape, 0, INSTANT) if felt else (now.tape, 1, now.a)
     signals = now.signals[row]
-    z, back = scratch("Tangents", s, size, columns=m), scratch("Cotangents", s, size)
+    z, back = scratch("Tangents", rig, size, columns=m), scratch("Cotangents", rig, size)
     scale = np.maximum(abs(tape.y[row]), 1e-6)
     start, dp = (
         scale[:, None] * ANY.normal(size=(size, m)),
-        abs(s.p)[:, None] * ANY.normal(size=(len(s.p), m)),
+        abs(rig.p)[:, None] * ANY.normal(size=(len(rig.p), m)),
     )
     dy = start.copy()
-    pads.find_spans(s, tape.y[row], dy, z.span)
-    tangent.stage_tangent(s, now.w, z, tape, row, a, signals, dy, dp, felt)
+    pads.find_spans(rig, tape.y[row], dy, z.span)
+    tangent.stage_tangent(rig, now.work, z, tape, row, a, signals, dy, dp, felt)
     out = z.recorded.copy() if felt else dy
     bar = ANY.normal(size=len(out)) / np.maximum(abs(out).max(1), 1e-12)
     y_bar = np.zeros(size) if felt else bar.copy()
-    p_bar, signals_bar = np.zeros(len(s.p)), np.zeros(signals.shape)
+    p_bar, signals_bar = np.zeros(len(rig.p)), np.zeros(signals.shape)
     adjoint.stage_adjoint(
-        s, now.w, back, tape, row, a, signals, y_bar, p_bar, signals_bar,
+        rig, now.work, back, tape, row, a, signals, y_bar, p_bar, signals_bar,
         bar if felt else np.zeros(0),
     )  # fmt: skip
     forwards = bar @ out

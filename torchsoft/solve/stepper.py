@@ -288,7 +288,7 @@ class ImplicitStepper:
         tape = out_tape = model.no_tape
         if now.taping:
             tape, out_tape = (
-                scratch("Tape", table.s, self.layout.size, stages=n, cap=self._cap)
+                scratch("Tape", table.rig, self.layout.size, stages=n, cap=self._cap)
                 for n in (2 * len(plan.h), count if now.outputs_too else 0)
             )
             if now.outputs_too:

@@ -4,6 +4,9 @@ A rig has coordinates (x, y, theta) of its bodies, three each, and last those of
 are zero. A coordinate is free (a component of the state) or follows a signal. "At" in a name is a
 position in the vector p of all law parameters, "start" one in another array. Nodes are the surface
 nodes of all pads, points the contact points of all contacts, dofs those of all nodal pads.
+
+Kernels call their tables alike: `rig` is a `System`, what they compute in is `work` (`Work`),
+`bars` (`Cotangents`) and `tangents`, and `call` has the arguments of an entry.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -422,11 +425,11 @@ class Outputs(NamedTuple):
 class Run(NamedTuple):
     """Arguments of `run`, explained in its docstring."""
 
-    s: Annotated[Any, System]
-    w: Annotated[Any, Work]
-    d: Annotated[Any, Step]
-    f: Signals
-    e: Errors
+    rig: Annotated[Any, System]
+    work: Annotated[Any, Work]
+    taken: Annotated[Any, Step]
+    followed: Signals
+    errors: Errors
     limits: Limits
     start: Limits
     out: Outputs
@@ -452,9 +455,9 @@ class Run(NamedTuple):
 class Rates(NamedTuple):
     """Arguments of `rates`."""
 
-    s: Annotated[Any, System]
-    w: Annotated[Any, Work]
-    f: Signals
+    rig: Annotated[Any, System]
+    work: Annotated[Any, Work]
+    followed: Signals
     limits: Limits
     t: float
     y: Array
@@ -469,9 +472,9 @@ class Rates(NamedTuple):
 class Backward(NamedTuple):
     """Arguments of `backward`."""
 
-    s: Annotated[Any, System]
-    w: Annotated[Any, Work]
-    z: Annotated[Any, Cotangents]
+    rig: Annotated[Any, System]
+    work: Annotated[Any, Work]
+    bars: Annotated[Any, Cotangents]
     tape: Annotated[Any, Tape]
     h: Array
     signals: Cube
@@ -492,9 +495,9 @@ class Backward(NamedTuple):
 class Forward(NamedTuple):
     """Arguments of `forward`."""
 
-    s: Annotated[Any, System]
-    w: Annotated[Any, Work]
-    z: Annotated[Any, Tangents]
+    rig: Annotated[Any, System]
+    work: Annotated[Any, Work]
+    tangents: Annotated[Any, Tangents]
     tape: Annotated[Any, Tape]
     h: Array
     signals: Cube
@@ -511,41 +514,42 @@ class Forward(NamedTuple):
     dsums: Cube
 
 
-def recorded_size(s: Any) -> int:
+def recorded_size(rig: Any) -> int:
     """Number of forces of one output: (F_N, F_T) of every point, force and moment of every pad,
     loads on all coordinates, in this order."""
-    return 2 * len(s.point_X) + 3 * len(s.pad_base) + len(s.body_free)
+    return 2 * len(rig.point_X) + 3 * len(rig.pad_base) + len(rig.body_free)
 
 
-def columns(s: Any) -> Any:
+def columns(rig: Any) -> Any:
     """Numbers of inputs by which the laws of sources are differentiated: what they read, with
     rates, and their states."""
     return (
-        2 * (np.diff(s.source_signal_start) + np.diff(s.source_coordinate_start)) + s.source_states
+        2 * (np.diff(rig.source_signal_start) + np.diff(rig.source_coordinate_start))
+        + rig.source_states
     )
 
 
-def scratch(kind: str, s: Any, state: int, **sizes: int) -> Any:
+def scratch(kind: str, rig: Any, state: int, **sizes: int) -> Any:
     """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those
     that it does not decide."""
-    states, nodes = int(s.contact_states.max(initial=1)), int(s.pad_node_start[-1])
-    reads, efforts = 1 + columns(s).max(initial=1), 1 + s.source_states.max(initial=0)
-    dofs, band = np.diff(s.nodal_dof_start), 2 * s.nodal_band + 1
-    widest, corners = 2 * int(np.diff(s.pad_node_start).max(initial=0)), s.nodal_dof.shape[1]
+    states, nodes = int(rig.contact_states.max(initial=1)), int(rig.pad_node_start[-1])
+    reads, efforts = 1 + columns(rig).max(initial=1), 1 + rig.source_states.max(initial=0)
+    dofs, band = np.diff(rig.nodal_dof_start), 2 * rig.nodal_band + 1
+    widest, corners = 2 * int(np.diff(rig.pad_node_start).max(initial=0)), rig.nodal_dof.shape[1]
     sizes |= {
-        "state": state, "coordinates": len(s.body_free), "free": len(s.body_coordinate),
-        "contacts": len(s.contact_pad), "points": len(s.point_X), "pads": len(s.pad_base),
+        "state": state, "coordinates": len(rig.body_free), "free": len(rig.body_coordinate),
+        "contacts": len(rig.contact_pad), "points": len(rig.point_X), "pads": len(rig.pad_base),
         "nodes": nodes, "nodes2": 2 * nodes, "condensed": 2 * nodes, "widest": widest,
         "reads": int(reads), "efforts": int(efforts), "effort_jacobian": int(reads * efforts),
         "states": states, "rows": max(WRENCH + states + 2, int(efforts)),
         "outputs": WRENCH + states + 4,
         "inputs": MOTION + states + 2, "jacobian": (WRENCH + states + 2) * (MOTION + states),
         "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
-        "lanes": LANES, "groups": int(s.nodal_element_start[-1]) // LANES,
-        "dofs": int(s.nodal_dof_start[-1]), "banded": int((dofs * band).sum()),
+        "lanes": LANES, "groups": int(rig.nodal_element_start[-1]) // LANES,
+        "dofs": int(rig.nodal_dof_start[-1]), "banded": int((dofs * band).sum()),
         "corners": corners, "2corners": 2 * corners,
-        "element_inputs": 2 * corners + s.nodal_constants.shape[1], "parameters": len(s.p),
-        "recorded": recorded_size(s),
+        "element_inputs": 2 * corners + rig.nodal_constants.shape[1], "parameters": len(rig.p),
+        "recorded": recorded_size(rig),
     }  # fmt: skip
     sizes["responses"] = sizes["dofs"] * (widest + 2)
     sizes["solves"] = int(dofs.max(initial=0)) * max(widest + 3, sizes.get("columns", 1))
@@ -560,7 +564,7 @@ def scratch(kind: str, s: Any, state: int, **sizes: int) -> Any:
             name: np.zeros(lengths, np.int64 if whole else np.float64) for name in names.split()
         }
     if kind == "Work":
-        constants = s.nodal_constants
+        constants = rig.nodal_constants
         grouped = constants.reshape(sizes["groups"], LANES, constants.shape[1])
         made["element_x"][:, 2 * corners :] = grouped.swapaxes(1, 2)
     return KINDS[kind](**made)

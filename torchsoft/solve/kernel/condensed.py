@@ -24,43 +24,45 @@ NEGLIGIBLE_PART = 1e-17
 
 
 @compiled
-def softness(s: Any, pad: int) -> float:
+def softness(rig: Any, pad: int) -> float:
     """1 / (E depth) [m/N]; the stored compliance is that for E depth = 1."""
-    return s.p[s.condensed_chain_at[pad] + 2 * s.condensed_branches[pad]]
+    return rig.p[rig.condensed_chain_at[pad] + 2 * rig.condensed_branches[pad]]
 
 
 @compiled
-def mobility(s: Any, pad: int, a: float) -> float:
+def mobility(rig: Any, pad: int, a: float) -> float:
     """Factor of the stored compliance in P: sum of J / rest, by 1 / (E depth)."""
-    at, n, total = s.condensed_chain_at[pad], s.condensed_branches[pad], 0.0
+    at, n, total = rig.condensed_chain_at[pad], rig.condensed_branches[pad], 0.0
     for b in range(n):
-        total += s.p[at + b] / (s.p[at + n + b] + a)
-    return total * softness(s, pad)
+        total += rig.p[at + b] / (rig.p[at + n + b] + a)
+    return total * softness(rig, pad)
 
 
 @compiled
-def size_of(s: Any, pad: int) -> int:
+def size_of(rig: Any, pad: int) -> int:
     """Number of surface dofs."""
-    return 2 * (s.pad_node_start[pad + 1] - s.pad_node_start[pad])
+    return 2 * (rig.pad_node_start[pad + 1] - rig.pad_node_start[pad])
 
 
 @compiled
-def branch_rate(s: Any, w: Any, pad: int, b: int, i: int, F: Array, y: Array, a: float) -> float:
+def branch_rate(
+    rig: Any, work: Any, pad: int, b: int, i: int, F: Array, y: Array, a: float
+) -> float:
     """Rate of the force that has set in at surface dof i, in branch b of the chain, under the nodal
     forces F (nodes, 2)."""
-    size, node = size_of(s, pad), s.pad_node_start[pad] + i // 2
-    force = F[node, i % 2] if w.low[pad] <= node < w.high[pad] else 0.0
-    tau = s.p[s.condensed_chain_at[pad] + s.condensed_branches[pad] + b]
-    return (force - y[s.pad_y_start[pad] + b * size + i]) / (tau + a)
+    size, node = size_of(rig, pad), rig.pad_node_start[pad] + i // 2
+    force = F[node, i % 2] if work.low[pad] <= node < work.high[pad] else 0.0
+    tau = rig.p[rig.condensed_chain_at[pad] + rig.condensed_branches[pad] + b]
+    return (force - y[rig.pad_y_start[pad] + b * size + i]) / (tau + a)
 
 
 @compiled
-def begin(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
+def begin(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
     """Start of a stage: zeta = sum of J z and sum of J z / rest."""
-    p, first, start = s.p, s.pad_node_start[pad], s.pad_y_start[pad]
-    last = s.pad_node_start[pad + 1]
-    at, n = s.condensed_chain_at[pad], s.condensed_branches[pad]
-    zeta, rate = w.zeta[2 * first : 2 * last], w.zeta_rate[2 * first : 2 * last]
+    p, first, start = rig.p, rig.pad_node_start[pad], rig.pad_y_start[pad]
+    last = rig.pad_node_start[pad + 1]
+    at, n = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
+    zeta, rate = work.zeta[2 * first : 2 * last], work.zeta_rate[2 * first : 2 * last]
     for i in range(zeta.size):
         zeta[i], rate[i] = 0.0, 0.0
     for b in range(n):
@@ -72,109 +74,112 @@ def begin(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 
 
 @compiled
-def displace(s: Any, w: Any, pad: int, low: int, high: int) -> None:
+def displace(rig: Any, work: Any, pad: int, low: int, high: int) -> None:
     """u* and the rates without contact of the surface nodes from `low` to `high`, from the result
     of `begin`."""
-    first, last = s.pad_node_start[pad], s.pad_node_start[pad + 1]
-    zeta, rate = w.zeta[2 * first : 2 * last], w.zeta_rate[2 * first : 2 * last]
+    first, last = rig.pad_node_start[pad], rig.pad_node_start[pad + 1]
+    zeta, rate = work.zeta[2 * first : 2 * last], work.zeta_rate[2 * first : 2 * last]
     left, right, size = 0, 2 * (last - first), 2 * (last - first)
     while left < right and abs(zeta[left]) < NEGLIGIBLE:
         left += 1
     while right > left and abs(zeta[right - 1]) < NEGLIGIBLE:
         right -= 1
-    zeta, rate, soft = zeta[left:right], rate[left:right], softness(s, pad)
+    zeta, rate, soft = zeta[left:right], rate[left:right], softness(rig, pad)
     for i in range(2 * low, 2 * high):
-        row = row_of(s.condensed_C, s.condensed_C_start[pad], i - 2 * first, size)[left:right]
-        w.u[i // 2, i % 2], w.free[i // 2, i % 2] = soft * dot(row, zeta), -soft * dot(row, rate)
+        row = row_of(rig.condensed_C, rig.condensed_C_start[pad], i - 2 * first, size)[left:right]
+        work.u[i // 2, i % 2], work.free[i // 2, i % 2] = (
+            soft * dot(row, zeta),
+            -soft * dot(row, rate),
+        )
 
 
 @compiled
-def relation(s: Any, w: Any, pad: int, a: float) -> None:
-    """The mobility between the touched nodes into w.P."""
-    first, n, start = s.pad_node_start[pad], w.counts[pad], s.condensed_C_start[pad]
-    P, size, scale = w.P, size_of(s, pad), mobility(s, pad, a)
+def relation(rig: Any, work: Any, pad: int, a: float) -> None:
+    """The mobility between the touched nodes into work.P."""
+    first, n, start = rig.pad_node_start[pad], work.counts[pad], rig.condensed_C_start[pad]
+    P, size, scale = work.P, size_of(rig, pad), mobility(rig, pad, a)
     for i in range(n):
-        row = 2 * (w.touched[first + i] - first)
+        row = 2 * (work.touched[first + i] - first)
         for j in range(n):
-            col = 2 * (w.touched[first + j] - first)
+            col = 2 * (work.touched[first + j] - first)
             for r in range(2):
                 line = start + (row + r) * size + col
-                P[2 * i + r, 2 * j] = scale * s.condensed_C[line]
-                P[2 * i + r, 2 * j + 1] = scale * s.condensed_C[line + 1]
+                P[2 * i + r, 2 * j] = scale * rig.condensed_C[line]
+                P[2 * i + r, 2 * j + 1] = scale * rig.condensed_C[line + 1]
 
 
 @compiled
-def propose(s: Any, w: Any, pad: int, a: float) -> None:
-    """Nodal rates w.u_dot_new under the forces w.F_new, in the window."""
-    first, start, size = s.pad_node_start[pad], s.condensed_C_start[pad], size_of(s, pad)
-    scale, low, high = mobility(s, pad, a), 2 * w.low[pad], 2 * w.high[pad]
-    rates = w.u_dot_new[low:high]
+def propose(rig: Any, work: Any, pad: int, a: float) -> None:
+    """Nodal rates work.u_dot_new under the forces work.F_new, in the window."""
+    first, start, size = rig.pad_node_start[pad], rig.condensed_C_start[pad], size_of(rig, pad)
+    scale, low, high = mobility(rig, pad, a), 2 * work.low[pad], 2 * work.high[pad]
+    rates = work.u_dot_new[low:high]
     for i in range(rates.size):
-        rates[i] = w.free[(low + i) // 2, i % 2]
-    for i in range(w.counts[pad]):
-        node = w.touched[first + i]
+        rates[i] = work.free[(low + i) // 2, i % 2]
+    for i in range(work.counts[pad]):
+        node = work.touched[first + i]
         for r in range(2):
-            row = row_of(s.condensed_C, start, 2 * (node - first) + r, size)
-            add(scale * w.F_new[node, r], row[low - 2 * first :], rates)
+            row = row_of(rig.condensed_C, start, 2 * (node - first) + r, size)
+            add(scale * work.F_new[node, r], row[low - 2 * first :], rates)
 
 
 @compiled
-def quadratic(s: Any, pad: int, x: Array, low: int, high: int) -> float:
+def quadratic(rig: Any, pad: int, x: Array, low: int, high: int) -> float:
     """x C x of a vector of surface dofs that is zero but from `low` to `high`, with the stored
     compliance C."""
-    total, size, inside = 0.0, size_of(s, pad), x[low:high]
+    total, size, inside = 0.0, size_of(rig, pad), x[low:high]
     for m in range(inside.size):
-        row = row_of(s.condensed_C, s.condensed_C_start[pad], low + m, size)
+        row = row_of(rig.condensed_C, rig.condensed_C_start[pad], low + m, size)
         total += inside[m] * dot(inside, row[low:])
     return total
 
 
 @compiled
-def stored(s: Any, pad: int, y: Array) -> float:
+def stored(rig: Any, pad: int, y: Array) -> float:
     """Strain energy of the pad [J] in a state."""
-    size, chain, total = size_of(s, pad), s.condensed_chain_at[pad], 0.0
-    for b in range(s.condensed_branches[pad]):
-        start = s.pad_y_start[pad] + b * size
+    size, chain, total = size_of(rig, pad), rig.condensed_chain_at[pad], 0.0
+    for b in range(rig.condensed_branches[pad]):
+        start = rig.pad_y_start[pad] + b * size
         z, low, high = y[start : start + size], 0, size
         while low < high and abs(z[low]) < NEGLIGIBLE:
             low += 1
         while high > low and abs(z[high - 1]) < NEGLIGIBLE:
             high -= 1
-        total += 0.5 * s.p[chain + b] * quadratic(s, pad, z, low, high)
-    return softness(s, pad) * total
+        total += 0.5 * rig.p[chain + b] * quadratic(rig, pad, z, low, high)
+    return softness(rig, pad) * total
 
 
 @compiled
-def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array) -> float:
-    """Rates of the forces that have set in into w.k, and the power [W] that the pad dissipates;
+def finish(rig: Any, work: Any, pad: int, y: Array, a: float, powers: Array) -> float:
+    """Rates of the forces that have set in into work.k, and the power [W] that the pad dissipates;
     returns a bound of its nodes' speeds [m/s]."""
-    p, k, size, start = s.p, w.k, size_of(s, pad), s.pad_y_start[pad]
-    chain, branches = s.condensed_chain_at[pad], s.condensed_branches[pad]
+    p, k, size, start = rig.p, work.k, size_of(rig, pad), rig.pad_y_start[pad]
+    chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
     total = 0.0
     for b in range(branches):
         J, tau, z = p[chain + b], p[chain + branches + b], start + b * size
         low, high = size, 0
         for m in range(size):
-            rate = branch_rate(s, w, pad, b, m, w.F_linear, y, a)
+            rate = branch_rate(rig, work, pad, b, m, work.F_linear, y, a)
             k[z + m] = rate
             if abs(rate) * a > NEGLIGIBLE_RATE:
                 low, high = min(low, m), m + 1
                 total += J * abs(rate)
-        power = quadratic(s, pad, k[z : z + size], low, high)
-        powers[pad] += J * tau * power * softness(s, pad)
-    return total * s.condensed_reach[pad] * softness(s, pad)
+        power = quadratic(rig, pad, k[z : z + size], low, high)
+        powers[pad] += J * tau * power * softness(rig, pad)
+    return total * rig.condensed_reach[pad] * softness(rig, pad)
 
 
 # Tangent.
 
 
 @compiled
-def find_span(s: Any, pad: int, y: Array, dy: Array, span: Array) -> None:
+def find_span(rig: Any, pad: int, y: Array, dy: Array, span: Array) -> None:
     """The first surface dof that is loaded or has a derivative, and the end; negligible derivatives
     become zero."""
-    size, start = size_of(s, pad), s.pad_y_start[pad]
+    size, start = size_of(rig, pad), rig.pad_y_start[pad]
     span[pad, 0], span[pad, 1] = size, 0
-    for b in range(s.condensed_branches[pad]):
+    for b in range(rig.condensed_branches[pad]):
         rows = dy[start + b * size : start + (b + 1) * size]
         for k in range(dy.shape[1]):
             largest = 0.0
@@ -191,21 +196,27 @@ def find_span(s: Any, pad: int, y: Array, dy: Array, span: Array) -> None:
 
 
 @compiled
-def push(s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: float) -> None:
-    """Derivatives of u* (z.u) and of u' before the forces' own change (z.v) at the touched
-    nodes."""
-    p, first, start, m = s.p, s.pad_node_start[pad], s.pad_y_start[pad], dy.shape[1]
-    size, chain, branches = size_of(s, pad), s.condensed_chain_at[pad], s.condensed_branches[pad]
-    material, span, du, dv = chain + 2 * branches, z.span, z.u, z.v
-    left = min(span[pad, 0], 2 * (w.low[pad] - first))
-    right = max(span[pad, 1], 2 * (w.high[pad] - first))
+def push(
+    rig: Any, work: Any, tangents: Any, pad: int, y: Array, dy: Array, dp: Array, a: float
+) -> None:
+    """Derivatives of u* (tangents.u) and of u' before the forces' own change (tangents.v) at the
+    touched nodes."""
+    p, first, start, m = rig.p, rig.pad_node_start[pad], rig.pad_y_start[pad], dy.shape[1]
+    size, chain, branches = (
+        size_of(rig, pad),
+        rig.condensed_chain_at[pad],
+        rig.condensed_branches[pad],
+    )
+    material, span, du, dv = chain + 2 * branches, tangents.span, tangents.u, tangents.v
+    left = min(span[pad, 0], 2 * (work.low[pad] - first))
+    right = max(span[pad, 1], 2 * (work.high[pad] - first))
     span[pad, 0], span[pad, 1] = left, right
-    zeta, rate, dzeta, drate = z.zeta, z.rate, z.dzeta, z.drate
+    zeta, rate, dzeta, drate = tangents.zeta, tangents.rate, tangents.dzeta, tangents.drate
     zeta[:], rate[:], dzeta[:], drate[:] = 0.0, 0.0, 0.0, 0.0
     for b in range(branches):
         J, rest, at = p[chain + b], p[chain + branches + b] + a, start + b * size
         for i in range(left, right):
-            z_dot = branch_rate(s, w, pad, b, i, w.F, y, a)
+            z_dot = branch_rate(rig, work, pad, b, i, work.F, y, a)
             zeta[i] += J * y[at + i]
             rate[i] += J * z_dot
             add(J, dy[at + i], dzeta[i])
@@ -213,63 +224,63 @@ def push(s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: fl
             add(z_dot, dp[chain + b], drate[i])
             add(-J / rest, dy[at + i], drate[i])
             add(-J / rest * z_dot, dp[chain + branches + b], drate[i])
-    stiffer, soft = False, softness(s, pad)
+    stiffer, soft = False, softness(rig, pad)
     for k in range(m):
         stiffer |= dp[material + 1, k] != 0.0
     for i in range(left, right):  # C is proportional to the material's first entry
         add(zeta[i] / p[material], dp[material], dzeta[i])
         add(rate[i] / p[material], dp[material], drate[i])
-    for i in range(w.counts[pad]):
-        node = w.touched[first + i]
+    for i in range(work.counts[pad]):
+        node = work.touched[first + i]
         for r in range(2):
             dof = 2 * (node - first) + r
-            row = row_of(s.condensed_C, s.condensed_C_start[pad], dof, size)
+            row = row_of(rig.condensed_C, rig.condensed_C_start[pad], dof, size)
             u, v = du[node, r], dv[node, r]
             u[:], v[:] = 0.0, 0.0
             for j in range(left, right):
                 add(soft * row[j], dzeta[j], u)
                 add(soft * row[j], drate[j], v)
             if stiffer:
-                row = row_of(s.condensed_dC, s.condensed_C_start[pad], dof, size)[left:right]
+                row = row_of(rig.condensed_dC, rig.condensed_C_start[pad], dof, size)[left:right]
                 add(soft * dot(row, zeta[left:]), dp[material + 1], u)
                 add(soft * dot(row, rate[left:]), dp[material + 1], v)
 
 
 @compiled
-def push_rates(s: Any, w: Any, z: Any, pad: int, a: float, X: Array) -> None:
-    """Tangents of the touched nodes' rates, less z.v, under those of the nodal forces X."""
+def push_rates(rig: Any, work: Any, tangents: Any, pad: int, a: float, X: Array) -> None:
+    """Tangents of the touched nodes' rates, less tangents.v, under those of the nodal forces X."""
     first, n, size, scale = (
-        s.pad_node_start[pad],
-        w.counts[pad],
-        size_of(s, pad),
-        mobility(s, pad, a),
+        rig.pad_node_start[pad],
+        work.counts[pad],
+        size_of(rig, pad),
+        mobility(rig, pad, a),
     )
     for i in range(n):
         for o in range(2):
-            dof = 2 * (w.touched[first + i] - first) + o
-            row = row_of(s.condensed_C, s.condensed_C_start[pad], dof, size)
+            dof = 2 * (work.touched[first + i] - first) + o
+            row = row_of(rig.condensed_C, rig.condensed_C_start[pad], dof, size)
             for j in range(n):
                 for q in range(2):
-                    c = scale * row[2 * (w.touched[first + j] - first) + q]
-                    add(c, X[2 * j + q], z.own_rate[i, o])
+                    c = scale * row[2 * (work.touched[first + j] - first) + q]
+                    add(c, X[2 * j + q], tangents.own_rate[i, o])
 
 
 @compiled
 def push_state(
-    s: Any, w: Any, z: Any, pad: int, y: Array, a: float, X: Array, dy: Array, dp: Array
+    rig: Any, work: Any, tangents: Any, pad: int, y: Array, a: float, X: Array, dy: Array, dp: Array
 ) -> None:
     """Tangents of the state at the stage's end."""
-    first, size, start = s.pad_node_start[pad], size_of(s, pad), s.pad_y_start[pad]
-    chain, branches, span = s.condensed_chain_at[pad], s.condensed_branches[pad], z.span
+    first, size, start = rig.pad_node_start[pad], size_of(rig, pad), rig.pad_y_start[pad]
+    chain, branches, span = rig.condensed_chain_at[pad], rig.condensed_branches[pad], tangents.span
     for b in range(branches):
-        part, first_z = a / (s.p[chain + branches + b] + a), start + b * size
+        part, first_z = a / (rig.p[chain + branches + b] + a), start + b * size
         for i in range(span[pad, 0], span[pad, 1]):
-            z_dot = branch_rate(s, w, pad, b, i, w.F, y, a)
+            z_dot = branch_rate(rig, work, pad, b, i, work.F, y, a)
             add(-part, dy[first_z + i], dy[first_z + i])
             add(-part * z_dot, dp[chain + branches + b], dy[first_z + i])
-        for i in range(w.counts[pad]):
+        for i in range(work.counts[pad]):
             for o in range(2):
-                dof = first_z + 2 * (w.touched[first + i] - first) + o
+                dof = first_z + 2 * (work.touched[first + i] - first) + o
                 add(part, X[2 * i + o], dy[dof])
 
 
@@ -277,38 +288,38 @@ def push_state(
 
 
 @compiled
-def pull_forces(s: Any, w: Any, pad: int, y_bar: Array, a: float, b: Array, X: Array) -> None:
+def pull_forces(rig: Any, work: Any, pad: int, y_bar: Array, a: float, b: Array, X: Array) -> None:
     """Cotangents of the touched nodes' forces into X[:, 0], from those of the state and of the
     nodal rates, b."""
-    first, size = s.pad_node_start[pad], size_of(s, pad)
-    chain, branches = s.condensed_chain_at[pad], s.condensed_branches[pad]
-    for i in range(w.counts[pad]):
+    first, size = rig.pad_node_start[pad], size_of(rig, pad)
+    chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
+    for i in range(work.counts[pad]):
         for r in range(2):
-            dof, total = 2 * (w.touched[first + i] - first) + r, dot(b, w.P[2 * i + r])
+            dof, total = 2 * (work.touched[first + i] - first) + r, dot(b, work.P[2 * i + r])
             for branch in range(branches):
-                z_bar = y_bar[s.pad_y_start[pad] + branch * size + dof]
-                total += a * z_bar / (s.p[chain + branches + branch] + a)
+                z_bar = y_bar[rig.pad_y_start[pad] + branch * size + dof]
+                total += a * z_bar / (rig.p[chain + branches + branch] + a)
             X[2 * i + r, 0] = total
 
 
 @compiled
 def pull_state(
-    s: Any, w: Any, scratch: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array
+    rig: Any, work: Any, scratch: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array
 ) -> None:
     """Cotangents of the state at the stage's start and of the material, from those of the nodal
     rates and displacements, `scratch.rate` and `scratch.u`."""
-    p, first, start = s.p, s.pad_node_start[pad], s.pad_y_start[pad]
-    size, start_C = size_of(s, pad), s.condensed_C_start[pad]
-    chain, branches = s.condensed_chain_at[pad], s.condensed_branches[pad]
-    material, soft = chain + 2 * branches, softness(s, pad)
+    p, first, start = rig.p, rig.pad_node_start[pad], rig.pad_y_start[pad]
+    size, start_C = size_of(rig, pad), rig.condensed_C_start[pad]
+    chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
+    material, soft = chain + 2 * branches, softness(rig, pad)
     by_rate, by_u = scratch.surface[0], scratch.surface[1]
     zeta, z_dot = scratch.surface[2], scratch.surface[3]
     scratch.surface[:, :size] = 0.0
-    for node in range(w.low[pad], w.high[pad]):
+    for node in range(work.low[pad], work.high[pad]):
         for r in range(2):
             c, d = soft * scratch.rate[node, r], soft * scratch.u[node, r]
             if c != 0.0 or d != 0.0:
-                row = row_of(s.condensed_C, start_C, 2 * (node - first) + r, size)
+                row = row_of(rig.condensed_C, start_C, 2 * (node - first) + r, size)
                 add(c, row, by_rate[:size])
                 add(d, row, by_u[:size])
     scale_bar, left, right = 0.0, size, 0
@@ -317,7 +328,7 @@ def pull_state(
         J_bar = tau_bar = 0.0
         for m in range(size):
             total = (a * y_bar[z + m] + J * by_rate[m]) / rest
-            rate = branch_rate(s, w, pad, b, m, w.F, y, a)
+            rate = branch_rate(rig, work, pad, b, m, work.F, y, a)
             if abs(rate) * rest > NEGLIGIBLE or abs(y[z + m]) > NEGLIGIBLE:
                 left, right = min(left, m), m + 1 if m + 1 > right else right
                 zeta[m] += J * y[z + m]
@@ -329,9 +340,9 @@ def pull_state(
         p_bar[chain + branches + b] += tau_bar
         scale_bar += J * J_bar
     p_bar[material] += scale_bar / p[material]
-    for node in range(w.low[pad], w.high[pad]):
+    for node in range(work.low[pad], work.high[pad]):
         for r in range(2):
             c, d = soft * scratch.rate[node, r], soft * scratch.u[node, r]
             if c != 0.0 or d != 0.0:
-                row = row_of(s.condensed_dC, start_C, 2 * (node - first) + r, size)[left:right]
+                row = row_of(rig.condensed_dC, start_C, 2 * (node - first) + r, size)[left:right]
                 p_bar[material + 1] += c * dot(row, z_dot[left:]) + d * dot(row, zeta[left:])

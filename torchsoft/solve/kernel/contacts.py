@@ -25,119 +25,126 @@ from torchsoft.solve.kernel.table import Array
 
 
 @compiled
-def relate(s: Any, w: Any, c: int, derivatives: bool) -> None:
-    """Relative motion of contact c and its loads under the wrench in w.pair[c]."""
-    x = w.pair[c]
+def relate(rig: Any, work: Any, c: int, derivatives: bool) -> None:
+    """Relative motion of contact c and its loads under the wrench in work.pair[c]."""
+    x = work.pair[c]
     for i in range(6):
-        coordinate = s.contact_coordinate[c, i]
-        x[i], x[6 + i] = w.q[coordinate], w.V[coordinate]
+        coordinate = rig.contact_coordinate[c, i]
+        x[i], x[6 + i] = work.q[coordinate], work.V[coordinate]
     if derivatives:
-        call_linearise(s.contact_relative_linearise, x, s.p, w.relative[c], w.by_pair[c])
+        call_linearise(rig.contact_relative_linearise, x, rig.p, work.relative[c], work.by_pair[c])
     else:
-        call_value(s.contact_relative, x, s.p, w.relative[c])
+        call_value(rig.contact_relative, x, rig.p, work.relative[c])
 
 
 @compiled
-def relate_all(s: Any, w: Any) -> None:
+def relate_all(rig: Any, work: Any) -> None:
     """The same of all contacts, without a wrench."""
-    for c in range(s.contact_pad.size):
-        w.pair[c, 12:] = 0.0
-        relate(s, w, c, False)
+    for c in range(rig.contact_pad.size):
+        work.pair[c, 12:] = 0.0
+        relate(rig, work, c, False)
 
 
 @compiled
-def load(s: Any, w: Any, c: int) -> None:
-    """Sum of the points' wrenches on the pad of contact c into w.pair[c]."""
-    at, wrench = s.pad_point_start[s.contact_pad[c]], w.pair[c, 12:]
+def load(rig: Any, work: Any, c: int) -> None:
+    """Sum of the points' wrenches on the pad of contact c into work.pair[c]."""
+    at, wrench = rig.pad_point_start[rig.contact_pad[c]], work.pair[c, 12:]
     wrench[:] = 0.0
-    for i in range(at, at + w.actives[s.contact_pad[c]]):
-        if s.point_contact[w.active[i]] == c:
-            add(1.0, w.out[w.active[i]], wrench)
+    for i in range(at, at + work.actives[rig.contact_pad[c]]):
+        if rig.point_contact[work.active[i]] == c:
+            add(1.0, work.out[work.active[i]], wrench)
 
 
 @compiled
-def at_point(s: Any, k: int, nodal: Array) -> tuple[float, float]:
+def at_point(rig: Any, k: int, nodal: Array) -> tuple[float, float]:
     """A nodal quantity (nodes, 2) at point k."""
-    n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
+    n0, n1, N0, N1 = (
+        rig.point_node[k, 0],
+        rig.point_node[k, 1],
+        rig.point_N[k, 0],
+        rig.point_N[k, 1],
+    )
     return N0 * nodal[n0, 0] + N1 * nodal[n1, 0], N0 * nodal[n0, 1] + N1 * nodal[n1, 1]
 
 
 @compiled
-def place(s: Any, w: Any, k: int, ux: float, uy: float, vx: float, vy: float, x: Array) -> None:
+def place(
+    rig: Any, work: Any, k: int, ux: float, uy: float, vx: float, vy: float, x: Array
+) -> None:
     """Motion at point k into x, for its displacement (ux, uy) and rate (vx, vy)."""
-    relative = w.relative[s.point_contact[k]]
-    x[0], x[1], x[5], x[6] = s.point_X[k, 0] + ux, s.point_X[k, 1] + uy, vx, vy
+    relative = work.relative[rig.point_contact[k]]
+    x[0], x[1], x[5], x[6] = rig.point_X[k, 0] + ux, rig.point_X[k, 1] + uy, vx, vy
     x[2], x[3], x[4] = relative[0], relative[1], relative[2]
     x[7], x[8], x[9] = relative[3], relative[4], relative[5]
 
 
 @compiled
-def separation(s: Any, w: Any, k: int, x: Array) -> float:
+def separation(rig: Any, work: Any, k: int, x: Array) -> float:
     """Signed distance [m] of point k from the body."""
-    c = s.point_contact[k]
-    call_value(s.contact_distance[c], x, s.p[bounds(s.contact_p_start, c)], w.phi)
-    return w.phi[0]
+    c = rig.point_contact[k]
+    call_value(rig.contact_distance[c], x, rig.p[bounds(rig.contact_p_start, c)], work.phi)
+    return work.phi[0]
 
 
 @compiled
-def state_at(s: Any, k: int, j: int) -> int:
+def state_at(rig: Any, k: int, j: int) -> int:
     """Place in the state of number j of the states of point k."""
-    c = s.point_contact[k]
-    return s.point_y_start[k] + j * (s.contact_point_start[c + 1] - s.contact_point_start[c])
+    c = rig.point_contact[k]
+    return rig.point_y_start[k] + j * (rig.contact_point_start[c + 1] - rig.contact_point_start[c])
 
 
 @compiled
-def fill(s: Any, w: Any, k: int, y: Array, a: float) -> None:
+def fill(rig: Any, work: Any, k: int, y: Array, a: float) -> None:
     """The inputs of the law at point k besides its motion."""
-    n, x = s.contact_states[s.point_contact[k]], w.x[k]
+    n, x = rig.contact_states[rig.point_contact[k]], work.x[k]
     for j in range(n):
-        x[MOTION + j] = y[state_at(s, k, j)]
-    x[MOTION + n], x[MOTION + n + 1] = s.point_weight[k], a
+        x[MOTION + j] = y[state_at(rig, k, j)]
+    x[MOTION + n], x[MOTION + n + 1] = rig.point_weight[k], a
 
 
 @compiled
-def press(s: Any, w: Any, k: int) -> None:
-    """Add the force of point k to its nodes, in w.F."""
+def press(rig: Any, work: Any, k: int) -> None:
+    """Add the force of point k to its nodes, in work.F."""
     for j in range(2):
         for r in range(2):
-            w.F[s.point_node[k, j], r] += s.point_N[k, j] * w.out[k, r]
+            work.F[rig.point_node[k, j], r] += rig.point_N[k, j] * work.out[k, r]
 
 
 @compiled
-def by_state(s: Any, w: Any, k: int, r: int, j: int) -> float:
+def by_state(rig: Any, work: Any, k: int, r: int, j: int) -> float:
     """Derivative of output r of the law at point k by its state j."""
-    columns = MOTION + s.contact_states[s.point_contact[k]]
-    return w.J[k, r * columns + MOTION + j]
+    columns = MOTION + rig.contact_states[rig.point_contact[k]]
+    return work.J[k, r * columns + MOTION + j]
 
 
 @compiled
-def outputs(s: Any, c: int, felt: bool) -> int:
+def outputs(rig: Any, c: int, felt: bool) -> int:
     """Number of differentiated outputs of a contact's law: those that a stage needs, or with the
     normal and the friction force that are felt."""
-    return WRENCH + s.contact_states[c] + (2 if felt else 0)
+    return WRENCH + rig.contact_states[c] + (2 if felt else 0)
 
 
 @compiled
-def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """The law at the window's points with the trial rates in `w`, its forces at the nodes, and the
-    touching points."""
-    at, actives = s.pad_point_start[pad], 0
-    for node in range(w.low[pad], w.high[pad]):
-        w.F[node, 0], w.F[node, 1] = 0.0, 0.0
-    for i in range(w.windows[pad]):
-        k = w.window[at + i]
-        ux, uy = at_point(s, k, w.u)
-        vx, vy = at_point(s, k, w.u_dot)
-        place(s, w, k, ux + a * vx, uy + a * vy, vx, vy, w.x[k])
-        if separation(s, w, k, w.x[k]) >= 0.0:
+def evaluate(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
+    """The law at the window's points with the trial rates in `work`, its forces at the nodes, and
+    the touching points."""
+    at, actives = rig.pad_point_start[pad], 0
+    for node in range(work.low[pad], work.high[pad]):
+        work.F[node, 0], work.F[node, 1] = 0.0, 0.0
+    for i in range(work.windows[pad]):
+        k = work.window[at + i]
+        ux, uy = at_point(rig, k, work.u)
+        vx, vy = at_point(rig, k, work.u_dot)
+        place(rig, work, k, ux + a * vx, uy + a * vy, vx, vy, work.x[k])
+        if separation(rig, work, k, work.x[k]) >= 0.0:
             continue
-        fill(s, w, k, y, a)
-        own = s.p[bounds(s.contact_p_start, s.point_contact[k])]
-        call_value(s.contact_value[s.point_contact[k]], w.x[k], own, w.out[k])
-        press(s, w, k)
-        w.active[at + actives] = k
+        fill(rig, work, k, y, a)
+        own = rig.p[bounds(rig.contact_p_start, rig.point_contact[k])]
+        call_value(rig.contact_value[rig.point_contact[k]], work.x[k], own, work.out[k])
+        press(rig, work, k)
+        work.active[at + actives] = k
         actives += 1
-    w.actives[pad] = actives
+    work.actives[pad] = actives
 
 
 @compiled
@@ -151,96 +158,97 @@ def combine(J: Array, by: Array, out: Array) -> None:
 
 
 @compiled
-def linearise(s: Any, w: Any, pad: int, a: float, felt: bool) -> None:
+def linearise(rig: Any, work: Any, pad: int, a: float, felt: bool) -> None:
     """The law at the touching points of a pad with its derivatives, H, and the contacts' loads with
     theirs."""
-    at = s.pad_point_start[pad]
-    for i in range(at, at + w.actives[pad]):
-        k = w.active[i]
-        c = s.point_contact[k]
-        own = s.p[bounds(s.contact_p_start, c)]
-        call_linearise(s.contact_linearise[c], w.x[k], own, w.out[k], w.J[k])
-    for c in range(s.contact_pad.size):
-        if s.contact_pad[c] != pad:
+    at = rig.pad_point_start[pad]
+    for i in range(at, at + work.actives[pad]):
+        k = work.active[i]
+        c = rig.point_contact[k]
+        own = rig.p[bounds(rig.contact_p_start, c)]
+        call_linearise(rig.contact_linearise[c], work.x[k], own, work.out[k], work.J[k])
+    for c in range(rig.contact_pad.size):
+        if rig.contact_pad[c] != pad:
             continue
-        load(s, w, c)
-        relate(s, w, c, True)
-        J = w.by_pair[c]
+        load(rig, work, c)
+        relate(rig, work, c, True)
+        J = work.by_pair[c]
         for i in range(6):
             for j in range(6):
-                w.by_stage[c, i, j] = J[i, 6 + j] + a * J[i, j]
-    for i in range(at, at + w.actives[pad]):
-        k = w.active[i]
-        c = s.point_contact[k]
-        columns, stage, own = MOTION + s.contact_states[c], w.by_stage[c], w.J[k]
-        for o in range(outputs(s, c, felt)):
-            J, H = own[o * columns : o * columns + MOTION], w.H[i, o]
+                work.by_stage[c, i, j] = J[i, 6 + j] + a * J[i, j]
+    for i in range(at, at + work.actives[pad]):
+        k = work.active[i]
+        c = rig.point_contact[k]
+        columns, stage, own = MOTION + rig.contact_states[c], work.by_stage[c], work.J[k]
+        for o in range(outputs(rig, c, felt)):
+            J, H = own[o * columns : o * columns + MOTION], work.H[i, o]
             H[0], H[1] = J[5] + a * J[0], J[6] + a * J[1]
             combine(J, stage, H[2:])
 
 
 @compiled
-def by_positions(s: Any, w: Any, pad: int, felt: bool) -> None:
+def by_positions(rig: Any, work: Any, pad: int, felt: bool) -> None:
     """S of the touching points of a pad; needs `linearise`."""
-    at = s.pad_point_start[pad]
-    for i in range(at, at + w.actives[pad]):
-        k = w.active[i]
-        c = s.point_contact[k]
-        columns, by = MOTION + s.contact_states[c], w.by_pair[c]
-        for o in range(outputs(s, c, felt)):
-            J, S = w.J[k, o * columns : o * columns + MOTION], w.S[i, o]
+    at = rig.pad_point_start[pad]
+    for i in range(at, at + work.actives[pad]):
+        k = work.active[i]
+        c = rig.point_contact[k]
+        columns, by = MOTION + rig.contact_states[c], work.by_pair[c]
+        for o in range(outputs(rig, c, felt)):
+            J, S = work.J[k, o * columns : o * columns + MOTION], work.S[i, o]
             S[0], S[1] = J[0], J[1]
             combine(J, by, S[2:])
 
 
 @compiled
-def touched_nodes(s: Any, w: Any, pad: int) -> int:
-    """Number the nodes that touching points load, in w.touched and w.slot; how many there are."""
-    at, first, n = s.pad_point_start[pad], s.pad_node_start[pad], 0
-    for node in range(w.low[pad], w.high[pad]):
-        w.slot[node] = -1
-    for i in range(w.actives[pad]):
+def touched_nodes(rig: Any, work: Any, pad: int) -> int:
+    """Number the nodes that touching points load, in work.touched and work.slot; how many there
+    are."""
+    at, first, n = rig.pad_point_start[pad], rig.pad_node_start[pad], 0
+    for node in range(work.low[pad], work.high[pad]):
+        work.slot[node] = -1
+    for i in range(work.actives[pad]):
         for j in range(2):
-            node = s.point_node[w.active[at + i], j]
-            if s.point_N[w.active[at + i], j] != 0.0 and w.slot[node] < 0:
-                w.slot[node], w.touched[first + n] = n, node
+            node = rig.point_node[work.active[at + i], j]
+            if rig.point_N[work.active[at + i], j] != 0.0 and work.slot[node] < 0:
+                work.slot[node], work.touched[first + n] = n, node
                 n += 1
-    w.counts[pad] = n
+    work.counts[pad] = n
     return n
 
 
 @compiled
-def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> None:
-    """The block of one pad, of its mobility w.P: w.A, w.Hc, w.Rf, and its part in Rv (free,
-    free)."""
-    at, column, n = s.pad_point_start[pad], s.pad_column[pad], w.counts[pad]
-    A, P, Hc, Rf, K, PB = w.A, w.P, w.Hc, w.Rf, w.K, w.PB
-    Hc[: 2 * n, : s.pad_columns[pad]] = 0.0
-    Rf[: s.pad_columns[pad], : 2 * n] = 0.0
+def assemble(rig: Any, work: Any, pad: int, a: float, Rv: Array) -> None:
+    """The block of one pad, of its mobility work.P: work.A, work.Hc, work.Rf, and its part in Rv
+    (free, free)."""
+    at, column, n = rig.pad_point_start[pad], rig.pad_column[pad], work.counts[pad]
+    A, P, Hc, Rf, K, PB = work.A, work.P, work.Hc, work.Rf, work.K, work.PB
+    Hc[: 2 * n, : rig.pad_columns[pad]] = 0.0
+    Rf[: rig.pad_columns[pad], : 2 * n] = 0.0
     for i in range(2 * n):
         A[i, : 2 * n] = 0.0
         A[i, i] = 1.0
-    for c in range(s.contact_pad.size):
-        for row in range(6 if s.contact_pad[c] == pad else 0):
+    for c in range(rig.contact_pad.size):
+        for row in range(6 if rig.contact_pad[c] == pad else 0):
             for other in range(6):
-                if s.contact_number[c, row] >= 0 and s.contact_number[c, other] >= 0:
-                    by = a * w.by_pair[c, 6 + row, other]
-                    Rv[s.contact_number[c, row], s.contact_number[c, other]] += by
-    for i in range(w.actives[pad]):
-        k = w.active[at + i]
-        c = s.point_contact[k]
-        H, number = w.H[at + i], s.contact_number[c]
+                if rig.contact_number[c, row] >= 0 and rig.contact_number[c, other] >= 0:
+                    by = a * work.by_pair[c, 6 + row, other]
+                    Rv[rig.contact_number[c, row], rig.contact_number[c, other]] += by
+    for i in range(work.actives[pad]):
+        k = work.active[at + i]
+        c = rig.point_contact[k]
+        H, number = work.H[at + i], rig.contact_number[c]
         PB[:, : 2 * n] = 0.0
         for j in range(2):
-            N = s.point_N[k, j]
+            N = rig.point_N[k, j]
             if N != 0.0:
-                row = 2 * w.slot[s.point_node[k, j]]
+                row = 2 * work.slot[rig.point_node[k, j]]
                 for r in range(2):
                     add(N, P[row + r], PB[r, : 2 * n])
         for row in range(6):
             if number[row] < 0:
                 continue
-            down = w.by_pair[c, 6 + row, 12:]
+            down = work.by_pair[c, 6 + row, 12:]
             for m in range(8):
                 K[row, m] = down[0] * H[0, m] + down[1] * H[1, m] + down[2] * H[2, m]
             for r in range(2):
@@ -249,10 +257,10 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> None:
                 if number[other] >= 0:
                     Rv[number[row], number[other]] += K[row, 2 + other]
         for j in range(2):
-            N = s.point_N[k, j]
+            N = rig.point_N[k, j]
             if N == 0.0:
                 continue
-            row = 2 * w.slot[s.point_node[k, j]]
+            row = 2 * work.slot[rig.point_node[k, j]]
             for r in range(2):
                 for q in range(2):
                     add(-N * H[r, q], PB[q], A[row + r, : 2 * n])
@@ -262,52 +270,52 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> None:
 
 
 @compiled
-def residual(s: Any, w: Any, pad: int, r: Array) -> None:
-    """Right-hand side of Newton's block in the first column of w.X, and the pad's part in r."""
-    at, first, n = s.pad_point_start[pad], s.pad_node_start[pad], w.counts[pad]
-    b = w.X[2 * first : 2 * (first + n)]
+def residual(rig: Any, work: Any, pad: int, r: Array) -> None:
+    """Right-hand side of Newton's block in the first column of work.X, and the pad's part in r."""
+    at, first, n = rig.pad_point_start[pad], rig.pad_node_start[pad], work.counts[pad]
+    b = work.X[2 * first : 2 * (first + n)]
     b[:, 0] = 0.0
-    for c in range(s.contact_pad.size):
-        for row in range(6 if s.contact_pad[c] == pad else 0):
-            if s.contact_number[c, row] >= 0:
-                r[s.contact_number[c, row], 0] += w.relative[c, 6 + row]
-    for i in range(w.actives[pad]):
-        k = w.active[at + i]
-        c, H = s.point_contact[k], w.H[at + i]
+    for c in range(rig.contact_pad.size):
+        for row in range(6 if rig.contact_pad[c] == pad else 0):
+            if rig.contact_number[c, row] >= 0:
+                r[rig.contact_number[c, row], 0] += work.relative[c, 6 + row]
+    for i in range(work.actives[pad]):
+        k = work.active[at + i]
+        c, H = rig.point_contact[k], work.H[at + i]
         dx = dy = 0.0
         for j in range(2):
-            node, N = s.point_node[k, j], s.point_N[k, j]
-            dx += N * (w.free[node, 0] - w.u_dot[node, 0])
-            dy += N * (w.free[node, 1] - w.u_dot[node, 1])
+            node, N = rig.point_node[k, j], rig.point_N[k, j]
+            dx += N * (work.free[node, 0] - work.u_dot[node, 0])
+            dy += N * (work.free[node, 1] - work.u_dot[node, 1])
         for j in range(2):
-            if s.point_N[k, j] != 0.0:
-                row = 2 * w.slot[s.point_node[k, j]]
+            if rig.point_N[k, j] != 0.0:
+                row = 2 * work.slot[rig.point_node[k, j]]
                 for o in range(2):
-                    f = w.out[k, o] + H[o, 0] * dx + H[o, 1] * dy
-                    b[row + o, 0] += s.point_N[k, j] * f
+                    f = work.out[k, o] + H[o, 0] * dx + H[o, 1] * dy
+                    b[row + o, 0] += rig.point_N[k, j] * f
         for o in range(WRENCH):
             change = H[o, 0] * dx + H[o, 1] * dy
             for row in range(6):
-                if s.contact_number[c, row] >= 0:
-                    down = w.by_pair[c, 6 + row, 12 + o]
-                    r[s.contact_number[c, row], 0] += down * change
+                if rig.contact_number[c, row] >= 0:
+                    down = work.by_pair[c, 6 + row, 12 + o]
+                    r[rig.contact_number[c, row], 0] += down * change
 
 
 @compiled
-def eliminate(s: Any, w: Any, pad: int, m: int, r: Array, Rv: Array) -> None:
-    """Solve a pad's block for its forces, A^-1 (b | Hc) in w.X with m right-hand sides b, and put
-    them into the bodies' equations r (free, m) and Rv."""
-    column, columns = s.pad_column[pad], s.pad_columns[pad]
-    first, n = s.pad_node_start[pad], w.counts[pad]
-    X = w.X[2 * first : 2 * (first + n)]
+def eliminate(rig: Any, work: Any, pad: int, m: int, r: Array, Rv: Array) -> None:
+    """Solve a pad's block for its forces, A^-1 (b | Hc) in work.X with m right-hand sides b, and
+    put them into the bodies' equations r (free, m) and Rv."""
+    column, columns = rig.pad_column[pad], rig.pad_columns[pad]
+    first, n = rig.pad_node_start[pad], work.counts[pad]
+    X = work.X[2 * first : 2 * (first + n)]
     for i in range(2 * n):
         for j in range(columns):
-            X[i, m + j] = w.Hc[i, j]
-    solve_dense(w.A, X, 2 * n, m + columns)
+            X[i, m + j] = work.Hc[i, j]
+    solve_dense(work.A, X, 2 * n, m + columns)
     for number in range(column.size):
         if column[number] < 0:
             continue
-        line = w.Rf[column[number]]
+        line = work.Rf[column[number]]
         for i in range(2 * n):
             add(line[i], X[i], r[number, :m])
             for other in range(column.size):
@@ -316,129 +324,129 @@ def eliminate(s: Any, w: Any, pad: int, m: int, r: Array, Rv: Array) -> None:
 
 
 @compiled
-def transpose(s: Any, w: Any, pad: int) -> None:
+def transpose(rig: Any, work: Any, pad: int) -> None:
     """Exchange A and Hc of a pad's block with the transposes of A and Rf."""
-    n = 2 * w.counts[pad]
+    n = 2 * work.counts[pad]
     for i in range(n):
         for j in range(i):
-            w.A[i, j], w.A[j, i] = w.A[j, i], w.A[i, j]
-        for j in range(s.pad_columns[pad]):
-            w.Hc[i, j], w.Rf[j, i] = w.Rf[j, i], w.Hc[i, j]
+            work.A[i, j], work.A[j, i] = work.A[j, i], work.A[i, j]
+        for j in range(rig.pad_columns[pad]):
+            work.Hc[i, j], work.Rf[j, i] = work.Rf[j, i], work.Hc[i, j]
 
 
 @compiled
-def load_nodes(s: Any, w: Any, pad: int, m: int, dV: Array) -> None:
-    """Add to the forces of the first m columns of w.X, after `eliminate`, their change with the
+def load_nodes(rig: Any, work: Any, pad: int, m: int, dV: Array) -> None:
+    """Add to the forces of the first m columns of work.X, after `eliminate`, their change with the
     velocities dV (free, m)."""
-    first = s.pad_node_start[pad]
-    X = w.X[2 * first : 2 * (first + w.counts[pad])]
+    first = rig.pad_node_start[pad]
+    X = work.X[2 * first : 2 * (first + work.counts[pad])]
     for number in range(dV.shape[0]):
-        column = s.pad_column[pad, number]
+        column = rig.pad_column[pad, number]
         for i in range(X.shape[0] if column >= 0 else 0):
             add(X[i, m + column], dV[number], X[i, :m])
 
 
 @compiled
-def fade(s: Any, w: Any, k: int, y: Array, a: float) -> None:
-    """The law at point k away from contact into w.decay, with w.decay_J by its states."""
-    c, x = s.point_contact[k], w.decay_x
-    n = s.contact_states[c]
+def fade(rig: Any, work: Any, k: int, y: Array, a: float) -> None:
+    """The law at point k away from contact into work.decay, with work.decay_J by its states."""
+    c, x = rig.point_contact[k], work.decay_x
+    n = rig.contact_states[c]
     for j in range(n):
-        x[j] = y[state_at(s, k, j)]
-    x[n], x[n + 1] = s.point_weight[k], a
-    own = s.p[bounds(s.contact_p_start, c)]
-    call_linearise(s.contact_free_linearise[c], x, own, w.decay, w.decay_J)
+        x[j] = y[state_at(rig, k, j)]
+    x[n], x[n + 1] = rig.point_weight[k], a
+    own = rig.p[bounds(rig.contact_p_start, c)]
+    call_linearise(rig.contact_free_linearise[c], x, own, work.decay, work.decay_J)
 
 
 @compiled
-def rests(s: Any, k: int, y: Array) -> bool:
+def rests(rig: Any, k: int, y: Array) -> bool:
     """Whether nothing changes at point k away from contact: a stretch alone that is zero stays
     so."""
-    return s.contact_states[s.point_contact[k]] == 1 and y[s.point_y_start[k]] == 0.0
+    return rig.contact_states[rig.point_contact[k]] == 1 and y[rig.point_y_start[k]] == 0.0
 
 
 @compiled
-def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array) -> None:
-    """Rates of the states of a pad's points into w.k, powers of dashpots and of slip [W], and the
-    contacts' force on the pad [N] with its moment (Eq. 35) [N.m] in its base's axes."""
-    at, i, count = s.pad_point_start[pad], 0, s.pad_base.size
+def finish(rig: Any, work: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array) -> None:
+    """Rates of the states of a pad's points into work.k, powers of dashpots and of slip [W], and
+    the contacts' force on the pad [N] with its moment (Eq. 35) [N.m] in its base's axes."""
+    at, i, count = rig.pad_point_start[pad], 0, rig.pad_base.size
     wrench[:] = 0.0
-    for k in range(at, s.pad_point_start[pad + 1]):
-        n = s.contact_states[s.point_contact[k]]
-        if i < w.actives[pad] and w.active[at + i] == k:
+    for k in range(at, rig.pad_point_start[pad + 1]):
+        n = rig.contact_states[rig.point_contact[k]]
+        if i < work.actives[pad] and work.active[at + i] == k:
             i += 1
-            fx, fy = w.out[k, 0], w.out[k, 1]
+            fx, fy = work.out[k, 0], work.out[k, 1]
             wrench[0] += fx
             wrench[1] += fy
-            wrench[2] += s.point_X[k, 0] * fy - s.point_X[k, 1] * fx
+            wrench[2] += rig.point_X[k, 0] * fy - rig.point_X[k, 1] * fx
             for j in range(n):
-                w.k[state_at(s, k, j)] = w.out[k, WRENCH + j]
-            powers[count] += w.out[k, WRENCH + n + 2]
-            powers[count + 1] += w.out[k, WRENCH + n + 3]
-        elif rests(s, k, y):
-            w.k[s.point_y_start[k]] = 0.0
+                work.k[state_at(rig, k, j)] = work.out[k, WRENCH + j]
+            powers[count] += work.out[k, WRENCH + n + 2]
+            powers[count + 1] += work.out[k, WRENCH + n + 3]
+        elif rests(rig, k, y):
+            work.k[rig.point_y_start[k]] = 0.0
         else:
-            fade(s, w, k, y, a)
+            fade(rig, work, k, y, a)
             for j in range(n):
-                w.k[state_at(s, k, j)] = w.decay[j]
-            powers[count] += w.decay[n]
-            powers[count + 1] += w.decay[n + 1]
+                work.k[state_at(rig, k, j)] = work.decay[j]
+            powers[count] += work.decay[n]
+            powers[count + 1] += work.decay[n + 1]
 
 
 @compiled
-def stored(s: Any, w: Any, pad: int, y: Array) -> float:
+def stored(rig: Any, work: Any, pad: int, y: Array) -> float:
     """Energy [J] in the springs of a pad's points, in the state y where the last stage ended."""
-    at, i, total, x, out = s.pad_point_start[pad], 0, 0.0, w.decay_x, w.decay
-    for k in range(at, s.pad_point_start[pad + 1]):
-        c, stretch, depth = s.point_contact[k], y[s.point_y_start[k]], 0.0
-        if i < w.actives[pad] and w.active[at + i] == k:
-            i, depth = i + 1, -separation(s, w, k, w.x[k])
+    at, i, total, x, out = rig.pad_point_start[pad], 0, 0.0, work.decay_x, work.decay
+    for k in range(at, rig.pad_point_start[pad + 1]):
+        c, stretch, depth = rig.point_contact[k], y[rig.point_y_start[k]], 0.0
+        if i < work.actives[pad] and work.active[at + i] == k:
+            i, depth = i + 1, -separation(rig, work, k, work.x[k])
         if depth != 0.0 or stretch != 0.0:
-            x[0], x[1], x[2] = depth, stretch, s.point_weight[k]
-            call_value(s.contact_stored[c], x, s.p[bounds(s.contact_p_start, c)], out)
+            x[0], x[1], x[2] = depth, stretch, rig.point_weight[k]
+            call_value(rig.contact_stored[c], x, rig.p[bounds(rig.contact_p_start, c)], out)
             total += out[0] + out[1]
     return total
 
 
 @compiled
-def loads(s: Any, w: Any) -> None:
-    """The contacts' generalised forces on all coordinates into w.load."""
-    w.load[:] = 0.0
-    for c in range(s.contact_pad.size):
-        load(s, w, c)
-        relate(s, w, c, False)
+def loads(rig: Any, work: Any) -> None:
+    """The contacts' generalised forces on all coordinates into work.load."""
+    work.load[:] = 0.0
+    for c in range(rig.contact_pad.size):
+        load(rig, work, c)
+        relate(rig, work, c, False)
         for row in range(6):
-            w.load[s.contact_coordinate[c, row]] += w.relative[c, 6 + row]
+            work.load[rig.contact_coordinate[c, row]] += work.relative[c, 6 + row]
 
 
 @compiled
-def restore(s: Any, w: Any, tape: Any, row: int, a: float, felt: bool) -> None:
+def restore(rig: Any, work: Any, tape: Any, row: int, a: float, felt: bool) -> None:
     """A stage from the tape: coordinates, touching points with their laws' derivatives, touched
-    nodes and nodal forces (w.F)."""
-    put(tape.q[row], w.q)
-    put(tape.V[row], w.V)
-    relate_all(s, w)
+    nodes and nodal forces (work.F)."""
+    put(tape.q[row], work.q)
+    put(tape.V[row], work.V)
+    relate_all(rig, work)
     slot = 0
-    for pad in range(s.pad_base.size):
-        at = s.pad_point_start[pad]
-        low, high = s.pad_node_start[pad + 1], s.pad_node_start[pad]
-        w.actives[pad] = tape.count[row, pad]
-        for i in range(w.actives[pad]):
+    for pad in range(rig.pad_base.size):
+        at = rig.pad_point_start[pad]
+        low, high = rig.pad_node_start[pad + 1], rig.pad_node_start[pad]
+        work.actives[pad] = tape.count[row, pad]
+        for i in range(work.actives[pad]):
             for j in range(2):
-                node = s.point_node[tape.point[row, slot + i], j]
+                node = rig.point_node[tape.point[row, slot + i], j]
                 low, high = min(low, node), max(high, node + 1)
-        w.low[pad], w.high[pad] = min(low, high), high
+        work.low[pad], work.high[pad] = min(low, high), high
         for node in range(low, high):
-            w.F[node, 0], w.F[node, 1] = 0.0, 0.0
-        for i in range(w.actives[pad]):
+            work.F[node, 0], work.F[node, 1] = 0.0, 0.0
+        for i in range(work.actives[pad]):
             k, state = tape.point[row, slot], tape.state[row, slot]
             ux, uy = state[0] + a * state[2], state[1] + a * state[3]
-            place(s, w, k, ux, uy, state[2], state[3], w.x[k])
-            fill(s, w, k, tape.y[row], a)
-            w.active[at + i] = k
+            place(rig, work, k, ux, uy, state[2], state[3], work.x[k])
+            fill(rig, work, k, tape.y[row], a)
+            work.active[at + i] = k
             slot += 1
-        linearise(s, w, pad, a, felt)
-        for i in range(at, at + w.actives[pad]):
-            press(s, w, w.active[i])
-        by_positions(s, w, pad, felt)
-        touched_nodes(s, w, pad)
+        linearise(rig, work, pad, a, felt)
+        for i in range(at, at + work.actives[pad]):
+            press(rig, work, work.active[i])
+        by_positions(rig, work, pad, felt)
+        touched_nodes(rig, work, pad)

@@ -35,107 +35,107 @@ ROUNDING = 1e-15
 
 
 @compiled
-def to_base(w: Any, base: int, x: float, y: float) -> tuple[float, float]:
+def to_base(work: Any, base: int, x: float, y: float) -> tuple[float, float]:
     """A vector of the world in the axes of a base."""
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+    cos, sin = np.cos(work.q[base + 2]), np.sin(work.q[base + 2])
     return cos * x + sin * y, cos * y - sin * x
 
 
 @compiled
-def to_world(w: Any, base: int, x: float, y: float) -> tuple[float, float]:
+def to_world(work: Any, base: int, x: float, y: float) -> tuple[float, float]:
     """A vector in the axes of a base in the world's."""
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+    cos, sin = np.cos(work.q[base + 2]), np.sin(work.q[base + 2])
     return cos * x - sin * y, sin * x + cos * y
 
 
 @compiled
-def inertial(s: Any, pad: int) -> bool:
+def inertial(rig: Any, pad: int) -> bool:
     """Whether a pad has inertia; condensed pads have none."""
-    return s.nodal_v_start[pad] >= 0
+    return rig.nodal_v_start[pad] >= 0
 
 
 @compiled
-def mass_rate(s: Any, pad: int, i: int, a: float) -> float:
+def mass_rate(rig: Any, pad: int, i: int, a: float) -> float:
     """M / (a h) of a dof [N.s/m]; zero without inertia."""
-    return s.p[s.nodal_density_at[pad]] * s.nodal_area[i] / a if inertial(s, pad) else 0.0
+    return rig.p[rig.nodal_density_at[pad]] * rig.nodal_area[i] / a if inertial(rig, pad) else 0.0
 
 
 @compiled
-def change_of_speed(s: Any, w: Any, pad: int, i: int, y: Array, v_base: float) -> float:
+def change_of_speed(rig: Any, work: Any, pad: int, i: int, y: Array, v_base: float) -> float:
     """a h v' of dof i of all, whose base moves at `v_base` along it."""
-    at = s.nodal_v_start[pad] + i - s.nodal_dof_start[pad]
-    return w.rate[i] + v_base - y[at] if inertial(s, pad) else 0.0
+    at = rig.nodal_v_start[pad] + i - rig.nodal_dof_start[pad]
+    return work.rate[i] + v_base - y[at] if inertial(rig, pad) else 0.0
 
 
 @compiled
-def groups(s: Any, pad: int) -> tuple[int, int]:
+def groups(rig: Any, pad: int) -> tuple[int, int]:
     """Ends of a pad's elements among groups of `LANES`, whose law is called at once."""
-    return s.nodal_element_start[pad] // LANES, s.nodal_element_start[pad + 1] // LANES
+    return rig.nodal_element_start[pad] // LANES, rig.nodal_element_start[pad + 1] // LANES
 
 
 @compiled
-def element_inputs(s: Any, w: Any, pad: int, g: int, y: Array, a: float) -> None:
+def element_inputs(rig: Any, work: Any, pad: int, g: int, y: Array, a: float) -> None:
     """Displacements and rates of the corners of a group of elements at the stage's end into
-    w.element_x, where their constants stand."""
-    x, i0, U = w.element_x[g], s.nodal_dof_start[pad], s.pad_y_start[pad]
-    corners = s.nodal_dof.shape[1]
+    work.element_x, where their constants stand."""
+    x, i0, U = work.element_x[g], rig.nodal_dof_start[pad], rig.pad_y_start[pad]
+    corners = rig.nodal_dof.shape[1]
     for lane in range(LANES):
         for c in range(corners):
-            dof = s.nodal_dof[g * LANES + lane, c]
+            dof = rig.nodal_dof[g * LANES + lane, c]
             x[c, lane], x[corners + c, lane] = 0.0, 0.0
             if dof >= 0:
-                rate = w.rate[i0 + dof]
+                rate = work.rate[i0 + dof]
                 x[c, lane], x[corners + c, lane] = y[U + dof] + a * rate, rate
 
 
 @compiled
-def element_parameters(s: Any, pad: int) -> slice:
+def element_parameters(rig: Any, pad: int) -> slice:
     """Places of the elements' parameters in p."""
-    return slice(s.nodal_p_first[pad], s.nodal_p_last[pad])
+    return slice(rig.nodal_p_first[pad], rig.nodal_p_last[pad])
 
 
 @compiled
-def displace(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> None:
+def displace(rig: Any, work: Any, pad: int, y: Array, low: int, high: int) -> None:
     """u* of the surface nodes from `low` to `high`, and their rates as they are."""
     for node in range(low, high):
         for r in range(2):
-            dof = s.nodal_surface[2 * node + r]
-            w.u[node, r] = y[s.pad_y_start[pad] + dof]
-            w.free[node, r] = w.rate[s.nodal_dof_start[pad] + dof]
-            w.u_dot[node, r] = w.free[node, r]
+            dof = rig.nodal_surface[2 * node + r]
+            work.u[node, r] = y[rig.pad_y_start[pad] + dof]
+            work.free[node, r] = work.rate[rig.nodal_dof_start[pad] + dof]
+            work.u_dot[node, r] = work.free[node, r]
 
 
 @compiled
-def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float]:
+def evaluate(rig: Any, work: Any, pad: int, y: Array, a: float) -> tuple[float, float]:
     """Forces of the elements and their power at the trial rates; how far the nodes are from their
-    balance under w.F_linear beyond rounding: the largest force [N], and the sum of squares
+    balance under work.F_linear beyond rounding: the largest force [N], and the sum of squares
     [N2]."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    own = s.p[element_parameters(s, pad)]
-    w.internal[first:last], w.noise[first:last], w.power[pad] = 0.0, 0.0, 0.0
-    (low, high), corners = groups(s, pad), s.nodal_dof.shape[1]
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    own = rig.p[element_parameters(rig, pad)]
+    work.internal[first:last], work.noise[first:last], work.power[pad] = 0.0, 0.0, 0.0
+    (low, high), corners = groups(rig, pad), rig.nodal_dof.shape[1]
     for g in range(low, high):
-        element_inputs(s, w, pad, g, y, a)
-        call_value(s.nodal_value[pad], w.element_x[g], own, w.element)
+        element_inputs(rig, work, pad, g, y, a)
+        call_value(rig.nodal_value[pad], work.element_x[g], own, work.element)
         for lane in range(LANES):
-            w.power[pad] += w.element[corners, lane]
+            work.power[pad] += work.element[corners, lane]
             for c in range(corners):
-                dof = s.nodal_dof[g * LANES + lane, c]
+                dof = rig.nodal_dof[g * LANES + lane, c]
                 if dof >= 0:
-                    w.internal[first + dof] += w.element[c, lane]
-                    w.noise[first + dof] += abs(w.element[c, lane])
-    vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
-    load = w.load_dof
+                    work.internal[first + dof] += work.element[c, lane]
+                    work.noise[first + dof] += abs(work.element[c, lane])
+    vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
+    load = work.load_dof
     load[first:last] = 0.0
-    for node in range(w.low[pad], w.high[pad]):
+    for node in range(work.low[pad], work.high[pad]):
         for r in range(2):
-            load[first + s.nodal_surface[2 * node + r]] = w.F_linear[node, r]
+            load[first + rig.nodal_surface[2 * node + r]] = work.F_linear[node, r]
     worst, squares = 0.0, 0.0
     for i in range(first, last):
         v_base = vx if i % 2 == 0 else vy
-        M, change = mass_rate(s, pad, i, a), change_of_speed(s, w, pad, i, y, v_base)
-        size = w.noise[i] + M * (abs(w.rate[i]) + abs(v_base) + abs(change))
-        off = abs(w.internal[i] + M * change - load[i]) - ROUNDING * size
+        M, change = mass_rate(rig, pad, i, a), change_of_speed(rig, work, pad, i, y, v_base)
+        size = work.noise[i] + M * (abs(work.rate[i]) + abs(v_base) + abs(change))
+        off = abs(work.internal[i] + M * change - load[i]) - ROUNDING * size
         if not off <= worst:  # a force that is not a number is the largest
             worst = off
         squares += max(off, 0.0) ** 2
@@ -143,18 +143,18 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
 
 
 @inlined
-def matrix(s: Any, w: Any, pad: int) -> Array:
+def matrix(rig: Any, work: Any, pad: int) -> Array:
     """A of a pad, a view."""
-    n = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad]
-    at = s.nodal_band_start[pad]
-    return w.band[at : at + n * (2 * s.nodal_band[pad] + 1)]
+    n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
+    at = rig.nodal_band_start[pad]
+    return work.band[at : at + n * (2 * rig.nodal_band[pad] + 1)]
 
 
 @compiled
-def strained(s: Any, w: Any, g: int, a: float) -> float:
+def strained(rig: Any, work: Any, g: int, a: float) -> float:
     """A bound of how far any element of a group is strained from where its derivatives are held."""
-    x, held, worst = w.element_x[g], w.element_at[g], 0.0
-    corners = s.nodal_dof.shape[1]
+    x, held, worst = work.element_x[g], work.element_at[g], 0.0
+    corners = rig.nodal_dof.shape[1]
     for lane in range(LANES):
         total = 0.0
         for c in range(corners):
@@ -167,261 +167,275 @@ def strained(s: Any, w: Any, g: int, a: float) -> float:
 
 
 @compiled
-def linearise(s: Any, w: Any, pad: int, y: Array, a: float, hold: float) -> bool:
-    """Derivatives of the elements' forces, w.element_J, anew where they are strained by more than
-    `hold`; whether any are."""
-    own, changed = s.p[element_parameters(s, pad)], False
-    (low, high), corners = groups(s, pad), s.nodal_dof.shape[1]
+def linearise(rig: Any, work: Any, pad: int, y: Array, a: float, hold: float) -> bool:
+    """Derivatives of the elements' forces, work.element_J, anew where they are strained by more
+    than `hold`; whether any are."""
+    own, changed = rig.p[element_parameters(rig, pad)], False
+    (low, high), corners = groups(rig, pad), rig.nodal_dof.shape[1]
     for g in range(low, high):
-        element_inputs(s, w, pad, g, y, a)
-        if w.held[pad] == 0.0 or not strained(s, w, g, a) <= hold:
-            call_linearise(s.nodal_linearise[pad], w.element_x[g], own, w.element, w.element_J[g])
-            put(w.element_x[g, : 2 * corners], w.element_at[g])
+        element_inputs(rig, work, pad, g, y, a)
+        if work.held[pad] == 0.0 or not strained(rig, work, g, a) <= hold:
+            call_linearise(
+                rig.nodal_linearise[pad], work.element_x[g], own, work.element, work.element_J[g]
+            )
+            put(work.element_x[g, : 2 * corners], work.element_at[g])
             changed = True
     return changed
 
 
 @compiled
-def relinearise(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """Derivatives of all elements at the rates w.rate; `relation` factorises them."""
-    w.held[pad] = 0.0
-    linearise(s, w, pad, y, a, 0.0)
+def relinearise(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
+    """Derivatives of all elements at the rates work.rate; `relation` factorises them."""
+    work.held[pad] = 0.0
+    linearise(rig, work, pad, y, a, 0.0)
 
 
 @compiled
-def factor(s: Any, w: Any, pad: int, a: float) -> None:
-    """A of a pad, factorised, in w.band, from the elements' derivatives."""
-    first, last, band = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.nodal_band[pad]
-    width, A, corners = 2 * band + 1, matrix(s, w, pad), s.nodal_dof.shape[1]
+def factor(rig: Any, work: Any, pad: int, a: float) -> None:
+    """A of a pad, factorised, in work.band, from the elements' derivatives."""
+    first, last, band = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.nodal_band[pad]
+    width, A, corners = 2 * band + 1, matrix(rig, work, pad), rig.nodal_dof.shape[1]
     A[:] = 0.0
-    for e in range(s.nodal_element_start[pad], s.nodal_element_start[pad + 1]):
-        J, lane = w.element_J[e // LANES], e % LANES
+    for e in range(rig.nodal_element_start[pad], rig.nodal_element_start[pad + 1]):
+        J, lane = work.element_J[e // LANES], e % LANES
         for c in range(corners):
-            row = s.nodal_dof[e, c]
+            row = rig.nodal_dof[e, c]
             for d in range(corners if row >= 0 else 0):
-                column = s.nodal_dof[e, d]
+                column = rig.nodal_dof[e, d]
                 if column >= 0:
                     by = a * J[c, d, lane] + J[c, corners + d, lane]
                     A[row * width + band + column - row] += by
     for i in range(last - first):
-        A[i * width + band] += mass_rate(s, pad, first + i, a)
+        A[i * width + band] += mass_rate(rig, pad, first + i, a)
     factor_banded(A, last - first, band)
 
 
 @compiled
-def solve(s: Any, w: Any, pad: int, b: Array, m: int, first: int) -> None:
+def solve(rig: Any, work: Any, pad: int, b: Array, m: int, first: int) -> None:
     """A^-1 of m right-hand sides b (dofs m,), zero before dof `first`, in place."""
-    n = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad]
-    solve_banded(matrix(s, w, pad), n, s.nodal_band[pad], b, m, first)
+    n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
+    solve_banded(matrix(rig, work, pad), n, rig.nodal_band[pad], b, m, first)
 
 
 @compiled
-def solve_back(s: Any, w: Any, pad: int, b: Array) -> None:
+def solve_back(rig: Any, work: Any, pad: int, b: Array) -> None:
     """A^-T of b (dofs,) in place."""
-    solve_transposed(matrix(s, w, pad), b.size, s.nodal_band[pad], b)
+    solve_transposed(matrix(rig, work, pad), b.size, rig.nodal_band[pad], b)
 
 
 @compiled
-def relation(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """The pad's relation at the rates w.rate and the forces w.internal that `evaluate` found there:
-    free rates, which only Newton's method takes, w.P between the touched nodes, D and B of the
-    base's motion. What nothing has changed since is held."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    nodes, n = s.pad_node_start[pad], w.counts[pad]
-    fresh = w.held[pad] != a
-    if linearise(s, w, pad, y, a, s.nodal_hold[pad]) or fresh:
-        factor(s, w, pad, a)
-        w.held[pad], fresh = a, True
-    same = not fresh and n == w.held_count[pad]
+def relation(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
+    """The pad's relation at the rates work.rate and the forces work.internal that `evaluate` found
+    there: free rates, which only Newton's method takes, work.P between the touched nodes, D and B
+    of the base's motion. What nothing has changed since is held."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    nodes, n = rig.pad_node_start[pad], work.counts[pad]
+    fresh = work.held[pad] != a
+    if linearise(rig, work, pad, y, a, rig.nodal_hold[pad]) or fresh:
+        factor(rig, work, pad, a)
+        work.held[pad], fresh = a, True
+    same = not fresh and n == work.held_count[pad]
     for i in range(nodes, nodes + (n if same else 0)):
-        same &= w.touched[i] == w.held_touched[i]
+        same &= work.touched[i] == work.held_touched[i]
     if not same:
-        respond(s, w, pad, a)
-    b, m = responses(s, w, pad), responses_width(s, w, pad)
+        respond(rig, work, pad, a)
+    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
     for j in range(2 * n):
-        dof = s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2]
-        put(b[dof * m : dof * m + 2 * n], w.P[j, : 2 * n])
-    free = w.rate_free[first:last]
-    vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
+        dof = rig.nodal_surface[2 * work.touched[nodes + j // 2] + j % 2]
+        put(b[dof * m : dof * m + 2 * n], work.P[j, : 2 * n])
+    free = work.rate_free[first:last]
+    vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
     for i in range(last - first):
-        change = change_of_speed(s, w, pad, first + i, y, vx if i % 2 == 0 else vy)
-        free[i] = -w.internal[first + i] - mass_rate(s, pad, first + i, a) * change
-    solve(s, w, pad, free, 1, 0)
+        change = change_of_speed(rig, work, pad, first + i, y, vx if i % 2 == 0 else vy)
+        free[i] = -work.internal[first + i] - mass_rate(rig, pad, first + i, a) * change
+    solve(rig, work, pad, free, 1, 0)
     for i in range(last - first):
-        free[i] += w.rate[first + i]
-    for node in range(w.low[pad], w.high[pad]):
+        free[i] += work.rate[first + i]
+    for node in range(work.low[pad], work.high[pad]):
         for r in range(2):
-            w.free[node, r] = free[s.nodal_surface[2 * node + r]]
+            work.free[node, r] = free[rig.nodal_surface[2 * node + r]]
 
 
 @compiled
-def responses_width(s: Any, w: Any, pad: int) -> int:
+def responses_width(rig: Any, work: Any, pad: int) -> int:
     """Number of held responses of a pad."""
-    return 2 * w.held_count[pad] + (2 if inertial(s, pad) else 0)
+    return 2 * work.held_count[pad] + (2 if inertial(rig, pad) else 0)
 
 
 @inlined
-def responses(s: Any, w: Any, pad: int) -> Array:
+def responses(rig: Any, work: Any, pad: int) -> Array:
     """Held responses of a pad's dofs, row by row, a view."""
-    n = s.nodal_dof_start[pad + 1] - s.nodal_dof_start[pad]
-    at = s.nodal_dof_start[pad] * (w.responses.size // s.nodal_dof_start[-1])
-    return w.responses[at : at + n * responses_width(s, w, pad)]
+    n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
+    at = rig.nodal_dof_start[pad] * (work.responses.size // rig.nodal_dof_start[-1])
+    return work.responses[at : at + n * responses_width(rig, work, pad)]
 
 
 @compiled
-def respond(s: Any, w: Any, pad: int, a: float) -> None:
+def respond(rig: Any, work: Any, pad: int, a: float) -> None:
     """Responses to unit forces on the touched nodes, and to the base's motion, D and B."""
-    first, last, nodes = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_node_start[pad]
-    n, moved = w.counts[pad], 2 if inertial(s, pad) else 0
-    w.held_count[pad] = n
-    put(w.touched[nodes : nodes + n], w.held_touched[nodes : nodes + n])
-    b, m = responses(s, w, pad), responses_width(s, w, pad)
+    first, last, nodes = (
+        rig.nodal_dof_start[pad],
+        rig.nodal_dof_start[pad + 1],
+        rig.pad_node_start[pad],
+    )
+    n, moved = work.counts[pad], 2 if inertial(rig, pad) else 0
+    work.held_count[pad] = n
+    put(work.touched[nodes : nodes + n], work.held_touched[nodes : nodes + n])
+    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
     b[:] = 0.0
     for i in range(last - first if moved else 0):
-        M = mass_rate(s, pad, first + i, a)
+        M = mass_rate(rig, pad, first + i, a)
         b[i * m + 2 * n + i % 2] = M
-        w.D_left[first + i, i % 2], w.D_left[first + i, 1 - i % 2] = M, 0.0
+        work.D_left[first + i, i % 2], work.D_left[first + i, 1 - i % 2] = M, 0.0
     loaded = 0 if moved else last - first
     for j in range(2 * n):
-        dof = s.nodal_surface[2 * w.touched[nodes + j // 2] + j % 2]
+        dof = rig.nodal_surface[2 * work.touched[nodes + j // 2] + j % 2]
         b[dof * m + j], loaded = 1.0, min(loaded, dof)
-    solve(s, w, pad, b, m, loaded)
+    solve(rig, work, pad, b, m, loaded)
     if moved:
-        B = w.B[pad]
+        B = work.B[pad]
         B[:] = 0.0
         for i in range(last - first):
-            M = mass_rate(s, pad, first + i, a)
+            M = mass_rate(rig, pad, first + i, a)
             B[i % 2, i % 2] += M
             for axis in range(2):
-                w.D[first + i, axis] = b[i * m + 2 * n + axis]
-                B[i % 2, axis] -= M * w.D[first + i, axis]
+                work.D[first + i, axis] = b[i * m + 2 * n + axis]
+                B[i % 2, axis] -= M * work.D[first + i, axis]
         for axis in range(2):
-            left = w.load_dof[first:last]
-            put(w.D_left[first:last, axis], left)
-            solve_back(s, w, pad, left)
-            put(left, w.D_left[first:last, axis])
+            left = work.load_dof[first:last]
+            put(work.D_left[first:last, axis], left)
+            solve_back(rig, work, pad, left)
+            put(left, work.D_left[first:last, axis])
 
 
 @compiled
-def couple(s: Any, w: Any, pad: int, Rv: Array) -> None:
+def couple(rig: Any, work: Any, pad: int, Rv: Array) -> None:
     """Effects of the motion of the base of a pad with inertia on the points' rates, and its
-    reaction to nodal forces and to its own velocity, in w.Hc, w.Rf and Rv."""
-    at, base, free = s.pad_point_start[pad], s.pad_base[pad], s.body_free
-    first = s.nodal_dof_start[pad]
+    reaction to nodal forces and to its own velocity, in work.Hc, work.Rf and Rv."""
+    at, base, free = rig.pad_point_start[pad], rig.pad_base[pad], rig.body_free
+    first = rig.nodal_dof_start[pad]
     for axis in range(2):
         towards = free[base + axis]
         if towards < 0:
             continue
-        column = s.pad_column[pad, towards]
-        ex, ey = to_base(w, base, 1.0 - axis, axis)
-        for i in range(w.actives[pad]):
-            k = w.active[at + i]
-            c, H = s.point_contact[k], w.H[at + i]
+        column = rig.pad_column[pad, towards]
+        ex, ey = to_base(work, base, 1.0 - axis, axis)
+        for i in range(work.actives[pad]):
+            k = work.active[at + i]
+            c, H = rig.point_contact[k], work.H[at + i]
             Dx, Dy = 0.0, 0.0
             for j in range(2):
-                dof, N = first + s.nodal_surface[2 * s.point_node[k, j]], s.point_N[k, j]
-                Dx += N * (w.D[dof, 0] * ex + w.D[dof, 1] * ey)
-                Dy += N * (w.D[dof + 1, 0] * ex + w.D[dof + 1, 1] * ey)
+                dof, N = first + rig.nodal_surface[2 * rig.point_node[k, j]], rig.point_N[k, j]
+                Dx += N * (work.D[dof, 0] * ex + work.D[dof, 1] * ey)
+                Dy += N * (work.D[dof + 1, 0] * ex + work.D[dof + 1, 1] * ey)
             for j in range(2):
-                if s.point_N[k, j] != 0.0:
-                    row = 2 * w.slot[s.point_node[k, j]]
+                if rig.point_N[k, j] != 0.0:
+                    row = 2 * work.slot[rig.point_node[k, j]]
                     for r in range(2):
-                        w.Hc[row + r, column] -= s.point_N[k, j] * (H[r, 0] * Dx + H[r, 1] * Dy)
+                        work.Hc[row + r, column] -= rig.point_N[k, j] * (
+                            H[r, 0] * Dx + H[r, 1] * Dy
+                        )
             for row in range(6):
-                number = s.contact_number[c, row]
+                number = rig.contact_number[c, row]
                 if number >= 0:
-                    down = w.by_pair[c, 6 + row, 12:]
+                    down = work.by_pair[c, 6 + row, 12:]
                     for o in range(3):
                         Rv[number, towards] -= down[o] * (H[o, 0] * Dx + H[o, 1] * Dy)
-        for m in range(2 * w.counts[pad]):
-            node = w.touched[s.pad_node_start[pad] + m // 2]
-            dof = first + s.nodal_surface[2 * node + m % 2]
-            w.Rf[column, m] -= ex * w.D_left[dof, 0] + ey * w.D_left[dof, 1]
+        for m in range(2 * work.counts[pad]):
+            node = work.touched[rig.pad_node_start[pad] + m // 2]
+            dof = first + rig.nodal_surface[2 * node + m % 2]
+            work.Rf[column, m] -= ex * work.D_left[dof, 0] + ey * work.D_left[dof, 1]
         for other in range(2):
             if free[base + other] >= 0:
-                ox, oy = to_base(w, base, 1.0 - other, other)
-                B = w.B[pad]
+                ox, oy = to_base(work, base, 1.0 - other, other)
+                B = work.B[pad]
                 Rv[towards, free[base + other]] -= ex * (B[0, 0] * ox + B[0, 1] * oy) + ey * (
                     B[1, 0] * ox + B[1, 1] * oy
                 )
 
 
 @compiled
-def react(s: Any, w: Any, pad: int, y: Array, a: float, r: Array) -> None:
+def react(rig: Any, work: Any, pad: int, y: Array, a: float, r: Array) -> None:
     """The base's reaction to the free rates, - sum of M v', in r."""
-    base = s.pad_base[pad]
-    vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
+    base = rig.pad_base[pad]
+    vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
     x = z = 0.0
-    for i in range(s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], 2):
-        M = mass_rate(s, pad, i, a)
-        at = s.nodal_v_start[pad] + i - s.nodal_dof_start[pad]
-        x += M * (w.rate_free[i] + vx - y[at])
-        z += M * (w.rate_free[i + 1] + vy - y[at + 1])
-    X, Y = to_world(w, base, x, z)
-    if s.body_free[base] >= 0:
-        r[s.body_free[base], 0] -= X
-    if s.body_free[base + 1] >= 0:
-        r[s.body_free[base + 1], 0] -= Y
+    for i in range(rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], 2):
+        M = mass_rate(rig, pad, i, a)
+        at = rig.nodal_v_start[pad] + i - rig.nodal_dof_start[pad]
+        x += M * (work.rate_free[i] + vx - y[at])
+        z += M * (work.rate_free[i + 1] + vy - y[at + 1])
+    X, Y = to_world(work, base, x, z)
+    if rig.body_free[base] >= 0:
+        r[rig.body_free[base], 0] -= X
+    if rig.body_free[base + 1] >= 0:
+        r[rig.body_free[base + 1], 0] -= Y
 
 
 @compiled
-def propose(s: Any, w: Any, pad: int, dV: Array) -> None:
-    """Rates of all nodes, w.rate_new, and of the surface, w.u_dot_new, under the forces w.F_new and
-    the change of velocity dV."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    new, free, forces = w.rate_new[first:last], s.body_free, w.load_dof[: 2 * w.counts[pad]]
-    for i in range(w.counts[pad]):
-        node = w.touched[s.pad_node_start[pad] + i]
-        forces[2 * i], forces[2 * i + 1] = w.F_new[node, 0], w.F_new[node, 1]
-    b, m = responses(s, w, pad), responses_width(s, w, pad)
+def propose(rig: Any, work: Any, pad: int, dV: Array) -> None:
+    """Rates of all nodes, work.rate_new, and of the surface, work.u_dot_new, under the forces
+    work.F_new and the change of velocity dV."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    new, free, forces = (
+        work.rate_new[first:last],
+        rig.body_free,
+        work.load_dof[: 2 * work.counts[pad]],
+    )
+    for i in range(work.counts[pad]):
+        node = work.touched[rig.pad_node_start[pad] + i]
+        forces[2 * i], forces[2 * i + 1] = work.F_new[node, 0], work.F_new[node, 1]
+    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
     x, y = 0.0, 0.0
-    if inertial(s, pad):
+    if inertial(rig, pad):
         x = dV[free[base]] if free[base] >= 0 else 0.0
         y = dV[free[base + 1]] if free[base + 1] >= 0 else 0.0
-    vx, vy = to_base(w, base, x, y)
+    vx, vy = to_base(work, base, x, y)
     for i in range(last - first):
-        new[i] = w.rate_free[first + i] + dot(forces, b[i * m :])
-        if inertial(s, pad):
-            new[i] -= w.D[first + i, 0] * vx + w.D[first + i, 1] * vy
-        w.rate_old[first + i] = w.rate[first + i]
-    for node in range(w.low[pad], w.high[pad]):
+        new[i] = work.rate_free[first + i] + dot(forces, b[i * m :])
+        if inertial(rig, pad):
+            new[i] -= work.D[first + i, 0] * vx + work.D[first + i, 1] * vy
+        work.rate_old[first + i] = work.rate[first + i]
+    for node in range(work.low[pad], work.high[pad]):
         for r in range(2):
-            w.u_dot_new[2 * node + r] = new[s.nodal_surface[2 * node + r]]
+            work.u_dot_new[2 * node + r] = new[rig.nodal_surface[2 * node + r]]
 
 
 @compiled
-def move(s: Any, w: Any, pad: int, part: float) -> None:
+def move(rig: Any, work: Any, pad: int, part: float) -> None:
     """Go `part` of the way from the old rates to the proposed ones."""
-    for i in range(s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1]):
-        w.rate[i] = w.rate_old[i] + part * (w.rate_new[i] - w.rate_old[i])
+    for i in range(rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1]):
+        work.rate[i] = work.rate_old[i] + part * (work.rate_new[i] - work.rate_old[i])
 
 
 @compiled
-def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array) -> float:
-    """Rates of the state into w.k, and the power [W] that the pad dissipates; with inertia also the
-    force on it, its moment and its base's load, which are those of the elements. Returns a bound of
-    the nodes' speeds [m/s]."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
-    fastest, U, W = 0.0, s.pad_y_start[pad], s.nodal_v_start[pad]
-    powers[pad] += w.power[pad]
+def finish(
+    rig: Any, work: Any, pad: int, y: Array, a: float, powers: Array, wrench: Array
+) -> float:
+    """Rates of the state into work.k, and the power [W] that the pad dissipates; with inertia also
+    the force on it, its moment and its base's load, which are those of the elements. Returns a
+    bound of the nodes' speeds [m/s]."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
+    fastest, U, W = 0.0, rig.pad_y_start[pad], rig.nodal_v_start[pad]
+    powers[pad] += work.power[pad]
     for i in range(last - first):
-        w.k[U + i] = w.rate[first + i]
-        fastest = max(fastest, abs(w.rate[first + i]))
-        if inertial(s, pad):
+        work.k[U + i] = work.rate[first + i]
+        fastest = max(fastest, abs(work.rate[first + i]))
+        if inertial(rig, pad):
             v_base = vx if i % 2 == 0 else vy
-            w.k[W + i] = change_of_speed(s, w, pad, first + i, y, v_base) / a
-    if inertial(s, pad):
+            work.k[W + i] = change_of_speed(rig, work, pad, first + i, y, v_base) / a
+    if inertial(rig, pad):
         x, z = wrench[0], wrench[1]
         wrench[:] = 0.0
         for i in range(first, last, 2):
-            fx, fy = w.internal[i], w.internal[i + 1]
+            fx, fy = work.internal[i], work.internal[i + 1]
             wrench[0] += fx
             wrench[1] += fy
-            wrench[2] += s.nodal_X[i] * fy - s.nodal_X[i + 1] * fx
-        X, Y = to_world(w, base, wrench[0] - x, wrench[1] - z)
-        w.load[base] += X
-        w.load[base + 1] += Y
+            wrench[2] += rig.nodal_X[i] * fy - rig.nodal_X[i + 1] * fx
+        X, Y = to_world(work, base, wrench[0] - x, wrench[1] - z)
+        work.load[base] += X
+        work.load[base + 1] += Y
     return 1.5 * fastest
 
 
@@ -430,15 +444,23 @@ def finish(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrench: 
 
 @compiled
 def push_elements(
-    s: Any, w: Any, z: Any, pad: int, du: Array, dv: Array, dp: Array, rates: bool, out: Array
+    rig: Any,
+    work: Any,
+    tangents: Any,
+    pad: int,
+    du: Array,
+    dv: Array,
+    dp: Array,
+    rates: bool,
+    out: Array,
 ) -> None:
     """Add the tangents of the elements' forces to `out` (all dofs, m): by displacements du (dofs,
     m), by the parameters, and with `rates` by rates dv (all dofs, m)."""
-    own, i0, m = element_parameters(s, pad), s.nodal_dof_start[pad], dp.shape[1]
-    d, (low, high) = z.direction[: own.stop - own.start], groups(s, pad)
-    corners = s.nodal_dof.shape[1]
+    own, i0, m = element_parameters(rig, pad), rig.nodal_dof_start[pad], dp.shape[1]
+    d, (low, high) = tangents.direction[: own.stop - own.start], groups(rig, pad)
+    corners = rig.nodal_dof.shape[1]
     for g in range(low, high):
-        J, dofs = w.element_J[g], s.nodal_dof[g * LANES : (g + 1) * LANES]
+        J, dofs = work.element_J[g], rig.nodal_dof[g * LANES : (g + 1) * LANES]
         for lane in range(LANES):
             for c in range(corners):
                 row = dofs[lane, c]
@@ -454,127 +476,129 @@ def push_elements(
             d[j] = dp[own.start + j, k]
             moved |= d[j] != 0.0
         for g in range(low, high if moved else low):
-            call_push(s.nodal_push[pad], w.element_x[g], s.p[own], d, z.element)
+            call_push(rig.nodal_push[pad], work.element_x[g], rig.p[own], d, tangents.element)
             for lane in range(LANES):
                 for c in range(corners):
-                    row = s.nodal_dof[g * LANES + lane, c]
+                    row = rig.nodal_dof[g * LANES + lane, c]
                     if row >= 0:
-                        out[i0 + row, k] += z.element[c, lane]
+                        out[i0 + row, k] += tangents.element[c, lane]
 
 
 @compiled
 def push(
-    s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, r: Array
+    rig: Any, work: Any, tangents: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, r: Array
 ) -> None:
-    """Derivatives of u* (z.u) and of u' before the forces' own change (z.v) at the touched nodes,
-    z.free of all of them, and the base's reaction in r."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    U, W, m, free = s.pad_y_start[pad], s.nodal_v_start[pad], dy.shape[1], z.free
-    vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
-    du, at = dy[U : U + last - first], s.nodal_density_at[pad]
+    """Derivatives of u* (tangents.u) and of u' before the forces' own change (tangents.v) at the
+    touched nodes, tangents.free of all of them, and the base's reaction in r."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    U, W, m, free = rig.pad_y_start[pad], rig.nodal_v_start[pad], dy.shape[1], tangents.free
+    vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
+    du, at = dy[U : U + last - first], rig.nodal_density_at[pad]
     free[first:last] = 0.0
-    push_elements(s, w, z, pad, du, free, dp, False, free)
+    push_elements(rig, work, tangents, pad, du, free, dp, False, free)
     for i in range(first, last):
         for k in range(m):
             free[i, k] = -free[i, k]
-        if inertial(s, pad):
-            change = change_of_speed(s, w, pad, i, y, vx if i % 2 == 0 else vy)
-            add(mass_rate(s, pad, i, a), dy[W + i - first], free[i])
-            add(-s.nodal_area[i] / a * change, dp[at], free[i])
-    b = w.solves[: (last - first) * m]
+        if inertial(rig, pad):
+            change = change_of_speed(rig, work, pad, i, y, vx if i % 2 == 0 else vy)
+            add(mass_rate(rig, pad, i, a), dy[W + i - first], free[i])
+            add(-rig.nodal_area[i] / a * change, dp[at], free[i])
+    b = work.solves[: (last - first) * m]
     for i in range(last - first):
         put(free[first + i], b[i * m : (i + 1) * m])
-    solve(s, w, pad, b, m, 0)
+    solve(rig, work, pad, b, m, 0)
     for i in range(last - first):
         put(b[i * m : (i + 1) * m], free[first + i])
-    for i in range(w.counts[pad]):
-        node = w.touched[s.pad_node_start[pad] + i]
+    for i in range(work.counts[pad]):
+        node = work.touched[rig.pad_node_start[pad] + i]
         for axis in range(2):
-            dof = s.nodal_surface[2 * node + axis]
-            put(du[dof], z.u[node, axis])
-            put(free[first + dof], z.v[node, axis])
-    for k in range(m if inertial(s, pad) else 0):
+            dof = rig.nodal_surface[2 * node + axis]
+            put(du[dof], tangents.u[node, axis])
+            put(free[first + dof], tangents.v[node, axis])
+    for k in range(m if inertial(rig, pad) else 0):
         along = across = 0.0
         for i in range(first, last):
-            change = change_of_speed(s, w, pad, i, y, vx if i % 2 == 0 else vy)
-            M = mass_rate(s, pad, i, a)
+            change = change_of_speed(rig, work, pad, i, y, vx if i % 2 == 0 else vy)
+            M = mass_rate(rig, pad, i, a)
             push = (
-                M * (free[i, k] - dy[W + i - first, k]) + s.nodal_area[i] / a * change * dp[at, k]
+                M * (free[i, k] - dy[W + i - first, k]) + rig.nodal_area[i] / a * change * dp[at, k]
             )
             if i % 2 == 0:
                 along += push
             else:
                 across += push
-        X, Y = to_world(w, base, along, across)
-        if s.body_free[base] >= 0:
-            r[s.body_free[base], k] -= X
-        if s.body_free[base + 1] >= 0:
-            r[s.body_free[base + 1], k] -= Y
+        X, Y = to_world(work, base, along, across)
+        if rig.body_free[base] >= 0:
+            r[rig.body_free[base], k] -= X
+        if rig.body_free[base + 1] >= 0:
+            r[rig.body_free[base + 1], k] -= Y
 
 
 @compiled
-def push_rates(s: Any, w: Any, z: Any, pad: int, X: Array, m: int) -> None:
-    """Tangents of all nodes' rates, z.rate_of, under those of the nodal forces X, and z.own_rate of
-    the touched nodes, less z.v."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    nodes = s.pad_node_start[pad]
-    z.base_rate[:] = 0.0
-    for axis in range(2 if inertial(s, pad) else 0):
-        number = s.body_free[base + axis]
+def push_rates(rig: Any, work: Any, tangents: Any, pad: int, X: Array, m: int) -> None:
+    """Tangents of all nodes' rates, tangents.rate_of, under those of the nodal forces X, and
+    tangents.own_rate of the touched nodes, less tangents.v."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    nodes = rig.pad_node_start[pad]
+    tangents.base_rate[:] = 0.0
+    for axis in range(2 if inertial(rig, pad) else 0):
+        number = rig.body_free[base + axis]
         if number >= 0:
-            ex, ey = to_base(w, base, 1.0 - axis, axis)
-            add(ex, z.V[number], z.base_rate[0])
-            add(ey, z.V[number], z.base_rate[1])
-    b = w.solves[: (last - first) * m]
+            ex, ey = to_base(work, base, 1.0 - axis, axis)
+            add(ex, tangents.V[number], tangents.base_rate[0])
+            add(ey, tangents.V[number], tangents.base_rate[1])
+    b = work.solves[: (last - first) * m]
     b[:] = 0.0
-    for i in range(w.counts[pad]):
+    for i in range(work.counts[pad]):
         for o in range(2):
-            dof = s.nodal_surface[2 * w.touched[nodes + i] + o]
+            dof = rig.nodal_surface[2 * work.touched[nodes + i] + o]
             put(X[2 * i + o, :m], b[dof * m : (dof + 1) * m])
-    solve(s, w, pad, b, m, 0)
+    solve(rig, work, pad, b, m, 0)
     for i in range(last - first):
-        rate = z.rate_of[first + i]
-        put(z.free[first + i], rate)
+        rate = tangents.rate_of[first + i]
+        put(tangents.free[first + i], rate)
         add(1.0, b[i * m : (i + 1) * m], rate)
-        for q in range(2 if inertial(s, pad) else 0):
-            add(-w.D[first + i, q], z.base_rate[q], rate)
-    for i in range(w.counts[pad]):
-        node = w.touched[nodes + i]
+        for q in range(2 if inertial(rig, pad) else 0):
+            add(-work.D[first + i, q], tangents.base_rate[q], rate)
+    for i in range(work.counts[pad]):
+        node = work.touched[nodes + i]
         for o in range(2):
-            put(z.rate_of[first + s.nodal_surface[2 * node + o]], z.own_rate[i, o])
-            add(-1.0, z.v[node, o], z.own_rate[i, o])
+            put(tangents.rate_of[first + rig.nodal_surface[2 * node + o]], tangents.own_rate[i, o])
+            add(-1.0, tangents.v[node, o], tangents.own_rate[i, o])
 
 
 @compiled
-def push_state(s: Any, w: Any, z: Any, pad: int, a: float, dy: Array) -> None:
+def push_state(rig: Any, work: Any, tangents: Any, pad: int, a: float, dy: Array) -> None:
     """Tangents of the state at the stage's end."""
-    first, U, W = s.nodal_dof_start[pad], s.pad_y_start[pad], s.nodal_v_start[pad]
-    for i in range(s.nodal_dof_start[pad + 1] - first):
-        add(a, z.rate_of[first + i], dy[U + i])
-        if inertial(s, pad):
-            put(z.rate_of[first + i], dy[W + i])
-            add(1.0, z.base_rate[i % 2], dy[W + i])
+    first, U, W = rig.nodal_dof_start[pad], rig.pad_y_start[pad], rig.nodal_v_start[pad]
+    for i in range(rig.nodal_dof_start[pad + 1] - first):
+        add(a, tangents.rate_of[first + i], dy[U + i])
+        if inertial(rig, pad):
+            put(tangents.rate_of[first + i], dy[W + i])
+            add(1.0, tangents.base_rate[i % 2], dy[W + i])
 
 
 @compiled
-def push_felt(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array) -> None:
+def push_felt(
+    rig: Any, work: Any, tangents: Any, pad: int, y: Array, a: float, dy: Array, dp: Array
+) -> None:
     """Tangents of the force and the moment of the elements, and of the base's load, in
-    z.recorded."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    U, m, into, out = s.pad_y_start[pad], dy.shape[1], z.recorded, z.free
-    wrench = 2 * s.point_contact.size + 3 * pad
-    load = 2 * s.point_contact.size + 3 * s.pad_base.size + base
+    tangents.recorded."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    U, m, into, out = rig.pad_y_start[pad], dy.shape[1], tangents.recorded, tangents.free
+    wrench = 2 * rig.point_contact.size + 3 * pad
+    load = 2 * rig.point_contact.size + 3 * rig.pad_base.size + base
     out[first:last] = 0.0
     du = dy[U : U + last - first]
-    push_elements(s, w, z, pad, du, z.rate_of, dp, True, out)
+    push_elements(rig, work, tangents, pad, du, tangents.rate_of, dp, True, out)
     for k in range(m):
         x = z_axis = moment = 0.0
         for i in range(first, last, 2):
             x += out[i, k]
             z_axis += out[i + 1, k]
-            moment += s.nodal_X[i] * out[i + 1, k] - s.nodal_X[i + 1] * out[i, k]
+            moment += rig.nodal_X[i] * out[i + 1, k] - rig.nodal_X[i + 1] * out[i, k]
         into[wrench, k], into[wrench + 1, k], into[wrench + 2, k] = x, z_axis, moment
-        X, Y = to_world(w, base, x, z_axis)
+        X, Y = to_world(work, base, x, z_axis)
         into[load, k] += X
         into[load + 1, k] += Y
 
@@ -584,20 +608,20 @@ def push_felt(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, d
 
 @compiled
 def pull_elements(
-    s: Any, w: Any, z: Any, pad: int, factor: float, forces_bar: Array, u_bar: Array,
+    rig: Any, work: Any, bars: Any, pad: int, factor: float, forces_bar: Array, u_bar: Array,
     rate_bar: Array, p_bar: Array,
 ) -> None:  # fmt: skip
     """Add to the cotangents of displacements (dofs,), of rates (all dofs,) and of the parameters
     those of the elements' forces, `factor` forces_bar (all dofs,)."""
-    own, i0, bar = element_parameters(s, pad), s.nodal_dof_start[pad], z.element
-    (low, high), corners = groups(s, pad), s.nodal_dof.shape[1]
+    own, i0, bar = element_parameters(rig, pad), rig.nodal_dof_start[pad], bars.element
+    (low, high), corners = groups(rig, pad), rig.nodal_dof.shape[1]
     for g in range(low, high):
-        J, dofs = w.element_J[g], s.nodal_dof[g * LANES : (g + 1) * LANES]
+        J, dofs = work.element_J[g], rig.nodal_dof[g * LANES : (g + 1) * LANES]
         for c in range(corners):
             for lane in range(LANES):
                 dof = dofs[lane, c]
                 bar[c, lane] = factor * forces_bar[i0 + dof] if dof >= 0 else 0.0
-        call_pullback(s.nodal_pullback[pad], w.element_x[g], s.p[own], bar, p_bar[own])
+        call_pullback(rig.nodal_pullback[pad], work.element_x[g], rig.p[own], bar, p_bar[own])
         for d in range(corners):
             for lane in range(LANES):
                 dof = dofs[lane, d]
@@ -612,87 +636,100 @@ def pull_elements(
 
 @compiled
 def pull_felt(
-    s: Any, w: Any, z: Any, pad: int, y: Array, a: float, y_bar: Array, p_bar: Array
+    rig: Any, work: Any, bars: Any, pad: int, y: Array, a: float, y_bar: Array, p_bar: Array
 ) -> None:
-    """Adjoint of `push_felt`: the cotangents of rates go to z.rate_of."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    U, wrench, bar = s.pad_y_start[pad], z.wrenches[pad], z.own
-    x, z_axis = to_base(w, base, z.load[base], z.load[base + 1])
+    """Adjoint of `push_felt`: the cotangents of rates go to bars.rate_of."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    U, wrench, bar = rig.pad_y_start[pad], bars.wrenches[pad], bars.own
+    x, z_axis = to_base(work, base, bars.load[base], bars.load[base + 1])
     for i in range(first, last, 2):
-        bar[i] = wrench[0] + x - s.nodal_X[i + 1] * wrench[2]
-        bar[i + 1] = wrench[1] + z_axis + s.nodal_X[i] * wrench[2]
-    pull_elements(s, w, z, pad, 1.0, bar, y_bar[U : U + last - first], z.rate_of, p_bar)
+        bar[i] = wrench[0] + x - rig.nodal_X[i + 1] * wrench[2]
+        bar[i + 1] = wrench[1] + z_axis + rig.nodal_X[i] * wrench[2]
+    pull_elements(rig, work, bars, pad, 1.0, bar, y_bar[U : U + last - first], bars.rate_of, p_bar)
 
 
 @compiled
 def pull_forces(
-    s: Any, w: Any, z: Any, pad: int, y_bar: Array, a: float, b: Array, X: Array, V_bar: Array
+    rig: Any,
+    work: Any,
+    bars: Any,
+    pad: int,
+    y_bar: Array,
+    a: float,
+    b: Array,
+    X: Array,
+    V_bar: Array,
 ) -> None:
     """Cotangents of the touched nodes' forces into X[:, 0], and of the base's velocity, from those
-    of the state and of the nodal rates, b, and z.rate_of."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    U, W, nodes, own = s.pad_y_start[pad], s.nodal_v_start[pad], s.pad_node_start[pad], z.own
+    of the state and of the nodal rates, b, and bars.rate_of."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    U, W, nodes, own = (
+        rig.pad_y_start[pad],
+        rig.nodal_v_start[pad],
+        rig.pad_node_start[pad],
+        bars.own,
+    )
     for i in range(first, last):
-        own[i] = z.rate_of[i] + a * y_bar[U + i - first]
-        if inertial(s, pad):
+        own[i] = bars.rate_of[i] + a * y_bar[U + i - first]
+        if inertial(rig, pad):
             own[i] += y_bar[W + i - first]
-    for i in range(w.counts[pad]):
+    for i in range(work.counts[pad]):
         for r in range(2):
-            own[first + s.nodal_surface[2 * w.touched[nodes + i] + r]] += b[2 * i + r]
-    if inertial(s, pad):
-        reaction = z.pair[0]
+            own[first + rig.nodal_surface[2 * work.touched[nodes + i] + r]] += b[2 * i + r]
+    if inertial(rig, pad):
+        reaction = bars.pair[0]
         reaction[:] = 0.0
         for i in range(first, last):
             for axis in range(2):
-                reaction[axis] -= w.D[i, axis] * own[i]
+                reaction[axis] -= work.D[i, axis] * own[i]
             reaction[i % 2] += y_bar[W + i - first]
-        X_bar, Y_bar = to_world(w, base, reaction[0], reaction[1])
-        if s.body_free[base] >= 0:
-            V_bar[s.body_free[base]] += X_bar
-        if s.body_free[base + 1] >= 0:
-            V_bar[s.body_free[base + 1]] += Y_bar
-    solve_back(s, w, pad, own[first:last])
-    for i in range(w.counts[pad]):
+        X_bar, Y_bar = to_world(work, base, reaction[0], reaction[1])
+        if rig.body_free[base] >= 0:
+            V_bar[rig.body_free[base]] += X_bar
+        if rig.body_free[base + 1] >= 0:
+            V_bar[rig.body_free[base + 1]] += Y_bar
+    solve_back(rig, work, pad, own[first:last])
+    for i in range(work.counts[pad]):
         for r in range(2):
-            X[2 * i + r, 0] = own[first + s.nodal_surface[2 * w.touched[nodes + i] + r]]
+            X[2 * i + r, 0] = own[first + rig.nodal_surface[2 * work.touched[nodes + i] + r]]
 
 
 @compiled
 def pull_state(
-    s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, nu: Array, V_bar: Array,
-    p_bar: Array,
+    rig: Any, work: Any, bars: Any, pad: int, y: Array, y_bar: Array, a: float, nu: Array,
+    V_bar: Array, p_bar: Array,
 ) -> None:  # fmt: skip
     """Cotangents of the state at the stage's start, of the material and of the base's velocity,
-    from those of the nodal rates and displacements, z.rate, z.rate_of and z.u, and nu of the
-    bodies' equations."""
-    first, last, base = s.nodal_dof_start[pad], s.nodal_dof_start[pad + 1], s.pad_base[pad]
-    U, W, at = s.pad_y_start[pad], s.nodal_v_start[pad], s.nodal_density_at[pad]
-    own, reaction, local = z.own, z.pair[0], z.pair[1]
-    nx = nu[s.body_free[base], 0] if s.body_free[base] >= 0 else 0.0
-    ny = nu[s.body_free[base + 1], 0] if s.body_free[base + 1] >= 0 else 0.0
-    reaction[0], reaction[1] = to_base(w, base, -nx, -ny)
+    from those of the nodal rates and displacements, bars.rate, bars.rate_of and bars.u, and nu of
+    the bodies' equations."""
+    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
+    U, W, at = rig.pad_y_start[pad], rig.nodal_v_start[pad], rig.nodal_density_at[pad]
+    own, reaction, local = bars.own, bars.pair[0], bars.pair[1]
+    nx = nu[rig.body_free[base], 0] if rig.body_free[base] >= 0 else 0.0
+    ny = nu[rig.body_free[base + 1], 0] if rig.body_free[base + 1] >= 0 else 0.0
+    reaction[0], reaction[1] = to_base(work, base, -nx, -ny)
     for i in range(first, last):
-        own[i] = z.rate_of[i] + a * y_bar[U + i - first]
-        if inertial(s, pad):
-            own[i] += y_bar[W + i - first] + mass_rate(s, pad, i, a) * reaction[i % 2]
-    for node in range(w.low[pad], w.high[pad]):
+        own[i] = bars.rate_of[i] + a * y_bar[U + i - first]
+        if inertial(rig, pad):
+            own[i] += y_bar[W + i - first] + mass_rate(rig, pad, i, a) * reaction[i % 2]
+    for node in range(work.low[pad], work.high[pad]):
         for r in range(2):
-            own[first + s.nodal_surface[2 * node + r]] += z.rate[node, r]
-            y_bar[U + s.nodal_surface[2 * node + r]] += z.u[node, r]
-    solve_back(s, w, pad, own[first:last])  # now the multiplier of the pad's equation
+            own[first + rig.nodal_surface[2 * node + r]] += bars.rate[node, r]
+            y_bar[U + rig.nodal_surface[2 * node + r]] += bars.u[node, r]
+    solve_back(rig, work, pad, own[first:last])  # now the multiplier of the pad's equation
     # the rates' cotangents are spent: what comes to them here is not read
-    pull_elements(s, w, z, pad, -1.0, own, y_bar[U : U + last - first], z.rate_of, p_bar)
-    if not inertial(s, pad):
+    pull_elements(rig, work, bars, pad, -1.0, own, y_bar[U : U + last - first], bars.rate_of, p_bar)
+    if not inertial(rig, pad):
         return
-    vx, vy = to_base(w, base, w.V[base], w.V[base + 1])
+    vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
     local[:] = 0.0
     for i in range(first, last):
-        M = mass_rate(s, pad, i, a)
-        change = change_of_speed(s, w, pad, i, y, vx if i % 2 == 0 else vy)
+        M = mass_rate(rig, pad, i, a)
+        change = change_of_speed(rig, work, pad, i, y, vx if i % 2 == 0 else vy)
         balance = M * (reaction[i % 2] - own[i])
         local[i % 2] += y_bar[W + i - first] + balance
-        p_bar[at] += s.nodal_area[i] / a * change * (reaction[i % 2] - own[i])
+        p_bar[at] += rig.nodal_area[i] / a * change * (reaction[i % 2] - own[i])
         y_bar[W + i - first] = -balance
-    X_bar, Y_bar = to_world(w, base, local[0], local[1])
+    X_bar, Y_bar = to_world(work, base, local[0], local[1])
     V_bar[base] += X_bar
     V_bar[base + 1] += Y_bar

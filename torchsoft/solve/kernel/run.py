@@ -41,62 +41,73 @@ LEAST_ERROR = 1e-6
 
 
 @compiled
-def follow(f: Any, t_0: float, t_1: float, out: Array) -> None:
+def follow(followed: Any, t_0: float, t_1: float, out: Array) -> None:
     """Value and rate of every signal into out (1 or 2, signals, 2): at t_0 [s], and at t_1."""
     for row in range(len(out)):
         t = t_0 if row == 0 else t_1
-        if f.address != 0:
-            f.room[0] = t
-            call_value(f.address, f.room, f.room, out[row])
+        if followed.address != 0:
+            followed.room[0] = t
+            call_value(followed.address, followed.room, followed.room, out[row])
             continue
-        for i in range(f.start.size - 1):
+        for i in range(followed.start.size - 1):
             piece = (
-                f.start[i] + np.searchsorted(f.at[f.start[i] : f.start[i + 1]], t, side="right") - 1
+                followed.start[i]
+                + np.searchsorted(
+                    followed.at[followed.start[i] : followed.start[i + 1]], t, side="right"
+                )
+                - 1
             )
-            piece = max(piece, f.start[i])
-            u, n = (t - f.at[piece]) / f.span[piece], f.points[i]
+            piece = max(piece, followed.start[i])
+            u, n = (t - followed.at[piece]) / followed.span[piece], followed.points[i]
             inside = 0.0 <= u <= 1.0
             u = min(max(u, 0.0), 1.0)
-            points, slope = f.room, 0.0
-            put(f.control[piece], points[: f.control.shape[1]])
+            points, slope = followed.room, 0.0
+            put(followed.control[piece], points[: followed.control.shape[1]])
             for level in range(n - 1, 0, -1):  # de Casteljau
                 slope = (n - 1) * (points[1] - points[0])
                 for j in range(level):
                     points[j] = (1.0 - u) * points[j] + u * points[j + 1]
-            out[row, i, 0], out[row, i, 1] = points[0], slope / f.span[piece] if inside else 0.0
+            out[row, i, 0], out[row, i, 1] = (
+                points[0],
+                slope / followed.span[piece] if inside else 0.0,
+            )
 
 
 @compiled
-def estimate(e: Any, d: Any, y: Array, k: Array, h: float, rtol: float) -> tuple[float, int]:
+def estimate(
+    errors: Any, taken: Any, y: Array, k: Array, h: float, rtol: float
+) -> tuple[float, int]:
     """The step's error over what the tolerances allow, of the worst part of the state, and which
     part that is."""
     worst, which = 0.0, -1
-    for part in range(e.first.size):
+    for part in range(errors.first.size):
         total = size = 0.0
-        for i in range(e.first[part], e.last[part]):
+        for i in range(errors.first[part], errors.last[part]):
             error = (
-                ERROR * h * ((d.K[1, i] - d.K[0, i]) / (1.0 - GAMMA) - (d.K[0, i] - k[i]) / GAMMA)
+                ERROR
+                * h
+                * ((taken.K[1, i] - taken.K[0, i]) / (1.0 - GAMMA) - (taken.K[0, i] - k[i]) / GAMMA)
             )
             total += error * error
-            change = y[i] - e.origin[i]
+            change = y[i] - errors.origin[i]
             size += change * change
-        size = max(np.sqrt(size), e.size[part])
-        if e.rate[part] != 0:  # an error of a rate counts by what it displaces within the step
+        size = max(np.sqrt(size), errors.size[part])
+        if errors.rate[part] != 0:  # an error of a rate counts by what it displaces within the step
             total *= h * h
             size *= h
-        ratio = np.sqrt(total) / (e.atol[part] + rtol * size)
+        ratio = np.sqrt(total) / (errors.atol[part] + rtol * size)
         if not ratio <= worst:
             worst, which = ratio, part
     return worst, which
 
 
 @compiled
-def passing(s: Any, w: Any) -> float:
+def passing(rig: Any, work: Any) -> float:
     """The largest speed of a body over a pad that it may touch, over its size [1/s]."""
     most = 0.0
-    for c in range(s.contact_pad.size):
-        speed = np.hypot(w.relative[c, 3], w.relative[c, 4])
-        most = max(most, speed / s.contact_size[c])
+    for c in range(rig.contact_pad.size):
+        speed = np.hypot(work.relative[c, 3], work.relative[c, 4])
+        most = max(most, speed / rig.contact_size[c])
     return most
 
 
@@ -111,24 +122,24 @@ def next_end(t: float, length: float, stops: Array) -> float:
 
 
 @compiled
-def guess(s: Any, w: Any, y: Array) -> None:
+def guess(rig: Any, work: Any, y: Array) -> None:
     """Newton's first guess: the velocities of the state."""
-    w.V[:], w.u_dot[:], w.rate[:] = 0.0, 0.0, 0.0
-    for i in range(s.body_coordinate.size):
-        w.V[s.body_coordinate[i]] = y[s.body_V_start + i]
+    work.V[:], work.u_dot[:], work.rate[:] = 0.0, 0.0, 0.0
+    for i in range(rig.body_coordinate.size):
+        work.V[rig.body_coordinate[i]] = y[rig.body_V_start + i]
 
 
 @compiled
-def afresh(w: Any) -> None:
+def afresh(work: Any) -> None:
     """Forget which points are near and what is held, so that what is made again has the same
     bits."""
-    w.travelled[0] = np.inf
-    w.low[:], w.high[:], w.held[:] = 0, 0, 0.0
+    work.travelled[0] = np.inf
+    work.low[:], work.high[:], work.held[:] = 0, 0, 0.0
 
 
 @compiled
-def run(r: Any) -> None:
-    """Take up to h.size steps of the rig's arrays `s`, with `begin` after the output 0, that of y
+def run(call: Any) -> None:
+    """Take up to h.size steps of the arrays of a rig, with `begin` after the output 0, that of y
     itself, of step -1.
 
     starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages, and the
@@ -144,36 +155,44 @@ def run(r: Any) -> None:
     error and that Newton did not solve, and the part of the state whose error was largest in the
     last one.
     """
-    s, w, d, y, out, given, begin = r.s, r.w, r.d, r.y, r.out, r.given != 0, r.begin != 0
-    clock, counts, h, t_out = r.clock, r.counts, r.h, r.t_out
+    rig, work, taken, y, out, given, begin = (
+        call.rig,
+        call.work,
+        call.taken,
+        call.y,
+        call.out,
+        call.given != 0,
+        call.begin != 0,
+    )
+    clock, counts, h, t_out = call.clock, call.counts, call.h, call.t_out
     steps, row, solves, refused, failed, which, status = 0, 0, 0, 0, 0, -1, CONVERGED
-    afresh(w)
+    afresh(work)
     while (steps < h.size and (given or row < t_out.size)) or begin:
-        t, length, end, error, last = clock[0], min(clock[1], r.longest), 0.0, 0.0, row
+        t, length, end, error, last = clock[0], min(clock[1], call.longest), 0.0, 0.0, row
         if begin:  # nothing has moved
-            d.K[:], d.powers[:], now, last = 0.0, 0.0, 0.0, 1
-            guess(s, w, y)
-            put(y, d.y)
-            put(r.integrals, d.integrals)
-            put(w.travelled, d.travelled)
+            taken.K[:], taken.powers[:], now, last = 0.0, 0.0, 0.0, 1
+            guess(rig, work, y)
+            put(y, taken.y)
+            put(call.integrals, taken.integrals)
+            put(work.travelled, taken.travelled)
             out.step[0], out.part[0] = -1, 0.0
             if not given:
-                follow(r.f, t_out[0], t_out[0], out.signals)
+                follow(call.followed, t_out[0], t_out[0], out.signals)
         else:
             now = h[steps]
             if not given:
-                end = next_end(t, length, r.stops)
+                end = next_end(t, length, call.stops)
                 now = end - t
-                follow(r.f, t + GAMMA * now, end, r.signals[steps])
-            status, count = take_step(r, now, r.signals[steps], 2 * steps)
+                follow(call.followed, t + GAMMA * now, end, call.signals[steps])
+            status, count = take_step(call, now, call.signals[steps], 2 * steps)
             solves += count
             if status == CONVERGED and not given:
-                error, which = estimate(r.e, d, y, r.k, now, r.rtol)
-                error = max(error, (now * passing(s, w) / PASSED) ** 3)
+                error, which = estimate(call.errors, taken, y, call.k, now, call.rtol)
+                error = max(error, (now * passing(rig, work) / PASSED) ** 3)
                 if not error <= 1.0:
                     status = REFUSED
             if status == CONVERGED:
-                status = departed(s, w)
+                status = departed(rig, work)
             if status == CONVERGED:
                 while last < out.step.size and (
                     out.step[last] == steps if given else t_out[last] <= end
@@ -181,23 +200,25 @@ def run(r: Any) -> None:
                     if not given:
                         part = (t_out[last] - t) / now
                         out.step[last], out.part[last] = steps, part if part < 1.0 - 1e-9 else 1.0
-                        follow(r.f, t_out[last], t_out[last], out.signals[last : last + 1])
+                        follow(
+                            call.followed, t_out[last], t_out[last], out.signals[last : last + 1]
+                        )
                     last += 1
         if status == CONVERGED:
-            limits = r.start if begin else r.limits
-            status, count = write_rows(r, limits, now, row, last)
+            limits = call.start if begin else call.limits
+            status, count = write_rows(call, limits, now, row, last)
             solves += count
         if begin and status != CONVERGED:
             break
         if begin:
-            put(w.k, r.k)
-            afresh(w)
+            put(work.k, call.k)
+            afresh(work)
             begin, row, solves = False, last, 0
         elif status == CONVERGED:
             if not given:
-                r.starts[steps], h[steps] = t, now
-                put(d.K[1], r.k)
-                enlarge(r.e, y)
+                call.starts[steps], h[steps] = t, now
+                put(taken.K[1], call.k)
+                enlarge(call.errors, y)
                 error = max(error, LEAST_ERROR)
                 longer = now * min(
                     LARGEST, max(SMALLEST, SAFETY * error**-INTEGRAL * clock[2] ** PROPORTIONAL)
@@ -206,14 +227,14 @@ def run(r: Any) -> None:
                 clock[0], clock[1], clock[2] = end, length, error
             row, steps = last, steps + 1
         else:
-            take_back(r)
+            take_back(call)
             # not `now`, which rounding leaves a little longer
-            again = not given and length > r.shortest
+            again = not given and length > call.shortest
             if again and status == REFUSED:
                 refused, smaller = refused + 1, SAFETY * error ** (-1.0 / 3.0)
-                clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), r.shortest)
+                clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), call.shortest)
             elif again and status in (NEWTON_FAILED, NOT_FINITE):
-                failed, clock[1] = failed + 1, max(now * SMALLEST, r.shortest)
+                failed, clock[1] = failed + 1, max(now * SMALLEST, call.shortest)
             else:
                 break
             status = CONVERGED
@@ -222,13 +243,13 @@ def run(r: Any) -> None:
 
 
 @compiled
-def enlarge(e: Any, y: Array) -> None:
+def enlarge(errors: Any, y: Array) -> None:
     """Note how large every part of the state has become."""
-    for part in range(e.first.size):
+    for part in range(errors.first.size):
         size = 0.0
-        for i in range(e.first[part], e.last[part]):
-            size += (y[i] - e.origin[i]) ** 2
-        e.size[part] = max(e.size[part], np.sqrt(size))
+        for i in range(errors.first[part], errors.last[part]):
+            size += (y[i] - errors.origin[i]) ** 2
+        errors.size[part] = max(errors.size[part], np.sqrt(size))
 
 
 AT_ONCE = 1e-18
@@ -236,24 +257,26 @@ AT_ONCE = 1e-18
 
 
 @compiled
-def rates(r: Any) -> None:
+def rates(call: Any) -> None:
     """dy/dt of the state y at t [s] into out, of a rig whose pads are massless; converged receives
     0 if Newton finds no forces there.
 
     A stage of no length gives all rates; those of the velocities are a difference over its length
     and come from the loads instead. signals (1, signals, 2) is scratch, as are powers and wrenches.
     """
-    s, w, y, out = r.s, r.w, r.y, r.out
-    follow(r.f, r.t, r.t, r.signals)
-    for i in range(s.body_coordinate.size):
-        w.V[s.body_coordinate[i]] = y[s.body_V_start + i]
-    w.travelled[0] = np.inf  # the last state was any other one
-    converged, _, _ = solve_near(s, w, r.limits, y, r.signals[0], AT_ONCE, r.powers, r.wrenches)
-    put(w.k, out)
-    for i in range(s.source_pushed.size):
-        w.load[s.source_pushed[i]] += effort(s, w, i, y, r.signals[0], AT_ONCE)
-    for i in range(s.body_coordinate.size):
-        load = w.load[s.body_coordinate[i]]
-        out[s.body_V_start + i] = load / s.p[s.body_mass_at[i]]  # (17), (18)
-        out[s.body_q_start + i] = y[s.body_V_start + i]
-    r.converged[0] = 1 if converged else 0
+    rig, work, y, out = call.rig, call.work, call.y, call.out
+    follow(call.followed, call.t, call.t, call.signals)
+    for i in range(rig.body_coordinate.size):
+        work.V[rig.body_coordinate[i]] = y[rig.body_V_start + i]
+    work.travelled[0] = np.inf  # the last state was any other one
+    converged, _, _ = solve_near(
+        rig, work, call.limits, y, call.signals[0], AT_ONCE, call.powers, call.wrenches
+    )
+    put(work.k, out)
+    for i in range(rig.source_pushed.size):
+        work.load[rig.source_pushed[i]] += effort(rig, work, i, y, call.signals[0], AT_ONCE)
+    for i in range(rig.body_coordinate.size):
+        load = work.load[rig.body_coordinate[i]]
+        out[rig.body_V_start + i] = load / rig.p[rig.body_mass_at[i]]  # (17), (18)
+        out[rig.body_q_start + i] = y[rig.body_V_start + i]
+    call.converged[0] = 1 if converged else 0

@@ -23,129 +23,129 @@ step lessens it."""
 
 
 @compiled
-def drive(s: Any, w: Any, y: Array, signals: Array, a: float) -> None:
+def drive(rig: Any, work: Any, y: Array, signals: Array, a: float) -> None:
     """All coordinates at the end of the stage: those of the state for the free velocities in V,
     signals for the others."""
-    q, V = w.q, w.V
-    for c in range(s.body_free.size):
-        if s.body_free[c] >= 0:
-            q[c] = y[s.body_q_start + s.body_free[c]] + a * V[c]
-        elif s.body_signal[c] >= 0:
-            q[c], V[c] = signals[s.body_signal[c], 0], signals[s.body_signal[c], 1]
+    q, V = work.q, work.V
+    for c in range(rig.body_free.size):
+        if rig.body_free[c] >= 0:
+            q[c] = y[rig.body_q_start + rig.body_free[c]] + a * V[c]
+        elif rig.body_signal[c] >= 0:
+            q[c], V[c] = signals[rig.body_signal[c], 0], signals[rig.body_signal[c], 1]
 
 
 @compiled
-def scan(s: Any, w: Any, y: Array, margin: float) -> None:
-    """List the points within `margin` [m] of touching at the stage's start, w.q, in `w.window`;
-    needs `pads.begin`."""
-    contacts.relate_all(s, w)
-    for pad in range(s.pad_base.size):
-        first, last = s.pad_node_start[pad], s.pad_node_start[pad + 1]
-        pads.displace(s, w, pad, y, first, last)
-        at = s.pad_point_start[pad]
+def scan(rig: Any, work: Any, y: Array, margin: float) -> None:
+    """List the points within `margin` [m] of touching at the stage's start, work.q, in
+    `work.window`; needs `pads.begin`."""
+    contacts.relate_all(rig, work)
+    for pad in range(rig.pad_base.size):
+        first, last = rig.pad_node_start[pad], rig.pad_node_start[pad + 1]
+        pads.displace(rig, work, pad, y, first, last)
+        at = rig.pad_point_start[pad]
         count, low, high = 0, last, first
-        for k in range(at, s.pad_point_start[pad + 1]):
-            n0, n1 = s.point_node[k, 0], s.point_node[k, 1]
-            ux, uy = contacts.at_point(s, k, w.u)
-            contacts.place(s, w, k, ux, uy, 0.0, 0.0, w.probe)
-            if not contacts.separation(s, w, k, w.probe) > margin:
-                w.window[at + count] = k
+        for k in range(at, rig.pad_point_start[pad + 1]):
+            n0, n1 = rig.point_node[k, 0], rig.point_node[k, 1]
+            ux, uy = contacts.at_point(rig, k, work.u)
+            contacts.place(rig, work, k, ux, uy, 0.0, 0.0, work.probe)
+            if not contacts.separation(rig, work, k, work.probe) > margin:
+                work.window[at + count] = k
                 count += 1
                 low, high = min(low, min(n0, n1)), max(high, max(n0, n1) + 1)
         for node in range(first, last):
-            if node < w.low[pad] or node >= w.high[pad]:
-                w.u_dot[node, 0], w.u_dot[node, 1] = w.free[node, 0], w.free[node, 1]
-        w.windows[pad], w.low[pad], w.high[pad] = count, low, max(low, high)
-    w.travelled[0], w.travelled[1], w.travelled[2] = 0.0, margin, w.travelled[2] + 1.0
+            if node < work.low[pad] or node >= work.high[pad]:
+                work.u_dot[node, 0], work.u_dot[node, 1] = work.free[node, 0], work.free[node, 1]
+        work.windows[pad], work.low[pad], work.high[pad] = count, low, max(low, high)
+    work.travelled[0], work.travelled[1], work.travelled[2] = 0.0, margin, work.travelled[2] + 1.0
 
 
 @compiled
 def solve_stage(
-    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, margin: float
+    rig: Any, work: Any, limits: Any, y: Array, signals: Array, a: float, margin: float
 ) -> tuple[bool, int]:
-    """Velocities (w.V, on entry the guess), nodal forces and rates at the end of the stage that
+    """Velocities (work.V, on entry the guess), nodal forces and rates at the end of the stage that
     starts from y.
 
     Newton ends when the law and the linear relations agree to the tolerance at every node. Returns
     success and the number of linear solves.
     """
-    count, free = s.pad_base.size, s.body_coordinate.size
-    drive(s, w, y, signals, a)
+    count, free = rig.pad_base.size, rig.body_coordinate.size
+    drive(rig, work, y, signals, a)
     for pad in range(count):
-        pads.begin(s, w, pad, y, a)
-    if not w.travelled[0] <= w.travelled[1]:  # also where they are no numbers yet
-        scan(s, w, y, margin)
+        pads.begin(rig, work, pad, y, a)
+    if not work.travelled[0] <= work.travelled[1]:  # also where they are no numbers yet
+        scan(rig, work, y, margin)
     for pad in range(count):
-        pads.displace(s, w, pad, y, w.low[pad], w.high[pad])
-        w.F_linear[w.low[pad] : w.high[pad]] = 0.0
-    V_old, dV, r, Rv, b = w.V_old, w.dV, w.r, w.Rv, w.b
+        pads.displace(rig, work, pad, y, work.low[pad], work.high[pad])
+        work.F_linear[work.low[pad] : work.high[pad]] = 0.0
+    V_old, dV, r, Rv, b = work.V_old, work.dV, work.r, work.Rv, work.b
     previous, part, iteration = np.inf, 1.0, 0
     while True:
-        contacts.relate_all(s, w)
+        contacts.relate_all(rig, work)
         mismatch, squares = 0.0, 0.0
         for pad in range(count):
-            contacts.evaluate(s, w, pad, y, a)
-            worst, total = pads.evaluate(s, w, pad, y, a)
+            contacts.evaluate(rig, work, pad, y, a)
+            worst, total = pads.evaluate(rig, work, pad, y, a)
             mismatch, squares = worst if not worst <= mismatch else mismatch, squares + total
         most = previous if iteration > SEARCH_AFTER else np.inf
         stuck = iteration > 0 and not squares < most
         if stuck and part > SHORTEST:
             part *= 0.5
             for pad in range(count):
-                pads.move(s, w, pad, part)
+                pads.move(rig, work, pad, part)
             for i in range(free):
-                c = s.body_coordinate[i]
-                w.V[c] = V_old[c] + part * dV[i]
-            drive(s, w, y, signals, a)
+                c = rig.body_coordinate[i]
+                work.V[c] = V_old[c] + part * dV[i]
+            drive(rig, work, y, signals, a)
             continue
         if iteration > 0 and mismatch <= limits.tolerance:
             return True, iteration
         rounded = mismatch <= ROUNDED * limits.tolerance
         if not np.isfinite(mismatch) or iteration == limits.max_iterations or (stuck and rounded):
             return rounded, iteration
-        balance(s, w, y, signals, a, r, Rv)
+        balance(rig, work, y, signals, a, r, Rv)
         for pad in range(count):
-            contacts.linearise(s, w, pad, a, False)
-            contacts.touched_nodes(s, w, pad)
-            pads.assemble(s, w, pad, y, a, Rv)
-            contacts.residual(s, w, pad, r)
-            pads.react(s, w, pad, y, a, r)
-            contacts.eliminate(s, w, pad, 1, r, Rv)
+            contacts.linearise(rig, work, pad, a, False)
+            contacts.touched_nodes(rig, work, pad)
+            pads.assemble(rig, work, pad, y, a, Rv)
+            contacts.residual(rig, work, pad, r)
+            pads.react(rig, work, pad, y, a, r)
+            contacts.eliminate(rig, work, pad, 1, r, Rv)
         for i in range(free):
             b[i, 0] = -r[i, 0]
         solve_dense(Rv, b, free, 1)
         for i in range(free):
             dV[i] = b[i, 0]
-        put(w.V, V_old)
+        put(work.V, V_old)
         for pad in range(count):
-            pads.propose(s, w, pad, a, 1, dV)
-            pads.move(s, w, pad, 1.0)
+            pads.propose(rig, work, pad, a, 1, dV)
+            pads.move(rig, work, pad, 1.0)
         for i in range(free):
-            w.V[s.body_coordinate[i]] += dV[i]
-        drive(s, w, y, signals, a)
+            work.V[rig.body_coordinate[i]] += dV[i]
+        drive(rig, work, y, signals, a)
         previous, part, iteration = squares, 1.0, iteration + 1
 
 
 @compiled
 def finish(
-    s: Any, w: Any, y: Array, signals: Array, a: float, powers: Array, wrenches: Array
+    rig: Any, work: Any, y: Array, signals: Array, a: float, powers: Array, wrenches: Array
 ) -> float:
-    """All rates of the accepted stage in w.k, what the pads and contacts dissipate in `powers`
-    (pads, dashpots, slip) [W], generalised forces in w.load, the force on every pad [N] and its
+    """All rates of the accepted stage in work.k, what the pads and contacts dissipate in `powers`
+    (pads, dashpots, slip) [W], generalised forces in work.load, the force on every pad [N] and its
     moment (Eq. 35) [N.m] in its base's axes. Returns a bound of every surface speed [m/s]."""
-    count, fastest, bound = s.pad_base.size, 0.0, 0.0
+    count, fastest, bound = rig.pad_base.size, 0.0, 0.0
     powers[: count + 2] = 0.0
-    contacts.loads(s, w)
+    contacts.loads(rig, work)
     for pad in range(count):
-        contacts.finish(s, w, pad, y, a, powers, wrenches[pad])
-        fastest = max(fastest, pads.finish(s, w, pad, y, a, powers, wrenches[pad]))
-    for i in range(s.body_coordinate.size):
-        c = s.body_coordinate[i]
-        w.k[s.body_q_start + i] = w.V[c]
-        w.k[s.body_V_start + i] = (w.V[c] - y[s.body_V_start + i]) / a
-    remember(s, w, y, signals, a)
-    for c in range(s.contact_pad.size):
-        rate = w.relative[c, 3:]
-        speed = np.hypot(rate[0], rate[1]) + abs(rate[2]) * s.contact_size[c]
+        contacts.finish(rig, work, pad, y, a, powers, wrenches[pad])
+        fastest = max(fastest, pads.finish(rig, work, pad, y, a, powers, wrenches[pad]))
+    for i in range(rig.body_coordinate.size):
+        c = rig.body_coordinate[i]
+        work.k[rig.body_q_start + i] = work.V[c]
+        work.k[rig.body_V_start + i] = (work.V[c] - y[rig.body_V_start + i]) / a
+    remember(rig, work, y, signals, a)
+    for c in range(rig.contact_pad.size):
+        rate = work.relative[c, 3:]
+        speed = np.hypot(rate[0], rate[1]) + abs(rate[2]) * rig.contact_size[c]
         bound = max(bound, speed)
     return bound + fastest

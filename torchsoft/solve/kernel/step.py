@@ -30,146 +30,161 @@ from torchsoft.solve.kernel.table import Array
 
 
 @compiled
-def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array, way: float) -> bool:
+def write_tape(rig: Any, work: Any, tape: Any, row: int, y: Array, way: float) -> bool:
     """Put one solved stage on the tape, its displacements after `way` [s] at its rates; False if
     more points touch than it has room for."""
     put(y, tape.y[row])
-    put(w.q, tape.q[row])
-    put(w.V, tape.V[row])
-    put(w.rate, tape.rate[row])
+    put(work.q, tape.q[row])
+    put(work.V, tape.V[row])
+    put(work.rate, tape.rate[row])
     slot = 0
-    for pad in range(s.pad_base.size):
-        at = s.pad_point_start[pad]
-        tape.count[row, pad] = w.actives[pad]
-        if slot + w.actives[pad] > tape.point.shape[1]:
+    for pad in range(rig.pad_base.size):
+        at = rig.pad_point_start[pad]
+        tape.count[row, pad] = work.actives[pad]
+        if slot + work.actives[pad] > tape.point.shape[1]:
             return False
-        for i in range(w.actives[pad]):
-            k = w.active[at + i]
+        for i in range(work.actives[pad]):
+            k = work.active[at + i]
             tape.point[row, slot] = k
             state = tape.state[row, slot]
-            ux, uy = contacts.at_point(s, k, w.u)
-            state[2], state[3] = contacts.at_point(s, k, w.u_dot)
+            ux, uy = contacts.at_point(rig, k, work.u)
+            state[2], state[3] = contacts.at_point(rig, k, work.u_dot)
             state[0], state[1] = ux + way * state[2], uy + way * state[3]
             slot += 1
     return True
 
 
 @compiled
-def departed(s: Any, w: Any) -> int:
+def departed(rig: Any, work: Any) -> int:
     """Whether a contact has reached the end of a pad, or a body has left the space over one."""
-    for c in range(s.contact_pad.size):
-        at = s.pad_point_start[s.contact_pad[c]]
-        for i in range(w.actives[s.contact_pad[c]]):
+    for c in range(rig.contact_pad.size):
+        at = rig.pad_point_start[rig.contact_pad[c]]
+        for i in range(work.actives[rig.contact_pad[c]]):
             if (
-                w.active[at + i] == s.contact_point_start[c]
-                or w.active[at + i] == s.contact_point_start[c + 1] - 1
+                work.active[at + i] == rig.contact_point_start[c]
+                or work.active[at + i] == rig.contact_point_start[c + 1] - 1
             ):
                 return OFF_THE_PAD
-        x, y, limit = w.relative[c, 0], w.relative[c, 1], s.contact_limits[c]
+        x, y, limit = work.relative[c, 0], work.relative[c, 1], rig.contact_limits[c]
         if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
             return LOST
     return CONVERGED
 
 
 @compiled
-def record(s: Any, w: Any, wrenches: Array, out: Array) -> None:
+def record(rig: Any, work: Any, wrenches: Array, out: Array) -> None:
     """One row of forces, as `recorded_size` orders them."""
     out[:] = 0.0
-    for pad in range(s.pad_base.size):
-        at = s.pad_point_start[pad]
-        for i in range(w.actives[pad]):
-            k = w.active[at + i]
-            felt = WRENCH + s.contact_states[s.point_contact[k]]
-            out[2 * k], out[2 * k + 1] = w.out[k, felt], w.out[k, felt + 1]
-    first = 2 * s.point_contact.size
+    for pad in range(rig.pad_base.size):
+        at = rig.pad_point_start[pad]
+        for i in range(work.actives[pad]):
+            k = work.active[at + i]
+            felt = WRENCH + rig.contact_states[rig.point_contact[k]]
+            out[2 * k], out[2 * k + 1] = work.out[k, felt], work.out[k, felt + 1]
+    first = 2 * rig.point_contact.size
     put(wrenches, out[first : first + wrenches.size])
-    put(w.load, out[first + wrenches.size :])
+    put(work.load, out[first + wrenches.size :])
 
 
 @compiled
-def stored(s: Any, w: Any, y: Array) -> float:
+def stored(rig: Any, work: Any, y: Array) -> float:
     """Energy [J] of the rig in the state y where the last stage ended; nan with nodal pads."""
     total = 0.0
-    for pad in range(s.pad_base.size):
-        total += pads.stored(s, pad, y) + contacts.stored(s, w, pad, y)
-    for i in range(s.body_coordinate.size):
-        total += 0.5 * s.p[s.body_mass_at[i]] * y[s.body_V_start + i] ** 2
+    for pad in range(rig.pad_base.size):
+        total += pads.stored(rig, pad, y) + contacts.stored(rig, work, pad, y)
+    for i in range(rig.body_coordinate.size):
+        total += 0.5 * rig.p[rig.body_mass_at[i]] * y[rig.body_V_start + i] ** 2
     return total
 
 
 @compiled
 def solve_near(
-    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, powers: Array, wrenches: Array
+    rig: Any,
+    work: Any,
+    limits: Any,
+    y: Array,
+    signals: Array,
+    a: float,
+    powers: Array,
+    wrenches: Array,
 ) -> tuple[bool, int, float]:
     """A stage from y with every point that may touch in the window: success, linear solves, a bound
     of all speeds [m/s]."""
     solves, speed, margin, done, converged = 0, 0.0, limits.margin, False, True
     reach = margin
     while converged and not done:
-        converged, count = solve_stage(s, w, limits, y, signals, a, reach)
+        converged, count = solve_stage(rig, work, limits, y, signals, a, reach)
         solves += count
         if converged:
-            speed = finish(s, w, y, signals, a, powers, wrenches)
-            done = w.travelled[0] + a * speed <= w.travelled[1]
+            speed = finish(rig, work, y, signals, a, powers, wrenches)
+            done = work.travelled[0] + a * speed <= work.travelled[1]
             if not done:  # a point may have come near that was not looked at
                 converged = reach == margin  # one look further must do
-                if w.travelled[0] == 0.0:
+                if work.travelled[0] == 0.0:
                     reach = margin + 1.5 * a * speed
-                w.travelled[0] = np.inf
+                work.travelled[0] = np.inf
     return converged, solves, speed
 
 
 @compiled
-def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
+def take_step(call: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
     """One step of h [s] from y, which goes to its end with `integrals`; signals (2, signals, 2) are
-    those of the stages, `row` the first one's on the tape. The start stays in d.y, d.integrals;
-    d.K, d.powers and d.speed receive the stages' results. Returns status and solves."""
-    s, w, d, y, integrals, tape = r.s, r.w, r.d, r.y, r.integrals, r.tape
+    those of the stages, `row` the first one's on the tape. The start stays in taken.y,
+    taken.integrals; taken.K, taken.powers and taken.speed receive the stages' results. Returns
+    status and solves."""
+    rig, work, taken, y, integrals, tape = (
+        call.rig,
+        call.work,
+        call.taken,
+        call.y,
+        call.integrals,
+        call.tape,
+    )
     a, solves = GAMMA * h, 0
-    put(y, d.y)
-    put(integrals, d.integrals)
-    put(w.V, d.V)
-    put(w.u_dot, d.u_dot)
-    put(w.rate, d.rate)
-    put(w.travelled, d.travelled)
+    put(y, taken.y)
+    put(integrals, taken.integrals)
+    put(work.V, taken.V)
+    put(work.u_dot, taken.u_dot)
+    put(work.rate, taken.rate)
+    put(work.travelled, taken.travelled)
     status = CONVERGED
     for stage in range(2):
-        powers = d.powers[stage]
+        powers = taken.powers[stage]
         converged, count, speed = solve_near(
-            s, w, r.limits, y, signals[stage], a, powers, d.wrenches
+            rig, work, call.limits, y, signals[stage], a, powers, taken.wrenches
         )
         solves += count
         if not converged:
             status = NEWTON_FAILED
             break
-        if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y, 0.0):
+        if tape.y.shape[0] > 0 and not write_tape(rig, work, tape, row + stage, y, 0.0):
             status = TAPE_FULL
             break
-        sources.supply(s, w, y, signals[stage], a, powers, s.pad_base.size + 2)
-        put(w.k, d.K[stage])
-        d.speed[stage] = speed
+        sources.supply(rig, work, y, signals[stage], a, powers, rig.pad_base.size + 2)
+        put(work.k, taken.K[stage])
+        taken.speed[stage] = speed
         dt = a if stage == 1 else h - a
         for i in range(integrals.size):
             integrals[i] += dt * powers[i]
         for i in range(y.size):
-            value = y[i] + dt * w.k[i]
+            value = y[i] + dt * work.k[i]
             y[i] = value if abs(value) > TINY else 0.0
-        w.travelled[0] += dt * speed
+        work.travelled[0] += dt * speed
     if status == CONVERGED and not np.isfinite(y.sum()):
         status = NOT_FINITE
     return status, solves
 
 
 @compiled
-def take_back(r: Any) -> None:
+def take_back(call: Any) -> None:
     """Return to where `take_step` began."""
-    w, d = r.w, r.d
-    put(d.y, r.y)
-    put(d.integrals, r.integrals)
-    put(d.V, w.V)
-    put(d.u_dot, w.u_dot)
-    put(d.rate, w.rate)
-    w.travelled[0] = np.inf
+    work, taken = call.work, call.taken
+    put(taken.y, call.y)
+    put(taken.integrals, call.integrals)
+    put(taken.V, work.V)
+    put(taken.u_dot, work.u_dot)
+    put(taken.rate, work.rate)
+    work.travelled[0] = np.inf
 
 
 @compiled
@@ -191,53 +206,62 @@ def dense_states(part: float) -> tuple[float, float, float]:
 
 
 @compiled
-def write_rows(r: Any, limits: Any, h: float, first: int, last: int) -> tuple[int, int]:
+def write_rows(call: Any, limits: Any, h: float, first: int, last: int) -> tuple[int, int]:
     """The outputs from `first` to `last` of the step just taken. At its end they are what the last
     stage found; before it, dense output with the forces that belong to it, which take a stage of no
     length; that is what `out.tape` holds, if it has rows. Returns status and linear solves."""
-    s, w, d, y, integrals, out = r.s, r.w, r.d, r.y, r.integrals, r.out
+    rig, work, taken, y, integrals, out = (
+        call.rig,
+        call.work,
+        call.taken,
+        call.y,
+        call.integrals,
+        call.out,
+    )
     parts, ys, tape = out.part, out.y, out.tape
-    solves, here = 0, w.travelled[0]
-    put(w.V, d.guess_V)
-    put(w.u_dot, d.guess)
-    put(w.rate, d.guess_rate)
+    solves, here = 0, work.travelled[0]
+    put(work.V, taken.guess_V)
+    put(work.u_dot, taken.guess)
+    put(work.rate, taken.guess_rate)
     for i in range(
         last - 1, first - 1, -1
     ):  # the end comes first: the others disturb what the last stage left
-        way, scans = GAMMA * h if parts[i] == 1.0 else 0.0, w.travelled[2]
+        way, scans = GAMMA * h if parts[i] == 1.0 else 0.0, work.travelled[2]
         if parts[i] == 1.0:
             put(y, ys[i])
-            put(integrals, d.at_row)
+            put(integrals, taken.at_row)
         else:
             b_1, b_2 = dense(parts[i])
             for j in range(y.size):
-                ys[i, j] = d.y[j] + h * (b_1 * d.K[0, j] + b_2 * d.K[1, j])
+                ys[i, j] = taken.y[j] + h * (b_1 * taken.K[0, j] + b_2 * taken.K[1, j])
             early = min(parts[i], 1.0 - GAMMA)
             for j in range(integrals.size):
                 first_part, second_part = b_1, b_2
                 if (
-                    j < s.pad_base.size + 2
+                    j < rig.pad_base.size + 2
                 ):  # what is dissipated never falls: a stage's power until its weight is used up
                     first_part, second_part = early, parts[i] - early
-                d.at_row[j] = d.integrals[j] + h * (
-                    first_part * d.powers[0, j] + second_part * d.powers[1, j]
+                taken.at_row[j] = taken.integrals[j] + h * (
+                    first_part * taken.powers[0, j] + second_part * taken.powers[1, j]
                 )
-            gone_by = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
-            w.travelled[0] = gone_by if scans == d.travelled[2] else np.inf
+            gone_by = taken.travelled[0] + h * (
+                abs(b_1) * taken.speed[0] + abs(b_2) * taken.speed[1]
+            )
+            work.travelled[0] = gone_by if scans == taken.travelled[2] else np.inf
             converged, count, _ = solve_near(
-                s, w, limits, ys[i], out.signals[i], INSTANT, d.scrap, d.wrenches
+                rig, work, limits, ys[i], out.signals[i], INSTANT, taken.scrap, taken.wrenches
             )
             solves += count
             if not converged:
                 return NEWTON_FAILED, solves
-        if tape.count.shape[0] > 0 and not write_tape(s, w, tape, i, ys[i], way):
+        if tape.count.shape[0] > 0 and not write_tape(rig, work, tape, i, ys[i], way):
             return TAPE_FULL, solves
-        put(d.at_row, out.integrals[i])
-        record(s, w, d.wrenches, out.recorded[i])
-        put(w.rate, out.rate[i])
-        out.stored[i] = stored(s, w, ys[i])
-        put(d.guess_V, w.V)
-        put(d.guess, w.u_dot)
-        put(d.guess_rate, w.rate)
-        w.travelled[0] = here if w.travelled[2] == scans else np.inf
+        put(taken.at_row, out.integrals[i])
+        record(rig, work, taken.wrenches, out.recorded[i])
+        put(work.rate, out.rate[i])
+        out.stored[i] = stored(rig, work, ys[i])
+        put(taken.guess_V, work.V)
+        put(taken.guess, work.u_dot)
+        put(taken.guess_rate, work.rate)
+        work.travelled[0] = here if work.travelled[2] == scans else np.inf
     return CONVERGED, solves
