@@ -162,6 +162,27 @@ def difference(end: Fit, one: Variation) -> tuple[Array | None, str]:
     return (None, got.reason) if got.failed else (got.r - end.at.r, "")
 
 
+def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[str, float]:
+    """Fraction of the effect of a cause that each of some other assumptions has, to first order at
+    the end of the fit under it and beside its other coordinates, by name; without those whose run
+    fails."""
+    c, exact = fit.problem.coordinates, exact_columns(fit, others)[0]
+    k = c.labels.index(cause.label)
+    own = fit.free & (np.arange(len(c.labels)) != k)
+    Q, _ = np.linalg.qr(fit.at.J[:, own])
+
+    def across(d: Array) -> Array:
+        """Component (m,) orthogonal to the Jacobian of the others, of length one."""
+        d = d - Q @ (Q.T @ d)
+        return d / max(float(np.linalg.norm(d)), 1e-150)
+
+    effect = across(fit.at.J[:, k])
+    run = [(one, *difference(fit, one)) for one in others if one.vary is not None]
+    return {
+        one.name: float(across(d) @ effect) ** 2 for one, d, _ in (*exact, *run) if d is not None
+    }
+
+
 def under(end: Fit, other: Problem, x: Array) -> Fit:
     """The begin at x (n,) of the fit of a problem under assumptions, with the coordinates of the
     fit that has ended, and its own."""

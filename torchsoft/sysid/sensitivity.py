@@ -28,6 +28,7 @@ from torchsoft.sysid.refits import (
     exact_columns,
     far_off,
     joint_fit,
+    likeness,
     refit,
     shares,
 )
@@ -296,8 +297,9 @@ def new_fits(
 
     Sensors that explain the misfit by one kind of fault come first, in one fit, and costly suspects
     last. Once one suspect explains it, or `NEARLY` all of it, those with much smaller gains are
-    left out, and costly ones; numbers are left out, too, once a law leaves less than `RIVAL` of the
-    misfit that all numbers together leave.
+    left out, by their effects at the end under it where the fit was far off, and costly ones;
+    numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that all numbers
+    together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
@@ -333,7 +335,7 @@ def new_fits(
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
             if gain < enough or (enough and some[0].costly):
-                break
+                continue
             if name in bounded and least < bounded[name]:
                 continue
             bar.set_description(plain(f"new fit with another {name} ({number} of {len(order)})"))
@@ -350,6 +352,12 @@ def new_fits(
             if len(some) == 1:
                 yield some[0]
             if name in checks and judge.nearly(checks[name]):
+                number_alone = len(some) == 1 and some[0].kind in ("known", "sensor")
+                if far and not enough and number_alone and name in judge.ends:
+                    bar.set_description(plain(f"effects of the others under another {name}"))
+                    left = [one for (one, *more) in order[number:] if not (more or one.costly)]
+                    parts, gain = likeness(judge.ends[name], tried[0], left), checks[name].gain
+                    gains |= {one: part * gain for one, part in parts.items()}
                 enough = max(enough, RIVAL * gain)
         best = max(
             (name for name in ends if checks[name].suspected),
