@@ -20,8 +20,8 @@ FLOWS = {
     """,
     "codegen": "graph operations trace emit . stops",
     "physics": """
-        arguments mesh shapes state contact rate_and_state material hyperelastic elements pads
-        balance multibond parts
+        arguments mesh shapes state contact rate_and_state ageing material hyperelastic elements
+        pads balance multibond parts
         names motion validity graph energy statics start channels namespace rig extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torchsoft import (
     PD,
     Actuator,
+    AgeingSlip,
     Body,
     Circle,
     Contact,
@@ -316,6 +317,7 @@ RIGS: dict[str, Callable[[], Start]] = {
         mu=[2.8e5, -2e4], alpha=[1.8, -3.0], nu=0.45, rho=1100.0, tau=0.01, depth=0.044)),
     "network of energy": lambda: grip(material=NetworkEnergy()),
     "Coulomb": lambda: grip(friction=Coulomb(0.5, 0.4)),
+    "friction that ages": lambda: grip(friction=AgeingSlip(0.4, 0.3, ageing=0.02, age_0=0.01)),
     "rate and state": lambda: grip(friction=RateAndState(0.4, 0.02, 0.03, 4e-5, 1e-3, 0.05)),
     "network of friction": lambda: grip(friction=NetworkFriction()),
     "turning jaws": lambda: grip(

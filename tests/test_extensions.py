@@ -24,6 +24,7 @@ def test_what_a_rig_may_be_extended_by():
         "pads.L.E_ratio", "pads.L.tau_ratio", "pads.U.E_ratio", "pads.U.tau_ratio",
         "materials.rubber.fast(0.0001 s)", "materials.rubber.slow(0.1 s)",
         "materials.rubber.slow(1 s)", POWER, "laws.steel_on_rubber.adhesion",
+            "laws.steel_on_rubber.friction.ageing",
         "contacts.L.friction_ratio", "contacts.U.friction_ratio",
         "guides.bracket.x.friction", "guides.bracket.x.damping", "guides.bracket.y.friction",
         "guides.bracket.y.damping", "gravity_tilt",

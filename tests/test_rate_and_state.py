@@ -37,8 +37,13 @@ def test_the_slip_rate_solves_the_elements_equation():
     assert torch.equal(law(E, 0 * F_N, R, theta[:, None], h)[0], torch.exp(torch.log(E / R)))
 
 
-def sled(**friction: float) -> RigFile:
-    """A block that is drawn over a stiff pad, slowly and then ten times as fast."""
+FRICTION = {"kind": "rate_and_state", "mu_0": MU_0, "a": A, "b": B, "D_c": D_C, "V_0": V_0,
+            "theta_0": D_C / SLOW}  # fmt: skip
+
+
+def sled(**friction: Any) -> RigFile:
+    """A block that is drawn over a stiff pad, slowly and then ten times as fast, under the friction
+    of these tests with other numbers, or of another `kind`."""
     return RigFile.from_tree({
         "title": "velocity steps",
         "bodies": {"block": {
@@ -50,9 +55,8 @@ def sled(**friction: float) -> RigFile:
                                   "depth": 10e-3}},
         "pads": {"track": {"material": "plastic", "origin": [-20e-3, 0.0], "length": 40e-3,
                            "height": 10e-3, "elements_x": 40, "elements_y": 4}},
-        "laws": {"dry": {"K_n": 1e5, "R_n": 10.0, "K_t": 1e6, "R_t": 20.0, "friction": {
-            "kind": "rate_and_state", "mu_0": MU_0, "a": A, "b": B, "D_c": D_C, "V_0": V_0,
-            "theta_0": D_C / SLOW} | friction}},
+        "laws": {"dry": {"K_n": 1e5, "R_n": 10.0, "K_t": 1e6, "R_t": 20.0,
+                         "friction": friction if "kind" in friction else FRICTION | friction}},
         "contacts": {"track": {"pad": "track", "body": "block", "law": "dry"}},
         "motion": {"block.x": {"kind": "profile", "times": [0.0, 1.0], "values": [0.0, 1e-3]}},
         "outputs": {"duration": JUMP + 0.1, "interval": 1e-3, "video": "none", "figures": False},

@@ -17,7 +17,7 @@ materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony; at finit
             MooneyRivlin, Yeoh, Ogden, Hyperelastic (an energy of one's own)
 shapes      Circle, Ellipse, Superellipse, RoundedBox, RoundedPolygon, Contour,
             Eccentric
-friction    SmoothSlip, Coulomb, RateAndState, or any torch function
+friction    SmoothSlip, AgeingSlip, Coulomb, RateAndState, or any torch function
 motions     Reference, Profile, Sampled, hold
 runs        simulate, simulate_batch, Trajectory, Batch; register_method (torchdiffeq)
 beyond      torchsoft.sysid (identification), torchsoft.reduced, torchsoft.datasets, torchsoft.envs

@@ -1,5 +1,6 @@
 """torchsoft: a differentiable simulator of soft contact manipulation."""
 
+from .physics.ageing import AgeingSlip
 from .physics.contact import Coulomb, SmoothSlip, SoftContact
 from .physics.hyperelastic import Hyperelastic, MooneyRivlin, NeoHookean, Ogden, Yeoh
 from .physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
@@ -45,6 +46,7 @@ __all__ = [
     "METHOD",
     "PD",
     "Actuator",
+    "AgeingSlip",
     "Batch",
     "Body",
     "BuiltRig",

@@ -11,7 +11,8 @@ from typing import NamedTuple, TypeVar
 
 from torch import nn
 
-from torchsoft.physics.contact import REFERENCE_DEPTH, SoftContact
+from torchsoft.physics.ageing import AgeingSlip
+from torchsoft.physics.contact import REFERENCE_DEPTH, SmoothSlip, SoftContact
 from torchsoft.physics.material import Branch, Material
 from torchsoft.physics.parts import Actuator, Guide, Tilt
 from torchsoft.physics.rig import Rig
@@ -26,8 +27,8 @@ branches over the longest."""
 
 class Extension(NamedTuple):
     """A number that may be added: its `neutral` value, the `amount` of a variation and the interval
-    of a search [`unit`], clauses for the neutral value and for any other, and the function that
-    adds the parameter and returns it."""
+    of a search [`unit`], clauses for the neutral value and for any other, the function that adds
+    the parameter and returns it, and whether runs with it are `costly`, as with more states."""
 
     neutral: float
     amount: float
@@ -37,6 +38,7 @@ class Extension(NamedTuple):
     stated: str
     otherwise: str
     add: Callable[[Rig], nn.Parameter]
+    costly: bool = False
 
 
 def extensions(rig: Rig) -> dict[str, Extension]:
@@ -79,6 +81,14 @@ def extensions(rig: Rig) -> dict[str, Extension]:
             f"a point that touches adhered with 0.001 N per {1e3 * law.node_spacing:g} mm",
             partial(_of_law, stem=stem, name="adhesion", neutral=0.0),
         )  # fmt: skip
+        friction = law.friction
+        own = type(friction) is not SmoothSlip  # a law of the user's, or another one
+        if isinstance(friction, SmoothSlip) and not own and friction.R_pad is None:
+            out[f"{stem}.friction.ageing"] = Extension(
+                0.0, 2e-3, 0.0, 0.5, "", f"friction of {stem} does not age",
+                "static friction grew by 0.002 for every factor e of the time at rest",
+                partial(_ageing, friction=friction), costly=True,
+            )  # fmt: skip
         users = [name for name, one in rig.contacts.items() if same_law(one.law, law)]
         for name in users if len(users) > 1 else ():
             out[f"contacts.{name}.friction_ratio"] = Extension(
@@ -174,6 +184,17 @@ def _of_law(rig: Rig, stem: str, name: str, neutral: float) -> nn.Parameter:
         if same_law(contact.law, law):
             setattr(contact.law, name, made)
     return made
+
+
+def _ageing(rig: Rig, friction: SmoothSlip) -> nn.Parameter:
+    """Put friction that ages in the place of the smooth friction with the same parameters."""
+    own = friction._parameters
+    made = AgeingSlip(*(own[name].item() for name in ("mu_s", "mu_k", "v_s")))  # pyright: ignore[reportOptionalMemberAccess]
+    made._parameters.update(own)
+    for contact in rig.contacts.values():
+        if contact.law.friction is friction:
+            contact.law.friction = made
+    return made.ageing
 
 
 def _friction_ratio(rig: Rig, name: str) -> nn.Parameter:

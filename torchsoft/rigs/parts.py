@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, TypeAdapter, mo
 
 from torchsoft.display import suggestion
 from torchsoft.materials.presets import PRESETS, from_shore_a
+from torchsoft.physics.ageing import AgeingSlip
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.hyperelastic import KINDS
 from torchsoft.physics.material import Material
@@ -547,6 +548,7 @@ else:
             table_of(SmoothSlip, "smooth"),
             table_of(Coulomb, "coulomb"),
             table_of(RateAndState, "rate_and_state"),
+            table_of(AgeingSlip, "ageing"),
             CodeTable,
         ),
         **{

@@ -104,7 +104,7 @@ def add_results(run: Trajectory, add: Add) -> None:
             meaning = f"displacements of the relaxing branches of the pad {key}"
             v = run.state.pads[key][..., 2:].unflatten(-1, (-1, 2)).movedim(-2, 1)
             add(f"relaxing_{key}", ("time", f"{key}_branch", *nodes), v, "m", meaning)
-    for block in own_states(run.layout, run.setup):
+    for block in own_arrays(run.layout, run.setup):
         name, dims, meaning = STATES[block.field]
         value, unit = getattr(run.state, block.field)[block.name], ", ".join(block.units)
         own = [one.format(block.name) for one in (*dims, meaning)]
@@ -130,7 +130,7 @@ def add_results(run: Trajectory, add: Add) -> None:
         add(f"sensitivities_{name}", ("time", "unknown"), value, "", meaning)
 
 
-def own_states(layout: Layout, setup: Setup) -> Iterator[StateBlock]:
+def own_arrays(layout: Layout, setup: Setup) -> Iterator[StateBlock]:
     """States that have an array of their own."""
     for block in layout.blocks.values():
         if block.field in STATES and not (block.field == "pads" and setup.pads[block.name].nodal):
@@ -252,7 +252,7 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
     }
     layout = Layout(free, (StateBlock.again(*block) for block in states))
     fields: dict[str, dict[str, Tensor]] = {field: {} for field in State._fields}
-    for block in own_states(layout, setup):
+    for block in own_arrays(layout, setup):
         fields[block.field][block.name] = of(STATES[block.field][0].format(block.name))
     for name, pad in setup.pads.items():
         if pad.nodal:
