@@ -356,6 +356,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
         explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
+        ends={},
         together=lambda name, again, stated, tried, linear: replace(
             linear[0], name=name, left=50.0 if len(tried) > 1 else lefts.get(name, 999.0),
             refitted=True,

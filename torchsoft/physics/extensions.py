@@ -27,8 +27,8 @@ branches over the longest."""
 
 class Extension(NamedTuple):
     """A number that may be added: its `neutral` value, the `amount` of a variation and the interval
-    of a search [`unit`], clauses for the neutral value and for any other, the function that adds
-    the parameter and returns it, and whether runs with it are `costly`, as with more states."""
+    of a search [`unit`], clauses for the neutral value and for any other, and the function that
+    adds the parameter and returns it."""
 
     neutral: float
     amount: float
@@ -38,7 +38,6 @@ class Extension(NamedTuple):
     stated: str
     otherwise: str
     add: Callable[[Rig], nn.Parameter]
-    costly: bool = False
 
 
 def extensions(rig: Rig) -> dict[str, Extension]:
@@ -87,7 +86,7 @@ def extensions(rig: Rig) -> dict[str, Extension]:
             out[f"{stem}.friction.ageing"] = Extension(
                 0.0, 2e-3, 0.0, 0.5, "", f"friction of {stem} does not age",
                 "static friction grew by 0.002 for every factor e of the time at rest",
-                partial(_ageing, friction=friction), costly=True,
+                partial(_ageing, friction=friction),
             )  # fmt: skip
         users = [name for name, one in rig.contacts.items() if same_law(one.law, law)]
         for name in users if len(users) > 1 else ():

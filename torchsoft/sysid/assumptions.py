@@ -157,11 +157,6 @@ class Variation(Assumption):
             return 0.0, 1.0
         return -AMOUNTS * self.amount * (not self.one_sided), AMOUNTS * self.amount
 
-    @property
-    def is_lengthy(self) -> bool:
-        """Whether a new fit with it takes minutes."""
-        return self.costly and self.kind == "law"
-
     def within(self, amount: float) -> "Variation":
         """The variation with a range for another amount, wider for a large one."""
         wider = min(max(abs(amount / self.amount) / NEAR, 1.0), WIDEST)
@@ -204,7 +199,7 @@ def assumptions(
             more = Variation(
                 name, "known", one.stated, one.otherwise, one.amount, one.unit, parameter=name,
                 nominal=one.neutral, step=one.amount, one_sided=one.low == one.neutral,
-                extension=True, costly=one.costly,
+                extension=True,
             )  # fmt: skip
             out.append(more)
     return [*out, *of_sensors(first, unknown, sensors)]

@@ -295,11 +295,11 @@ def new_fits(
 ) -> Iterator[Variation]:
     """Repeat the fit with one suspect after the other, and replace its test in `checks`.
 
-    Sensors that explain the misfit by one kind of fault come first, in one fit, and lengthy
-    suspects last. Once one suspect explains it, or `NEARLY` all of it, those with much smaller
-    gains are left out, by their effects at the end under it where the fit was far off, and lengthy
-    ones; numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that all
-    numbers together leave.
+    Sensors that explain the misfit by one kind of fault come first, in one fit, and costly suspects
+    last. Once one suspect explains it, or `NEARLY` all of it, those with much smaller gains are
+    left out, by their effects at the end under it where the fit was far off, and costly ones;
+    numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that all numbers
+    together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
@@ -321,7 +321,7 @@ def new_fits(
             [one]
             for one in sorted(
                 candidates,
-                key=lambda one: (one.is_lengthy, blind and one.kind != "law", -gains[one.name]),
+                key=lambda one: (one.costly, blind and one.kind != "law", -gains[one.name]),
             )
         ]
         if explains and len(together) > 1:
@@ -334,7 +334,7 @@ def new_fits(
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
-            if gain < enough or (enough and some[0].is_lengthy):
+            if gain < enough or (enough and some[0].costly):
                 continue
             if name in bounded and least < bounded[name]:
                 continue
@@ -355,7 +355,7 @@ def new_fits(
                 number_alone = len(some) == 1 and some[0].kind in ("known", "sensor")
                 if far and not enough and number_alone and name in judge.ends:
                     bar.set_description(plain(f"effects of the others under another {name}"))
-                    left = [one for (one, *more) in order[number:] if not (more or one.is_lengthy)]
+                    left = [one for (one, *more) in order[number:] if not (more or one.costly)]
                     parts, gain = likeness(judge.ends[name], tried[0], left), checks[name].gain
                     gains |= {one: part * gain for one, part in parts.items()}
                 enough = max(enough, RIVAL * gain)
