@@ -165,6 +165,14 @@ def contradictions(
             f"sum of squares would fall about as far: {listed}{more}: `explain` compares them by "
             "new fits"
         ]
+    rivals = [c for c in favoured[1:] if c.odds > LIKELY and c.passed]
+    if rivals:
+        some = [best, *rivals]
+        listed = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in some)
+        return [
+            f"the data contradict one of {len(some)} assumptions and do not tell which: the sum of "
+            f"squares {best.falls} under {listed}{between(some)}"
+        ]
     label, move = best.shift
     text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
     if label:
@@ -174,8 +182,16 @@ def contradictions(
     elif label:
         under = list(best.under.items())[:UNDER]
         text += f"; estimates under it: {', '.join(f'{name} = {x:.4g}' for name, x in under)}"
-    rivals = [c for c in favoured[1:] if c.odds > LIKELY and c.passed]
-    if rivals:
-        listed = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
-        text += f". The data cannot tell it (odds {best.odds:.2g}) from: {listed}"
     return [text]
+
+
+def between(some: Sequence[AssumptionTest]) -> str:
+    """A clause on where estimates lie under each of some suspects; empty where tests to first order
+    are too far off."""
+    if any(one.far for one in some):
+        return ""
+    shown = []
+    for label in [*some[0].under][:UNDER]:
+        values = [one.under[label] for one in some if label in one.under]
+        shown.append(f"{label} = {min(values):.4g} to {max(values):.4g}")
+    return f"; estimates under one or another: {', '.join(shown)}" if shown else ""
