@@ -596,7 +596,7 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch):
             raise KeyboardInterrupt
         return difference(*args)
 
-    monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
+    monkeypatch.setattr("torchsoft.sysid.refits.difference", interrupted)
     problem = Problem([brief()], SENSORS, {name: Unknown() for name in TRUTH})
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     assert answer[E].value == pytest.approx(TRUTH[E], rel=0.01)

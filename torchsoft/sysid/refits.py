@@ -1,8 +1,9 @@
 """Variations of a problem by one wrong assumption: effects on the residuals, and repeated fits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -112,6 +113,14 @@ Column = tuple[Variation, Array | None, str]
 """A variation with the change of the residuals (m,) by its amount, or None and the reason."""
 
 
+def columns(end: Fit, taken: Sequence[Variation]) -> tuple[Iterator[Column], Array | None]:
+    """Columns of assumptions, those that are exact first, the others when they are asked for, which
+    takes a run each; and the Jacobian (m, n) of the fitted coordinates on the same steps."""
+    exact, J = exact_columns(end, taken)
+    others = (one for one in taken if one.vary is not None)
+    return chain(exact, ((one, *difference(end, one)) for one in others)), J
+
+
 def exact_columns(end: Fit, taken: Sequence[Variation]) -> tuple[list[Column], Array | None]:
     """Columns of parameters, of extensions of the rigs, of faults of sensors and of other readings,
     and the Jacobian (m, n) of the fitted coordinates on the same steps: all from one run for each
@@ -166,7 +175,7 @@ def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[st
     """Fraction of the effect of a cause that each of some other assumptions has, to first order at
     the end of the fit under it and beside its other coordinates, by name; without those whose run
     fails."""
-    c, exact = fit.problem.coordinates, exact_columns(fit, others)[0]
+    c = fit.problem.coordinates
     k = c.labels.index(cause.label)
     own = fit.free & (np.arange(len(c.labels)) != k)
     Q, _ = np.linalg.qr(fit.at.J[:, own])
@@ -177,10 +186,8 @@ def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[st
         return d / max(float(np.linalg.norm(d)), 1e-150)
 
     effect = across(fit.at.J[:, k])
-    run = [(one, *difference(fit, one)) for one in others if one.vary is not None]
-    return {
-        one.name: float(across(d) @ effect) ** 2 for one, d, _ in (*exact, *run) if d is not None
-    }
+    found = columns(fit, others)[0]
+    return {one.name: float(across(d) @ effect) ** 2 for one, d, _ in found if d is not None}
 
 
 def under(end: Fit, other: Problem, x: Array) -> Fit:

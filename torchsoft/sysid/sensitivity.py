@@ -24,8 +24,7 @@ from torchsoft.sysid.fit import Fit, fisher, shift, standard_deviations
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import (
     NEARLY,
-    difference,
-    exact_columns,
+    columns,
     far_off,
     joint_fit,
     likeness,
@@ -246,24 +245,21 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, explain: bool = False
     faults = [f"{one.kind} of {one.name}" for one in c.all if one.kind in FAULTS]
     every = assumptions(recordings, {*c.names, *faults}, problem.sensors)
     taken = [one for one in every if doubtful or not one.costly]
-    checks, columns = dict[str, AssumptionTest](), list[Array]()
+    checks, constants = dict[str, AssumptionTest](), list[Array]()
     untried = [one.name for one in taken if one.vary is not None]
     # such as of pads that creep longer than the lead of a run
     with warnings.catch_warnings(action="ignore"):
-        exact, J = exact_columns(end, taken)
+        found, J = columns(end, taken)
     judge = Judge(end, J)
     try:
-        for one, d, reason in exact:
-            if d is None or d.any():
-                checks[one.name] = judge.first_order(one, d, reason)
-        for one in taken:
-            if one.vary is None:
+        for one, d, reason in found:
+            if one.vary is None and d is not None and not d.any():
                 continue
-            d, reason = difference(end, one)
             checks[one.name] = judge.first_order(one, d, reason)
             if d is not None and one.kind == "numerical":
-                columns.append(d)
-            untried.remove(one.name)
+                constants.append(d)
+            if one.vary is not None:
+                untried.remove(one.name)
         explained = judge.explained(checks.values())
         if doubtful and not end.at.failed:
             candidates = (rivals if explained else doubted)(taken, checks)
@@ -275,7 +271,7 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, explain: bool = False
             untried, candidates = [], []
     except KeyboardInterrupt:  # the fit is done: what was tried is kept
         candidates = []
-    rows = np.stack(columns, 1) if columns else np.zeros((len(judge.r), 0))
+    rows = np.stack(constants, 1) if constants else np.zeros((len(judge.r), 0))
     names = tuple(one.name for one in candidates)
     sd = dict(zip(judge.labels, judge.sd.tolist()))
     done = Checked(
