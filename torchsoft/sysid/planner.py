@@ -30,7 +30,7 @@ from torchsoft.display import suggestion
 from torchsoft.parallel import parallel_map, single_threaded
 from torchsoft.plan.knots import Moves
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import simulate
+from torchsoft.solve.simulate import unjudged
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choice, predict, prepared
@@ -329,7 +329,7 @@ class Planner:
         reference = self.moves.reference(variables)
         with self._begun() as begun:
             y0 = prepared(begun, self.problem.values(x, self.k), ())[0].detach()
-            run = simulate(
+            run = unjudged(
                 begun.rig,
                 self.grid.t,
                 y0=y0,
