@@ -511,6 +511,13 @@ def test_what_would_not_be_seen_is_said_with_its_size_or_its_price(same):
         "deviations",
         f"{E} takes far as exact: 1 % of it is +1.2 % of {E}",
     ]
+    hinted = one("hint", 1.0, 2.0, significance=12.0, favoured=1.5, favoured_sd=0.43)
+    first, *others = unseen(same._replace(checks=[*tests, hinted], sd={E: 0.004}))
+    assert first == (
+        f"hint: 2 % more or less than stated would not be seen, and moves {E} by 2 standard "
+        "deviations; the data favour +1.5 % +- 0.43, which may be chance"
+    )
+    assert others == [*said[:2], said[3]]
 
 
 @pytest.mark.slow

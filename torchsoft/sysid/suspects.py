@@ -23,6 +23,10 @@ MOVED = 0.5
 no notice."""
 
 
+HINT = 10.0
+"""Significance above which the data favour an assumption though not evidently: three standard
+deviations."""
+
 WORST = 3
 """Most sentences on assumptions of each kind that the data would not show to be wrong."""
 
@@ -118,36 +122,31 @@ def constant_notices(checked: Checked) -> list[str]:
 
 def unseen(checked: Checked) -> list[str]:
     """Sentences on assumptions that the data would not show to be wrong though estimates move by
-    more than a standard deviation, the worst first: those with a size from which on they would, and
-    those that only a change of the estimates could tell."""
-    hidden, priced = list[tuple[float, str]](), list[tuple[float, str]]()
+    more than a standard deviation, the worst first: those with a size from which on they would,
+    above all those that the data favour though not evidently, and those that only a change of the
+    estimates could tell."""
+    hidden, priced = list[tuple[bool, float, str]](), list[tuple[bool, float, str]]()
     for c in checked.checks:
         label, move, size = c.impact
         if c.kind not in ("known", "sensor") or c.unchecked or c.suspected or abs(move) < 1.0:
             continue
         if c.detectable <= AMOUNTS * c.amount:
-            hidden.append(
-                (
-                    abs(move),
-                    f"{c.name}: {size:.2g} {c.unit}".rstrip()
-                    + " more or less than stated would not "
-                    f"be seen, and moves {label} by {abs(move):.2g} standard deviations",
-                )
+            text = (
+                f"{c.name}: {size:.2g} {c.unit}".rstrip() + " more or less than stated would not "
+                f"be seen, and moves {label} by {abs(move):.2g} standard deviations"
             )
+            if hinted := c.significance > HINT:
+                text += (
+                    f"; the data favour {c.favoured:+.2g} {c.unit}".rstrip()
+                    + f" +- {c.favoured_sd:.2g}, which may be chance"
+                )
+            hidden.append((hinted, abs(move), text))
         else:
             part = 100 * c.moves[label] * checked.sd[label]
-            priced.append(
-                (
-                    abs(move),
-                    f"{label} takes {c.name} as exact: {c.amount:.2g} {c.unit}".rstrip()
-                    + f" of it is {part:+.2g} % of {label}",
-                )
-            )
-    return [
-        sentence
-        for some in (hidden, priced)
-        for _, sentence in sorted(some, key=lambda row: -row[0])[:WORST]
-    ]
+            text = f"{label} takes {c.name} as exact: {c.amount:.2g} {c.unit}".rstrip()
+            priced.append((False, abs(move), f"{text} of it is {part:+.2g} % of {label}"))
+    worst = [row for some in (hidden, priced) for row in sorted(some, reverse=True)[:WORST]]
+    return [text for _, _, text in worst]
 
 
 def contradictions(
