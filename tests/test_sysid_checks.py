@@ -518,6 +518,10 @@ def test_what_would_not_be_seen_is_said_with_its_size_or_its_price(same):
         "deviations; the data favour +1.5 % +- 0.43, which may be chance"
     )
     assert others == [*said[:2], said[3]]
+    more = [one("x", 4.0, 3.0), one("y", 8.0, 2.0), one("z", 7.0, 0.5)]
+    assert unseen(same._replace(checks=[*tests, *more], sd={E: 0.004}))[-1] == (
+        "1 more would move an estimate by up to 3.5 standard deviations without being seen: z"
+    )
 
 
 @pytest.mark.slow

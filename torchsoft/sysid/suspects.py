@@ -2,6 +2,7 @@
 misfit, constants of the computation that affect the estimates, and what would not be noticed."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from torchsoft.sysid.assumptions import AMOUNTS
 from torchsoft.sysid.sensitivity import AssumptionTest, Checked
@@ -26,6 +27,9 @@ no notice."""
 HINT = 10.0
 """Significance above which the data favour an assumption though not evidently: three standard
 deviations."""
+
+OFF = 3.0
+"""Shift of an estimate, in standard deviations, from which on every such assumption is named."""
 
 WORST = 3
 """Most sentences on assumptions of each kind that the data would not show to be wrong."""
@@ -120,12 +124,23 @@ def constant_notices(checked: Checked) -> list[str]:
     return out
 
 
+class Unseen(NamedTuple):
+    """An assumption that the data would not show to be wrong: whether they favour it though not
+    evidently, the largest shift of an estimate at a size that they would not show, in standard
+    deviations, its name, and a sentence."""
+
+    hinted: bool
+    move: float
+    name: str
+    text: str
+
+
 def unseen(checked: Checked) -> list[str]:
     """Sentences on assumptions that the data would not show to be wrong though estimates move by
     more than a standard deviation, the worst first: those with a size from which on they would,
-    above all those that the data favour though not evidently, and those that only a change of the
-    estimates could tell."""
-    hidden, priced = list[tuple[bool, float, str]](), list[tuple[bool, float, str]]()
+    above all those that the data favour though not evidently; those that only a change of the
+    estimates could tell; and the names of the others that move an estimate by `OFF`."""
+    hidden, priced = list[Unseen](), list[Unseen]()
     for c in checked.checks:
         label, move, size = c.impact
         if c.kind not in ("known", "sensor") or c.unchecked or c.suspected or abs(move) < 1.0:
@@ -140,13 +155,21 @@ def unseen(checked: Checked) -> list[str]:
                     f"; the data favour {c.favoured:+.2g} {c.unit}".rstrip()
                     + f" +- {c.favoured_sd:.2g}, which may be chance"
                 )
-            hidden.append((hinted, abs(move), text))
+            hidden.append(Unseen(hinted, abs(move), c.name, text))
         else:
             part = 100 * c.moves[label] * checked.sd[label]
             text = f"{label} takes {c.name} as exact: {c.amount:.2g} {c.unit}".rstrip()
-            priced.append((False, abs(move), f"{text} of it is {part:+.2g} % of {label}"))
-    worst = [row for some in (hidden, priced) for row in sorted(some, reverse=True)[:WORST]]
-    return [text for _, _, text in worst]
+            text += f" of it is {part:+.2g} % of {label}"
+            priced.append(Unseen(False, abs(move), c.name, text))
+    worst = [one for some in (hidden, priced) for one in sorted(some, reverse=True)[:WORST]]
+    others = sorted({*hidden, *priced} - {*worst}, key=lambda one: -one.move)
+    out, others = [one.text for one in worst], [one for one in others if one.move >= OFF]
+    if others:
+        out.append(
+            f"{len(others)} more would move an estimate by up to {others[0].move:.2g} standard "
+            f"deviations without being seen: {', '.join(one.name for one in others)}"
+        )
+    return out
 
 
 def contradictions(
