@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_rate_and_state import sled
 
-from torchsoft import AgeingSlip, Reference, RigFile, SmoothSlip, simulate
+from torchsoft import AgeingSlip, Reference, RigFile, SmoothSlip, Trajectory, simulate
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.motion import Lines
 
@@ -67,6 +67,16 @@ def test_static_friction_grows_with_the_logarithm_of_the_time_at_rest():
         t, friction = peak(rest)
         assert rest < t < rest + 0.01
         assert friction == pytest.approx(MU + AGEING * np.log1p(t / T_0), abs=0.05 * AGEING)
+
+
+def test_a_file_keeps_the_states_with_their_units(tmp_path):
+    built = sled(kind="ageing", mu_s=MU, mu_k=MU, ageing=AGEING).build()
+    run = simulate(built.rig, built.t[:3], y0=built.y0, rtol=1e-4)
+    assert run.to_xarray()["friction_state_track"].attrs["units"] == "s"
+    run.save(tmp_path / "run.nc")
+    again = Trajectory.load(tmp_path / "run.nc")
+    assert again.layout.blocks == run.layout.blocks
+    assert torch.equal(again.y, run.y)
 
 
 def test_a_rig_is_extended_by_ageing_and_keeps_its_names():

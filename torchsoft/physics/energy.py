@@ -33,7 +33,7 @@ class AtState:
         self.rig, self.state, self.displacement = rig, state, displacement
 
     @cached_property
-    def energies(self) -> tuple[Tensor, Tensor]:
+    def springs(self) -> tuple[Tensor, Tensor]:
         rig, zero = self.rig, torch.zeros_like(next(iter(self.state.pose.values()))[..., 0])
         normal, tangential = zero, zero
         for name, contact in rig.contacts.items():
@@ -60,8 +60,8 @@ def stores(rig: Graph) -> dict[str, Store]:
         return 0.5 * (masses[:, None] * rates**2).sum((-2, -1))
 
     out: dict[str, Store] = {f"strain_{name}": partial(strain, name=name) for name in rig.pads}
-    out["normal_springs"] = lambda at: at.energies[0]
-    out["tangential_springs"] = lambda at: at.energies[1]
+    out["normal_springs"] = lambda at: at.springs[0]
+    out["tangential_springs"] = lambda at: at.springs[1]
     for name, axes in rig.layout.free.items():
         for key, own in ((name, [i for i in axes if i < 2]), (f"{name}_spin", [2] * (2 in axes))):
             if own:
