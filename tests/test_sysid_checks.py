@@ -369,7 +369,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
     problem: Any = ClosedForm(lambda x: 10.0 + x, 1)
     end = Fit(problem, Runner(()), np.zeros(1), Stage("far off", ("data",), ("p0",), RTOL)).begun()
-    found = [one.name for one in new_fits(end, taken, judge, checks)]
+    found = [one.name for one in new_fits(end, taken, taken, judge, checks)]
     assert found == tried
 
 
@@ -466,6 +466,20 @@ def test_a_suspect_is_no_cause_where_residuals_pass_without_it(same):
         "without it, so that nothing confirms the cause"
     )
     assert not checked.explained
+
+
+def test_a_suspect_that_moves_estimates_far_is_no_cause_to_first_order(same):
+    (one,) = (one for one in same.checks if one.name == RADIUS)
+    found = replace(
+        one, suspected=True, passed=True, odds=1.0, gain=531.0, favoured=2.0, favoured_sd=0.1,
+        value=0.0198, moves={E: 0.9},
+    )  # fmt: skip
+    (said,) = notices(same._replace(checks=[found], as_stated=(ALARM,), candidates=(RADIUS,)))
+    assert said == (
+        f"something is not as stated, most like {RADIUS}: the sum of squares would fall by 531 "
+        f"with {RADIUS} = 0.0198 (+2 %, +- 0.1); {E} would move by 18 standard deviations, too far "
+        "for a test to first order: `explain` fits again with it, and with what acts alike there"
+    )
 
 
 def test_a_suspect_under_which_something_is_left_loses_to_one_that_passes(same):

@@ -266,8 +266,9 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, explain: bool = False
         if explain and candidates:
             untried = [f"a new fit with another {one.name}" for one in candidates]
             near = end.by(judge.finest) if explained else end  # rivals differ by little
-            for one in new_fits(near, candidates, judge, checks):
-                untried.remove(f"a new fit with another {one.name}")
+            tested = [one for one in taken if one.name in checks and not one.costly]
+            for one in new_fits(near, candidates, tested, judge, checks):
+                untried = [name for name in untried if name != f"a new fit with another {one.name}"]
             untried, candidates = [], []
     except KeyboardInterrupt:  # the fit is done: what was tried is kept
         candidates = []
@@ -287,17 +288,22 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, explain: bool = False
 
 
 def new_fits(
-    end: Fit, candidates: Sequence[Variation], judge: "Judge", checks: dict[str, AssumptionTest]
+    end: Fit,
+    candidates: Sequence[Variation],
+    tested: Sequence[Variation],
+    judge: "Judge",
+    checks: dict[str, AssumptionTest],
 ) -> Iterator[Variation]:
     """Repeat the fit with one suspect after the other, and replace its test in `checks`.
 
     Sensors that explain the misfit by one kind of fault come first, in one fit, and costly suspects
     last. Once one suspect explains it, or `NEARLY` all of it, those with much smaller gains are
-    left out, by their effects at the end under it where the fit was far off, and costly ones;
-    numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that all numbers
-    together leave.
+    left out, and costly ones; where that one was too far off for tests to first order, the gains
+    are those of the effects at the end under it, of all that were `tested`. Numbers are left out,
+    too, once a law leaves less than `RIVAL` of the misfit that all numbers together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
+    linear = dict(checks)
     bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
     with warnings.catch_warnings(action="ignore"), bar:
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
@@ -348,12 +354,21 @@ def new_fits(
             if len(some) == 1:
                 yield some[0]
             if name in checks and judge.nearly(checks[name]):
-                number_alone = len(some) == 1 and some[0].kind in ("known", "sensor")
-                if far and not enough and number_alone and name in judge.ends:
+                alone = len(some) == 1 and some[0].kind in ("known", "sensor") and not enough
+                if alone and name in judge.ends and (far or linear[name].far):
                     bar.set_description(plain(f"effects of the others under another {name}"))
-                    left = [one for (one, *more) in order[number:] if not (more or one.costly)]
-                    parts, gain = likeness(judge.ends[name], tried[0], left), checks[name].gain
-                    gains |= {one: part * gain for one, part in parts.items()}
+                    before = {one.name for some in order[:number] for one in some}
+                    parts = likeness(
+                        judge.ends[name],
+                        tried[0],
+                        [one for one in tested if one.name not in before],
+                    )
+                    gain = checks[name].gain
+                    gains |= {other: part * gain for other, part in parts.items()}
+                    known = {one.name for some in order for one in some}
+                    more = [one for one in tested if one.name in parts.keys() - known]
+                    more.sort(key=lambda one: -gains[one.name])
+                    order += [[one] for one in more[:MOST]]
                 enough = max(enough, RIVAL * gain)
         best = max(
             (name for name in ends if checks[name].suspected),

@@ -52,6 +52,14 @@ def assumption_doubts(checked: Checked) -> list[str]:
     the cause where nothing is left under it; else the misfit stands for something else."""
     favoured, candidates = checked.favoured, len(checked.candidates)
     again = f": `explain` fits again with each of {candidates} and compares them"
+    if favoured and checked.explained and favoured[0].far and len(checked.candidates) < 2:
+        label, move = favoured[0].shift
+        return [
+            f"something is not as stated, most like {favoured[0].name}: the sum of squares "
+            f"{favoured[0].falls}{favoured[0].found}; {label} would move by {abs(move):.2g} "
+            "standard deviations, too far for a test to first order: `explain` fits again with it, "
+            "and with what acts alike there"
+        ]
     if favoured and checked.explained:
         near = [c for c in checked.checks if c.name in checked.candidates]
         return contradictions(favoured, near)
@@ -198,12 +206,9 @@ def contradictions(
     label, move = best.shift
     text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
     if label:
-        text += f"; {label} would move by {abs(move):.2g} standard deviations"
-    if label and best.far:
-        text += ", too far for estimates to first order: `explain` fits again"
-    elif label:
         under = list(best.under.items())[:UNDER]
-        text += f"; estimates under it: {', '.join(f'{name} = {x:.4g}' for name, x in under)}"
+        text += f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
+        text += ", ".join(f"{name} = {x:.4g}" for name, x in under)
     return [text]
 
 
