@@ -367,8 +367,9 @@ def new_fits(
                     gains |= {other: part * gain for other, part in parts.items()}
                     known = {one.name for some in order for one in some}
                     more = [one for one in tested if one.name in parts.keys() - known]
-                    more.sort(key=lambda one: -gains[one.name])
-                    order += [[one] for one in more[:MOST]]
+                    more = sorted(more, key=lambda one: -gains[one.name])[:MOST]
+                    order += [[one] for one in more]
+                    bar.total += len(more)
                 enough = max(enough, RIVAL * gain)
         best = max(
             (name for name in ends if checks[name].suspected),
