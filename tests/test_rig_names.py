@@ -161,6 +161,9 @@ def test_motions_have_names_by_the_rule_of_the_others(name):
         ("pose", "an array `pose` of files"),
         ("stretch_{contact}", "`stretch_{contact}` of the contact"),
         ("{contact}.centre", "`{contact}.centre` of the contact"),
+        ("energy_strain_{pad}", "`energy_strain_{pad}` of the pad"),
+        ("energy_{body}", "`energy_{body}` of the body"),
+        ("supplied_control_{actuator}", "`supplied_control_{actuator}` of the actuator"),
     ],
 )
 def test_two_channels_of_one_name_are_refused_with_both_owners(name, owner):

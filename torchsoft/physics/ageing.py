@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor
 
-from torchsoft.physics.contact import KineticFriction, SmoothSlip, StaticFriction
+from torchsoft.physics.contact import FallingSpeed, KineticFriction, SmoothSlip, StaticFriction
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import OwnState
 from torchsoft.quantity import Quantity
@@ -35,9 +35,7 @@ class AgeingSlip(SmoothSlip):
         self,
         mu_s: StaticFriction,
         mu_k: KineticFriction,
-        v_s: Annotated[
-            float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")
-        ] = 5e-3,
+        v_s: FallingSpeed = 5e-3,
         ageing: Annotated[
             float, Quantity("1", 0.0, 1.0, "rise of static friction with ln of the time at rest")
         ] = 0.0,

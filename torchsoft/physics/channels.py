@@ -1,5 +1,9 @@
 """Channels of a rig: the series of its coordinates, signals, efforts and moments in a run, each
-with its unit, meaning and value."""
+with its unit, meaning and value.
+
+A moment is that of the bonded nodes (Eq. 35), with undeformed arms; the graph's, which a turning
+base feels and which conserves power, has deformed ones.
+"""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial

@@ -133,6 +133,9 @@ def normal_force(spring: Tensor, dashpot: Tensor) -> Tensor:
 
 StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]
 KineticFriction = Annotated[FrictionCoefficient, "kinetic coefficient of friction, at most mu_s"]
+FallingSpeed = Annotated[
+    float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")
+]
 
 
 class Friction(nn.Module):
@@ -171,9 +174,7 @@ class SmoothSlip(Friction):
         self,
         mu_s: StaticFriction,
         mu_k: KineticFriction,
-        v_s: Annotated[
-            float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")
-        ] = 5e-3,
+        v_s: FallingSpeed = 5e-3,
         R_pad: Annotated[
             float,
             Quantity(

@@ -80,13 +80,12 @@ def extensions(rig: Rig) -> dict[str, Extension]:
             f"a point that touches adhered with 0.001 N per {1e3 * law.node_spacing:g} mm",
             partial(_of_law, stem=stem, name="adhesion", neutral=0.0),
         )  # fmt: skip
-        friction = law.friction
-        own = type(friction) is not SmoothSlip  # a law of the user's, or another one
-        if isinstance(friction, SmoothSlip) and not own and friction.R_pad is None:
+        friction = law.friction  # of this class, and none that a user derives from it
+        if type(friction) is SmoothSlip and friction.R_pad is None:
             out[f"{stem}.friction.ageing"] = Extension(
                 0.0, 2e-3, 0.0, 0.5, "", f"friction of {stem} does not age",
                 "static friction grew by 0.002 for every factor e of the time at rest",
-                partial(_ageing, friction=friction),
+                partial(_ageing, stem=stem),
             )  # fmt: skip
         users = [name for name, one in rig.contacts.items() if same_law(one.law, law)]
         for name in users if len(users) > 1 else ():
@@ -185,11 +184,11 @@ def _of_law(rig: Rig, stem: str, name: str, neutral: float) -> nn.Parameter:
     return made
 
 
-def _ageing(rig: Rig, friction: SmoothSlip) -> nn.Parameter:
+def _ageing(rig: Rig, stem: str) -> nn.Parameter:
     """Put friction that ages in the place of the smooth friction with the same parameters."""
-    own = friction._parameters
-    made = AgeingSlip(*(own[name].item() for name in ("mu_s", "mu_k", "v_s")))  # pyright: ignore[reportOptionalMemberAccess]
-    made._parameters.update(own)
+    friction, made = _part(rig, SoftContact, stem).friction, AgeingSlip(1.0, 1.0)
+    assert isinstance(friction, SmoothSlip)
+    made._parameters.update(friction._parameters)
     for contact in rig.contacts.values():
         if contact.law.friction is friction:
             contact.law.friction = made

@@ -5,7 +5,6 @@ junctions. Two of one name would replace each other in silence.
 from collections.abc import Iterator
 
 from torchsoft.physics.channels import declared
-from torchsoft.physics.energy import Integrals, stores
 from torchsoft.physics.graph import Graph
 from torchsoft.physics.multibond import GROUND
 from torchsoft.physics.names import FORCES, ON_BODY
@@ -22,23 +21,23 @@ OF_CONTACT = (
 )  # fmt: skip
 OF_PAD = (
     "displacement_{}", "velocity_{}", "nodal_force_{}", "relaxing_{}", "mesh_nodes_{}",
-    "mesh_elements_{}", "mesh_bonded_{}", "mesh_face_{}", "{}_node", "{}_branch", "{}_mesh_node",
-    "{}_element", "{}_face",
+    "mesh_elements_{}", "mesh_bonded_{}", "mesh_face_{}", "energy_strain_{}",
+    "energy_kinetic_{}", "dissipated_pad_{}", "{}_node", "{}_branch", "{}_mesh_node", "{}_element",
+    "{}_face",
 )  # fmt: skip
-OF_BODY = "outline_{}", "{}_outline"
-OF_ACTUATOR = "control_{}", "{}_control"
+OF_BODY = "outline_{}", "energy_{}", "energy_{}_spin", "supplied_drive_{}", "{}_outline"
+OF_ACTUATOR = "supplied_control_{}", "control_{}", "{}_control"
+OF_RIG = (
+    "energy_normal_springs", "energy_tangential_springs", "dissipated_contact_dashpots",
+    "dissipated_slip", "supplied_gravity",
+)  # fmt: skip
 """Arrays and dimensions of a file by the part that they belong to."""
 
 
 def arrays(rig: Graph) -> Iterator[tuple[str, str]]:
     """Key and owner of every other array and dimension of a run's file, and of the channels of
     touch."""
-    integrals = Integrals(rig)
-    for name in (
-        *FORMAT, *(f"energy_{name}" for name in stores(rig)),
-        *(f"dissipated_{name}" for name in integrals.dissipated),
-        *(f"supplied_{name}" for name in integrals.supplied),
-    ):  # fmt: skip
+    for name in (*FORMAT, *OF_RIG):
         yield name, f"an array `{name}` of files of runs"
     touch = [f"{{}}.{key}" for key in ("centre", *FORCES)]
     for kind, parts, keys in (

@@ -180,14 +180,20 @@ def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[st
     own = fit.free & (np.arange(len(c.labels)) != k)
     Q, _ = np.linalg.qr(fit.at.J[:, own])
 
-    def across(d: Array) -> Array:
-        """Component (m,) orthogonal to the Jacobian of the others, of length one."""
-        d = d - Q @ (Q.T @ d)
-        return d / max(float(np.linalg.norm(d)), 1e-150)
+    effect, found = unit(across(fit.at.J[:, k], Q)), columns(fit, others)[0]
+    return {
+        one.name: float(unit(across(d, Q)) @ effect) ** 2 for one, d, _ in found if d is not None
+    }
 
-    effect = across(fit.at.J[:, k])
-    found = columns(fit, others)[0]
-    return {one.name: float(across(d) @ effect) ** 2 for one, d, _ in found if d is not None}
+
+def across(d: Array, Q: Array) -> Array:
+    """Component (m,) of d orthogonal to the span of an orthonormal basis Q (m, n)."""
+    return d - Q @ (Q.T @ d)
+
+
+def unit(d: Array) -> Array:
+    """d (m,) with length one."""
+    return d / max(float(np.linalg.norm(d)), 1e-150)
 
 
 def under(end: Fit, other: Problem, x: Array) -> Fit:
@@ -247,17 +253,10 @@ def shares(
     own = np.isin(c.labels, end.problem.coordinates.labels) & joint.free
     Q, _ = np.linalg.qr(J[:, own])
 
-    def across(d: Array) -> Array:
-        """Component (m,) orthogonal to the Jacobian of the first fit's coordinates."""
-        return d - Q @ (Q.T @ d)
-
     columns = [*tried.values()]
-    stated = across(joint.at.r - J[:, columns] @ (joint.x - c.start)[columns])
-    effects = dict[str, Array]()
+    stated = across(joint.at.r - J[:, columns] @ (joint.x - c.start)[columns], Q)
     misfit = max(float(stated @ stated) - joint.square, 1e-300)
-    for name, k in tried.items():
-        d = across(J[:, k])
-        effects[name] = d / max(float(np.linalg.norm(d)), 1e-150)
+    effects = {name: unit(across(J[:, k], Q)) for name, k in tried.items()}
     parts = {name: float(d @ stated) ** 2 / misfit for name, d in effects.items()}
     return parts, fewest(effects, stated, joint.square + (1 - NEARLY) * misfit)
 

@@ -24,6 +24,7 @@ from torchsoft.sysid.fit import Fit, fisher, shift, standard_deviations
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import (
     NEARLY,
+    across,
     columns,
     far_off,
     joint_fit,
@@ -538,8 +539,8 @@ class Judge:
         residuals; on residuals r (m,) beside columns with the orthonormal basis Q (m, n), by
         default those of the fit."""
         Q, r = self.Q if Q is None else Q, self.r if r is None else r
-        across = d - Q @ (Q.T @ d)
-        size, along, square = float(across @ across), float(across @ r), float(r @ r)
+        part = across(d, Q)
+        size, along, square = float(part @ part), float(part @ r), float(r @ r)
         moves = -shift(self.J, d) / self.sd
         least = 1e-12 if Q is self.Q else 1e-6  # it is what is taken in already
         if size < least * max(float(d @ d), 1e-300) or size == 0.0:
@@ -548,7 +549,7 @@ class Judge:
         rest = max(1.0, (square - gain) / max(self.dof - 1, 1))
         sd = (max(1.0, square / self.dof) / size) ** 0.5 * one.amount
         test = self.made(
-            one, moves, gain, square - gain, alpha * one.amount, sd, rest, r + alpha * across, r
+            one, moves, gain, square - gain, alpha * one.amount, sd, rest, r + alpha * part, r
         )
         return replace(test, detectable=EVIDENT**0.5 * sd)
 
@@ -632,7 +633,7 @@ class Judge:
                 break
             out.append(found)
             d = self.columns[found.name]
-            r = r + found.favoured / found.amount * (d - Q @ (Q.T @ d))
+            r = r + found.favoured / found.amount * across(d, Q)
             J = np.column_stack((J, d))
             left = [one for one in left if one.name != found.name]
         return tuple(out), alone, self.alarms(r, J)
