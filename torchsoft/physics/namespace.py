@@ -39,6 +39,8 @@ def arrays(rig: Graph) -> Iterator[tuple[str, str]]:
     touch."""
     for name in (*FORMAT, *OF_RIG):
         yield name, f"an array `{name}` of files of runs"
+    for name, symbol in rig.symbols.items():  # of those too that do not turn
+        yield f"angular_momentum_{symbol}", f"the angular momentum of the body `{name}`"
     touch = [f"{{}}.{key}" for key in ("centre", *FORCES)]
     for kind, parts, keys in (
         ("contact", rig.contacts, OF_CONTACT), ("pad", rig.pads, OF_PAD),
