@@ -39,6 +39,7 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.estimate import Quantity
 from torchsoft.sysid.fit import Check, Fit, standard_deviations
 from torchsoft.sysid.identification import notices_on, ordering_constraints
+from torchsoft.sysid.plan import settle
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import (
@@ -53,6 +54,7 @@ from torchsoft.sysid.residual_tests import Verdict
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
+    TIGHTENINGS,
     AssumptionTest,
     Checked,
     alike,
@@ -272,7 +274,9 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     )
     as_stated, again = (refit(far_off, tried) for tried in ((), [law]))
     assert as_stated.chi2 > 20  # nothing can be done with smooth friction
-    assert again.chi2 < 2  # on steps as coarse as those of the checks
+    again = settle(again, TIGHTENINGS)  # on coarse steps it may end 20 deviations off
+    assert again.converged
+    assert again.chi2 < 1.2
     for name, value in TRUTH.items():
         sd = dict(zip(again.labels, standard_deviations(again.J)))[name]
         assert sd < 0.1
@@ -486,6 +490,22 @@ def test_a_suspect_that_moves_estimates_far_is_no_cause_to_first_order(same):
         f"with {RADIUS} = 0.0198 (+2 %, +- 0.1); {E} would move by 18 standard deviations, too far "
         "for a test to first order: `explain` fits again with it, and with what acts alike there"
     )
+
+
+def test_a_cause_whose_fit_has_not_come_to_rest_tells_no_estimates(same):
+    (one,) = (one for one in same.checks if one.name == RADIUS)
+    found = replace(
+        one, suspected=True, passed=True, odds=1.0, gain=531.0, favoured=2.0, favoured_sd=0.1,
+        value=0.0198, moves={E: 0.9}, refitted=True, under={},
+    )  # fmt: skip
+    (said,) = notices(same._replace(checks=[found], as_stated=(ALARM,)))
+    assert said.startswith(f"the data contradict that {one.stated}")
+    assert said.endswith("; the fit under it has not come to rest, and tells no estimates")
+    assert "estimates under" not in said
+    rival = replace(found, name="b", odds=0.4)
+    (said,) = notices(same._replace(checks=[replace(found, odds=0.6), rival], as_stated=(ALARM,)))
+    assert "do not tell which" in said
+    assert "estimates under" not in said
 
 
 def test_a_suspect_under_which_something_is_left_loses_to_one_that_passes(same):

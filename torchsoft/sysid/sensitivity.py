@@ -21,6 +21,7 @@ from tqdm import tqdm
 from torchsoft.display import hidden
 from torchsoft.sysid.assumptions import AMOUNTS, FAULTS, Assumption, Variation, assumptions
 from torchsoft.sysid.fit import Fit, fisher, shift, standard_deviations
+from torchsoft.sysid.plan import settle
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import (
     NEARLY,
@@ -57,6 +58,9 @@ RIVAL = 0.3
 
 FIRST_ORDER = 3.0
 """Standard deviations by which estimates may move in a test to first order."""
+
+TIGHTENINGS = 2
+"""Most times that a repeated fit goes on with a tenth of its tolerance."""
 
 BESIDES = 3
 """Most effects that are looked for besides the likeliest suspect."""
@@ -298,10 +302,11 @@ def new_fits(
     """Repeat the fit with one suspect after the other, and replace its test in `checks`.
 
     Sensors that explain the misfit by one kind of fault come first, in one fit, and costly suspects
-    last. Once one suspect explains it, or `NEARLY` all of it, those with much smaller gains are
-    left out, and costly ones; where that one was too far off for tests to first order, the gains
-    are those of the effects at the end under it, of all that were `tested`. Numbers are left out,
-    too, once a law leaves less than `RIVAL` of the misfit that all numbers together leave.
+    last. Where one suspect explains it, or `NEARLY` all of it, the fit goes on until it is at rest;
+    those with much smaller gains are then left out, and costly ones; where that one was too far off
+    for tests to first order, the gains are those of the effects at the end under it, of all that
+    were `tested`. Numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that
+    all numbers together leave.
     """
     gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
     linear = dict(checks)
@@ -333,7 +338,7 @@ def new_fits(
         bar.set_description("new fit with all assumptions")
         as_stated = refit(end, ())
         bar.update()
-        enough, ends = 0.0, dict[str, list[Variation]]()
+        enough, ends = 0.0, dict[str, tuple[list[Variation], list[AssumptionTest]]]()
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
@@ -345,11 +350,12 @@ def new_fits(
             tried = [one.within(checks[one.name].favoured) for one in some]
             other = refit(end, tried, joint if explains else None)
             if other is not None and as_stated is not None:
-                found = judge.together(
-                    name, other, as_stated, tried, [checks[one.name] for one in some]
-                )
+                own = [checks[one.name] for one in some]
+                found = judge.together(name, other, as_stated, tried, own)
+                if judge.nearly(found):
+                    found = judge.at_rest(found, as_stated, tried, own)
                 if found.refitted:
-                    checks[name], ends[name] = found, tried
+                    checks[name], ends[name] = found, (tried, own)
                     least = min(least, judge.misfit(found.left))
             bar.update()
             if len(some) == 1:
@@ -377,13 +383,9 @@ def new_fits(
             key=lambda name: (checks[name].passed, checks[name].gain),
             default="",
         )
-        if best and as_stated is not None and not checks[best].passed and end.rtol > judge.finest:
+        if best and as_stated is not None and not judge.nearly(checks[best]):
             bar.set_description(plain(f"new fit with another {best}, by finer steps"))
-            tried = ends[best]
-            other = refit(end.by(judge.finest), tried, judge.ends[best])
-            if other is not None:
-                linear = [replace(checks[one.name], refitted=False) for one in tried]
-                checks[best] = judge.together(best, other, as_stated, tried, linear)
+            checks[best] = judge.at_rest(checks[best], as_stated, *ends[best])
 
 
 def alike(
@@ -608,6 +610,20 @@ class Judge:
             stated=" and ".join(one.stated for one in found),
             otherwise=" and".join(one.found for one in found),
         )
+
+    def at_rest(
+        self,
+        found: AssumptionTest,
+        as_stated: Fit,
+        tried: Sequence[Variation],
+        linear: Sequence[AssumptionTest],
+    ) -> AssumptionTest:
+        """A test by a repeated fit that goes on until its steps do not matter, as that of the
+        parameters did; without estimates where it does not come to rest."""
+        fit = settle(self.ends[found.name], TIGHTENINGS)
+        again = self.together(found.name, fit, as_stated, tried, linear)
+        again = again if again.refitted else found
+        return again if fit.converged else replace(again, under={})
 
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]

@@ -205,6 +205,8 @@ def contradictions(
         ]
     label, move = best.shift
     text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
+    if label and not best.under:
+        return [f"{text}; the fit under it has not come to rest, and tells no estimates"]
     if label:
         under = list(best.under.items())[:UNDER]
         text += f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
@@ -214,8 +216,8 @@ def contradictions(
 
 def between(some: Sequence[AssumptionTest]) -> str:
     """A clause on where estimates lie under each of some suspects; empty where tests to first order
-    are too far off."""
-    if any(one.far for one in some):
+    are too far off, or a fit has not come to rest."""
+    if any(one.far or not one.under for one in some):
         return ""
     shown = []
     for label in [*some[0].under][:UNDER]:
