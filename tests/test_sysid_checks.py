@@ -55,6 +55,7 @@ from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     MOST,
     TIGHTENINGS,
+    Again,
     AssumptionTest,
     Checked,
     alike,
@@ -360,6 +361,11 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
+
+    def fitted(again: Again, as_stated: Fit) -> AssumptionTest:
+        left = 50.0 if len(again.tried) > 1 else lefts.get(again.name, 999.0)
+        return replace(again.linear[0], name=again.name, left=left, refitted=True)
+
     checks = {one.name: assumption_test(one, gain=gains[one.name]) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
@@ -367,11 +373,9 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
         ends={},
-        together=lambda name, again, stated, tried, linear: replace(
-            linear[0], name=name, left=50.0 if len(tried) > 1 else lefts.get(name, 999.0),
-            refitted=True,
-        ),
-    )  # fmt: skip
+        fit=fitted,
+        at_rest=fitted,
+    )
     parts = {"a": 0.25, "b": 0.25 if together else 0.9}
     joint = SimpleNamespace(square=joint_left)
     monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)

@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from torchsoft.sysid.assumptions import AMOUNTS, FAULT_BOUNDS, Variation
+from torchsoft.sysid.assumptions import AMOUNTS, FAULT_BOUNDS, WIDEST, Variation
 from torchsoft.sysid.fit import Fit, Stage, Unreachable
 from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, continued, default_plan
 from torchsoft.sysid.problem import Problem, check_possible
@@ -172,18 +172,38 @@ def difference(end: Fit, one: Variation) -> tuple[Array | None, str]:
 
 
 def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[str, float]:
-    """Fraction of the effect of a cause that each of some other assumptions has, to first order at
-    the end of the fit under it and beside its other coordinates, by name; without those whose run
-    fails."""
+    """Fraction of the effect of a cause that each of some other assumptions can have in a new fit,
+    to first order at the end of the fit under the cause and beside its other coordinates, by name;
+    without those whose run fails. A number has it within its range only."""
     c = fit.problem.coordinates
     k = c.labels.index(cause.label)
     own = fit.free & (np.arange(len(c.labels)) != k)
     Q, _ = np.linalg.qr(fit.at.J[:, own])
+    effect = across(fit.at.J[:, k] * (fit.x[k] - c.start[k]), Q)
+    square, out = max(float(effect @ effect), 1e-300), dict[str, float]()
+    for one, d, _ in columns(fit, others)[0]:
+        if d is not None:
+            part = across(d, Q)
+            size, along = max(float(part @ part), 1e-300), float(part @ effect)
+            low, high = reach(fit.problem, one)
+            if along != 0:  # amount at which it has most of the effect, and what there is of it
+                there = float(np.clip(along / size, low, high)) * size / along
+                out[one.name] = along**2 / size / square * there * (2 - there)
+            else:
+                out[one.name] = 0.0
+    return out
 
-    effect, found = unit(across(fit.at.J[:, k], Q)), columns(fit, others)[0]
-    return {
-        one.name: float(unit(across(d, Q)) @ effect) ** 2 for one, d, _ in found if d is not None
-    }
+
+def reach(problem: Problem, one: Variation) -> tuple[float, float]:
+    """Range of an assumption in a new fit, over the amount of its variation; unlimited for a law or
+    a constant of the computation, whose test to first order says little."""
+    if one.kind in ("numerical", "law"):
+        return -np.inf, np.inf
+    c = assuming(problem, [one], free=True).coordinates
+    mine = c.all[c.labels.index(one.label)]
+    step = one.amount if one.vary is not None or one.read is not None else one.step
+    ends = sorted((end - mine.nominal) / step for end in (mine.low, mine.high))
+    return WIDEST * ends[0], WIDEST * ends[1]
 
 
 def across(d: Array, Q: Array) -> Array:

@@ -180,6 +180,15 @@ def assumption_test(one: Assumption, **outcome: Any) -> AssumptionTest:
     )
 
 
+class Again(NamedTuple):
+    """A repeated fit with some assumptions varied at once, and their tests to first order."""
+
+    name: str
+    tried: list[Variation]
+    linear: list[AssumptionTest]
+    fit: Fit
+
+
 class Checked(NamedTuple):
     """All tests; columns (m, k) of the constants of the computation, and the Jacobian (m, n) of the
     free coordinates."""
@@ -338,7 +347,7 @@ def new_fits(
         bar.set_description("new fit with all assumptions")
         as_stated = refit(end, ())
         bar.update()
-        enough, ends = 0.0, dict[str, tuple[list[Variation], list[AssumptionTest]]]()
+        enough = 0.0
         for number, some in enumerate(order if as_stated is not None else (), 1):
             name = " and ".join(one.name for one in some)
             gain = gains.get(name, judge.square)
@@ -350,12 +359,12 @@ def new_fits(
             tried = [one.within(checks[one.name].favoured) for one in some]
             other = refit(end, tried, joint if explains else None)
             if other is not None and as_stated is not None:
-                own = [checks[one.name] for one in some]
-                found = judge.together(name, other, as_stated, tried, own)
+                again = Again(name, tried, [checks[one.name] for one in some], other)
+                found = judge.fit(again, as_stated)
                 if judge.nearly(found):
-                    found = judge.at_rest(found, as_stated, tried, own)
+                    found = judge.at_rest(again, as_stated)
                 if found.refitted:
-                    checks[name], ends[name] = found, (tried, own)
+                    checks[name] = found
                     least = min(least, judge.misfit(found.left))
             bar.update()
             if len(some) == 1:
@@ -366,7 +375,7 @@ def new_fits(
                     bar.set_description(plain(f"effects of the others under another {name}"))
                     before = {one.name for some in order[:number] for one in some}
                     parts = likeness(
-                        judge.ends[name],
+                        judge.ends[name].fit,
                         tried[0],
                         [one for one in tested if one.name not in before],
                     )
@@ -379,13 +388,13 @@ def new_fits(
                     bar.total += len(more)
                 enough = max(enough, RIVAL * gain)
         best = max(
-            (name for name in ends if checks[name].suspected),
+            (name for name in judge.ends if checks[name].suspected),
             key=lambda name: (checks[name].passed, checks[name].gain),
             default="",
         )
         if best and as_stated is not None and not judge.nearly(checks[best]):
             bar.set_description(plain(f"new fit with another {best}, by finer steps"))
-            checks[best] = judge.at_rest(checks[best], as_stated, *ends[best])
+            checks[best] = judge.at_rest(judge.ends[best], as_stated)
 
 
 def alike(
@@ -461,7 +470,7 @@ class Judge:
         self.J = end.check.finer.J[:, end.free] if J is None else J
         self.Q, _ = np.linalg.qr(self.J)
         self.sd, self.labels = standard_deviations(self.J), end.labels
-        self.columns, self.ends = dict[str, Array](), dict[str, Fit]()
+        self.columns, self.ends = dict[str, Array](), dict[str, Again]()
         self.places = [part.rows for part in parts(end.problem, self.r, end.which)]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
@@ -555,11 +564,35 @@ class Judge:
         )
         return replace(test, detectable=EVIDENT**0.5 * sd)
 
-    def fit(
+    def fit(self, again: Again, as_stated: Fit) -> AssumptionTest:
+        """Test of one or several variations by a repeated fit, compared with one as stated; it is
+        `refitted` only where that of each is."""
+        found = [
+            self.alone(one, again.fit, as_stated, linear)
+            for one, linear in zip(again.tried, again.linear)
+        ]
+        refitted = all(one.refitted for one in found)
+        if refitted:
+            self.ends[again.name] = again
+        if len(found) == 1:
+            return found[0]
+        return replace(
+            found[0],
+            name=again.name,
+            kind="several",
+            parameter="",
+            amount=float(len(found)),
+            unit="",
+            refitted=refitted,
+            stated=" and ".join(one.stated for one in found),
+            otherwise=" and".join(one.found for one in found),
+        )
+
+    def alone(
         self, one: Variation, again: Fit, as_stated: Fit, linear: AssumptionTest
     ) -> AssumptionTest:
-        """Test by a repeated fit with the variation, compared with a repeated fit as stated; the
-        test to first order, where the new fit gains less and has not converged."""
+        """Test of one of the variations of a repeated fit; the test to first order, where the new
+        fit gains less and has not converged."""
         left, gain = again.square, as_stated.square - again.square
         if gain <= linear.gain and not again.converged:
             return linear
@@ -573,7 +606,6 @@ class Judge:
             by_amount = one.vary is not None or one.read is not None
             nominal, scale = (0.0, 1.0) if by_amount else (one.nominal, one.amount / one.step)
             favoured, sd = (mine.to_value(x) - nominal) * scale, own * scale
-        self.ends[one.name] = again
         test = self.made(
             one, moves / self.sd, gain, left, favoured, sd, rest, again.at.r, as_stated.at.r, True
         )
@@ -585,45 +617,13 @@ class Judge:
             passed=not self.alarms(again.at.r, again.J),
         )
 
-    def together(
-        self,
-        name: str,
-        again: Fit,
-        as_stated: Fit,
-        tried: Sequence[Variation],
-        linear: Sequence[AssumptionTest],
-    ) -> AssumptionTest:
-        """Test of one or several variations by one repeated fit; it is `refitted` only where that
-        of each is."""
-        found = [self.fit(one, again, as_stated, c) for one, c in zip(tried, linear)]
-        if len(found) == 1:
-            return found[0]
-        self.ends[name] = again
-        return replace(
-            found[0],
-            name=name,
-            kind="several",
-            parameter="",
-            amount=float(len(found)),
-            unit="",
-            refitted=all(one.refitted for one in found),
-            stated=" and ".join(one.stated for one in found),
-            otherwise=" and".join(one.found for one in found),
-        )
-
-    def at_rest(
-        self,
-        found: AssumptionTest,
-        as_stated: Fit,
-        tried: Sequence[Variation],
-        linear: Sequence[AssumptionTest],
-    ) -> AssumptionTest:
-        """A test by a repeated fit that goes on until its steps do not matter, as that of the
+    def at_rest(self, again: Again, as_stated: Fit) -> AssumptionTest:
+        """Test by a repeated fit that goes on until its steps do not matter, as that of the
         parameters did; without estimates where it does not come to rest."""
-        fit = settle(self.ends[found.name], TIGHTENINGS)
-        again = self.together(found.name, fit, as_stated, tried, linear)
-        again = again if again.refitted else found
-        return again if fit.converged else replace(again, under={})
+        fit = settle(again.fit, TIGHTENINGS)
+        found = self.fit(again._replace(fit=fit), as_stated)
+        found = found if found.refitted else self.fit(again, as_stated)
+        return found if fit.converged else replace(found, under={})
 
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]
@@ -633,7 +633,7 @@ class Judge:
         out: list[AssumptionTest] = []
         r, J = self.r, self.J
         if best.refitted:
-            r, J = self.ends[best.name].at.r, self.ends[best.name].J
+            r, J = self.ends[best.name].fit.at.r, self.ends[best.name].fit.J
         else:
             J = np.column_stack((J, self.columns[best.name]))
             r = r - J @ shift(J, r)
