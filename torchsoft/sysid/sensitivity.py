@@ -314,10 +314,10 @@ def new_fits(
     last. Where one suspect explains it, or `NEARLY` all of it, the fit goes on until it is at rest;
     those with much smaller gains are then left out, and costly ones; where that one was too far off
     for tests to first order, the gains are those of the effects at the end under it, of all that
-    were `tested`. Numbers are left out, too, once a law leaves less than `RIVAL` of the misfit that
-    all numbers together leave.
+    were `tested`. Where all numbers together leave more than `RIVAL` of the misfit, none is the
+    cause alone, and they are left out.
     """
-    gains, joint, least = {one.name: checks[one.name].gain for one in candidates}, None, np.inf
+    gains, joint = {one.name: checks[one.name].gain for one in candidates}, None
     linear = dict(checks)
     bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
     with warnings.catch_warnings(action="ignore"), bar:
@@ -327,12 +327,13 @@ def new_fits(
             bar.set_description("new fit with all suspects unknown at once")
             joint = joint_fit(end, candidates, judge.explained_chi2)
         explains = joint is not None and joint.square <= judge.explained_chi2
-        bounded, together = dict[str, float](), list[str]()
-        if joint is not None:  # where it leaves much, no number of it explains the data alone
+        together = list[str]()
+        if joint is not None:
             parts, together = shares(end, joint, candidates)
             gains |= {name: explains * judge.square * part for name, part in parts.items()}
-            if not explains:
-                bounded = dict.fromkeys(parts, RIVAL * judge.misfit(joint.square))
+            if judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square):
+                checks |= {name: replace(checks[name], suspected=False) for name in parts}
+                candidates = [one for one in candidates if one.name not in parts]
         blind = far and not explains  # gains to first order say little
         order = [
             [one]
@@ -353,8 +354,6 @@ def new_fits(
             gain = gains.get(name, judge.square)
             if gain < enough or (enough and some[0].costly):
                 continue
-            if name in bounded and least < bounded[name]:
-                continue
             bar.set_description(plain(f"new fit with another {name} ({number} of {len(order)})"))
             tried = [one.within(checks[one.name].favoured) for one in some]
             other = refit(end, tried, joint if explains else None)
@@ -365,7 +364,6 @@ def new_fits(
                     found = judge.at_rest(again, as_stated)
                 if found.refitted:
                     checks[name] = found
-                    least = min(least, judge.misfit(found.left))
             bar.update()
             if len(some) == 1:
                 yield some[0]
