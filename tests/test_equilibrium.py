@@ -179,7 +179,7 @@ def outcome(one: Scene, start: Any) -> Tensor:
 
 
 @pytest.mark.parametrize("start", ["touch", *PRESSED], ids=str)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ["paper", pytest.param("ellipse", marks=pytest.mark.slow)])
 def test_derivatives_by_autograd_are_those_by_differences(name, start):
     """Along one direction in which every parameter counts."""
     one = scene(name)
@@ -205,7 +205,7 @@ def test_derivatives_by_autograd_are_those_by_differences(name, start):
     assert torch.allclose(exact, differences, rtol=1e-7, atol=5e-6)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ["paper", pytest.param("ellipse", marks=pytest.mark.slow)])
 def test_a_depth_and_a_force_are_differentiated_by(name):
     """The bracket goes down by as much as a depth grows; by a force as differences say."""
     one = scene(name)

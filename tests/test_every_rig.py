@@ -343,6 +343,8 @@ RIGS: dict[str, Callable[[], Start]] = {
 
 
 SLOW = (
+    "relaxing pad under another",
+    "Yeoh fingertip",
     "pads that relax twice",
     "Ogden pads",
     "Mooney-Rivlin pads on turning bases",

@@ -124,7 +124,7 @@ def test_the_literal_law(slipping):
 
 
 OTHERS = (
-    {"across": 120, "through": 6},
+    pytest.param({"across": 120, "through": 6}, marks=pytest.mark.slow),
     {"literal": True},
     {"x_C0": 60.34e-3},
 )

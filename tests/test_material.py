@@ -210,6 +210,7 @@ def test_relaxation_under_a_held_indentation_is_the_closed_form(material):
     )
 
 
+@pytest.mark.slow
 def test_every_coefficient_of_a_series_is_identified():
     """From the punch's height under a held force, without noise, from starts a third away."""
     t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0.5, 120, dtype=torch.float64)))

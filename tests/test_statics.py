@@ -120,6 +120,7 @@ def test_a_long_box_is_a_flat_punch_on_springs():
     )
 
 
+@pytest.mark.slow
 def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch():
     """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are
     bilinear of half a millimetre."""

@@ -303,6 +303,7 @@ def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest():
         assert np.abs(step).min() > 0.5 if moves else step == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes):
     """From a start so far off that the steps chosen there are the wrong ones in the end."""
     unknowns = {name: Unknown(nominal=0.4 * TRUTH[name]) for name in FOUR} | {MU_K: known(MU_K)}
@@ -449,6 +450,7 @@ def test_data_out_of_reach_name_the_recording():
         identify(problem, plan=[Stage("all", ("strokes",), (E,), 1e-3)])
 
 
+@pytest.mark.slow
 def test_a_plan_ends_where_a_finer_stage_cannot_begin(monkeypatch):
     """The fit is kept, says so, and is tested on its own steps."""
     residuals, first = Problem.residuals, iter([True])

@@ -275,6 +275,7 @@ def test_derivatives_of_a_run_that_drifts():
         np.testing.assert_allclose(got.derivatives[..., k], slope, atol=1e-5 * np.abs(slope).max())
 
 
+@pytest.mark.slow
 def test_linear_pads_at_finite_strain_are_those_of_a_neo_hookean_file():
     """With the same names of numbers, of which both pads have one."""
     made = at_finite_strain(strokes())

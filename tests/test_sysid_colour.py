@@ -55,6 +55,7 @@ def problem(recording: Recording, colour: str = "white") -> Problem:
     )
 
 
+@pytest.mark.slow
 def test_colour_of_coarse_steps_is_gone_with_them(exact):
     """White samples: what a first tolerance leaves is coloured, what the last leaves is not."""
     rng, quiet = np.random.default_rng(0), {name: 0.1 * noise for name, noise in NOISE.items()}
@@ -122,6 +123,7 @@ def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact):
     np.testing.assert_allclose(gradient, other.J.T @ other.r, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_robust_loss_sees_through_outliers(exact):
     """Every twentieth sample is off by twenty standard deviations: least squares says so, and a
     robust loss is as exact as the rest of the samples allow."""

@@ -204,6 +204,7 @@ def found(problem):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_designed_motion_tells_more(found, problem):
     """What is predicted for it is what its recording's own Jacobian says."""
     assert all(found.after[name] < 0.9 * was for name, was in found.before.items())

@@ -51,6 +51,7 @@ def jerks():
     return record("jerks", planned, TRUTH | {E: 0.9e6}, SENSORS, noise=0.0)
 
 
+@pytest.mark.slow
 def test_its_parameters_are_found_beside_those_of_the_pads(jerks):
     problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, E)})
     plan = [Stage("all", ("jerks",), problem.coordinates.labels, 1e-6)]

@@ -108,6 +108,7 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
     assert whole.file == str(tmp_path / "x.csv")
 
 
+@pytest.mark.slow
 def test_a_file_that_moves_otherwise_than_the_search_is_named(monkeypatch, tmp_path, capsys):
     def other(reference, names):
         return knots(reference, names) | {"bear": {"times": [0.0], "values": [9.0]}}

@@ -41,6 +41,7 @@ def test_torchdiffeq_runs_the_stepper():
     assert torch.equal(solution[:, 1].detach(), simulate(model, t, y0=y0[1], step=2e-3).y)
 
 
+@pytest.mark.slow
 def test_an_explicit_integration_backwards_is_warned_about_once():
     """Pads decay, and backwards they grow; forwards, with a graph or without, nothing is said."""
     model = coarse()
