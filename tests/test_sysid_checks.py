@@ -30,6 +30,7 @@ from torchsoft.sysid import (
 from torchsoft.sysid.assumptions import (
     AMOUNTS,
     PLACE,
+    WIDEST,
     Variation,
     assumptions,
     coulomb,
@@ -47,6 +48,8 @@ from torchsoft.sysid.refits import (
     difference,
     fewest,
     joint_fit,
+    likeness,
+    reach,
     refit,
     shares,
 )
@@ -385,6 +388,25 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     found = [one.name for one in new_fits(end, taken, taken, judge, checks)]
     assert found == tried
     assert all(checks[name].suspected == (joint_left < 400.0) for name in "ab")
+
+
+def test_a_number_is_like_a_cause_as_far_as_its_range_goes():
+    """A heavier disc: gravity has most of its effect, but not within a thousandth of its range."""
+    data = recorded({MASS: 1.03 * BASE.bodies["disc"].mass}, BRIEF)
+    problem = Problem([data], SENSORS, {name: Unknown() for name in TRUTH})
+    end = ended(problem, problem.coordinates.start)
+    known = {one.name: one for one in assumptions(problem.recordings, set(TRUTH), problem.sensors)}
+    fit = refit(end, [known[MASS]])
+    assert fit is not None
+    gravity = known["gravity"]
+    short = replace(gravity, amount=1e-3 * gravity.amount, step=1e-3 * gravity.step)
+    (far,), (near,) = (likeness(fit, known[MASS], [one]).values() for one in (gravity, short))
+    assert 0.1 < far <= 1.0
+    assert near < 0.2 * far
+    low, high = reach(fit.problem, gravity)
+    assert low == pytest.approx(-AMOUNTS * WIDEST)
+    assert high == pytest.approx(AMOUNTS * WIDEST)
+    assert reach(fit.problem, known["mesh"]) == (-np.inf, np.inf)
 
 
 @pytest.mark.parametrize(("second", "near"), [(250.0, ["a", "b"]), (80.0, [])])
