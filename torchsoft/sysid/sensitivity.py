@@ -618,7 +618,7 @@ class Judge:
     def at_rest(self, again: Again, as_stated: Fit) -> AssumptionTest:
         """Test by a repeated fit that goes on until its steps do not matter, as that of the
         parameters did; without estimates where it does not come to rest."""
-        fit = settle(again.fit, TIGHTENINGS)
+        fit = settle(again.fit, TIGHTENINGS if again.fit.loss == "linear" else 0)
         found = self.fit(again._replace(fit=fit), as_stated)
         found = found if found.refitted else self.fit(again, as_stated)
         return found if fit.converged else replace(found, under={})
