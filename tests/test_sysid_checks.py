@@ -61,6 +61,7 @@ from torchsoft.sysid.sensitivity import (
     Again,
     AssumptionTest,
     Checked,
+    Judge,
     alike,
     assumption_test,
     check_assumptions,
@@ -374,6 +375,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
         explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
+        large_enough=lambda one: True,
         ends={},
         fit=fitted,
         at_rest=fitted,
@@ -388,6 +390,24 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     found = [one.name for one in new_fits(end, taken, taken, judge, checks)]
     assert found == tried
     assert all(checks[name].suspected == (joint_left < 400.0) for name in "ab")
+
+
+def test_a_cause_has_an_effect_of_the_size_of_the_misfit():
+    """Known of a mesh, or of what is costly; a number may be off by more than its variation."""
+    e = np.eye(40)
+    judge: Any = SimpleNamespace(
+        Q=e[:, :1], square=140.0, misfit=lambda left: left - 40.0,
+        columns={"small": 5 * e[3] + 90 * e[0], "large": 6 * e[4]},
+    )  # fmt: skip
+
+    def large(name: str, **given: Any) -> bool:
+        return Judge.large_enough(judge, Variation(name, stated="", otherwise="", **given))
+
+    assert [large(name, kind="numerical") for name in ("small", "large")] == [False, True]
+    assert not large("small", kind="law", costly=True)
+    assert large("small", kind="known")
+    assert large("small", kind="law")
+    assert large("not run", kind="numerical")
 
 
 def test_a_number_is_like_a_cause_as_far_as_its_range_goes():

@@ -315,7 +315,7 @@ def new_fits(
     those with much smaller gains are then left out, and costly ones; where that one was too far off
     for tests to first order, the gains are those of the effects at the end under it, of all that
     were `tested`. Where all numbers together leave more than `RIVAL` of the misfit, none is the
-    cause alone, and they are left out.
+    cause alone, and they are left out; so are effects that are too small for it.
     """
     gains, joint = {one.name: checks[one.name].gain for one in candidates}, None
     linear = dict(checks)
@@ -334,6 +334,7 @@ def new_fits(
             if judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square):
                 checks |= {name: replace(checks[name], suspected=False) for name in parts}
                 candidates = [one for one in candidates if one.name not in parts]
+        candidates = [one for one in candidates if judge.large_enough(one)]
         blind = far and not explains  # gains to first order say little
         order = [
             [one]
@@ -488,6 +489,14 @@ class Judge:
     def explained(self, checks: Iterable[AssumptionTest]) -> bool:
         """Whether with a suspected variation nothing is left."""
         return any(one.suspected and one.passed for one in checks)
+
+    def large_enough(self, one: Variation) -> bool:
+        """Whether what is costly, or a constant of the computation, could be the cause: it has an
+        effect of one size, which is to be that of the misfit."""
+        d = self.columns.get(one.name)
+        if d is None or not (one.costly or one.kind == "numerical"):
+            return True
+        return float(np.sum(across(d, self.Q) ** 2)) > RIVAL * self.misfit(self.square)
 
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""
