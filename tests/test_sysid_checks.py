@@ -348,19 +348,21 @@ def test_the_fewest_effects_that_span_a_misfit_are_found():
 
 
 @pytest.mark.parametrize(
-    ("joint_left", "lefts", "tried", "together"),
+    ("joint_left", "rests", "lefts", "tried", "together"),
     [
-        (10.0, {"b": 50.0}, ["b"], ()),
-        (10.0, {}, ["b", "a", "law"], ()),
-        (10.0, {}, [], ("a", "b")),
-        (300.0, {"law": 50.0}, ["law"], ()),
-        (300.0, {"law": 150.0}, ["law", "a", "b"], ("a", "b")),
-        (500.0, {"law": 200.0}, ["law"], ("a", "b")),
+        (10.0, True, {"b": 50.0}, ["b"], ()),
+        (10.0, True, {}, ["b", "a", "law"], ()),
+        (10.0, True, {}, [], ("a", "b")),
+        (300.0, False, {"law": 50.0}, ["law"], ()),
+        (300.0, False, {"law": 150.0}, ["law", "a", "b"], ("a", "b")),
+        (300.0, True, {"law": 150.0}, ["law"], ("a", "b")),
+        (500.0, False, {"law": 200.0}, ["law"], ("a", "b")),
     ],
 )
-def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, monkeypatch):
+def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, together, monkeypatch):
     """Where it explains the data, those first that explain it together, then numbers by their part;
-    where not, no number before a law; and no number at all where all of them leave much."""
+    where not, no number before a law; and no number at all where all of them leave much, or rest
+    where much is left."""
     taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     gains = {"a": 300.0, "b": 200.0, "law": 100.0}
@@ -381,7 +383,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
         at_rest=fitted,
     )
     parts = {"a": 0.25, "b": 0.25 if together else 0.9}
-    joint = SimpleNamespace(square=joint_left)
+    joint = SimpleNamespace(square=joint_left, converged=rests, chi2=9.0)
     monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)
     monkeypatch.setattr(sensitivity, "shares", lambda *given: (parts, together))
     monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
@@ -389,7 +391,8 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, lefts, tried, together, m
     end = Fit(problem, Runner(()), np.zeros(1), Stage("far off", ("data",), ("p0",), RTOL)).begun()
     found = [one.name for one in new_fits(end, taken, taken, judge, checks)]
     assert found == tried
-    assert all(checks[name].suspected == (joint_left < 400.0) for name in "ab")
+    left_out = joint_left > 400.0 or (rests and joint_left > 100.0)
+    assert all(checks[name].suspected != left_out for name in "ab")
 
 
 def test_a_cause_has_an_effect_of_the_size_of_the_misfit():

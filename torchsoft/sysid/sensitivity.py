@@ -314,8 +314,8 @@ def new_fits(
     last. Where one suspect explains it, or `NEARLY` all of it, the fit goes on until it is at rest;
     those with much smaller gains are then left out, and costly ones; where that one was too far off
     for tests to first order, the gains are those of the effects at the end under it, of all that
-    were `tested`. Where all numbers together leave more than `RIVAL` of the misfit, none is the
-    cause alone, and they are left out; so are effects that are too small for it.
+    were `tested`. Where all numbers together leave more than `RIVAL` of the misfit, or are at rest
+    far off, none is the cause alone, and they are left out; so are effects too small for it.
     """
     gains, joint = {one.name: checks[one.name].gain for one in candidates}, None
     linear = dict(checks)
@@ -331,7 +331,8 @@ def new_fits(
         if joint is not None:
             parts, together = shares(end, joint, candidates)
             gains |= {name: explains * judge.square * part for name, part in parts.items()}
-            if judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square):
+            much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
+            if not explains and (much or (joint.converged and far_off(joint))):
                 checks |= {name: replace(checks[name], suspected=False) for name in parts}
                 candidates = [one for one in candidates if one.name not in parts]
         candidates = [one for one in candidates if judge.large_enough(one)]
