@@ -387,14 +387,15 @@ def new_fits(
                     order += [[one] for one in more]
                     bar.total += len(more)
                 enough = max(enough, RIVAL * gain)
+        near = {name: one for name, one in judge.ends.items() if not far_off(one.fit)}
         best = max(
-            (name for name in judge.ends if checks[name].suspected),
+            (name for name in near if checks[name].suspected),
             key=lambda name: (checks[name].passed, checks[name].gain),
             default="",
         )
         if best and as_stated is not None and not judge.nearly(checks[best]):
             bar.set_description(plain(f"new fit with another {best}, by finer steps"))
-            checks[best] = judge.at_rest(judge.ends[best], as_stated)
+            checks[best] = judge.at_rest(near[best], as_stated)
 
 
 def alike(
