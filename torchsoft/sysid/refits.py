@@ -181,7 +181,8 @@ def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[st
     Q, _ = np.linalg.qr(fit.at.J[:, own])
     effect = across(fit.at.J[:, k] * (fit.x[k] - c.start[k]), Q)
     square, out = max(float(effect @ effect), 1e-300), dict[str, float]()
-    for one, d, _ in columns(fit, others)[0]:
+    rough = fit if fit.check.bias is None else coarsened(fit)  # of many runs, on as few steps
+    for one, d, _ in columns(rough, others)[0]:
         if d is not None:
             part = across(d, Q)
             size, along = max(float(part @ part), 1e-300), float(part @ effect)
