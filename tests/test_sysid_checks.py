@@ -430,6 +430,8 @@ def test_a_number_is_like_a_cause_as_far_as_its_range_goes():
     assert low == pytest.approx(-AMOUNTS * WIDEST)
     assert high == pytest.approx(AMOUNTS * WIDEST)
     assert reach(fit.problem, known["mesh"]) == (-np.inf, np.inf)
+    never = replace(gravity, step=1e6 * gravity.step, nominal=-gravity.nominal)
+    assert reach(fit.problem, never) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(("second", "near"), [(250.0, ["a", "b"]), (80.0, [])])

@@ -197,10 +197,14 @@ def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[st
 
 def reach(problem: Problem, one: Variation) -> tuple[float, float]:
     """Range of an assumption in a new fit, over the amount of its variation; unlimited for a law or
-    a constant of the computation, whose test to first order says little."""
+    a constant of the computation, whose test to first order says little, and none where no new fit
+    can be."""
     if one.kind in ("numerical", "law"):
         return -np.inf, np.inf
-    c = assuming(problem, [one], free=True).coordinates
+    try:
+        c = assuming(problem, [one], free=True).coordinates
+    except ValueError:
+        return 0.0, 0.0
     mine = c.all[c.labels.index(one.label)]
     step = one.amount if one.vary is not None or one.read is not None else one.step
     ends = sorted((end - mine.nominal) / step for end in (mine.low, mine.high))
