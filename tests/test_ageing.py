@@ -6,9 +6,14 @@ import pytest
 import torch
 from test_rate_and_state import sled
 
-from torchsoft import AgeingSlip, Reference, RigFile, SmoothSlip, Trajectory, simulate
+from torchsoft import AgeingSlip, Reference, RigFile, SmoothSlip, SoftContact, Trajectory, simulate
+from torchsoft.codegen import emit
+from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.trace import traced
+from torchsoft.physics.contact import free_law
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.motion import Lines
+from torchsoft.solve.laws import as_law
 
 MU, AGEING, D_C, T_0 = 0.6, 0.02, 20e-6, 1e-3
 
@@ -88,3 +93,31 @@ def test_a_rig_is_extended_by_ageing_and_keeps_its_names():
     assert set(built.rig.names) - before == {"laws.steel_on_rubber.friction.ageing"}
     mu_s = built.rig.parameter("laws.steel_on_rubber.friction.mu_s")
     assert mu_s is next(iter(built.rig.contacts.values())).law.friction.mu_s
+
+
+@pytest.mark.parametrize("ageing", [0.005, 0.1])
+def test_derivatives_of_the_slip_rate_are_those_of_the_elements_equation(ageing):
+    """Though only the last of its steps are differentiated: dV/dE = 1 / (R - d(mu F_N)/dV)."""
+    E, F_N, R, h, age = some_points(ageing)
+    law = AgeingSlip(MU, 0.5, 5e-3, ageing, D_C, T_0)
+    E.requires_grad_()
+    V, _ = law(E, F_N, R, age[:, None], h)
+    (by_E,) = torch.autograd.grad(V.sum(), E)
+    V = V.detach().requires_grad_()
+    older = torch.log1p((age + h) / (1 + h * V / D_C) / T_0)
+    friction = (0.5 + (MU - 0.5) / (1 + V / 5e-3)) * (1 + ageing / MU * older) * F_N
+    (falls,) = torch.autograd.grad(friction.sum(), V)
+    slips = (V > 0).detach()
+    assert by_E[slips].numpy() == pytest.approx((1 / (R + falls))[slips].numpy(), rel=1e-8)
+    assert by_E[~slips].count_nonzero() == 0
+    assert slips.sum() > 5000
+
+
+def test_a_point_away_from_contact_iterates_nothing():
+    """No normal force, no slip to search: most points of a pad do not touch."""
+    law = SoftContact(1e5, 100.0, 1e5, 100.0, friction=AgeingSlip(MU, 0.5))
+    graph = Graph()
+    function, parameters = as_law(free_law, {"law": law})
+    out = traced(graph, function, torch.linspace(0.01, 0.02, 4).double(), parameters)
+    code = emit.function(graph, "value", ("x", "p", "out"), {"out": out})
+    assert code.count("@log1p") == 1

@@ -16,6 +16,10 @@ ITERATIONS, STEEP, SETTLED = 8, 0.99, 1e-9
 below which a step tells no slope: of 200,000 random points that spring and dashpot hold none was
 left with an error above 1e-9 of its effort."""
 
+DIFFERENTIATED = 2
+"""Last of these steps that are differentiated: each leaves a part of the derivative's error that is
+the relative error of the slope."""
+
 
 class AgeingSlip(SmoothSlip):
     """Smooth slip under friction that is
@@ -74,7 +78,9 @@ class AgeingSlip(SmoothSlip):
 
         first = slip(torch.zeros_like(E))  # zero where a point that presses sticks
         old, before, rate, secant = torch.zeros_like(E), first, first, torch.zeros_like(E)
-        for _ in range(ITERATIONS):
+        for left in reversed(range(ITERATIONS)):
+            if left + 1 == DIFFERENTIATED:
+                old, before, rate, secant = (one.detach() for one in (old, before, rate, secant))
             way, there = rate - old, slip(rate)
             far = way.abs() > SETTLED * rate
             slope = (there - before) / torch.where(far, way, 1.0)
