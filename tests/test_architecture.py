@@ -33,8 +33,8 @@ FLOWS = {
     "sysid": """
         initial_state recording unknowns noise prediction runs assumptions problem first_samples
         synthetic fit plan prechecks
-        residual_tests colour refits sensitivity suspects estimate result profile
-        posterior identification compare
+        residual_tests colour refits assumption_tests new_fits sensitivity suspects estimate
+        result profile posterior identification compare
         planner columns configuration measured design figures report .
     """,
     "testing": "energy laws gradients .",

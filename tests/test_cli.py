@@ -396,7 +396,7 @@ def test_an_interrupt_among_the_assumptions_draws_nothing(folder, monkeypatch, c
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
+    monkeypatch.setattr("torchsoft.sysid.refits.difference", interrupted)
     write(folder / "data.csv", rows(42))
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 130
     assert sorted(os.listdir("out")) == ["answer.json", "unfinished"]

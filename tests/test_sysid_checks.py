@@ -24,8 +24,15 @@ from torchsoft.sysid import (
     Stage,
     Unknown,
     identify,
+    new_fits,
     record,
-    sensitivity,
+)
+from torchsoft.sysid.assumption_tests import (
+    TIGHTENINGS,
+    Again,
+    AssumptionTest,
+    Judge,
+    assumption_test,
 )
 from torchsoft.sysid.assumptions import (
     AMOUNTS,
@@ -40,6 +47,7 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.estimate import Quantity
 from torchsoft.sysid.fit import Check, Fit, standard_deviations
 from torchsoft.sysid.identification import notices_on, ordering_constraints
+from torchsoft.sysid.new_fits import MOST, NewFits, alike
 from torchsoft.sysid.plan import settle
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
@@ -55,21 +63,7 @@ from torchsoft.sysid.refits import (
 )
 from torchsoft.sysid.residual_tests import Verdict
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.sensitivity import (
-    MOST,
-    TIGHTENINGS,
-    Again,
-    AssumptionTest,
-    Checked,
-    Judge,
-    alike,
-    assumption_test,
-    check_assumptions,
-    compared,
-    doubted,
-    new_fits,
-    rivals,
-)
+from torchsoft.sysid.sensitivity import Checked, check_assumptions, compared, doubted, rivals
 from torchsoft.sysid.suspects import LIKELY, assumption_doubts, assumption_notices, unseen
 
 BASE = PAPER.override(COARSE)
@@ -116,7 +110,7 @@ def checked(
     stages = [Stage("all", problem.names, problem.coordinates.labels, RTOL)]
     answer = identify(problem, plan=stages, assumptions="trusted")
     end = ended(problem, np.array(answer.x))
-    return check_assumptions(end, doubtful=doubtful, explain=explain)
+    return check_assumptions(end, doubtful=doubtful, effort=np.inf if explain else 0.0)
 
 
 def ended(problem: Problem, x: np.ndarray) -> Fit:
@@ -384,15 +378,42 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
     )
     parts = {"a": 0.25, "b": 0.25 if together else 0.9}
     joint = SimpleNamespace(square=joint_left, converged=rests, chi2=9.0)
-    monkeypatch.setattr(sensitivity, "joint_fit", lambda *given: joint)
-    monkeypatch.setattr(sensitivity, "shares", lambda *given: (parts, together))
-    monkeypatch.setattr(sensitivity, "refit", lambda *given: object())
+    monkeypatch.setattr(new_fits, "joint_fit", lambda *given: joint)
+    monkeypatch.setattr(new_fits, "shares", lambda *given: (parts, together))
+    monkeypatch.setattr(new_fits, "refit", lambda *given: object())
     problem: Any = ClosedForm(lambda x: 10.0 + x, 1)
     end = Fit(problem, Runner(()), np.zeros(1), Stage("far off", ("data",), ("p0",), RTOL)).begun()
-    found = [one.name for one in new_fits(end, taken, taken, judge, checks)]
+    found = [one.name for one in NewFits(end, taken, taken, judge, checks)]
     assert found == tried
     left_out = joint_left > 400.0 or (rests and joint_left > 100.0)
     assert all(checks[name].suspected != left_out for name in "ab")
+
+
+def test_new_fits_end_with_the_effort(monkeypatch):
+    """The first suspect is tried whatever it takes; those that are left then have names."""
+    taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "abc"]
+    checks = {one.name: assumption_test(one, gain=9.0, suspected=True) for one in taken}
+    judge: Any = SimpleNamespace(
+        square=1000.0, ends={}, large_enough=lambda one: True, nearly=lambda one: False
+    )
+    runner: Any = SimpleNamespace(work=2.0)
+    end: Any = SimpleNamespace(progress=False, runner=runner, chi2=1.0)
+    end._replace = lambda **_: end
+
+    def refitted(*_: object) -> None:
+        runner.work += 3.0
+
+    monkeypatch.setattr(new_fits, "refit", refitted)
+    fits = NewFits(end, taken, taken, judge, checks, effort=2.0)
+    assert [*fits] == []  # the fit as stated could not begin
+    monkeypatch.setattr(new_fits, "refit", lambda end, tried, near=None: refitted() or not tried)
+    monkeypatch.setattr(NewFits, "fit", lambda *_: refitted())
+    runner.work = 2.0
+    fits = NewFits(end, taken, taken, judge, checks, effort=2.0)
+    assert [one.name for one in fits] == ["a"]
+    assert fits.late == ["b", "c"]
+    (said,) = assumption_notices(Checked([], np.zeros((1, 0)), np.eye(1), late=tuple(fits.late)))
+    assert "there was none with another b, c; a larger one tries them" in said
 
 
 def test_a_cause_has_an_effect_of_the_size_of_the_misfit():

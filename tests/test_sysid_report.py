@@ -29,6 +29,7 @@ from torchsoft.sysid import (
     record,
 )
 from torchsoft.sysid import report as sections
+from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.estimate import Direction
 from torchsoft.sysid.figures import (
     correlation_figure,
@@ -45,7 +46,6 @@ from torchsoft.sysid.report import page as page_of
 from torchsoft.sysid.residual_tests import autocorrelation
 from torchsoft.sysid.result import ChannelNoise, load_answer, undetermined
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.sensitivity import AssumptionTest
 
 Found = tuple[IdentificationResult, Problem]
 E, K_N, R_N = "materials.rubber.E", "laws.steel_on_rubber.K_n", "laws.steel_on_rubber.R_n"

@@ -31,9 +31,9 @@ EXPLAIN = """\
 Why does the model not explain these recordings?
 
 Identifies as `identify` does, and where a misfit is left that no test of an assumption explains
-to first order, fits again without one assumption after the other until one explains the data:
-minutes each, the progress names which. With the checkpoint of an identification it begins where
-that ended."""
+to first order, fits again without one assumption after the other until one explains the data,
+or until new fits took --effort times the work of the fit; the progress names which. With the
+checkpoint of an identification it begins where that ended."""
 
 
 REHEARSE = """\
@@ -73,6 +73,12 @@ def add_arguments(one: argparse.ArgumentParser) -> None:
     add_yes(one)
     add_progress(one)
     verb = one.prog.split()[-1]
+    if verb == "explain":
+        one.add_argument(
+            "--effort",
+            type=float,
+            help="most work of new fits, over that of the fit itself (fit.effort)",
+        )
     one.set_defaults(explains=verb == "explain", rehearses=verb == "rehearse")
 
 
@@ -105,6 +111,7 @@ def identify(options: argparse.Namespace) -> int:
             changed = {
                 "rtol": options.rtol, "workers": options.workers,
                 "assumptions": "explained" if options.explains else None,
+                "effort": options.effort if options.explains else None,
             }  # fmt: skip
             fit = Settings.model_validate(
                 fit.model_dump() | {k: v for k, v in changed.items() if v is not None}

@@ -84,6 +84,10 @@ Assumed = Literal["checked", "explained", "trusted"]
 cause, or trusted."""
 
 
+EFFORT = 5.0
+"""Work of new fits, over that of the fit itself, after which `explain` begins no other."""
+
+
 class Settings(Table):
     """Settings of a fit, which are arguments of `identify`."""
 
@@ -95,6 +99,7 @@ class Settings(Table):
     seed: int = Field(0, ge=0, le=SEED)
     tightenings: int = Field(2, ge=0, le=10)
     assumptions: Assumed = "checked"
+    effort: float = Field(EFFORT, gt=0, le=1e6)
 
     @model_validator(mode="after")
     def _the_method_has_the_loss(self) -> "Settings":
@@ -164,7 +169,8 @@ def conclude(
     doubtful = not end.converged or bool(own) or bool(colour.refused) or bound or larger
     checked = Checked([], np.zeros((len(at.r), 0)), end.J)
     if settings.assumptions != "trusted":
-        checked = tested_assumptions(end, doubtful, settings.assumptions == "explained")
+        effort = settings.effort if settings.assumptions == "explained" else 0.0
+        checked = tested_assumptions(end, doubtful, effort)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if check.bias is None else check.bias
     C_fit = (
         C_free * max(1.0, chi2)
@@ -242,6 +248,7 @@ def conclude(
             "rtol_asked": rtol_asked,
             "acknowledged": list(acknowledged),
             "untried": list(checked.untried),
+            "late": list(checked.late),
             "candidates": list(checked.candidates),
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
@@ -276,7 +283,7 @@ def run_notices(end: Fit) -> list[str]:
     return [*found.values()]
 
 
-def tested_assumptions(end: Fit, doubtful: bool, explain: bool) -> Checked:
+def tested_assumptions(end: Fit, doubtful: bool, effort: float) -> Checked:
     """Tests of the assumptions at the end of a fit, on residuals whitened by declared colour only:
     undeclared colour may be the trace of a wrong assumption. The columns in the result are whitened
     by all of the noise."""
@@ -289,7 +296,7 @@ def tested_assumptions(end: Fit, doubtful: bool, explain: bool) -> Checked:
             problem=stated, runner=stated.runner(end.runner), check=check._replace(finer=finer)
         )
     )
-    found = check_assumptions(there, doubtful=doubtful, explain=explain)
+    found = check_assumptions(there, doubtful=doubtful, effort=effort)
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(stated, rows.r, end.which)).J
     return found._replace(columns=columns, J=end.J)
@@ -411,6 +418,7 @@ def identify(
     seed: int = 0,
     tightenings: int = 2,
     assumptions: Assumed = "checked",
+    effort: float = EFFORT,
     acknowledged: Sequence[str] = (),
 ) -> IdentificationResult:
     """Find the unknown parameters of `problem`, with intervals, and find which of them the data do
@@ -430,10 +438,11 @@ def identify(
     At the end the assumptions (mesh, place of the disc, numbers that are called
     known, faults of sensors, the friction law) are tested to first order, a run each, and intervals
     allow for constants of the computation that the data cannot tell. Where no test explains a
-    misfit, a notice names the candidates, and `explain` tries them. Before the fit recordings are
-    held against what such a rig can do at all: signs, units, delays, zeros, set-points, the body
-    that a loop senses; `acknowledged` names findings that are no mistakes. With `assumptions` =
-    "trusted" the tests at the end are left out, but not the checks of the recordings.
+    misfit, a notice names the candidates, and `explain` tries them, until new fits took `effort`
+    times the work of the fit itself. Before the fit recordings are held against what such a rig can
+    do at all: signs, units, delays, zeros, set-points, the body that a loop senses; `acknowledged`
+    names findings that are no mistakes. With `assumptions` = "trusted" the tests at the end are
+    left out, but not the checks of the recordings.
 
     Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or
     cannot be what they are taken for, `Unreachable` where the model cannot follow the data.
@@ -452,6 +461,7 @@ def identify(
         seed=seed,
         tightenings=tightenings,
         assumptions=assumptions,
+        effort=effort,
     )
     if plan is not None and (starts > 1 or rtol not in (RTOL, *(stage.rtol for stage in plan))):
         raise ValueError(
@@ -481,8 +491,9 @@ def explain(problem: Problem, **options: Any) -> IdentificationResult:
     order.
 
     The fit is repeated without one assumption after the other (another law, number, mesh, place,
-    sensor) until one explains the data: some minutes each, with progress that names it. Takes the
-    arguments of `identify`, and with its `checkpoint` begins where that ended; Ctrl-C keeps what
+    sensor) until one explains the data, or until new fits took `effort` times the work of the fit:
+    notices name the assumptions that are left then. Progress names each. Takes the arguments of
+    `identify`, and with its `checkpoint` begins where that ended; Ctrl-C keeps what
     was tried. Raises what `identify` does.
     """
     return identify(problem, **options, assumptions="explained")

@@ -26,6 +26,7 @@ from torchsoft.physics.arguments import whole
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.written import files_renamed
+from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.estimate import (
     ChannelResiduals,
     Contribution,
@@ -37,7 +38,6 @@ from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.sensitivity import AssumptionTest
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
 

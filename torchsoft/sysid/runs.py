@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.cost import steps_per_second
+from torchsoft.cost import rig_step, steps_per_second
 from torchsoft.files import (
     CHECKPOINT,
     SEALED,
@@ -208,6 +208,7 @@ class Runner:
         self.variations = dict(variations or {})
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.gradients = self.remembered = 0
+        self._work = 0.0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
         beginnings = {recording.beginning for recording in self.recordings}
         self._alike, self._lock = len(beginnings) < len(self.recordings), Lock()
@@ -233,8 +234,7 @@ class Runner:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
         self._starts = {}
         out = [self._journal.recall(job) if self._journal is not None else None for job in jobs]
-        for job, result in zip(jobs, out):
-            self._count(job, result is not None)
+        remembered = [result is not None for result in out]
         todo = [i for i, result in enumerate(out) if result is None]
         todo.sort(key=lambda i: self._length(jobs[i]), reverse=True)  # the longest first
         with single_threaded():
@@ -242,7 +242,22 @@ class Runner:
                 lambda k: self._made(jobs[todo[k]]), len(todo), self.workers
             ):
                 out[todo[i]] = result
+        for job, result, known in zip(jobs, out, remembered):
+            self._count(job, known, self._cost(job, result))
         return out
+
+    @property
+    def work(self) -> float:
+        """Expected time [s] of all runs of this runner and of those that count here, and of the one
+        that it counts for: the same in every repetition, remembered or not."""
+        return self._work if self._parent is None else self._parent.work
+
+    def _cost(self, job: Job, result: Any) -> float:
+        """Expected time [s] of the steps of a run, on a usual machine."""
+        differentiated = bool(job.names) or job.judged is not None
+        knots = getattr(result, "knots", None)
+        steps = self._length(job) if knots is None else len(knots) - 1
+        return steps * rig_step(self.recordings[job.recording].rig, differentiated)
 
     def _made(self, job: Job) -> Any:
         """Run a job and store its result, even if an interruption is pending."""
@@ -312,7 +327,8 @@ class Runner:
             return len(job.steps.knots) - 1
         return steps_per_second(job.steps) * self.recordings[job.recording].duration
 
-    def _count(self, job: Job, remembered: bool) -> None:
+    def _count(self, job: Job, remembered: bool, work: float) -> None:
+        self._work += work
         self.remembered += remembered
         if job.judged is not None:
             self.gradients += 1
@@ -321,7 +337,7 @@ class Runner:
         else:
             self.simulations += 1
         if self._parent is not None:
-            self._parent._count(job, remembered)
+            self._parent._count(job, remembered, work)
 
 
 EARLY = 2e-3

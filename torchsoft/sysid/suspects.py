@@ -4,8 +4,9 @@ misfit, constants of the computation that affect the estimates, and what would n
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.assumptions import AMOUNTS
-from torchsoft.sysid.sensitivity import AssumptionTest, Checked
+from torchsoft.sysid.sensitivity import Checked
 
 LIKELY = 0.01
 """Least odds of a suspect that is named."""
@@ -43,6 +44,12 @@ def assumption_notices(checked: Checked) -> list[str]:
         out.append(
             f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
             "tries them"
+        )
+    if checked.late:
+        more = f" and {len(checked.late) - NAMED} more" if len(checked.late) > NAMED else ""
+        out.append(
+            "new fits took as much work as `effort` allows, so there was none with another "
+            f"{', '.join(checked.late[:NAMED])}{more}; a larger one tries them"
         )
     return out + constant_notices(checked)
 

@@ -1,0 +1,189 @@
+"""New fits of what a model does not explain: with one suspect after the other, until one explains
+the data."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from tqdm import tqdm
+
+from torchsoft.display import hidden
+from torchsoft.sysid.assumption_tests import RIVAL, Again, AssumptionTest, Judge
+from torchsoft.sysid.assumptions import Variation
+from torchsoft.sysid.fit import Fit
+from torchsoft.sysid.refits import far_off, joint_fit, likeness, refit, shares
+from torchsoft.tables import plain
+
+MOST = 12
+"""Most suspects with which a fit is repeated, besides laws and constants of the computation."""
+
+
+class NewFits:
+    """New fits of a doubtful fit, with one suspect of the `candidates` after the other. The
+    iteration yields those that have been tried; their tests in `checks` are replaced.
+
+    Sensors that explain the misfit by one kind of fault come first, in one fit, and costly suspects
+    last. Where one suspect explains it, or `NEARLY` all of it, the fit goes on until it is at rest;
+    those with much smaller gains are then left out, and costly ones; where that one was too far off
+    for tests to first order, the gains are those of the effects at the end under it, of all that
+    were `tested`. Where all numbers together leave more than `RIVAL` of the misfit, or are at rest
+    far off, none is the cause alone, and they are left out; so are effects too small for it. No fit
+    is begun once all took more than `effort` times the work of the fit itself: `late` has the names
+    of the suspects that are left then.
+    """
+
+    def __init__(
+        self,
+        end: Fit,
+        candidates: Sequence[Variation],
+        tested: Sequence[Variation],
+        judge: Judge,
+        checks: dict[str, AssumptionTest],
+        effort: float = float("inf"),
+    ) -> None:
+        self.judge, self.tested, self.checks = judge, tested, checks
+        self.linear, self.far, self.late = dict(checks), far_off(end), list[str]()
+        self.gains = {one.name: checks[one.name].gain for one in candidates}
+        self.enough = 0.0
+        """Least gain of a suspect that is tried, once one explains the misfit."""
+        self.candidates, self.tried = list(candidates), set[str]()
+        self.queue = list[list[Variation]]()
+        self.bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
+        self.end = end._replace(notify=lambda chi2: self.bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
+        self.most = end.runner.work * (1.0 + effort)
+
+    def __iter__(self) -> Iterator[Variation]:
+        with warnings.catch_warnings(action="ignore"), self.bar:
+            near = self.prepare()
+            self.say("new fit with all assumptions")
+            as_stated = refit(self.end, ())
+            self.bar.update()
+            while self.queue and as_stated is not None:
+                some = self.queue.pop(0)
+                if not self.promising(some):
+                    continue
+                if self.tried and self.end.runner.work > self.most:
+                    self.late.append(named(some))
+                    continue
+                self.say(f"new fit with another {named(some)} ({len(self.queue)} more)")
+                self.tried |= {one.name for one in some}
+                self.fit(some, near, as_stated)
+                self.bar.update()
+                if len(some) == 1:
+                    yield some[0]
+                found = self.checks.get(named(some))
+                if found is not None and self.judge.nearly(found):
+                    self.limit(some)
+            if as_stated is not None:
+                self.finish(as_stated)
+
+    def say(self, text: str) -> None:
+        """Describe the work on the progress bar."""
+        self.bar.set_description(plain(text))
+
+    def prepare(self) -> Fit | None:
+        """Fill the queue, in the order in which suspects are likely; where all numbers together are
+        far off, or explain the misfit, by the fit with them all, which is returned if it does."""
+        end, judge, checks, joint = self.end, self.judge, self.checks, None
+        if self.far:
+            self.say("new fit with all suspects unknown at once")
+            joint = joint_fit(end, self.candidates, judge.explained_chi2)
+        explains, together = joint is not None and joint.square <= judge.explained_chi2, list[str]()
+        if joint is not None:
+            parts, together = shares(end, joint, self.candidates)
+            self.gains |= {name: explains * judge.square * part for name, part in parts.items()}
+            much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
+            if not explains and (much or (joint.converged and far_off(joint))):
+                for name in parts:
+                    checks[name] = replace(checks[name], suspected=False)
+                self.candidates = [one for one in self.candidates if one.name not in parts]
+        self.candidates = [one for one in self.candidates if judge.large_enough(one)]
+        blind = self.far and not explains  # gains to first order say little
+
+        def order(one: Variation) -> tuple[bool, bool, float]:
+            return one.costly, blind and one.kind != "law", -self.gains[one.name]
+
+        self.queue = [[one] for one in sorted(self.candidates, key=order)]
+        if explains and len(together) > 1:
+            alone = {one.name: self.linear[one.name].gain for one in self.candidates}
+            self.queue = [*alike(self.candidates, together, alone), *self.queue]
+        return joint if explains else None
+
+    def gain(self, some: Sequence[Variation]) -> float:
+        """Expected fall of the sum of squares with some suspects at once."""
+        return self.gains.get(named(some), self.judge.square)
+
+    def promising(self, some: Sequence[Variation]) -> bool:
+        """Whether suspects can explain about as much as the one that explains the misfit, if
+        any."""
+        return self.gain(some) >= self.enough and not (self.enough and some[0].costly)
+
+    def fit(self, some: Sequence[Variation], near: Fit | None, as_stated: Fit) -> None:
+        """Repeat the fit with some suspects at once, from its end or from one `near`."""
+        name, linear = named(some), [self.checks[one.name] for one in some]
+        tried = [one.within(test.favoured) for one, test in zip(some, linear)]
+        if (fit := refit(self.end, tried, near)) is None:
+            return
+        again = Again(name, tried, linear, fit)
+        found = self.judge.fit(again, as_stated)
+        if self.judge.nearly(found):
+            found = self.judge.at_rest(again, as_stated)
+        if found.refitted:
+            self.checks[name] = found
+
+    def limit(self, some: Sequence[Variation]) -> None:
+        """Leave out, where some suspects explain the misfit, those that gain much less; gains of
+        the others are those at the end of the first such fit, where the first end was too far
+        off."""
+        name = named(some)
+        gain, end = self.gain(some), self.judge.ends.get(name)
+        first = len(some) == 1 and some[0].kind in ("known", "sensor") and not self.enough
+        if first and end is not None and (self.far or self.linear[name].far):
+            self.say(f"effects of the others under another {name}")
+            left = [one for one in self.tested if one.name not in self.tried]
+            parts, gain = likeness(end.fit, end.tried[0], left), self.checks[name].gain
+            self.gains |= {other: part * gain for other, part in parts.items()}
+            queued = {one.name for some in self.queue for one in some}
+            more = [one for one in left if one.name in parts.keys() - queued]
+            more = sorted(more, key=lambda one: -self.gains[one.name])[:MOST]
+            self.queue += [[one] for one in more]
+            self.bar.total += len(more)
+        self.enough = max(self.enough, RIVAL * gain)
+        self.queue.sort(key=self.gain, reverse=True)
+
+    def finish(self, as_stated: Fit) -> None:
+        """Continue the fit of the likeliest suspect until it is at rest, where none explains the
+        misfit."""
+        checks, ends = self.checks, self.judge.ends
+        best = max(
+            (name for name, one in ends.items() if checks[name].suspected and not far_off(one.fit)),
+            key=lambda name: (checks[name].passed, checks[name].gain),
+            default="",
+        )
+        if best and not self.judge.nearly(checks[best]):
+            self.say(f"new fit with another {best}, by finer steps")
+            checks[best] = self.judge.at_rest(ends[best], as_stated)
+
+
+def named(some: Sequence[Variation]) -> str:
+    """Name of suspects that are tried at once."""
+    return " and ".join(one.name for one in some)
+
+
+def alike(
+    candidates: Sequence[Variation], together: Sequence[str], gains: Mapping[str, float]
+) -> list[list[Variation]]:
+    """The sensors whose faults explain the misfit `together`, with faults of one kind: of each kind
+    that explains about as much of it alone, since to first order a lag is a delay."""
+    some = [one for one in candidates if one.name in together]
+    faults = {one.fault: one for one in candidates if one.fault is not None}
+    if any(one.fault is None for one in some):
+        return []
+    out = list[list[Variation]]()
+    for kind in dict.fromkeys(kind for _, kind in faults):
+        same = [faults.get((one.fault[0], kind)) for one in some if one.fault]
+        if all(
+            other and gains[other.name] > RIVAL * gains[one.name] for one, other in zip(some, same)
+        ):
+            out.append([one for one in same if one])
+    return out
