@@ -10,6 +10,7 @@ import torch
 from conftest import COARSE, PAPER, RUBBER, dry, excited, stroked
 
 from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Reference, Rig
+from torchsoft.physics.motion import Sampled
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.assumptions import (
     COORDINATES,
@@ -19,6 +20,7 @@ from torchsoft.sysid.assumptions import (
     lifted,
     limited_effort,
     linear_pads,
+    of_fifth_degree,
     off_centre,
     pushed,
     read_across,
@@ -290,3 +292,17 @@ def test_linear_pads_at_finite_strain_are_those_of_a_neo_hookean_file():
     linear = predict(strokes().begin(), {E: 0.8e6}, grid, (), 1e-3)
     y = strokes().channels.index("effort_y")
     assert one.signals[-1, y] / linear.signals[-1, y] > 1.03
+
+
+@pytest.mark.parametrize("rated", [False, True])
+def test_curves_of_fifth_degree_show_the_error_of_cubics(rated):
+    """Of a sine with 8 set-points a period, in its rates."""
+    t = torch.linspace(0.0, 2.0, 33, dtype=torch.float64)
+    angle = 4 * torch.pi * t
+    one = Sampled(t, torch.sin(angle), 4 * torch.pi * torch.cos(angle) if rated else None)
+    inside = torch.linspace(0.5, 1.5, 201, dtype=torch.float64)
+    (_, own), (_, better) = one(inside), of_fifth_degree(one)(inside)
+    error = 4 * torch.pi * torch.cos(4 * torch.pi * inside) - own
+    shown = better - own
+    assert shown @ error / (error @ error) == pytest.approx(1.0, abs=0.15)
+    assert (shown - error).norm() < 0.3 * error.norm()

@@ -21,6 +21,9 @@ DIFFERENTIATED = {False: 2.5, True: 2.0}
 """Times of a step without sensitivities that one with a few takes, of condensed and of nodal
 pads."""
 
+FEW, COLUMN = 8, 0.09
+"""Number of parameters that are a few, and the part of such a step that each further one takes."""
+
 PER_NODE = {False: 2.2e-6, True: 6.5e-6}
 """Time of one step [s] for every node of two nodal pads, linear and at finite strain."""
 
@@ -74,15 +77,16 @@ def agree(cost: Cost, yes: bool, help: str) -> None:
     raise Costly(f"{cost.sentence}; {help}, or say --yes to begin")
 
 
-def rig_step(rig: Rig, differentiated: bool = False) -> float:
-    """Time of one step [s] of a rig; `differentiated` with sensitivities by a few parameters."""
+def rig_step(rig: Rig, differentiated: int = 0) -> float:
+    """Time of one step [s] of a rig, with sensitivities by so many parameters."""
+    more = 1.0 + COLUMN * max(differentiated - FEW, 0)
     seconds = 0.0
     for pad in rig.pads.values():
         points = len(pad.point_nodes) if pad.points else 0
         nodal = len(pad.mesh.free) if pad.nodal else 0
         finite = isinstance(pad.material, Hyperelastic)
         own = 0.5 * step_time(len(pad.mesh.surface), points, nodal, finite, pad.fields)
-        seconds += own * (DIFFERENTIATED[pad.nodal] if differentiated else 1.0)
+        seconds += own * (more * DIFFERENTIATED[pad.nodal] if differentiated else 1.0)
     return seconds
 
 

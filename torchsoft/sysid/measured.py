@@ -266,10 +266,6 @@ def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[f
 CHECKED = 30
 """Runs that a recording is asked for to check what is taken for granted."""
 
-FEW, COLUMN = 8, 0.09
-"""Number of unknowns that are few, and the share by which each one more lengthens a differentiated
-step."""
-
 
 def cost(
     problem: Problem,
@@ -298,11 +294,11 @@ def cost(
             for c in problem.coordinates.all
             if c.of_the_rig and c.recording in (None, recording.name)
         ]
-        more, span = 1 + COLUMN * max(len(mine) - FEW, 0), recording.duration + recording.start.lead
+        span = recording.duration + recording.start.lead
         seconds.append(0.0)
         for number, by, differentiated in runs:
             length = span * steps_per_second(by) + rows[recording.name]
-            step = rig_step(recording.rig, differentiated) * (more if differentiated else 1.0)
+            step = rig_step(recording.rig, max(len(mine), 1) if differentiated else 0)
             steps += number * length
             seconds[-1] += number * (length * step + RUN)
     matrix = 3 * 8 / 2**30 if descent else 0.0

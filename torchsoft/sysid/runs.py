@@ -254,10 +254,9 @@ class Runner:
 
     def _cost(self, job: Job, result: Any) -> float:
         """Expected time [s] of the steps of a run, on a usual machine."""
-        differentiated = bool(job.names) or job.judged is not None
         knots = getattr(result, "knots", None)
         steps = self._length(job) if knots is None else len(knots) - 1
-        return steps * rig_step(self.recordings[job.recording].rig, differentiated)
+        return steps * rig_step(self.recordings[job.recording].rig, len(job.names))
 
     def _made(self, job: Job) -> Any:
         """Run a job and store its result, even if an interruption is pending."""
