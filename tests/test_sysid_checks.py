@@ -389,12 +389,52 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
     assert all(checks[name].suspected != left_out for name in "ab")
 
 
+@pytest.mark.parametrize(("left", "tried"), [(50.0, ["a"]), (500.0, ["a", "law"])])
+def test_one_suspect_may_spare_the_joint_fit(left, tried, monkeypatch):
+    """Where it explains most of the misfit to first order, and all of it in a new fit; else all
+    numbers are fitted at once, and here none is the cause."""
+    taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "ab"]
+    taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
+    gains = {"a": 600.0, "b": 100.0, "law": 50.0}
+    checks = {one.name: assumption_test(one, gain=gains[one.name], suspected=True) for one in taken}
+    joints = list[str]()
+    judge: Any = SimpleNamespace(
+        square=1000.0,
+        explained_chi2=100.0,
+        ends={},
+        misfit=lambda left: left - 10.0,
+        large_enough=lambda one: True,
+        nearly=lambda one: one.left < 100.0,
+    )
+    end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=9.0)
+    end._replace = lambda **_: end
+
+    def joint_fit(*_: object) -> Any:
+        joints.append("joint")
+        return SimpleNamespace(square=900.0, converged=False, chi2=9.0)
+
+    def fitted(fits: NewFits, some: list[Variation], *_: object) -> None:
+        name = some[0].name
+        fits.checks[name] = replace(fits.checks[name], left=left if name == "a" else 999.0)
+
+    monkeypatch.setattr(new_fits, "joint_fit", joint_fit)
+    monkeypatch.setattr(new_fits, "shares", lambda *_: ({"a": 0.1, "b": 0.1}, []))
+    monkeypatch.setattr(new_fits, "refit", lambda *_: True)
+    monkeypatch.setattr(NewFits, "fit", fitted)
+    assert [one.name for one in NewFits(end, taken, taken, judge, checks)] == tried
+    assert len(joints) == len(tried) - 1
+
+
 def test_new_fits_end_with_the_effort(monkeypatch):
     """The first suspect is tried whatever it takes; those that are left then have names."""
     taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "abc"]
     checks = {one.name: assumption_test(one, gain=9.0, suspected=True) for one in taken}
     judge: Any = SimpleNamespace(
-        square=1000.0, ends={}, large_enough=lambda one: True, nearly=lambda one: False
+        square=1000.0,
+        ends={},
+        large_enough=lambda one: True,
+        nearly=lambda one: False,
+        misfit=lambda left: left - 10.0,
     )
     runner: Any = SimpleNamespace(work=2.0)
     end: Any = SimpleNamespace(progress=False, runner=runner, chi2=1.0)

@@ -17,19 +17,23 @@ from torchsoft.tables import plain
 MOST = 12
 """Most suspects with which a fit is repeated, besides laws and constants of the computation."""
 
+MOSTLY = 0.5
+"""Part of a misfit that a suspect explains to first order with which new fits begin."""
+
 
 class NewFits:
     """New fits of a doubtful fit, with one suspect of the `candidates` after the other. The
     iteration yields those that have been tried; their tests in `checks` are replaced.
 
-    Sensors that explain the misfit by one kind of fault come first, in one fit, and costly suspects
-    last. Where one suspect explains it, or `NEARLY` all of it, the fit goes on until it is at rest;
-    those with much smaller gains are then left out, and costly ones; where that one was too far off
-    for tests to first order, the gains are those of the effects at the end under it, of all that
-    were `tested`. Where all numbers together leave more than `RIVAL` of the misfit, or are at rest
-    far off, none is the cause alone, and they are left out; so are effects too small for it. No fit
-    is begun once all took more than `effort` times the work of the fit itself: `late` has the names
-    of the suspects that are left then.
+    Costly suspects come last. Where the misfit is far off, all numbers are fitted at once, unless
+    one suspect explains most of it to first order and `NEARLY` all in a new fit. Sensors that
+    explain it by one kind of fault then come first, in one fit; where all numbers leave more than
+    `RIVAL` of the misfit, or are at rest far off, none is the cause alone, and they are left out.
+    Effects too small for the misfit are left out always. Where one suspect explains it the fit goes
+    on until it is at rest; those with much smaller gains are then left out, and costly ones; where
+    that one was too far off for tests to first order, the gains are those of the effects at the end
+    under it, of all that were `tested`. No fit is begun once all took more than `effort` times the
+    work of the fit itself: `late` has the names of the suspects that are left then.
     """
 
     def __init__(
@@ -54,11 +58,15 @@ class NewFits:
 
     def __iter__(self) -> Iterator[Variation]:
         with warnings.catch_warnings(action="ignore"), self.bar:
-            near = self.prepare()
             self.say("new fit with all assumptions")
             as_stated = refit(self.end, ())
             self.bar.update()
-            while self.queue and as_stated is not None:
+            if as_stated is None:
+                return
+            self.queue = self.ordered(self.candidates)
+            evident = self.evident()
+            near = self.joint() if self.far and not evident else None
+            while self.queue:
                 some = self.queue.pop(0)
                 if not self.promising(some):
                     continue
@@ -74,39 +82,51 @@ class NewFits:
                 found = self.checks.get(named(some))
                 if found is not None and self.judge.nearly(found):
                     self.limit(some)
-            if as_stated is not None:
-                self.finish(as_stated)
+                elif evident:
+                    near = self.joint()
+                evident = False
+            self.finish(as_stated)
 
     def say(self, text: str) -> None:
         """Describe the work on the progress bar."""
         self.bar.set_description(plain(text))
 
-    def prepare(self) -> Fit | None:
-        """Fill the queue, in the order in which suspects are likely; where all numbers together are
-        far off, or explain the misfit, by the fit with them all, which is returned if it does."""
-        end, judge, checks, joint = self.end, self.judge, self.checks, None
-        if self.far:
-            self.say("new fit with all suspects unknown at once")
-            joint = joint_fit(end, self.candidates, judge.explained_chi2)
+    def ordered(
+        self, candidates: Sequence[Variation], blind: bool = False
+    ) -> list[list[Variation]]:
+        """Suspects in the order in which they are likely; `blind` where gains of all but laws say
+        little."""
+        large = [one for one in candidates if self.judge.large_enough(one)]
+        order = lambda one: (one.costly, blind and one.kind != "law", -self.gains[one.name])
+        return [[one] for one in sorted(large, key=order)]
+
+    def evident(self) -> bool:
+        """Whether the misfit is far off, and the likeliest suspect explains most of it to first
+        order."""
+        most = MOSTLY * self.judge.misfit(self.judge.square)
+        return self.far and bool(self.queue) and self.gain(self.queue[0]) >= most
+
+    def joint(self) -> Fit | None:
+        """Fit all suspects that are numbers at once, and fill the queue by what that tells; the fit
+        is returned if it explains the misfit."""
+        end, judge, checks, left = self.end, self.judge, self.checks, self.candidates
+        self.say("new fit with all suspects unknown at once")
+        joint = joint_fit(end, left, judge.explained_chi2)
         explains, together = joint is not None and joint.square <= judge.explained_chi2, list[str]()
         if joint is not None:
-            parts, together = shares(end, joint, self.candidates)
+            parts, together = shares(end, joint, left)
             self.gains |= {name: explains * judge.square * part for name, part in parts.items()}
             much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
             if not explains and (much or (joint.converged and far_off(joint))):
                 for name in parts:
                     checks[name] = replace(checks[name], suspected=False)
-                self.candidates = [one for one in self.candidates if one.name not in parts]
-        self.candidates = [one for one in self.candidates if judge.large_enough(one)]
-        blind = self.far and not explains  # gains to first order say little
-
-        def order(one: Variation) -> tuple[bool, bool, float]:
-            return one.costly, blind and one.kind != "law", -self.gains[one.name]
-
-        self.queue = [[one] for one in sorted(self.candidates, key=order)]
+                left = [one for one in left if one.name not in parts]
+        if not explains:
+            left = [one for one in left if one.name not in self.tried]
+        self.queue = self.ordered(left, blind=not explains)
         if explains and len(together) > 1:
-            alone = {one.name: self.linear[one.name].gain for one in self.candidates}
-            self.queue = [*alike(self.candidates, together, alone), *self.queue]
+            alone = {one.name: self.linear[one.name].gain for one in left}
+            self.queue = [*alike(left, together, alone), *self.queue]
         return joint if explains else None
 
     def gain(self, some: Sequence[Variation]) -> float:
