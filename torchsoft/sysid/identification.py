@@ -84,7 +84,7 @@ Assumed = Literal["checked", "explained", "trusted"]
 cause, or trusted."""
 
 
-EFFORT = 5.0
+EFFORT = 3.0
 """Work of new fits, over that of the fit itself, after which `explain` begins no other."""
 
 
