@@ -187,11 +187,29 @@ def test_frozen_steps_are_named_to_the_bit(tmp_path):
 def test_runs_of_varied_recordings_count_where_they_were_asked_for(monkeypatch):
     """The runs of tests and of new fits are a part of what an identification costs."""
     monkeypatch.setattr(runs, "simulated", lambda *_: PREDICTION)
+    monkeypatch.setattr(runs, "rig_step", lambda rig, parameters: 1.0 + parameters)
     one = {"beginning": "", "fingerprint": "a", "duration": 1.0, "begin": lambda: None}
-    recordings: Any = [SimpleNamespace(**one)]
+    recordings: Any = [SimpleNamespace(**one, rig=None)]
     parent = Runner(recordings)
     child = parent.of(recordings).of(recordings)
     child.run([Job(0, {"pad.E": 1.0}, (), 1e-3), Job(0, {"pad.E": 1.0}, ("pad.E",), 1e-3)])
     parent.run([Job(0, {"pad.E": 2.0}, (), 1e-3)])
     assert (child.simulations, child.jacobians) == (1, 1)
     assert (parent.simulations, parent.jacobians) == (2, 1)
+    steps = len(PREDICTION.knots) - 1
+    assert parent.work == child.work == (1 + 2 + 1) * steps
+
+
+def test_remembered_runs_are_as_much_work(tmp_path, monkeypatch):
+    """So that what a bound on the work leaves out does not hang on an interruption."""
+    monkeypatch.setattr(runs, "simulated", lambda *_: PREDICTION)
+    monkeypatch.setattr(runs, "rig_step", lambda rig, parameters: 1.0 + parameters)
+    one = {"beginning": "", "fingerprint": "a", "duration": 1.0, "begin": lambda: None}
+    recordings: Any = [SimpleNamespace(**one, rig=None)]
+    works = list[float]()
+    for _ in range(2):
+        runner = Runner(recordings, journal=tmp_path)
+        runner.run([Job(0, {"pad.E": 1.0}, ("pad.E",), 1e-3)])
+        works.append(runner.work)
+    assert runner.remembered == 1
+    assert works[0] == works[1] > 0.0
