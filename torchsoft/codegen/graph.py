@@ -178,7 +178,7 @@ class Graph:
                 return args[0]
             case "sub" if values[0] == 0.0:
                 return self("neg", args[1])
-            case "div" if None not in values and values[1] != 0.0:
+            case "div" if values[0] is not None and values[1]:
                 return self.constant(values[0] / values[1])
             case "add" | "mul" | "and" | "or":
                 return self._simplified_pair(op, args, values)
