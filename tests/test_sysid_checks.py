@@ -368,6 +368,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
     checks = {one.name: assumption_test(one, gain=gains[one.name], suspected=True) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
+        work={},
         explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
@@ -400,6 +401,7 @@ def test_one_suspect_may_spare_the_joint_fit(left, tried, monkeypatch):
     joints = list[str]()
     judge: Any = SimpleNamespace(
         square=1000.0,
+        work={},
         explained_chi2=100.0,
         ends={},
         misfit=lambda left: left - 10.0,
@@ -431,6 +433,7 @@ def test_new_fits_end_with_the_effort(monkeypatch):
     checks = {one.name: assumption_test(one, gain=9.0, suspected=True) for one in taken}
     judge: Any = SimpleNamespace(
         square=1000.0,
+        work={"c": 0.1},
         ends={},
         large_enough=lambda one: True,
         nearly=lambda one: False,
@@ -448,10 +451,14 @@ def test_new_fits_end_with_the_effort(monkeypatch):
     assert [*fits] == []  # the fit as stated could not begin
     monkeypatch.setattr(new_fits, "refit", lambda end, tried, near=None: refitted() or not tried)
     monkeypatch.setattr(NewFits, "fit", lambda *_: refitted())
+    for effort, tried in ((2.0, "a"), (4.9, "ab"), (5.1, "abc")):  # c is expected to take 1 more
+        runner.work = 2.0
+        fits = NewFits(end, taken, taken, judge, checks, effort)
+        assert [one.name for one in fits] == [*tried]
+        assert fits.late == [one for one in "abc" if one not in tried]
     runner.work = 2.0
     fits = NewFits(end, taken, taken, judge, checks, effort=2.0)
     assert [one.name for one in fits] == ["a"]
-    assert fits.late == ["b", "c"]
     (said,) = assumption_notices(Checked([], np.zeros((1, 0)), np.eye(1), late=tuple(fits.late)))
     assert "there was none with another b, c; a larger one tries them" in said
 

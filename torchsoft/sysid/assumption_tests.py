@@ -181,6 +181,8 @@ class Judge:
         self.Q, _ = np.linalg.qr(self.J)
         self.sd, self.labels = standard_deviations(self.J), end.labels
         self.columns, self.ends = dict[str, Array](), dict[str, Again]()
+        self.work = dict[str, float]()
+        """Expected time [s] of a run of every variation."""
         self.places = [part.rows for part in parts(end.problem, self.r, end.which)]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)

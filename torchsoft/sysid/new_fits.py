@@ -20,6 +20,9 @@ MOST = 12
 MOSTLY = 0.5
 """Part of a misfit that a suspect explains to first order with which new fits begin."""
 
+TRIALS = 10
+"""Evaluations that a new fit takes, as a rule."""
+
 
 class NewFits:
     """New fits of a doubtful fit, with one suspect of the `candidates` after the other. The
@@ -32,8 +35,8 @@ class NewFits:
     Effects too small for the misfit are left out always. Where one suspect explains it the fit goes
     on until it is at rest; those with much smaller gains are then left out, and costly ones; where
     that one was too far off for tests to first order, the gains are those of the effects at the end
-    under it, of all that were `tested`. No fit is begun once all took more than `effort` times the
-    work of the fit itself: `late` has the names of the suspects that are left then.
+    under it, of all that were `tested`. No fit is begun with which all would take more than
+    `effort` times the work of the fit itself: `late` has the names of the suspects that are left.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class NewFits:
                 some = self.queue.pop(0)
                 if not self.promising(some):
                     continue
-                if self.tried and self.end.runner.work > self.most:
+                if self.tried and self.end.runner.work + self.expected(some) > self.most:
                     self.late.append(named(some))
                     continue
                 self.say(f"new fit with another {named(some)} ({len(self.queue)} more)")
@@ -132,6 +135,10 @@ class NewFits:
     def gain(self, some: Sequence[Variation]) -> float:
         """Expected fall of the sum of squares with some suspects at once."""
         return self.gains.get(named(some), self.judge.square)
+
+    def expected(self, some: Sequence[Variation]) -> float:
+        """Least work of a fit with some suspects, which matters where their runs are costly."""
+        return TRIALS * sum(self.judge.work.get(one.name, 0.0) for one in some)
 
     def promising(self, some: Sequence[Variation]) -> bool:
         """Whether suspects can explain about as much as the one that explains the misfit, if

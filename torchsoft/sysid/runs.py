@@ -256,7 +256,8 @@ class Runner:
         """Expected time [s] of the steps of a run, on a usual machine."""
         knots = getattr(result, "knots", None)
         steps = self._length(job) if knots is None else len(knots) - 1
-        return steps * rig_step(self.recordings[job.recording].rig, len(job.names))
+        step = getattr(result, "step", 0.0)
+        return steps * (step or rig_step(self.recordings[job.recording].rig, len(job.names)))
 
     def _made(self, job: Job) -> Any:
         """Run a job and store its result, even if an interruption is pending."""
@@ -286,7 +287,8 @@ class Runner:
             if isinstance(made, FailedRun):
                 raise SimulationFailed(made.reason, made.time)
             own = [one.channels.index(channel) for channel in stated.channels]  # of more actuators
-            return made._replace(signals=made.signals[:, own])
+            step = rig_step(one.rig, len(job.names))
+            return made._replace(signals=made.signals[:, own], step=step)
 
         def watched(one: Recording) -> Prediction:
             """The run on a fine grid; that of the recording as stated is made once."""

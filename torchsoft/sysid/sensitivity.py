@@ -100,9 +100,10 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, effort: float = 0.0) 
     # such as of pads that creep longer than the lead of a run
     with warnings.catch_warnings(action="ignore"):
         found, J = columns(end, taken)
-    judge = Judge(end, J)
+    judge, spent = Judge(end, J), end.runner.work
     try:
         for one, d, reason in found:
+            judge.work[one.name], spent = end.runner.work - spent, end.runner.work
             if one.vary is None and d is not None and not d.any():
                 continue
             checks[one.name] = judge.first_order(one, d, reason)
