@@ -20,6 +20,11 @@ MOST = 12
 MOSTLY = 0.5
 """Part of a misfit that a suspect explains to first order with which new fits begin."""
 
+ALIKE = 0.5
+"""Part of the effect of a suspect that explains the misfit, to first order at the end under it,
+which another one must have to be tried: new fits of nine had as much of it to 0.15, and one that
+was the cause had 0.75 where another ended far from the truth."""
+
 TRIALS = 10
 """Evaluations that a new fit takes, as a rule."""
 
@@ -163,19 +168,20 @@ class NewFits:
         the others are those at the end of the first such fit, where the first end was too far
         off."""
         name = named(some)
-        gain, end = self.gain(some), self.judge.ends.get(name)
+        gain, end, part = self.gain(some), self.judge.ends.get(name), RIVAL
         first = len(some) == 1 and some[0].kind in ("known", "sensor") and not self.enough
         if first and end is not None and (self.far or self.linear[name].far):
             self.say(f"effects of the others under another {name}")
             left = [one for one in self.tested if one.name not in self.tried]
-            parts, gain = likeness(end.fit, end.tried[0], left), self.checks[name].gain
+            parts = likeness(end.fit, end.tried[0], left)
+            gain, part = self.checks[name].gain, ALIKE
             self.gains |= {other: part * gain for other, part in parts.items()}
             queued = {one.name for some in self.queue for one in some}
             more = [one for one in left if one.name in parts.keys() - queued]
             more = sorted(more, key=lambda one: -self.gains[one.name])[:MOST]
             self.queue += [[one] for one in more]
             self.bar.total += len(more)
-        self.enough = max(self.enough, RIVAL * gain)
+        self.enough = max(self.enough, part * gain)
         self.queue.sort(key=self.gain, reverse=True)
 
     def finish(self, as_stated: Fit) -> None:
