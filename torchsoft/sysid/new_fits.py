@@ -115,26 +115,31 @@ class NewFits:
         return self.far and bool(self.queue) and self.gain(self.queue[0]) >= most
 
     def joint(self) -> Fit | None:
-        """Fit all suspects that are numbers at once, and fill the queue by what that tells; the fit
-        is returned if it explains the misfit."""
+        """Fit all numbers that were tested at once, and fill the queue by what that tells: where it
+        explains the misfit, with those that alone have most of its effect; the fit is returned if
+        it does."""
         end, judge, checks, left = self.end, self.judge, self.checks, self.candidates
         self.say("new fit with all suspects unknown at once")
-        joint = joint_fit(end, left, judge.explained_chi2)
+        joint = joint_fit(end, self.tested, judge.explained_chi2)
         explains, together = joint is not None and joint.square <= judge.explained_chi2, list[str]()
         if joint is not None:
-            parts, together = shares(end, joint, left)
+            parts, together = shares(end, joint, self.tested)
             self.gains |= {name: explains * judge.square * part for name, part in parts.items()}
             much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
             if not explains and (much or (joint.converged and far_off(joint))):
                 for name in parts:
                     checks[name] = replace(checks[name], suspected=False)
                 left = [one for one in left if one.name not in parts]
+            if explains:
+                numbers = [one for one in self.tested if one.name in parts]
+                numbers.sort(key=lambda one: -self.gains[one.name])
+                left = [one for one in left if one.name not in parts] + numbers[:MOST]
         if not explains:
             left = [one for one in left if one.name not in self.tried]
         self.queue = self.ordered(left, blind=not explains)
         if explains and len(together) > 1:
-            alone = {one.name: self.linear[one.name].gain for one in left}
-            self.queue = [*alike(left, together, alone), *self.queue]
+            alone = {one.name: self.linear[one.name].gain for one in self.tested}
+            self.queue = [*alike(self.tested, together, alone), *self.queue]
         return joint if explains else None
 
     def gain(self, some: Sequence[Variation]) -> float:
