@@ -369,6 +369,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
     judge: Any = SimpleNamespace(
         square=1000.0,
         work={},
+        complementary=lambda some, count: some[:count],
         explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
@@ -402,6 +403,7 @@ def test_one_suspect_may_spare_the_joint_fit(left, tried, monkeypatch):
     judge: Any = SimpleNamespace(
         square=1000.0,
         work={},
+        complementary=lambda some, count: some[:count],
         explained_chi2=100.0,
         ends={},
         misfit=lambda left: left - 10.0,
@@ -461,6 +463,21 @@ def test_new_fits_end_with_the_effort(monkeypatch):
     assert [one.name for one in fits] == ["a"]
     (said,) = assumption_notices(Checked([], np.zeros((1, 0)), np.eye(1), late=tuple(fits.late)))
     assert "there was none with another b, c; a larger one tries them" in said
+
+
+def test_suspects_of_a_joint_fit_complement_each_other():
+    """A copy of the first one adds nothing; one that is one-sided counts on its side only."""
+    e = np.eye(40)
+    r = -(5 * e[3] + 3 * e[4] + e[5]) + 9 * e[0]
+    effects = {
+        "a": e[3], "copy of a": 2 * e[3], "near a": e[3] + 0.1 * e[4], "b": e[4], "c": e[5],
+        "wrong side": -(e[4] + e[5]),
+    }  # fmt: skip
+    judge: Any = SimpleNamespace(Q=e[:, :1], r=r, columns=effects)
+    some = [Variation(k, "known", "", "", one_sided=k == "wrong side") for k in effects]
+    found = [one.name for one in Judge.complementary(judge, some, 3)]
+    assert found == ["near a", "a", "c"]
+    assert len(Judge.complementary(judge, some, 9)) == 3
 
 
 def test_a_cause_has_an_effect_of_the_size_of_the_misfit():

@@ -16,13 +16,9 @@ from torchsoft.sysid.assumptions import AMOUNTS, Assumption, Variation
 from torchsoft.sysid.fit import Fit, shift, standard_deviations
 from torchsoft.sysid.plan import settle
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.refits import NEARLY, across
+from torchsoft.sysid.refits import EVIDENT, NEARLY, across, unit
 from torchsoft.sysid.residual_tests import Verdict, judge_residuals, parts, systematic
 from torchsoft.tables import Number
-
-EVIDENT = 20.0
-"""Fall of chi2, over the remaining misfit per sample, above which the data favour a variation: four
-and a half standard deviations, since some twenty variations are tested."""
 
 PATTERN = 0.5
 """Largest fraction of the residuals' autocorrelation that a favoured variation leaves: a cause
@@ -42,6 +38,9 @@ FIRST_ORDER = 3.0
 
 TIGHTENINGS = 2
 """Most times that a repeated fit goes on with a tenth of its tolerance."""
+
+REDUNDANT = 1e-6
+"""Part of the square of an effect beside others at which it counts as one of theirs."""
 
 BESIDES = 3
 """Most effects that are looked for besides the likeliest suspect."""
@@ -211,6 +210,25 @@ class Judge:
             return True
         return float(np.sum(across(d, self.Q) ** 2)) > RIVAL * self.misfit(self.square)
 
+    def complementary(self, some: Sequence[Variation], count: int) -> list[Variation]:
+        """Some assumptions, as many as asked for, by orthogonal matching pursuit to first order:
+        each explains most of what those before it leave."""
+        left = {one: across(self.columns[one.name], self.Q) for one in some}
+        least = {one: REDUNDANT * float(d @ d) for one, d in left.items()}
+        r, out = across(self.r, self.Q), list[Variation]()
+        while len(out) < count:
+            gains = {
+                one: float(d @ r) ** 2 / float(d @ d)
+                for one, d in left.items()
+                if float(d @ d) > least[one] and not (one.one_sided and float(d @ r) > 0)
+            }
+            if not gains:
+                break
+            out.append(max(gains, key=lambda one: gains[one]))
+            Q = unit(left.pop(out[-1]))[:, None]
+            r, left = across(r, Q), {one: across(d, Q) for one, d in left.items()}
+        return out
+
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""
         return self.explained([one]) or (one.refitted and one.left < self.explained_chi2)
@@ -273,7 +291,7 @@ class Judge:
         part = across(d, Q)
         size, along, square = float(part @ part), float(part @ r), float(r @ r)
         moves = -shift(self.J, d) / self.sd
-        least = 1e-12 if Q is self.Q else 1e-6  # it is what is taken in already
+        least = 1e-12 if Q is self.Q else REDUNDANT  # it is what is taken in already
         if size < least * max(float(d @ d), 1e-300) or size == 0.0:
             return self.made(one, moves, 0.0, square, 0.0, float("inf"), 1.0, r, r)
         gain, alpha = along**2 / size, -along / size

@@ -115,25 +115,24 @@ class NewFits:
         return self.far and bool(self.queue) and self.gain(self.queue[0]) >= most
 
     def joint(self) -> Fit | None:
-        """Fit all numbers that were tested at once, and fill the queue by what that tells: where it
-        explains the misfit, with those that alone have most of its effect; the fit is returned if
-        it does."""
+        """Fit at once the numbers that complement each other in explaining the misfit, and fill the
+        queue by what that tells; the fit is returned if it explains the misfit."""
         end, judge, checks, left = self.end, self.judge, self.checks, self.candidates
-        self.say("new fit with all suspects unknown at once")
-        joint = joint_fit(end, self.tested, judge.explained_chi2)
+        self.say("new fit with many suspects unknown at once")
+        every = [one for one in self.tested if one.parameter or one.fault is not None]
+        numbers = judge.complementary(every, MOST)
+        joint = joint_fit(end, numbers, judge.explained_chi2)
         explains, together = joint is not None and joint.square <= judge.explained_chi2, list[str]()
         if joint is not None:
-            parts, together = shares(end, joint, self.tested)
+            parts, together = shares(end, joint, numbers)
             self.gains |= {name: explains * judge.square * part for name, part in parts.items()}
             much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
             if not explains and (much or (joint.converged and far_off(joint))):
-                for name in parts:
-                    checks[name] = replace(checks[name], suspected=False)
-                left = [one for one in left if one.name not in parts]
+                for one in every:
+                    checks[one.name] = replace(checks[one.name], suspected=False)
+                left = [one for one in left if one not in every]
             if explains:
-                numbers = [one for one in self.tested if one.name in parts]
-                numbers.sort(key=lambda one: -self.gains[one.name])
-                left = [one for one in left if one.name not in parts] + numbers[:MOST]
+                left = [one for one in left if one.name not in parts] + numbers
         if not explains:
             left = [one for one in left if one.name not in self.tried]
         self.queue = self.ordered(left, blind=not explains)

@@ -30,6 +30,10 @@ NEARLY = 0.99
 """Fraction of the misfit above the noise that suspects must explain to make most other fits
 needless."""
 
+EVIDENT = 20.0
+"""Fall of chi2, over the remaining misfit per sample, above which the data favour a variation: four
+and a half standard deviations, since some twenty variations are tested."""
+
 TOGETHER = 4
 """Most suspects that explain a misfit between them."""
 
@@ -271,8 +275,8 @@ def shares(
     end: Fit, joint: Fit, suspects: Sequence[Variation]
 ) -> tuple[dict[str, float], list[str]]:
     """The fraction of the misfit, with all suspects of a joint fit as stated, that each alone
-    explains to first order there, by name; and those that explain nearly all of it between them, if
-    a few do."""
+    explains to first order there, by name; and those that explain it between them, if a few do: all
+    but chance, else nearly all."""
     c, J = joint.problem.coordinates, joint.at.J
     tried = {one.name: c.labels.index(one.label) for one in suspects if one.label in c.labels}
     own = np.isin(c.labels, end.problem.coordinates.labels) & joint.free
@@ -283,7 +287,9 @@ def shares(
     misfit = max(float(stated @ stated) - joint.square, 1e-300)
     effects = {name: unit(across(J[:, k], Q)) for name, k in tried.items()}
     parts = {name: float(d @ stated) ** 2 / misfit for name, d in effects.items()}
-    return parts, fewest(effects, stated, joint.square + (1 - NEARLY) * misfit)
+    chance = EVIDENT * max(1.0, joint.chi2)
+    enough = [joint.square + left for left in (chance, (1 - NEARLY) * misfit)]
+    return parts, fewest(effects, stated, min(enough)) or fewest(effects, stated, max(enough))
 
 
 def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
