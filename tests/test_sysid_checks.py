@@ -475,7 +475,6 @@ def test_suspects_of_a_joint_fit_complement_each_other():
     }  # fmt: skip
     judge: Any = SimpleNamespace(Q=e[:, :1], r=r, columns=effects)
     some = [Variation(k, "known", "", "", one_sided=k == "wrong side") for k in effects]
-    some.append(Variation("could not be run", "known", "", ""))
     found = [one.name for one in Judge.complementary(judge, some, 3)]
     assert found == ["near a", "a", "c"]
     assert len(Judge.complementary(judge, some, 9)) == 3

@@ -213,8 +213,7 @@ class Judge:
     def complementary(self, some: Sequence[Variation], count: int) -> list[Variation]:
         """Some assumptions, as many as asked for, by orthogonal matching pursuit to first order:
         each explains most of what those before it leave."""
-        known = [one for one in some if one.name in self.columns]
-        left = {one: across(self.columns[one.name], self.Q) for one in known}
+        left = {one: across(self.columns[one.name], self.Q) for one in some}
         least = {one: REDUNDANT * float(d @ d) for one, d in left.items()}
         r, out = across(self.r, self.Q), list[Variation]()
         while len(out) < count:

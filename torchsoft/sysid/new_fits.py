@@ -119,7 +119,7 @@ class NewFits:
         queue by what that tells; the fit is returned if it explains the misfit."""
         end, judge, checks, left = self.end, self.judge, self.checks, self.candidates
         self.say("new fit with many suspects unknown at once")
-        every = [one for one in self.tested if one.kind in ("known", "sensor")]
+        every = [one for one in self.tested if one.parameter or one.fault is not None]
         numbers = judge.complementary(every, MOST)
         joint = joint_fit(end, numbers, judge.explained_chi2)
         explains, together = joint is not None and joint.square <= judge.explained_chi2, list[str]()
@@ -128,10 +128,9 @@ class NewFits:
             self.gains |= {name: explains * judge.square * part for name, part in parts.items()}
             much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
             if not explains and (much or (joint.converged and far_off(joint))):
-                exact = [one.name for one in every if one.vary is None]
-                for name in {*parts, *exact}:
-                    checks[name] = replace(checks[name], suspected=False)
-                left = [one for one in left if one.name not in (*parts, *exact)]
+                for one in every:
+                    checks[one.name] = replace(checks[one.name], suspected=False)
+                left = [one for one in left if one not in every]
             if explains:
                 left = [one for one in left if one.name not in parts] + numbers
         if not explains:

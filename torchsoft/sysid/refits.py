@@ -239,7 +239,7 @@ def under(end: Fit, other: Problem, x: Array) -> Fit:
 
 
 def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | None:
-    """The fit with all suspects that are numbers or faults of sensors as unknowns; None where
+    """The fit with all suspects that are parameters or faults of sensors as unknowns; None where
     there are none. It starts at the end of the first fit and, if the sum of squares stays above
     `enough`, also at the start of that fit.
 
@@ -250,7 +250,7 @@ def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | N
     other = end.problem
     for one in suspects:
         with suppress(ValueError):
-            if one.kind in ("known", "sensor"):
+            if one.parameter or one.fault is not None:
                 other = assuming(other, [one], free=True)
     if other is end.problem:
         return None
