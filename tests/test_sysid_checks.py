@@ -4,7 +4,7 @@ what they cannot tell."""
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -374,6 +374,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
         large_enough=lambda one: True,
+        as_large=lambda one: True,
         ends={},
         fit=fitted,
         at_rest=fitted,
@@ -408,6 +409,7 @@ def test_one_suspect_may_spare_the_joint_fit(left, tried, monkeypatch):
         ends={},
         misfit=lambda left: left - 10.0,
         large_enough=lambda one: True,
+        as_large=lambda one: True,
         nearly=lambda one: one.left < 100.0,
     )
     end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=9.0)
@@ -438,6 +440,7 @@ def test_new_fits_end_with_the_effort(monkeypatch):
         work={"c": 0.1},
         ends={},
         large_enough=lambda one: True,
+        as_large=lambda one: True,
         nearly=lambda one: False,
         misfit=lambda left: left - 10.0,
     )
@@ -475,6 +478,7 @@ def test_suspects_of_a_joint_fit_complement_each_other():
     }  # fmt: skip
     judge: Any = SimpleNamespace(Q=e[:, :1], r=r, columns=effects)
     some = [Variation(k, "known", "", "", one_sided=k == "wrong side") for k in effects]
+    some.append(Variation("could not be run", "known", "", ""))
     found = [one.name for one in Judge.complementary(judge, some, 3)]
     assert found == ["near a", "a", "c"]
     assert len(Judge.complementary(judge, some, 9)) == 3
@@ -487,6 +491,7 @@ def test_a_cause_has_an_effect_of_the_size_of_the_misfit():
         Q=e[:, :1], square=140.0, misfit=lambda left: left - 40.0,
         columns={"small": 5 * e[3] + 90 * e[0], "large": 6 * e[4]},
     )  # fmt: skip
+    judge.as_large = partial(Judge.as_large, judge)
 
     def large(name: str, **given: Any) -> bool:
         return Judge.large_enough(judge, Variation(name, stated="", otherwise="", **given))

@@ -102,10 +102,11 @@ class NewFits:
     def ordered(
         self, candidates: Sequence[Variation], blind: bool = False
     ) -> list[list[Variation]]:
-        """Suspects in the order in which they are likely; `blind` where gains of all but laws say
-        little."""
+        """Suspects in the order in which they are likely; `blind` where gains of all say little,
+        and laws of a large effect come first."""
         large = [one for one in candidates if self.judge.large_enough(one)]
-        order = lambda one: (one.costly, blind and one.kind != "law", -self.gains[one.name])
+        law = lambda one: one.kind == "law" and self.judge.as_large(one)
+        order = lambda one: (one.costly, blind and not law(one), -self.gains[one.name])
         return [[one] for one in sorted(large, key=order)]
 
     def evident(self) -> bool:
