@@ -297,7 +297,7 @@ def test_a_joint_fit_ranks_suspects_where_the_first_fit_ended_far_off():
     enough = 1.1 * len(end.at.r)
     found = joint_fit(end, suspects, enough)
     assert found.square < enough
-    parts, together = shares(end, found, suspects)
+    parts, (together, _) = shares(end, found, suspects)
     assert parts.keys() == {MASS, NU, V_S}
     assert max(parts, key=lambda name: parts[name]) == MASS
     assert 0.95 < parts[MASS] < 1.05
@@ -382,7 +382,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
     parts = {"a": 0.25, "b": 0.25 if together else 0.9}
     joint = SimpleNamespace(square=joint_left, converged=rests, chi2=9.0)
     monkeypatch.setattr(new_fits, "joint_fit", lambda *given: joint)
-    monkeypatch.setattr(new_fits, "shares", lambda *given: (parts, together))
+    monkeypatch.setattr(new_fits, "shares", lambda *given: (parts, [["a", "law"], together]))
     monkeypatch.setattr(new_fits, "refit", lambda *given: object())
     problem: Any = ClosedForm(lambda x: 10.0 + x, 1)
     end = Fit(problem, Runner(()), np.zeros(1), Stage("far off", ("data",), ("p0",), RTOL)).begun()

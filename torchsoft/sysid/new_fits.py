@@ -123,9 +123,10 @@ class NewFits:
         every = [one for one in self.tested if one.parameter or one.fault is not None]
         numbers = judge.complementary(every, MOST)
         joint = joint_fit(end, numbers, judge.explained_chi2)
-        explains, together = joint is not None and joint.square <= judge.explained_chi2, list[str]()
+        explains = joint is not None and joint.square <= judge.explained_chi2
+        several = list[list[str]]()
         if joint is not None:
-            parts, together = shares(end, joint, numbers)
+            parts, several = shares(end, joint, numbers)
             self.gains |= {name: explains * judge.square * part for name, part in parts.items()}
             much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
             if not explains and (much or (joint.converged and far_off(joint))):
@@ -137,9 +138,9 @@ class NewFits:
         if not explains:
             left = [one for one in left if one.name not in self.tried]
         self.queue = self.ordered(left, blind=not explains)
-        if explains and len(together) > 1:
-            alone = {one.name: self.linear[one.name].gain for one in self.tested}
-            self.queue = [*alike(self.tested, together, alone), *self.queue]
+        alone = {one.name: self.linear[one.name].gain for one in self.tested}
+        sets = [alike(self.tested, one, alone) for one in several if explains and len(one) > 1]
+        self.queue = [*next(filter(None, sets), []), *self.queue]
         return joint if explains else None
 
     def gain(self, some: Sequence[Variation]) -> float:

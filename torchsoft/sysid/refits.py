@@ -273,10 +273,10 @@ def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | N
 
 def shares(
     end: Fit, joint: Fit, suspects: Sequence[Variation]
-) -> tuple[dict[str, float], list[str]]:
+) -> tuple[dict[str, float], list[list[str]]]:
     """The fraction of the misfit, with all suspects of a joint fit as stated, that each alone
-    explains to first order there, by name; and those that explain it between them, if a few do: all
-    but chance, else nearly all."""
+    explains to first order there, by name; and those that explain all but chance between them, and
+    nearly all, if a few do."""
     c, J = joint.problem.coordinates, joint.at.J
     tried = {one.name: c.labels.index(one.label) for one in suspects if one.label in c.labels}
     own = np.isin(c.labels, end.problem.coordinates.labels) & joint.free
@@ -288,8 +288,8 @@ def shares(
     effects = {name: unit(across(J[:, k], Q)) for name, k in tried.items()}
     parts = {name: float(d @ stated) ** 2 / misfit for name, d in effects.items()}
     chance = EVIDENT * max(1.0, joint.chi2)
-    enough = [joint.square + left for left in (chance, (1 - NEARLY) * misfit)]
-    return parts, fewest(effects, stated, min(enough)) or fewest(effects, stated, max(enough))
+    enough = sorted(joint.square + left for left in (chance, (1 - NEARLY) * misfit))
+    return parts, [fewest(effects, stated, one) for one in enough]
 
 
 def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
