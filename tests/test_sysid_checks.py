@@ -322,11 +322,11 @@ def test_faults_that_only_together_explain_the_data_are_named_together():
     data = record("strokes", excited(STROKES, BASE), TRUTH, QUIET, rtol=1e-6, seed=4)
     found = checked(late(data, 2e-3, ["x_C", "theta_C"], QUIET), doubtful=True, sensors=QUIET)
     one = max((one for one in found.checks if one.kind == "several"), key=lambda one: one.odds)
-    assert one.name == "delay theta_C and delay x_C"
+    assert one.name == "delay x_C and delay theta_C"
     assert one.odds > 0.9
     notice = notices(found)[0]
-    assert "delay theta_C and delay x_C" in notice or "no unknown delay and x_C has" in notice
-    assert re.search(r" if theta_C came late \(\+(1\.9|2)\S* ms fit best, .*\) and if x_C", notice)
+    assert "delay x_C and delay theta_C" in notice or "no unknown delay and theta_C" in notice
+    assert re.search(r" if x_C came late \(\+(1\.9|2)\S* ms fit best, .*\) and if theta_C", notice)
     assert one.under[E] == pytest.approx(TRUTH[E], rel=0.01)
 
 

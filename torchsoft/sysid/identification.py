@@ -84,7 +84,7 @@ Assumed = Literal["checked", "explained", "trusted"]
 cause, or trusted."""
 
 
-EFFORT = 3.0
+EFFORT = 4.0
 """Work of new fits, over that of the fit itself, after which `explain` begins no other."""
 
 
