@@ -15,7 +15,8 @@ from torchsoft.sysid.refits import far_off, joint_fit, likeness, refit, shares
 from torchsoft.tables import plain
 
 MOST = 12
-"""Most suspects with which a fit is repeated, besides laws and constants of the computation."""
+"""Most suspects with which a fit is repeated, besides laws and constants of the computation, and
+numbers of a joint fit."""
 
 MOSTLY = 0.5
 """Part of a misfit that a suspect explains to first order with which new fits begin."""
@@ -33,9 +34,9 @@ class NewFits:
     """New fits of a doubtful fit, with one suspect of the `candidates` after the other. The
     iteration yields those that have been tried; their tests in `checks` are replaced.
 
-    Costly suspects come last. Where the misfit is far off, all numbers are fitted at once, unless
+    Costly suspects come last. Where the misfit is far off, `MOST` numbers are fitted at once, unless
     one suspect explains most of it to first order and `NEARLY` all in a new fit. Sensors that
-    explain it by one kind of fault then come first, in one fit; where all numbers leave more than
+    explain it by one kind of fault then come first, in one fit; where the numbers leave more than
     `RIVAL` of the misfit, or are at rest far off, none is the cause alone, and they are left out.
     Effects too small for the misfit are left out always. Where one suspect explains it the fit goes
     on until it is at rest; those with much smaller gains are then left out, and costly ones; where
