@@ -34,7 +34,7 @@ class NewFits:
     """New fits of a doubtful fit, with one suspect of the `candidates` after the other. The
     iteration yields those that have been tried; their tests in `checks` are replaced.
 
-    Costly suspects come last. Where the misfit is far off, `MOST` numbers are fitted at once, unless
+    Costly suspects come last. Where the misfit is far off, some numbers are fitted at once, unless
     one suspect explains most of it to first order and `NEARLY` all in a new fit. Sensors that
     explain it by one kind of fault then come first, in one fit; where the numbers leave more than
     `RIVAL` of the misfit, or are at rest far off, none is the cause alone, and they are left out.
