@@ -135,7 +135,8 @@ class NewFits:
                     checks[one.name] = replace(checks[one.name], suspected=False)
                 left = [one for one in left if one not in every]
             if explains:
-                left = [one for one in left if one.name not in parts] + numbers
+                left = [one for one in left if one.name not in parts]
+                left += [one for one in numbers if one.name in parts]
         if not explains:
             left = [one for one in left if one.name not in self.tried]
         self.queue = self.ordered(left, blind=not explains)
