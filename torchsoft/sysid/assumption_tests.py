@@ -16,7 +16,7 @@ from torchsoft.sysid.assumptions import AMOUNTS, Assumption, Variation
 from torchsoft.sysid.fit import Fit, shift, standard_deviations
 from torchsoft.sysid.plan import settle
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.refits import EVIDENT, NEARLY, across, unit
+from torchsoft.sysid.refits import EVIDENT, NEARLY, REDUNDANT, across, pursuit
 from torchsoft.sysid.residual_tests import Verdict, judge_residuals, parts, systematic
 from torchsoft.tables import Number
 
@@ -38,9 +38,6 @@ FIRST_ORDER = 3.0
 
 TIGHTENINGS = 2
 """Most times that a repeated fit goes on with a tenth of its tolerance."""
-
-REDUNDANT = 1e-6
-"""Part of the square of an effect beside others at which it counts as one of theirs."""
 
 BESIDES = 3
 """Most effects that are looked for besides the likeliest suspect."""
@@ -215,24 +212,13 @@ class Judge:
         return not (one.costly or one.kind == "numerical") or self.as_large(one)
 
     def complementary(self, some: Sequence[Variation], count: int) -> list[Variation]:
-        """Some assumptions, as many as asked for, by orthogonal matching pursuit to first order:
-        each explains most of what those before it leave."""
-        known = [one for one in some if one.name in self.columns]
-        left = {one: across(self.columns[one.name], self.Q) for one in known}
-        least = {one: REDUNDANT * float(d @ d) for one, d in left.items()}
-        r, out = across(self.r, self.Q), list[Variation]()
-        while len(out) < count:
-            gains = {
-                one: float(d @ r) ** 2 / float(d @ d)
-                for one, d in left.items()
-                if float(d @ d) > least[one] and not (one.one_sided and float(d @ r) > 0)
-            }
-            if not gains:
-                break
-            out.append(max(gains, key=lambda one: gains[one]))
-            Q = unit(left.pop(out[-1]))[:, None]
-            r, left = across(r, Q), {one: across(d, Q) for one, d in left.items()}
-        return out
+        """Some assumptions, as many as asked for: each explains most, to first order, of what those
+        before it leave."""
+        known = {one.name: one for one in some if one.name in self.columns}
+        effects = {name: across(self.columns[name], self.Q) for name in known}
+        one_sided = {name for name, one in known.items() if one.one_sided}
+        names = pursuit(effects, across(self.r, self.Q), count, one_sided=one_sided)
+        return [known[name] for name in names]
 
     def nearly(self, one: AssumptionTest) -> bool:
         """Whether a new fit with a suspect leaves next to nothing above the noise."""

@@ -10,8 +10,8 @@ from tqdm import tqdm
 from torchsoft.display import hidden
 from torchsoft.sysid.assumption_tests import RIVAL, Again, AssumptionTest, Judge
 from torchsoft.sysid.assumptions import Variation
-from torchsoft.sysid.fit import Fit
-from torchsoft.sysid.refits import far_off, joint_fit, likeness, refit, shares
+from torchsoft.sysid.fit import Fit, gauss_newton
+from torchsoft.sysid.refits import far_off, joint_fit, likeness, refit, shares, short_fit
 from torchsoft.tables import plain
 
 MOST = 12
@@ -29,20 +29,28 @@ was the cause had 0.75 where another ended far from the truth."""
 TRIALS = 10
 """Evaluations that a new fit takes, as a rule."""
 
+LOOK, LONGER = 2, 4
+"""Evaluations of the short fits by which suspects are ranked where the first fit ended far off, and
+further ones of the best: the true cause leads by them where tests to first order have it tenth."""
+
+FAINT = 0.1
+"""Part of a misfit that a sensor's fault must explain to first order to have a short fit: readings
+are linear in it."""
+
 
 class NewFits:
     """New fits of a doubtful fit, with one suspect of the `candidates` after the other. The
     iteration yields those that have been tried; their tests in `checks` are replaced.
 
-    Costly suspects come last. Where the misfit is far off, some numbers are fitted at once, unless
-    one suspect explains most of it to first order and `NEARLY` all in a new fit. Sensors that
-    explain it by one kind of fault then come first, in one fit; where the numbers leave more than
-    `RIVAL` of the misfit, or are at rest far off, none is the cause alone, and they are left out.
-    Effects too small for the misfit are left out always. Where one suspect explains it the fit goes
-    on until it is at rest; those with much smaller gains are then left out, and costly ones; where
-    that one was too far off for tests to first order, the gains are those of the effects at the end
-    under it, of all that were `tested`. No fit is begun with which all would take more than
-    `effort` times the work of the fit itself: `late` has the names of the suspects that are left.
+    Costly suspects come last. Where the misfit is far off, one that explains most of it to first
+    order is tried; where that is not the cause, short fits of all that were `tested` rank them, and
+    the best is; then some numbers are fitted at once. Sensors that explain it by one kind of fault
+    then come first, in one fit; where the numbers leave more than `RIVAL` of the misfit, or are at
+    rest far off, none is the cause alone, and they are left out. Effects too small for the misfit
+    are left out always. Where one suspect explains it the fit goes on until it is at rest; those
+    with much smaller gains are then left out, and costly ones. No fit is begun with which all would
+    take more than `effort` times the work of the fit itself: `late` has the names of the suspects
+    that are left.
     """
 
     def __init__(
@@ -60,7 +68,7 @@ class NewFits:
         self.enough = 0.0
         """Least gain of a suspect that is tried, once one explains the misfit."""
         self.candidates, self.tried = list(candidates), set[str]()
-        self.queue = list[list[Variation]]()
+        self.queue, self.short = list[list[Variation]](), dict[str, Fit]()
         self.bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
         self.end = end._replace(notify=lambda chi2: self.bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
         self.most = end.runner.work * (1.0 + effort)
@@ -73,8 +81,9 @@ class NewFits:
             if as_stated is None:
                 return
             self.queue = self.ordered(self.candidates)
-            evident = self.evident()
-            near = self.joint() if self.far and not evident else None
+            near, rankings = None, [self.screen, self.joint] if self.far else []
+            if rankings and not self.evident():
+                rankings.pop(0)()
             while self.queue:
                 some = self.queue.pop(0)
                 if not self.promising(some):
@@ -90,31 +99,48 @@ class NewFits:
                     yield some[0]
                 found = self.checks.get(named(some))
                 if found is not None and self.judge.nearly(found):
+                    rankings.clear()
                     self.limit(some)
-                elif evident:
-                    near = self.joint()
-                evident = False
+                elif rankings:
+                    near = rankings.pop(0)()
             self.finish(as_stated)
 
     def say(self, text: str) -> None:
         """Describe the work on the progress bar."""
         self.bar.set_description(plain(text))
 
-    def ordered(
-        self, candidates: Sequence[Variation], blind: bool = False
-    ) -> list[list[Variation]]:
-        """Suspects in the order in which they are likely; `blind` where gains of all say little,
-        and laws of a large effect come first."""
+    def ordered(self, candidates: Sequence[Variation]) -> list[list[Variation]]:
+        """Suspects in the order in which they are likely."""
         large = [one for one in candidates if self.judge.large_enough(one)]
-        law = lambda one: one.kind == "law" and self.judge.as_large(one)
-        order = lambda one: (one.costly, blind and not law(one), -self.gains[one.name])
-        return [[one] for one in sorted(large, key=order)]
+        return [[one] for one in sorted(large, key=lambda one: (one.costly, -self.gains[one.name]))]
 
     def evident(self) -> bool:
         """Whether the misfit is far off, and the likeliest suspect explains most of it to first
         order."""
         most = MOSTLY * self.judge.misfit(self.judge.square)
         return self.far and bool(self.queue) and self.gain(self.queue[0]) >= most
+
+    def screen(self) -> None:
+        """Fill the queue by short fits: one step of every suspect, then more of the best, and of
+        laws, which begin far from where they end."""
+        least = FAINT * self.judge.misfit(self.judge.square)
+        left = [one for one in self.tested if one.name not in self.tried]
+        left = [one for one in left if one.kind != "sensor" or self.linear[one.name].gain > least]
+        left = [one for one in left if self.judge.large_enough(one)]
+        self.say("short fits with one suspect each")
+        self.bar.total += len(left)
+        fits = dict[Variation, Fit]()
+        for one in left:
+            fit = short_fit(self.end, one.within(self.linear[one.name].favoured), LOOK)
+            if fit is not None:
+                fits[one] = fit
+            self.bar.update()
+        best = sorted(fits, key=lambda one: (one.kind != "law", fits[one].square))[:MOST]
+        self.short = {one.name: gauss_newton(fits[one], LONGER) for one in best}
+        square = self.judge.square
+        self.gains |= {name: max(square - fit.square, 0.0) for name, fit in self.short.items()}
+        self.candidates = [*best, *(one for one in self.candidates if one.costly)]
+        self.queue = self.ordered(self.candidates)
 
     def joint(self) -> Fit | None:
         """Fit at once the numbers that complement each other in explaining the misfit, and fill the
@@ -128,18 +154,17 @@ class NewFits:
         several = list[list[str]]()
         if joint is not None:
             parts, several = shares(end, joint, numbers)
-            self.gains |= {name: explains * judge.square * part for name, part in parts.items()}
+            self.gains |= {name: judge.square * parts[name] for name in parts if explains}
             much = judge.misfit(joint.square) > RIVAL * judge.misfit(judge.square)
             if not explains and (much or (joint.converged and far_off(joint))):
                 for one in every:
                     checks[one.name] = replace(checks[one.name], suspected=False)
                 left = [one for one in left if one not in every]
-            if explains:
-                left = [one for one in left if one.name not in parts]
-                left += [one for one in numbers if one.name in parts]
-        if not explains:
-            left = [one for one in left if one.name not in self.tried]
-        self.queue = self.ordered(left, blind=not explains)
+        left = [one for one in left if one.name not in self.tried]
+        if explains:
+            left = [one for one in left if one.name not in parts]
+            left += [one for one in numbers if one.name in parts]
+        self.queue = self.ordered(left)
         alone = {one.name: self.linear[one.name].gain for one in self.tested}
         sets = [alike(self.tested, one, alone) for one in several if explains and len(one) > 1]
         self.queue = [*next(filter(None, sets), []), *self.queue]
@@ -162,7 +187,8 @@ class NewFits:
         """Repeat the fit with some suspects at once, from its end or from one `near`."""
         name, linear = named(some), [self.checks[one.name] for one in some]
         tried = [one.within(test.favoured) for one, test in zip(some, linear)]
-        if (fit := refit(self.end, tried, near)) is None:
+        begin, enough = near or self.short.get(name), self.judge.explained_chi2
+        if (fit := refit(self.end, tried, begin, enough, anew=near is None)) is None:
             return
         again = Again(name, tried, linear, fit)
         found = self.judge.fit(again, as_stated)
@@ -172,25 +198,32 @@ class NewFits:
             self.checks[name] = found
 
     def limit(self, some: Sequence[Variation]) -> None:
-        """Leave out, where some suspects explain the misfit, those that gain much less; gains of
-        the others are those at the end of the first such fit, where the first end was too far
-        off."""
+        """Leave out, where some suspects explain the misfit, those that gain much less: in short
+        fits or, where there were none and the first end was too far off, by what they can have of
+        the effect at the end of the first such fit."""
         name = named(some)
-        gain, end, part = self.gain(some), self.judge.ends.get(name), RIVAL
+        gain, part = self.gain(some), RIVAL
         first = len(some) == 1 and some[0].kind in ("known", "sensor") and not self.enough
-        if first and end is not None and (self.far or self.linear[name].far):
-            self.say(f"effects of the others under another {name}")
-            left = [one for one in self.tested if one.name not in self.tried]
-            parts = likeness(end.fit, end.tried[0], left)
+        if first and name in self.judge.ends and (self.far or self.linear[name].far):
             gain, part = self.checks[name].gain, ALIKE
-            self.gains |= {other: part * gain for other, part in parts.items()}
-            queued = {one.name for some in self.queue for one in some}
-            more = [one for one in left if one.name in parts.keys() - queued]
-            more = sorted(more, key=lambda one: -self.gains[one.name])[:MOST]
-            self.queue += [[one] for one in more]
-            self.bar.total += len(more)
+            if not self.short:
+                self.add_alike(name)
         self.enough = max(self.enough, part * gain)
         self.queue.sort(key=self.gain, reverse=True)
+
+    def add_alike(self, name: str) -> None:
+        """Gains of all suspects by what they can have of the effect of the one that explains the
+        misfit; the queue with the likeliest of those that were left out of it."""
+        self.say(f"effects of the others under another {name}")
+        end, gain = self.judge.ends[name], self.checks[name].gain
+        left = [one for one in self.tested if one.name not in self.tried]
+        parts = likeness(end.fit, end.tried[0], left)
+        self.gains |= {other: part * gain for other, part in parts.items()}
+        queued = {one.name for some in self.queue for one in some}
+        more = [one for one in left if one.name in parts.keys() - queued]
+        more = sorted(more, key=lambda one: -self.gains[one.name])[:MOST]
+        self.queue += [[one] for one in more]
+        self.bar.total += len(more)
 
     def finish(self, as_stated: Fit) -> None:
         """Continue the fit of the likeliest suspect until it is at rest, where none explains the

@@ -1,6 +1,6 @@
 """Variations of a problem by one wrong assumption: effects on the residuals, and repeated fits."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
@@ -36,6 +36,9 @@ and a half standard deviations, since some twenty variations are tested."""
 
 TOGETHER = 4
 """Most suspects that explain a misfit between them."""
+
+REDUNDANT = 1e-6
+"""Part of the square of an effect beside others at which it counts as one of theirs."""
 
 
 def coarsened(fit: Fit) -> Fit:
@@ -292,35 +295,76 @@ def shares(
     return parts, [fewest(effects, stated, one) for one in enough]
 
 
+def pursuit(
+    effects: Mapping[str, Array],
+    r: Array,
+    most: int,
+    enough: float = 0.0,
+    one_sided: Collection[str] = (),
+) -> list[str]:
+    """Names of effects (m,), `most` at most, that leave at most `enough` of the square of r (m,):
+    by orthogonal least squares, each explains most of what those before it leave. Those that are
+    `one_sided` only lower r."""
+    left, out = dict(effects), list[str]()
+    least = {name: REDUNDANT * float(d @ d) for name, d in effects.items()}
+    while len(out) < most and float(r @ r) > enough:
+        gains = {
+            name: float(d @ r) ** 2 / float(d @ d)
+            for name, d in left.items()
+            if float(d @ d) > least[name] and not (name in one_sided and float(d @ r) > 0)
+        }
+        if not gains:
+            break
+        out.append(max(gains, key=lambda name: gains[name]))
+        Q = unit(left.pop(out[-1]))[:, None]
+        r, left = across(r, Q), {name: across(d, Q) for name, d in left.items()}
+    return out
+
+
 def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
-    """Names of effects (m,), of length one, whose span leaves at most `enough` of the square of r
-    (m,): by orthogonal matching pursuit, then without those that are not needed. None where that
-    takes more than `TOGETHER`."""
+    """Names of effects (m,) whose span leaves at most `enough` of the square of r (m,), without
+    those that are not needed. None where that takes more than `TOGETHER`."""
 
-    def left(names: Sequence[str]) -> Array:
+    def left(names: Sequence[str]) -> float:
         A = np.array([effects[name] for name in names]).reshape(len(names), len(r)).T
-        return r - A @ np.linalg.lstsq(A, r, rcond=None)[0]
+        return float(np.sum((r - A @ np.linalg.lstsq(A, r, rcond=None)[0]) ** 2))
 
-    out, rest = list[str](), r
-    while float(rest @ rest) > enough:
-        if len(out) == min(TOGETHER, len(effects)):
-            return []
-        out.append(max(effects.keys() - out, key=lambda name: abs(float(effects[name] @ rest))))
-        rest = left(out)
+    out = pursuit(effects, r, TOGETHER, enough)
+    if left(out) > enough:
+        return []
     for name in tuple(out):
         others = [one for one in out if one != name]
-        if float(np.sum(left(others) ** 2)) <= enough:
+        if left(others) <= enough:
             out = others
     return out
 
 
-def refit(end: Fit, tried: Sequence[Variation], near: Fit | None = None) -> Fit | None:
+def short_fit(end: Fit, one: Variation, evaluations: int) -> Fit | None:
+    """The begin of the fit with an assumption varied, from the end of the fit and by the tolerance
+    `LOOSE`; None where it cannot begin."""
+    try:
+        other = assuming(end.problem, [one], free=True)
+    except ValueError:
+        return None
+    begin = under(end, other, begun(other, [one], end.by_label))
+    loose = max(LOOSE, end.rtol)
+    return continued(begin, replace(begin.stage, rtol=loose, evaluations=evaluations))
+
+
+def refit(
+    end: Fit,
+    tried: Sequence[Variation],
+    near: Fit | None = None,
+    enough: float = 0.0,
+    anew: bool = True,
+) -> Fit | None:
     """The fit with some assumptions varied, or with all as stated, on its own steps; None where it
     cannot begin.
 
     It starts at the end of the fit, or of one `near`; ratios at a bound are scanned again over
-    their whole range. Without another, and with a misfit above `FAR`, variations other than of a
-    sensor also start where the first fit did, and the better end counts.
+    their whole range. With a misfit above `FAR`, variations other than of a sensor also start
+    `anew`, where the first fit did, unless the sum of squares is below `enough`; the better end
+    counts.
     """
     try:
         other = assuming(end.problem, tried, free=True)
@@ -331,7 +375,8 @@ def refit(end: Fit, tried: Sequence[Variation], near: Fit | None = None) -> Fit 
     stuck = [one for one in c.within(begin.free & c.at_bound(begin.x)) if one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
     fits = [continued(begin, replace(begin.stage, scanned=scans))]
-    if any(one.kind != "sensor" for one in tried) and far_off(end) and near is None:
+    explains = fits[0] is not None and fits[0].square <= enough
+    if anew and any(one.kind != "sensor" for one in tried) and far_off(end) and not explains:
         with suppress(Unreachable):
             plan = default_plan(other, begin.runner, end.rtol, end.which)
             if set(plan[-1].free) == set(begin.stage.free):
