@@ -4,7 +4,7 @@ what they cannot tell."""
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -408,17 +408,24 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
 
 
 @pytest.mark.parametrize(
-    ("lefts", "tried"),
-    [({"a": 50.0}, ["a"]), ({"b": 50.0}, ["a", "b"]), ({}, ["a", "b", "law"])],
+    ("kind", "lefts", "tried", "ranked"),
+    [
+        ("known", {"a": 50.0}, ["a"], []),
+        ("known", {"b": 50.0}, ["a", "b"], ["short"]),
+        ("known", {}, ["a", "b", "law"], ["short", "joint"]),
+        ("sensor", {"a": 50.0}, ["a"], []),
+        ("sensor", {}, ["a", "b", "law"], ["joint", "short"]),
+    ],
 )
-def test_one_suspect_may_spare_the_joint_fit(lefts, tried, monkeypatch):
+def test_one_suspect_may_spare_the_joint_fit(kind, lefts, tried, ranked, monkeypatch):
     """Where it explains most of the misfit to first order, or comes farthest in a short fit, and
-    leaves nothing in a new fit; else all numbers are fitted at once, and here none is the cause."""
-    taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "ab"]
+    leaves nothing in a new fit; else all numbers are fitted at once, before if the first was a
+    sensor, and here none is the cause."""
+    taken = [Variation(name, kind, "", "", fault=(name, "delay")) for name in "ab"]
     taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     gains = {"a": 600.0, "b": 100.0, "law": 50.0}
     checks = {one.name: assumption_test(one, gain=gains[one.name], suspected=True) for one in taken}
-    joints = list[str]()
+    done = list[str]()
     judge: Any = SimpleNamespace(
         square=1000.0,
         work={},
@@ -433,20 +440,26 @@ def test_one_suspect_may_spare_the_joint_fit(lefts, tried, monkeypatch):
     end._replace = lambda **_: end
 
     def joint_fit(*_: object) -> Any:
-        joints.append("joint")
+        done.append("joint")
         return SimpleNamespace(square=900.0, converged=False, chi2=9.0)
 
     def fitted(fits: NewFits, some: list[Variation], *_: object) -> None:
         name = some[0].name
         fits.checks[name] = replace(fits.checks[name], left=lefts.get(name, 999.0))
 
+    def short(fits: NewFits) -> None:
+        done.append("short")
+        screen(fits)
+
+    screen = NewFits.screen
     screened(monkeypatch, {"b": 800.0, "law": 1900.0})
+    monkeypatch.setattr(NewFits, "screen", short)
     monkeypatch.setattr(new_fits, "joint_fit", joint_fit)
     monkeypatch.setattr(new_fits, "shares", lambda *_: ({"a": 0.1, "b": 0.1}, []))
     monkeypatch.setattr(new_fits, "refit", lambda *_: True)
     monkeypatch.setattr(NewFits, "fit", fitted)
     assert [one.name for one in NewFits(end, taken, taken, judge, checks)] == tried
-    assert len(joints) == (len(tried) == 3)
+    assert done == ranked
 
 
 def test_new_fits_end_with_the_effort(monkeypatch):
@@ -458,7 +471,6 @@ def test_new_fits_end_with_the_effort(monkeypatch):
         work={"c": 0.1},
         ends={},
         large_enough=lambda one: True,
-        as_large=lambda one: True,
         nearly=lambda one: False,
         misfit=lambda left: left - 10.0,
     )
@@ -509,7 +521,6 @@ def test_a_cause_has_an_effect_of_the_size_of_the_misfit():
         Q=e[:, :1], square=140.0, misfit=lambda left: left - 40.0,
         columns={"small": 5 * e[3] + 90 * e[0], "large": 6 * e[4]},
     )  # fmt: skip
-    judge.as_large = partial(Judge.as_large, judge)
 
     def large(name: str, **given: Any) -> bool:
         return Judge.large_enough(judge, Variation(name, stated="", otherwise="", **given))

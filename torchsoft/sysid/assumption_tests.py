@@ -199,17 +199,13 @@ class Judge:
         """Whether with a suspected variation nothing is left."""
         return any(one.suspected and one.passed for one in checks)
 
-    def as_large(self, one: Variation) -> bool:
-        """Whether the effect of a variation by its amount is about that of the misfit, if it could
-        be run."""
-        d = self.columns.get(one.name)
-        square = self.misfit(self.square)
-        return d is None or float(np.sum(across(d, self.Q) ** 2)) > RIVAL * square
-
     def large_enough(self, one: Variation) -> bool:
         """Whether what is costly, or a constant of the computation, could be the cause: it has an
-        effect of one size, which is to be that of the misfit."""
-        return not (one.costly or one.kind == "numerical") or self.as_large(one)
+        effect of one size, which is to be that of the misfit, if it could be run."""
+        d = self.columns.get(one.name)
+        if d is None or not (one.costly or one.kind == "numerical"):
+            return True
+        return float(np.sum(across(d, self.Q) ** 2)) > RIVAL * self.misfit(self.square)
 
     def complementary(self, some: Sequence[Variation], count: int) -> list[Variation]:
         """Some assumptions, as many as asked for: each explains most, to first order, of what those

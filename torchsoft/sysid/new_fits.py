@@ -44,7 +44,8 @@ class NewFits:
 
     Costly suspects come last. Where the misfit is far off, one that explains most of it to first
     order is tried; where that is not the cause, short fits of all that were `tested` rank them, and
-    the best is; then some numbers are fitted at once. Sensors that explain it by one kind of fault
+    the best is; then some numbers are fitted at once, which comes before short fits where the first
+    was a sensor, since readings are linear in several faults. Sensors that explain it by one kind of fault
     then come first, in one fit; where the numbers leave more than `RIVAL` of the misfit, or are at
     rest far off, none is the cause alone, and they are left out. Effects too small for the misfit
     are left out always. Where one suspect explains it the fit goes on until it is at rest; those
@@ -82,7 +83,9 @@ class NewFits:
                 return
             self.queue = self.ordered(self.candidates)
             near, rankings = None, [self.screen, self.joint] if self.far else []
-            if rankings and not self.evident():
+            if self.evident():
+                rankings = rankings[self.queue[0][0].kind == "sensor" :]
+            elif rankings:
                 rankings.pop(0)()
             while self.queue:
                 some = self.queue.pop(0)
@@ -144,7 +147,8 @@ class NewFits:
 
     def joint(self) -> Fit | None:
         """Fit at once the numbers that complement each other in explaining the misfit, and fill the
-        queue by what that tells; the fit is returned if it explains the misfit."""
+        queue by what that tells, or by short fits if they do not explain it and there were none;
+        the fit is returned if it explains the misfit."""
         end, judge, checks, left = self.end, self.judge, self.checks, self.candidates
         self.say("new fit with many suspects unknown at once")
         every = [one for one in self.tested if one.parameter or one.fault is not None]
@@ -160,6 +164,8 @@ class NewFits:
                 for one in every:
                     checks[one.name] = replace(checks[one.name], suspected=False)
                 left = [one for one in left if one not in every]
+        if not explains and not self.short:
+            return self.screen()
         left = [one for one in left if one.name not in self.tried]
         if explains:
             left = [one for one in left if one.name not in parts]
