@@ -373,7 +373,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
     number at all where all of them leave much, or rest where much is left."""
     taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "abc"]
     taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
-    gains = {"a": 300.0, "b": 200.0, "c": 90.0, "law": 100.0}
+    gains = {"a": 300.0, "b": 200.0, "c": 40.0, "law": 10.0}
 
     def fitted(again: Again, as_stated: Fit) -> AssumptionTest:
         left = 50.0 if len(again.tried) > 1 else lefts.get(again.name, 999.0)

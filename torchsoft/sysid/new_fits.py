@@ -33,9 +33,9 @@ LOOK, LONGER = 2, 4
 """Evaluations of the short fits by which suspects are ranked where the first fit ended far off, and
 further ones of the best: the true cause leads by them where tests to first order have it tenth."""
 
-FAINT = 0.1
-"""Part of a misfit that a sensor's fault must explain to first order to have a short fit: readings
-are linear in it."""
+FAINT = 0.05
+"""Part of a misfit that a suspect must explain to first order to have a short fit; those that were
+the cause had 0.16 and more."""
 
 
 class NewFits:
@@ -128,7 +128,7 @@ class NewFits:
         laws, which begin far from where they end."""
         least = FAINT * self.judge.misfit(self.judge.square)
         left = [one for one in self.tested if one.name not in self.tried]
-        left = [one for one in left if one.kind != "sensor" or self.linear[one.name].gain > least]
+        left = [one for one in left if one.kind == "law" or self.linear[one.name].gain > least]
         left = [one for one in left if self.judge.large_enough(one)]
         self.say("short fits with one suspect each")
         self.bar.total += len(left)
