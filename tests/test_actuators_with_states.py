@@ -1,4 +1,4 @@
-"""Actuators with states of their own: integral action and a lag."""
+"""Actuators with states of their own, integral action and a lag, and with a limit."""
 
 from typing import ClassVar
 
@@ -34,14 +34,14 @@ MASS, KP, KD, KI, LAG, PULLED = 0.4, 400.0, 20.0, 3e3, 8e-3, 1e-3
 KI_Y, LAG_Y = "actuators.y.Ki", "actuators.y.lag"
 
 
-def cart(law: nn.Module) -> Rig:
+def cart(law: nn.Module, limit: float | None = None) -> Rig:
     """A body on no ground, `PULLED` towards its set-point by a law."""
     rubber = KelvinVoigt(**RUBBER, tau=0.01)
     return Rig(
         bodies={"cart": Body(MASS, y=1.0, theta=0.0, weighted=False)},
         pads={"pad": Pad(PadMesh(20e-3, 4e-3, 4, 1), rubber)},
         contacts={},
-        actuators={"x": Actuator("cart.x", "cart.x", law, setpoint="x_d")},
+        actuators={"x": Actuator("cart.x", "cart.x", law, setpoint="x_d", limit=limit)},
         reference=Reference(x_d=Profile([0.0], [PULLED])),
     )
 
@@ -135,6 +135,40 @@ def test_a_gain_and_a_lag_are_identified_from_motion_and_effort():
     for name, value in truth.items():
         assert answer[name].identifiable
         assert answer[name].value == pytest.approx(value, rel=2e-3)
+
+
+def test_an_effort_saturates_at_its_limit():
+    """A constant force until the law says less, and the gradient by the limit until then."""
+    limit = 0.25 * KP * PULLED
+    rig, t = cart(PD(KP, KD), limit), times(0.08, 41)
+    y0 = rig.state(cart={"x": 0.0})
+    run = simulate(rig, t, y0=y0, rtol=1e-7)
+    fallen = 0.5 * limit / MASS * t**2
+    wanted = KP * (PULLED - fallen) - KD * limit / MASS * t
+    held = wanted > limit
+    assert 10 < held.sum() < 40
+    np.testing.assert_allclose(run["x_cart"][held].detach(), fallen[held], atol=1e-9)
+    np.testing.assert_allclose(run["effort_x"][held].detach(), limit, rtol=1e-12)
+    assert (run["effort_x"][~held] < limit).all()
+    opposite = simulate(rig, t, y0=rig.state(cart={"x": 2 * PULLED}), rtol=1e-7)
+    np.testing.assert_allclose(opposite["effort_x"].detach(), -run["effort_x"].detach(), atol=1e-9)
+    check_gradients(rig, t[:10], y0, wrt=["actuators.x.limit", "bodies.cart.mass"])
+
+
+def test_a_rig_file_limits_an_effort_that_has_a_lag():
+    name, most = "actuators.y.limit", 60.0
+    file = PAPER.override(COARSE | {LAG_Y: 2e-3, name: most})
+    assert file.unit_of(name) == "N"
+    built = file.build()
+    assert built.rig.actuators["y"].elements[-2:] == ("Se: lag", "Se: limit")
+    efforts = [
+        one.run(times(0.3, 31), rtol=1e-4)["effort_y"].abs().max().item()
+        for one in (PAPER.override(COARSE | {LAG_Y: 2e-3}).build(), built)
+    ]
+    assert efforts[0] > 1.01 * most
+    assert efforts[1] == pytest.approx(most, rel=1e-12)
+    with pytest.raises(ValueError, match=r"actuators\.y\.limit"):
+        PAPER.override({name: 0.0})
 
 
 class Wrong(nn.Module):

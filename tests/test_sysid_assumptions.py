@@ -18,11 +18,11 @@ from torchsoft.sysid.assumptions import (
     at_finite_strain,
     late_effort,
     lifted,
-    limited_effort,
+    limited,
     linear_pads,
     of_fifth_degree,
     off_centre,
-    pushed,
+    pushed_late,
     read_across,
     rescaled,
     resized,
@@ -95,7 +95,7 @@ def test_a_load_along_a_run_adds_to_gravity():
 @pytest.mark.parametrize("name", ["x", "y"])
 def test_a_controller_that_is_late_pushes_by_what_it_measured_before(name):
     """The y loop has a feed-forward of its own beside it."""
-    late = pushed(strokes(), run_of, [name], late_effort, 0.2)
+    late = pushed_late(strokes(), run_of, [name], 0.2)
     at = run_of(late)
     named = dict(zip(late.channels, at.signals.T))
     actuator = late.rig.actuators[name]
@@ -115,10 +115,18 @@ def test_a_controller_that_is_late_pushes_by_what_it_measured_before(name):
     assert np.sqrt(np.mean(apart[inside] ** 2)) < 0.1 * np.sqrt(np.mean(change[inside] ** 2))
 
 
-def test_a_limit_cuts_the_largest_efforts_off():
-    effort = np.array([1.0, -4.0, 2.0, 3.9])
-    np.testing.assert_allclose(limited_effort(np.arange(4.0), effort, 10.0), [1, -3.6, 2, 3.6])
-    assert (limited_effort(np.arange(4.0), effort, 0.0) == effort).all()
+@pytest.mark.parametrize("name", ["x", "y"])
+def test_a_limit_cuts_the_largest_efforts_off(name):
+    """By a part of the largest one without it, and no other effort, with what that does later."""
+    channel = strokes().channels.index(f"effort_{name}")
+    without, cut = (
+        run_of(limited(strokes(), run_of, name, part)).signals[:, channel] for part in (0.0, 10.0)
+    )
+    np.testing.assert_allclose(without, run_of(strokes()).signals[:, channel], atol=1e-3)
+    most = 0.9 * np.abs(without).max()
+    assert np.abs(cut).max() == pytest.approx(most, rel=1e-4)
+    first = np.flatnonzero(np.abs(without) > most)[0]
+    np.testing.assert_allclose(cut[:first], without[:first], atol=1e-3)
 
 
 def middle(recording: Recording, name: str) -> np.ndarray:

@@ -138,6 +138,10 @@ IntegralGain = Annotated[
 
 Lag = Annotated[float, Quantity("s", 1e-9, 1e3, "time constant of the lag of an effort")]
 
+EffortLimit = Annotated[
+    float, Quantity("N, N.m", 1e-9, 1e9, "largest size of an effort, at which it saturates")
+]
+
 Gravity = Annotated[float, Quantity("m/s2", 0.0, 1e3, "gravitational acceleration, downwards")]
 
 Time = Annotated[float, Quantity("s", 0.0, 1e5)]

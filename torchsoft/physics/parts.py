@@ -20,6 +20,7 @@ from torchsoft.physics.state import (
 )
 from torchsoft.quantity import (
     DerivativeGain,
+    EffortLimit,
     Inertia,
     InertiaRatio,
     IntegralGain,
@@ -287,14 +288,15 @@ class Actuator(nn.Module):
     mapping `states`, of names to `OwnState`, has states of its own, such as an integral: it is
     called with two more arguments, the states z* (..., n) at the start of a stage and the stage's
     length a h [s], and gives the effort and the rates z' (..., n), with the values z* + a h z' that
-    act at the end of the stage. `elements` are the graph's names of the elements behind it. Raises
-    `ValueError` unless names are given, and for more set-points than coordinates.
+    act at the end of the stage. The effort saturates at a `limit` [N or N.m], which is not smooth;
+    states go on as if it did not. `elements` are the graph's names of the elements behind it.
+    Raises `ValueError` unless names are given, and for more set-points than coordinates.
     """
 
     def __init__(
         self, measures: str | Sequence[str], pushes: str, law: Callable[..., Tensor], *,
         setpoint: str | Sequence[str], feed_forward: str | None = None,
-        elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
+        limit: EffortLimit | None = None, elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
     ) -> None:  # fmt: skip
         super().__init__()
         self.measures, self.setpoints = (
@@ -319,6 +321,7 @@ class Actuator(nn.Module):
             feed_forward,
             elements,
         )
+        self.limit = None if limit is None else parameter(limit)
 
     @property
     def follows(self) -> tuple[tuple[str, str], ...]:
@@ -389,7 +392,10 @@ class Actuator(nn.Module):
     def response(self, x: Tensor, z: Tensor, stage: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
         """Effort (...) and rates of the law's states (..., states), of x (..., inputs) at the end
         of a stage [s] that begins with the states z (..., states)."""
-        return respond(self.law, self._arguments(x), z, stage)
+        effort, rates = respond(self.law, self._arguments(x), z, stage)
+        if self.limit is not None:
+            effort = torch.maximum(torch.minimum(effort, self.limit), -self.limit)
+        return effort, rates
 
     def begin(self, x: Tensor) -> Tensor:
         """States (..., states) that the law begins with at x (..., inputs)."""

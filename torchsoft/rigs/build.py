@@ -248,13 +248,14 @@ class RigFile(Shown, Group):
             return self.unit(str(way[0]))
         if group == "actuators":
             one = self.actuators[str(way[0])]
-            order, pushed, measured = ORDERS[str(way[1])], one.pushes, one.measured
+            order, pushed, measured = ORDERS.get(str(way[1])), one.pushes, one.measured
         else:
             part, _, row, column = way if len(way) == 4 else (*way, 0, 0)
             one = self.controllers[str(part)]
             order, number = divmod(int(column), len(one.measures))
             pushed, measured = one.pushes[int(row)], one.measures[number]
-        return Actuator(measured, pushed, PD(1.0, 1.0), setpoint="w").gain_unit(order)
+        loop = Actuator(measured, pushed, PD(1.0, 1.0), setpoint="w")
+        return loop.effort_unit if order is None else loop.gain_unit(order)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         return f"RigFile: {self.title or 'a rig'}", [

@@ -28,7 +28,14 @@ from torchsoft.physics.parts import (
     StateFeedback,
     controller,
 )
-from torchsoft.quantity import DerivativeGain, IntegralGain, Lag, ProportionalGain, quantity
+from torchsoft.quantity import (
+    DerivativeGain,
+    EffortLimit,
+    IntegralGain,
+    Lag,
+    ProportionalGain,
+    quantity,
+)
 from torchsoft.rigs.fields import Group, at_field
 from torchsoft.tables import LISTED, line
 
@@ -188,9 +195,9 @@ class Loop(NamedTuple):
 
 class ActuatorTable(Group):
     """An effort on one free coordinate: Kp (w - q) + Kd (w' - q'), Ki times the integral of w - q,
-    network(w, w', q, q') and feed-forward, after a lag if there is one. The coordinate q that it
-    measures may be another one, of another body, and of another kind: "disc.theta" through
-    "bracket.x"."""
+    network(w, w', q, q') and feed-forward, after a lag and up to a limit if there are such. The
+    coordinate q that it measures may be another one, of another body, and of another kind:
+    "disc.theta" through "bracket.x"."""
 
     pushes: str = Field(
         min_length=1, description='the coordinate that it pushes, such as "bracket.x"'
@@ -215,6 +222,11 @@ class ActuatorTable(Group):
         default=None,
         description="time constant of a first-order lag of the whole effort, as drives have it, "
         "which begins settled; none if not given",
+    )
+    limit: EffortLimit | None = Field(
+        default=None,
+        description="largest size of the whole effort [N or N.m], at which it saturates; an "
+        "integral goes on; none if not given",
     )
     reversed: bool = Field(
         default=False,
@@ -273,9 +285,11 @@ class ActuatorTable(Group):
             law, elements = Integral(law, self.Ki, reversed=self.reversed), (*elements, "Se: Ki")
         if self.lag is not None:
             law, elements = Lagging(law, self.lag), (*elements, "Se: lag")
+        if self.limit is not None:
+            elements = (*elements, "Se: limit")
         return Actuator(
             self.measured, self.pushes, law, setpoint=followed, feed_forward=self.feed_forward,
-            elements=elements
+            limit=self.limit, elements=elements
         )  # fmt: skip
 
 

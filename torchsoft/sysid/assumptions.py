@@ -26,6 +26,7 @@ from torchsoft.physics.names import effort_channel, rate_channel
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES, PD, Actuator, Load
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import parameter
 from torchsoft.sysid.initial_state import SETTLE, Standing
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Simulated, Vary
@@ -346,16 +347,21 @@ def of_actuators(recording: Recording) -> Iterator[Variation]:
     """What controllers do besides their law."""
     loops = [name for name, one in recording.rig.actuators.items() if isinstance(one.law, PD)]
     for names in (*([loops] if len(loops) > 1 else []), *([name] for name in loops)):
-        who = "controllers" if len(names) > 1 else f"the controller {names[0]}"
-        for kind, one in EFFORTS.items():
-            if kind == "limit" and len(names) > 1:
-                continue
+        several = len(names) > 1
+        who = "controllers" if several else f"the controller {names[0]}"
+        yield Variation(
+            f"delay of {who}", "known", f"{who} {'push' if several else 'pushes'} without delay",
+            "it came late, by a lag, a delay or half the period of a hold", 0.1, "ms",
+            one_sided=True,
+            vary=lambda r, ms, run, names=names: pushed_late(r, run, names, ms),
+        )  # fmt: skip
+    for name in loops:
+        if recording.rig.actuators[name].limit is None:
             yield Variation(
-                f"{kind} of {who}", "known", f"{who} {one.stated[len(names) > 1]}",
-                one.otherwise, one.amount, one.unit, one_sided=True,
-                vary=lambda r, amount, run, names=names, fault=one.effort: pushed(
-                    r, run, names, fault, amount
-                ),
+                f"limit of the controller {name}", "known",
+                f"the controller {name} does not saturate",
+                "it were cut off below its largest effort", 10.0, "%", one_sided=True,
+                vary=lambda r, part, run, name=name: limited(r, run, name, part),
             )  # fmt: skip
 
 
@@ -623,6 +629,9 @@ def with_pads(
 APART = 1e-6
 """Least distance [s] between the knots of such a force and those of the signal that it adds to."""
 
+LEAST_EFFORT = 1e-6
+"""Least limit [N or N.m] of a controller's effort."""
+
 FIXED_POINT, CLOSE = 6, 3e-3
 """Most times that such forces are computed, and their relative change at which they are not once
 more. To first order in a fault once is exact."""
@@ -633,57 +642,36 @@ def settled(now: Array, before: Array | None) -> bool:
     return before is not None and float(np.abs(now - before).max()) <= CLOSE * np.abs(now).max()
 
 
-class Effort(NamedTuple):
-    """A fault of controllers: effort (G,) of times t (G,) [s], the effort by the law (G,) and the
-    amount; its variation [unit], and clauses without it, of one controller and of several, and with
-    it."""
-
-    effort: Callable[[Array, Array, float], Array]
-    amount: float
-    unit: str
-    stated: tuple[str, str]
-    otherwise: str
-
-
 def late_effort(t: Array, effort: Array, ms: float) -> Array:
     """The effort some time [ms] ago."""
     return CubicSpline(t, effort)(np.maximum(t - 1e-3 * ms, t[0]))
 
 
-def limited_effort(t: Array, effort: Array, part: float) -> Array:
-    """The effort, cut off at a part [%] below its largest size."""
-    most = (1 - 1e-2 * part) * float(np.abs(effort).max())
-    return effort.clip(-most, most)
-
-
-EFFORTS = {
-    "delay": Effort(
-        late_effort, 0.1, "ms", ("pushes without delay", "push without delay"),
-        "it came late, by a lag, a delay or half the period of a hold",
-    ),
-    "limit": Effort(
-        limited_effort, 10.0, "%", ("does not saturate", "do not saturate"),
-        "it were cut off below its largest effort",
-    ),
-}  # fmt: skip
-"""Faults of controllers."""
-
-
-def pushed(
-    recording: Recording, run: Simulated, names: Collection[str],
-    fault: Callable[[Array, Array, float], Array], amount: float,
-) -> Recording:  # fmt: skip
-    """Controllers that push otherwise than by their laws: what is missing is fed forward."""
+def pushed_late(
+    recording: Recording, run: Simulated, names: Collection[str], ms: float
+) -> Recording:
+    """Controllers that push some time [ms] after their laws: what is missing is fed forward."""
     columns = [recording.channels.index(effort_channel(name)) for name in names]
     made, fed = recording, None
     for _ in range(FIXED_POINT):
         at, before = run(made), fed
         own = at.signals[:, columns].T - (0.0 if before is None else before)
-        fed = np.stack([fault(at.t, one, amount) for one in own]) - own
+        fed = np.stack([late_effort(at.t, one, ms) for one in own]) - own
         made = with_efforts(recording, at.t, dict(zip(names, fed)))
         if settled(fed, before):
             break
     return made
+
+
+def limited(recording: Recording, run: Simulated, name: str, part: float) -> Recording:
+    """Cut off a controller's effort at a part [%] below the largest one of the run as stated."""
+    effort = run(recording).signals[:, recording.channels.index(effort_channel(name))]
+    most = (1 - 1e-2 * part) * float(np.abs(effort).max())
+
+    def change(rig: Rig) -> None:
+        rig.actuators[name].limit = parameter(max(most, LEAST_EFFORT))
+
+    return with_rig(recording, change)
 
 
 def with_efforts(recording: Recording, t: Array, fed: Mapping[str, Array]) -> Recording:

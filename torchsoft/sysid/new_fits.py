@@ -45,13 +45,13 @@ class NewFits:
     Costly suspects come last. Where the misfit is far off, one that explains most of it to first
     order is tried; where that is not the cause, short fits of all that were `tested` rank them, and
     the best is; then some numbers are fitted at once, which comes before short fits where the first
-    was a sensor, since readings are linear in several faults. Sensors that explain it by one kind of fault
-    then come first, in one fit; where the numbers leave more than `RIVAL` of the misfit, or are at
-    rest far off, none is the cause alone, and they are left out. Effects too small for the misfit
-    are left out always. Where one suspect explains it the fit goes on until it is at rest; those
-    with much smaller gains are then left out, and costly ones. No fit is begun with which all would
-    take more than `effort` times the work of the fit itself: `late` has the names of the suspects
-    that are left.
+    was a sensor, since readings are linear in several faults. Sensors that explain the misfit by
+    one kind of fault then come first, in one fit; where the numbers leave more than `RIVAL` of the
+    misfit, or are at rest far off, none is the cause alone, and they are left out. Effects too
+    small for the misfit are left out always. Where one suspect explains it the fit goes on until it
+    is at rest; those with much smaller gains are then left out, and costly ones. No fit is begun
+    with which all would take more than `effort` times the work of the fit itself: `late` has the
+    names of the suspects that are left.
     """
 
     def __init__(

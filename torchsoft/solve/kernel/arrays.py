@@ -280,8 +280,8 @@ SCRATCH: dict[str, dict[str, str]] = {
         "6 8": "K",
         "widest free": "Hc",
         "free widest": "Rf",
-        "free 1": "r b",
-        "free free": "Rv",
+        "free 1": "r r_before b",
+        "free free": "Rv Rv_before",
         "free": "dV",
         "nodes2 columns+free": "X",  # left by Newton's elimination
         "1": "phi",

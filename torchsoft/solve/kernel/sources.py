@@ -45,14 +45,10 @@ def first_state(rig: Any, i: int) -> int:
 
 
 @compiled
-def balance(rig: Any, work: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
-    """Efforts of the sources less M V' on the free coordinates, r (free, 1), and their derivative
-    by the velocities of a stage of length a, Rv."""
+def push(rig: Any, work: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
+    """Efforts of the sources on the free coordinates, r (free, 1), and their derivative by the
+    velocities of a stage of length a, Rv."""
     Rv[:], r[:] = 0.0, 0.0
-    for i in range(rig.body_coordinate.size):
-        mass = rig.p[rig.body_mass_at[i]]
-        r[i, 0] = -mass * (work.V[rig.body_coordinate[i]] - y[rig.body_V_start + i]) / a
-        Rv[i, i] = -mass / a  # (17)
     for i in range(rig.source_pushed.size):
         number = rig.body_free[rig.source_pushed[i]]
         if number < 0:
@@ -64,6 +60,22 @@ def balance(rig: Any, work: Any, y: Array, signals: Array, a: float, r: Array, R
             if towards >= 0:
                 Rv[number, towards] += a * work.effort_J[n] + work.effort_J[n + 1]
             n += 2
+
+
+@compiled
+def resist(rig: Any, work: Any, y: Array, a: float, r: Array, Rv: Array) -> None:
+    """Less M V'."""
+    for i in range(rig.body_coordinate.size):
+        mass = rig.p[rig.body_mass_at[i]]
+        r[i, 0] -= mass * (work.V[rig.body_coordinate[i]] - y[rig.body_V_start + i]) / a
+        Rv[i, i] -= mass / a  # (17)
+
+
+@compiled
+def balance(rig: Any, work: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
+    """Efforts of the sources less M V', r (free, 1), and their derivative by the velocities, Rv."""
+    push(rig, work, y, signals, a, r, Rv)
+    resist(rig, work, y, a, r, Rv)
 
 
 @compiled

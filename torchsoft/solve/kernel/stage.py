@@ -10,7 +10,7 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, contacts, pads
 from torchsoft.solve.kernel.linear import put, solve_dense
-from torchsoft.solve.kernel.sources import balance, remember
+from torchsoft.solve.kernel.sources import push, remember, resist
 from torchsoft.solve.kernel.table import Array
 
 SEARCH_AFTER, SHORTEST = 2, 2.0**-10
@@ -60,14 +60,28 @@ def scan(rig: Any, work: Any, y: Array, margin: float) -> None:
 
 
 @compiled
+def beyond_linear(work: Any, part: float) -> tuple[float, float]:
+    """Largest difference [N or N.m] between the efforts of the sources and what their derivatives
+    say of Newton's step, or a part of it; and the sum of its squares."""
+    worst = total = 0.0
+    for i in range(work.dV.size):
+        error = work.r[i, 0] - work.r_before[i, 0]
+        for j in range(work.dV.size):
+            error -= part * work.Rv_before[i, j] * work.dV[j]
+        worst = abs(error) if not abs(error) <= worst else worst
+        total += error * error
+    return worst, total
+
+
+@compiled
 def solve_stage(
     rig: Any, work: Any, limits: Any, y: Array, signals: Array, a: float, margin: float
 ) -> tuple[bool, int]:
     """Velocities (work.V, on entry the guess), nodal forces and rates at the end of the stage that
     starts from y.
 
-    Newton ends when the law and the linear relations agree to the tolerance at every node. Returns
-    success and the number of linear solves.
+    Newton ends when the law and the linear relations agree to the tolerance at every node, and the
+    sources with their derivatives. Returns success and the number of linear solves.
     """
     count, free = rig.pad_base.size, rig.body_coordinate.size
     drive(rig, work, y, signals, a)
@@ -87,6 +101,10 @@ def solve_stage(
             contacts.evaluate(rig, work, pad, y, a)
             worst, total = pads.evaluate(rig, work, pad, y, a)
             mismatch, squares = worst if not worst <= mismatch else mismatch, squares + total
+        push(rig, work, y, signals, a, r, Rv)
+        if iteration > 0:
+            worst, total = beyond_linear(work, part)
+            mismatch, squares = worst if not worst <= mismatch else mismatch, squares + total
         most = previous if iteration > SEARCH_AFTER else np.inf
         stuck = iteration > 0 and not squares < most
         if stuck and part > SHORTEST:
@@ -103,7 +121,9 @@ def solve_stage(
         rounded = mismatch <= ROUNDED * limits.tolerance
         if not np.isfinite(mismatch) or iteration == limits.max_iterations or (stuck and rounded):
             return rounded, iteration
-        balance(rig, work, y, signals, a, r, Rv)
+        put(r, work.r_before)
+        put(Rv, work.Rv_before)
+        resist(rig, work, y, a, r, Rv)
         for pad in range(count):
             contacts.linearise(rig, work, pad, a, False)
             contacts.touched_nodes(rig, work, pad)
