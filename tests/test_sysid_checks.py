@@ -351,7 +351,9 @@ def screened(monkeypatch: pytest.MonkeyPatch, left: dict[str, float]) -> None:
         ),
     )
     monkeypatch.setattr(
-        new_fits, "gauss_newton", lambda fit, count: SimpleNamespace(square=fit.square / 2)
+        new_fits,
+        "gauss_newton",
+        lambda fit, count, anew: SimpleNamespace(square=fit.square / 2),
     )
 
 

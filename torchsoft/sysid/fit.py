@@ -388,6 +388,12 @@ class Fit(NamedTuple):
         """The fit with another tolerance."""
         return self._replace(stage=replace(self.stage, rtol=rtol))
 
+    def within_bounds(self, x: Array) -> Array:
+        """x (n,) within the bounds, and not on them."""
+        low, high = self.problem.coordinates.bounds
+        gap = 1e-9 * (high - low)
+        return np.clip(x, low + gap, high - gap)
+
     def place(self, z: Array) -> Array:
         """x (n,) with other fitted coordinates z."""
         x = self.x.copy()
@@ -514,9 +520,8 @@ def gauss_newton(
     shortens the step. With the linear loss a fit that makes no headway far above the noise ends
     early, as `Fit.stalled`. Raises `Unreachable` where the start cannot be simulated.
     """
-    low, high = fit.problem.coordinates.bounds
-    gap, free = 1e-9 * (high - low), fit.free
-    fit, start = fit._replace(x=np.clip(fit.x, low + gap, high - gap)), fit.x
+    (low, high), free = fit.problem.coordinates.bounds, fit.free
+    fit, start = fit._replace(x=fit.within_bounds(fit.x)), fit.x
     zero = np.zeros(int(free.sum()))
     known = len(fit.at.r) and not anew and (fit.x == start).all()
     seen = {zero.tobytes(): fit.at} if known else {}  # the best and the latest

@@ -11,7 +11,7 @@ from torchsoft.display import hidden
 from torchsoft.sysid.assumption_tests import RIVAL, Again, AssumptionTest, Judge
 from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.fit import Fit, gauss_newton
-from torchsoft.sysid.refits import far_off, joint_fit, likeness, refit, shares, short_fit
+from torchsoft.sysid.refits import far_off, first_step, joint_fit, likeness, refit, shares
 from torchsoft.tables import plain
 
 MOST = 12
@@ -29,9 +29,9 @@ was the cause had 0.75 where another ended far from the truth."""
 TRIALS = 10
 """Evaluations that a new fit takes, as a rule."""
 
-LOOK, LONGER = 2, 4
-"""Evaluations of the short fits by which suspects are ranked where the first fit ended far off, and
-further ones of the best: the true cause leads by them where tests to first order have it tenth."""
+LONGER = 4
+"""Evaluations after the first step of the short fits by which suspects are ranked where the first
+fit ended far off: the true cause leads by them where tests to first order have it tenth."""
 
 FAINT = 0.05
 """Part of a misfit that a suspect must explain to first order to have a short fit; those that were
@@ -134,12 +134,12 @@ class NewFits:
         self.bar.total += len(left)
         fits = dict[Variation, Fit]()
         for one in left:
-            fit = short_fit(self.end, one.within(self.linear[one.name].favoured), LOOK)
+            fit = first_step(self.end, one.within(self.linear[one.name].favoured))
             if fit is not None:
                 fits[one] = fit
             self.bar.update()
         best = sorted(fits, key=lambda one: (one.kind != "law", fits[one].square))[:MOST]
-        self.short = {one.name: gauss_newton(fits[one], LONGER) for one in best}
+        self.short = {one.name: gauss_newton(fits[one], LONGER, anew=True) for one in best}
         square = self.judge.square
         self.gains |= {name: max(square - fit.square, 0.0) for name, fit in self.short.items()}
         self.candidates = [*best, *(one for one in self.candidates if one.costly)]

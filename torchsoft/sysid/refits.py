@@ -37,6 +37,9 @@ and a half standard deviations, since some twenty variations are tested."""
 TOGETHER = 4
 """Most suspects that explain a misfit between them."""
 
+PARTS = (1.0, 0.25, 0.0625)
+"""Parts of a step that are tried where a fit is far off."""
+
 REDUNDANT = 1e-6
 """Part of the square of an effect beside others at which it counts as one of theirs."""
 
@@ -339,16 +342,23 @@ def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
     return out
 
 
-def short_fit(end: Fit, one: Variation, evaluations: int) -> Fit | None:
-    """The begin of the fit with an assumption varied, from the end of the fit and by the tolerance
-    `LOOSE`; None where it cannot begin."""
+def first_step(end: Fit, one: Variation) -> Fit | None:
+    """The fit with an assumption varied, one step from the end of the fit, by the tolerance
+    `LOOSE`: the best of some `PARTS` of the Gauss-Newton step, or of one of length 1 where that is
+    longer. None where it cannot begin."""
     try:
         other = assuming(end.problem, [one], free=True)
-    except ValueError:
+        begin = under(end, other, begun(other, [one], end.by_label))
+        begin = begin.by(max(LOOSE, end.rtol)).begun(begin.within_bounds(begin.x))
+    except (ValueError, Unreachable):
         return None
-    begin = under(end, other, begun(other, [one], end.by_label))
-    loose = max(LOOSE, end.rtol)
-    return continued(begin, replace(begin.stage, rtol=loose, evaluations=evaluations))
+    step, fits = begin.newton_step(), [begin]
+    step /= max(1.0, float(np.linalg.norm(step)))
+    for part in PARTS:
+        x = begin.place(begin.x[begin.free] + part * step)
+        at = begin.residuals(x)
+        fits += [] if at.failed else [begin._replace(x=x, at=at)]
+    return min(fits, key=lambda fit: fit.square)
 
 
 def refit(
