@@ -26,6 +26,7 @@ from torchsoft.sysid import (
     identify,
     new_fits,
     record,
+    refits,
 )
 from torchsoft.sysid.assumption_tests import (
     TIGHTENINGS,
@@ -55,6 +56,7 @@ from torchsoft.sysid.refits import (
     assuming,
     difference,
     fewest,
+    first_step,
     joint_fit,
     likeness,
     reach,
@@ -341,14 +343,26 @@ def test_the_fewest_effects_that_span_a_misfit_are_found():
     assert fewest(effects, np.ones(8), 0.1) == []
 
 
+def test_a_first_step_far_off_is_the_best_of_its_parts(monkeypatch):
+    """A whole one passes the minimum by more than it was away; a tiny part brings little."""
+    problem: Any = ClosedForm(lambda x: 10.0 * np.arctan(8.0 * x), 1)
+    stage = Stage("far off", ("data",), ("p0",), RTOL)
+    end = Fit(problem, Runner(()), np.array([0.4]), stage).begun()
+    monkeypatch.setattr(refits, "assuming", lambda *given, free: problem)
+    monkeypatch.setattr(refits, "under", lambda *given: end)
+    monkeypatch.setattr(refits, "begun", lambda *given: end.x)
+    fit = first_step(end, Variation("a", "known", "", ""))
+    assert fit is not None
+    np.testing.assert_allclose(fit.x, 0.15)
+    assert fit.square < end.square < 100 * np.arctan(8 * 0.6) ** 2
+
+
 def screened(monkeypatch: pytest.MonkeyPatch, left: dict[str, float]) -> None:
     """Short fits that end with a sum of squares by name, which a few more steps halve."""
     monkeypatch.setattr(
         new_fits,
-        "short_fit",
-        lambda end, one, count: (
-            SimpleNamespace(square=left[one.name]) if one.name in left else None
-        ),
+        "first_step",
+        lambda end, one: SimpleNamespace(square=left[one.name]) if one.name in left else None,
     )
     monkeypatch.setattr(
         new_fits,
