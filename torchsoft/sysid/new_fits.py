@@ -2,7 +2,7 @@
 the data."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from tqdm import tqdm
@@ -44,8 +44,8 @@ class NewFits:
 
     Costly suspects come last. Where the misfit is far off, one that explains most of it to first
     order is tried; where that is not the cause, short fits of all that were `tested` rank them, and
-    the best is; then some numbers are fitted at once, which comes before short fits where the first
-    was a sensor, since readings are linear in several faults. Sensors that explain the misfit by
+    the best is if it explains most; then some numbers are fitted at once, which comes before short
+    fits where the first was a sensor. Sensors that explain the misfit by
     one kind of fault then come first, in one fit; where the numbers leave more than `RIVAL` of the
     misfit, or are at rest far off, none is the cause alone, and they are left out. Effects too
     small for the misfit are left out always. Where one suspect explains it the fit goes on until it
@@ -70,6 +70,8 @@ class NewFits:
         """Least gain of a suspect that is tried, once one explains the misfit."""
         self.candidates, self.tried = list(candidates), set[str]()
         self.queue, self.short = list[list[Variation]](), dict[str, Fit]()
+        ways: list[Callable[[], Fit | None]] = [self.screen, self.joint]
+        self.rankings = ways if self.far else []
         self.bar = tqdm(total=len(candidates) + 1, unit="fit", disable=hidden(end.progress))
         self.end = end._replace(notify=lambda chi2: self.bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
         self.most = end.runner.work * (1.0 + effort)
@@ -82,11 +84,11 @@ class NewFits:
             if as_stated is None:
                 return
             self.queue = self.ordered(self.candidates)
-            near, rankings = None, [self.screen, self.joint] if self.far else []
-            if self.evident():
-                rankings = rankings[self.queue[0][0].kind == "sensor" :]
-            elif rankings:
-                rankings.pop(0)()
+            near = None
+            if self.evident():  # a sensor: readings are linear in several faults
+                self.rankings = self.rankings[self.queue[0][0].kind == "sensor" :]
+            elif self.rankings:
+                near = self.rank()
             while self.queue:
                 some = self.queue.pop(0)
                 if not self.promising(some):
@@ -102,10 +104,10 @@ class NewFits:
                     yield some[0]
                 found = self.checks.get(named(some))
                 if found is not None and self.judge.nearly(found):
-                    rankings.clear()
+                    self.rankings = []
                     self.limit(some)
-                elif rankings:
-                    near = rankings.pop(0)()
+                elif self.rankings:
+                    near = self.rank()
             self.finish(as_stated)
 
     def say(self, text: str) -> None:
@@ -118,10 +120,15 @@ class NewFits:
         return [[one] for one in sorted(large, key=lambda one: (one.costly, -self.gains[one.name]))]
 
     def evident(self) -> bool:
-        """Whether the misfit is far off, and the likeliest suspect explains most of it to first
-        order."""
+        """Whether the misfit is far off, and the likeliest suspect explains most of it."""
         most = MOSTLY * self.judge.misfit(self.judge.square)
         return self.far and bool(self.queue) and self.gain(self.queue[0]) >= most
+
+    def rank(self) -> Fit | None:
+        """Rank the suspects by the next way, and by the one after it if no suspect is evident; a
+        joint fit that explains the misfit is returned."""
+        near = self.rankings.pop(0)()
+        return self.rank() if self.rankings and not self.evident() else near
 
     def screen(self) -> None:
         """Fill the queue by short fits: one step of every suspect, then more of the best, and of
