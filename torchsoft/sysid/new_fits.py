@@ -10,8 +10,16 @@ from tqdm import tqdm
 from torchsoft.display import hidden
 from torchsoft.sysid.assumption_tests import RIVAL, Again, AssumptionTest, Judge
 from torchsoft.sysid.assumptions import Variation
-from torchsoft.sysid.fit import Fit, gauss_newton
-from torchsoft.sysid.refits import far_off, first_step, joint_fit, likeness, refit, shares
+from torchsoft.sysid.fit import Fit
+from torchsoft.sysid.refits import (
+    carried_on,
+    far_off,
+    first_step,
+    joint_fit,
+    likeness,
+    refit,
+    shares,
+)
 from torchsoft.tables import plain
 
 MOST = 12
@@ -45,13 +53,13 @@ class NewFits:
     Costly suspects come last. Where the misfit is far off, one that explains most of it to first
     order is tried; where that is not the cause, short fits of all that were `tested` rank them, and
     the best is if it explains most; then some numbers are fitted at once, which comes before short
-    fits where the first was a sensor. Sensors that explain the misfit by
-    one kind of fault then come first, in one fit; where the numbers leave more than `RIVAL` of the
-    misfit, or are at rest far off, none is the cause alone, and they are left out. Effects too
-    small for the misfit are left out always. Where one suspect explains it the fit goes on until it
-    is at rest; those with much smaller gains are then left out, and costly ones. No fit is begun
-    with which all would take more than `effort` times the work of the fit itself: `late` has the
-    names of the suspects that are left.
+    fits where the first was a sensor. Sensors that explain the misfit by one kind of fault then
+    come first, in one fit; where the numbers leave more than `RIVAL` of the misfit, or are at rest
+    far off, none is the cause alone, and they are left out. Effects too small for the misfit are
+    left out always. Where one suspect explains it the fit goes on until it is at rest; those with
+    much smaller gains are then left out, and costly ones. No fit is begun with which all would take
+    more than `effort` times the work of the fit itself: `late` has the names of the suspects that
+    are left.
     """
 
     def __init__(
@@ -146,7 +154,7 @@ class NewFits:
                 fits[one] = fit
             self.bar.update()
         best = sorted(fits, key=lambda one: (one.kind != "law", fits[one].square))[:MOST]
-        self.short = {one.name: gauss_newton(fits[one], LONGER, anew=True) for one in best}
+        self.short = {one.name: carried_on(fits[one], LONGER) for one in best}
         square = self.judge.square
         self.gains |= {name: max(square - fit.square, 0.0) for name, fit in self.short.items()}
         self.candidates = [*best, *(one for one in self.candidates if one.costly)]

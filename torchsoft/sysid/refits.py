@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from torchsoft.sysid.assumptions import AMOUNTS, FAULT_BOUNDS, WIDEST, Variation
-from torchsoft.sysid.fit import Fit, Stage, Unreachable
+from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
 from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, continued, default_plan
 from torchsoft.sysid.problem import Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
@@ -359,6 +359,13 @@ def first_step(end: Fit, one: Variation) -> Fit | None:
         at = begin.residuals(x)
         fits += [] if at.failed else [begin._replace(x=x, at=at)]
     return min(fits, key=lambda fit: fit.square)
+
+
+def carried_on(fit: Fit, evaluations: int) -> Fit:
+    """The fit after some more evaluations on its steps, or as it is where these fail."""
+    with suppress(Unreachable):
+        return gauss_newton(fit, evaluations, ROUGH, anew=True)
+    return fit
 
 
 def refit(
