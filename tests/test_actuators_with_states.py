@@ -161,6 +161,7 @@ def test_a_rig_file_limits_an_effort_that_has_a_lag():
     assert file.unit_of(name) == "N"
     built = file.build()
     assert built.rig.actuators["y"].elements[-2:] == ("Se: lag", "Se: limit")
+    assert "Lagging limit 60 N\n" in str(built.rig)
     efforts = [
         one.run(times(0.3, 31), rtol=1e-4)["effort_y"].abs().max().item()
         for one in (PAPER.override(COARSE | {LAG_Y: 2e-3}).build(), built)

@@ -482,8 +482,10 @@ ORDERS = {"Ki": -1, "Kp": 0, "Kd": 1}
 
 
 def gain_unit(law: nn.Module, name: str, users: Sequence[Actuator]) -> str | None:
-    """Unit of a gain of a control law by its name in the law, which belongs to some actuators; None
-    for another number."""
+    """Unit of a gain of a control law by its name in the law, which belongs to some actuators, or
+    of the limit of one; None for another number."""
+    if isinstance(law, Actuator):
+        return law.effort_unit
     if isinstance(law, PD | Integral):
         return users[0].gain_unit(ORDERS[name])
     if not isinstance(law, StateFeedback):

@@ -13,7 +13,7 @@ from torchsoft.physics.parts import gain_unit, law_name
 from torchsoft.physics.start import start
 from torchsoft.quantity import Quantity, quantity_of
 
-NUMBERS = ("E", "tau", "K_n", "K_t", "mu_s", "mu_k", "Kp", "Kd")
+NUMBERS = ("E", "tau", "K_n", "K_t", "mu_s", "mu_k", "Kp", "Kd", "limit")
 """Parameters of laws that are shown."""
 
 
@@ -165,7 +165,11 @@ class Rig(Shown, Graph):
             )
         for name, actuator in self.actuators.items():
             follows = ", ".join(f"{at} to {signal}" for at, signal in actuator.follows)
-            law = self._numbers(f"actuators.{name}.law", actuator.law)
+            numbers = (
+                self._numbers(f"actuators.{name}.law", actuator.law),
+                self._numbers(f"actuators.{name}", actuator),
+            )
+            law = ", ".join(filter(None, numbers))
             rows.append(
                 (
                     f"actuator {name}",
