@@ -664,14 +664,19 @@ def pushed_late(
 
 
 def limited(recording: Recording, run: Simulated, name: str, part: float) -> Recording:
-    """Cut off a controller's effort at a part [%] below the largest one of the run as stated."""
-    effort = run(recording).signals[:, recording.channels.index(effort_channel(name))]
-    most = (1 - 1e-2 * part) * float(np.abs(effort).max())
+    """Cut off a controller's effort at a part [%] below the largest one of the run as stated, with
+    which the limit moves."""
+    made, channel = run(recording, True), recording.channels.index(effort_channel(name))
+    effort, left = made.signals[:, channel], 1 - 1e-2 * part
+    k = int(np.abs(effort).argmax())
+    limit, tied = max(left * abs(effort[k]), LEAST_EFFORT), dict(recording.tied)
+    if made.derivatives is not None:
+        tied[f"actuators.{name}.limit"] = left * np.sign(effort[k]) * made.derivatives[k, channel]
 
     def change(rig: Rig) -> None:
-        rig.actuators[name].limit = parameter(max(most, LEAST_EFFORT))
+        rig.actuators[name].limit = parameter(limit)
 
-    return with_rig(recording, change)
+    return replace(with_rig(recording, change), tied=tied)
 
 
 def with_efforts(recording: Recording, t: Array, fed: Mapping[str, Array]) -> Recording:

@@ -33,6 +33,7 @@ from scipy.sparse.linalg import spsolve_triangular
 
 from torchsoft.display import suggestion
 from torchsoft.files import write_json
+from torchsoft.parallel import single_threaded
 from torchsoft.sysid.colour import allow_for_colour, declared_colour
 from torchsoft.sysid.fit import Fit, Stage, Unreachable
 from torchsoft.sysid.identification import RTOL
@@ -379,6 +380,7 @@ CLOSE = 1e-3
 """Relative tolerance of the last fits, on the misfit and on the coordinates."""
 
 
+@single_threaded()
 def compare(
     laws: Mapping[str, Problem],
     *,

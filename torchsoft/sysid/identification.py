@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from tqdm import tqdm
 
+from torchsoft.parallel import single_threaded
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.colour import (
     WORSE,
@@ -403,6 +404,7 @@ def rough_notices(c: Coordinates, rough: Sequence[str]) -> list[str]:
 # Identification and explanation
 
 
+@single_threaded()
 def identify(
     problem: Problem,
     *,

@@ -29,11 +29,6 @@ numbers of a joint fit."""
 MOSTLY = 0.5
 """Part of a misfit that a suspect explains to first order with which new fits begin."""
 
-ALIKE = 0.5
-"""Part of the effect of a suspect that explains the misfit, to first order at the end under it,
-which another one must have to be tried: new fits of nine had as much of it to 0.15, and one that
-was the cause had 0.75 where another ended far from the truth."""
-
 TRIALS = 10
 """Evaluations that a new fit takes, as a rule."""
 
@@ -223,13 +218,13 @@ class NewFits:
         fits or, where there were none and the first end was too far off, by what they can have of
         the effect at the end of the first such fit."""
         name = named(some)
-        gain, part = self.gain(some), RIVAL
+        gain = self.gain(some)
         first = len(some) == 1 and some[0].kind in ("known", "sensor") and not self.enough
         if first and name in self.judge.ends and (self.far or self.linear[name].far):
-            gain, part = self.checks[name].gain, ALIKE
+            gain = self.checks[name].gain
             if not self.short:
                 self.add_alike(name)
-        self.enough = max(self.enough, part * gain)
+        self.enough = max(self.enough, RIVAL * gain)
         self.queue.sort(key=self.gain, reverse=True)
 
     def add_alike(self, name: str) -> None:

@@ -111,6 +111,10 @@ def check_possible(recording: Recording, values: Mapping[str, float]) -> None:
         check_values(rig)
 
 
+DIFFERENCE = 0.1
+"""Part of the amount of a variation by which its column is differenced."""
+
+
 class Reading(NamedTuple):
     """One channel of a run as read by its sensor: times (k,) [s], samples, expected readings with
     their derivatives (k, n) by the run's parameters and by nuisances; residuals r (k,) over the
@@ -318,9 +322,16 @@ class Problem(Shown):
         coordinates, and the steps of their runs, on which residuals are smooth in x.
 
         Columns of variations are differences: a run with another amount, or the same run read in
-        another way.
+        another way. Runs of varied recordings choose steps of their own, so that those of the last
+        are taken by all.
         """
         jobs = self.jobs(x, which, steps, free)
+        if not isinstance(steps, Mapping) and any(job.varied for job in jobs):
+            plain = [job._replace(names=()) for job in jobs]
+            first = self.gather(x, plain, runner.run(plain))
+            if first.failed:
+                return first
+            jobs = self.jobs(x, which, first.steps, free)
         runs = runner.run(jobs)
         at = self.gather(x, jobs, runs)
         if free is None or at.failed:
@@ -329,11 +340,11 @@ class Problem(Shown):
             one = self.coordinates.all[i]
             if one.kind != "variation":
                 continue
-            step = self.variations[one.name].amount / (one.high - one.low)
+            step = DIFFERENCE * self.variations[one.name].amount / (one.high - one.low)
             moved = x + step * np.eye(len(x))[i]
             others, rerun = jobs, runs
             if self.variations[one.name].vary is not None:
-                others = self.jobs(moved, which, steps, None)
+                others = self.jobs(moved, which, at.steps, None)
                 rerun = runner.run(others)
             there = self.gather(moved, others, rerun)
             if there.failed:

@@ -77,7 +77,8 @@ class Recording:
     that the run followed; runs use copies of it. `samples` holds times (k,) [s] and values (k,) by
     channel, each with its own times; channels are those of `measurable`, and those of touch.
     `start` is the start of the run. Numbers of the rig in `drifts` change along the samples, by a
-    part of what they are. `dataclasses.replace` makes variants, such as one with another law.
+    part of what they are. Those in `tied` follow from runs, with their derivatives (n,) by the
+    parameters of a run. `dataclasses.replace` makes variants, such as one with another law.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Recording:
     samples: dict[str, tuple[Array, Array]] = field(repr=False)
     start: Start
     drifts: Mapping[str, float] = field(default_factory=dict, repr=False)
+    tied: Mapping[str, Array] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if not self.samples:

@@ -378,21 +378,23 @@ def refit(
     """The fit with some assumptions varied, or with all as stated, on its own steps; None where it
     cannot begin.
 
-    It starts at the end of the fit, or of one `near`; ratios at a bound are scanned again over
-    their whole range. With a misfit above `FAR`, variations other than of a sensor also start
-    `anew`, where the first fit did, unless the sum of squares is below `enough`; the better end
-    counts.
+    It starts at the end of one `near`, or of the fit where that fails; ratios at a bound are
+    scanned again over their whole range. With a misfit above `FAR`, variations other than of a
+    sensor also start `anew`, where the first fit did, unless the sum of squares is below `enough`;
+    the better end counts.
     """
     try:
         other = assuming(end.problem, tried, free=True)
     except ValueError:
         return None
-    c = other.coordinates
-    begin = under(end, other, begun(other, tried, end.by_label | (near.by_label if near else {})))
-    stuck = [one for one in c.within(begin.free & c.at_bound(begin.x)) if one.ratio_to]
-    scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-    fits = [continued(begin, replace(begin.stage, scanned=scans))]
-    explains = fits[0] is not None and fits[0].square <= enough
+    c, fit, begin = other.coordinates, None, end
+    for there in filter(None, (near, end)):
+        begin = under(end, other, begun(other, tried, end.by_label | there.by_label))
+        stuck = [one for one in c.within(begin.free & c.at_bound(begin.x)) if one.ratio_to]
+        scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
+        if (fit := continued(begin, replace(begin.stage, scanned=scans))) is not None:
+            break
+    fits, explains = [fit], fit is not None and fit.square <= enough
     if anew and any(one.kind != "sensor" for one in tried) and far_off(end) and not explains:
         with suppress(Unreachable):
             plan = default_plan(other, begin.runner, end.rtol, end.which)

@@ -14,7 +14,7 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -184,8 +184,13 @@ class Job(NamedTuple):
     varied: tuple[tuple[str, float], ...] = ()
 
 
-Simulated = Callable[[Recording], Prediction]
-"""The run of a recording at the values of a job. Raises `SimulationFailed`."""
+
+class Simulated(Protocol):
+    """The run of a recording at the values of a job, with its derivatives if they are asked for.
+    Raises `SimulationFailed`."""
+
+    def __call__(self, one: Recording, derived: bool = False, /) -> Prediction: ...
+
 
 Vary = Callable[[Recording, float, Simulated], Recording | None]
 """A recording with an assumption varied by an amount, which may look at runs; None where the
@@ -279,20 +284,28 @@ class Runner:
     def _varied(self, job: Job) -> Any:
         """Run a job of a varied recording, of which each run has another."""
         stated = self.recordings[job.recording]
-        plain = job._replace(varied=())
+        plain, work = job._replace(varied=()), 0.0
 
         def run(one: Recording, job: Job = plain, fine: bool = False) -> Any:
-            job = job._replace(steps=since(job.steps, one.begins))
+            nonlocal work
+            tied = tuple(one.tied) if job.names else ()
+            job = job._replace(steps=since(job.steps, one.begins), names=(*tied, *job.names))
             made = simulated(one, one.begin(), job, grid=between(one, job) if fine else None)
             if isinstance(made, FailedRun):
                 raise SimulationFailed(made.reason, made.time)
+            if one is not stated or job.names:  # that as stated is made once
+                work += rig_step(one.rig, len(job.names))
             own = [one.channels.index(channel) for channel in stated.channels]  # of more actuators
-            step = rig_step(one.rig, len(job.names))
-            return made._replace(signals=made.signals[:, own], step=step)
+            slopes = None if made.derivatives is None else made.derivatives[:, own]
+            if slopes is not None and tied:
+                by, slopes = np.split(slopes, [len(tied)], axis=-1)
+                slopes = slopes + by @ np.stack([one.tied[name] for name in tied])
+            return made._replace(signals=made.signals[:, own], derivatives=slopes, step=work)
 
-        def watched(one: Recording) -> Prediction:
-            """The run on a fine grid; that of the recording as stated is made once."""
-            fine = plain._replace(names=(), judged=None)
+        def watched(one: Recording, derived: bool = False) -> Prediction:
+            """The run on a fine grid, with the derivatives of the job if they are asked for; the
+            last one of the recording as stated is kept."""
+            fine = plain._replace(names=plain.names if derived else (), judged=None)
             if one is not stated:
                 return run(one, fine, True)
             with self._lock:
