@@ -25,23 +25,24 @@ def some_points(ageing: float) -> tuple[torch.Tensor, ...]:
     E, F_N, R, h, age = torch.from_numpy(
         10 ** random.uniform([[-6], [-5], [-1], [-7], [-5]], [[2], [1], [3], [-2], [3]], (5, 20000))
     )
-    return E, F_N, R + 40 * F_N + h * ageing * F_N / D_C, h, age
+    falls = MU - 0.5 + ageing * torch.log1p((age + h) / T_0)
+    return E, F_N, R + (falls / 5e-3 + h * ageing / D_C) * F_N, h, age
 
 
 @pytest.mark.parametrize("ageing", [0.005, 0.1])
 def test_the_slip_rate_solves_the_elements_equation(ageing):
-    """R V + mu(V) (1 + ageing / mu_s ln(1 + age / t_0)) F_N = E at the end of a stage, and V = 0
-    where the effort is below the strength of a point at rest."""
+    """R V + mu(V) F_N = E at the end of a stage with mu_s + ageing ln(1 + age / t_0) at rest, and
+    V = 0 where the effort is below the strength of a point at rest."""
     E, F_N, R, h, age = some_points(ageing)
     law = AgeingSlip(MU, 0.5, 5e-3, ageing, D_C, T_0)
     with torch.no_grad():
         V, rate = law(E, F_N, R, age[:, None], h)
     aged, slips = age + h * rate[:, 0], V > 0
     assert aged == pytest.approx((age + h) / (1 + h * V / D_C), rel=1e-9)
-    stronger = 1 + ageing / MU * torch.log1p(aged / T_0)
-    friction = stronger * (0.5 + (MU - 0.5) / (1 + V / 5e-3)) * F_N
+    mu_s = MU + ageing * torch.log1p(aged / T_0)
+    friction = (0.5 + (mu_s - 0.5) / (1 + V / 5e-3)) * F_N
     assert float(((R * V + friction) / E - 1)[slips].abs().max()) < 1e-9
-    at_rest = (1 + ageing / MU * torch.log1p((age + h) / T_0)) * MU * F_N
+    at_rest = (MU + ageing * torch.log1p((age + h) / T_0)) * F_N
     assert bool((slips == (at_rest < E)).all())
     assert 1000 < int(slips.sum()) < 19000
 
@@ -56,7 +57,15 @@ def test_without_ageing_it_is_smooth_slip():
 def peak(rest: float) -> tuple[float, float]:
     """When a block that is drawn after a rest [s] has its largest friction over normal force [s],
     and that friction."""
-    numbers = {"mu_s": MU, "mu_k": MU, "ageing": AGEING, "D_c": D_C, "t_0": T_0, "age_0": 0.0}
+    numbers = {
+        "mu_s": MU,
+        "mu_k": MU,
+        "v_s": 1.0,
+        "ageing": AGEING,
+        "D_c": D_C,
+        "t_0": T_0,
+        "age_0": 0.0,
+    }
     built = sled(kind="ageing", **numbers).build()
     way = Lines(np.array([0.0, rest, rest + 0.05]), np.array([0.0, 0.0, 1e-4]))
     t = torch.cat((torch.tensor([0.0]), torch.linspace(rest, rest + 0.05, 400))).double()
@@ -105,7 +114,7 @@ def test_derivatives_of_the_slip_rate_are_those_of_the_elements_equation(ageing)
     (by_E,) = torch.autograd.grad(V.sum(), E)
     V = V.detach().requires_grad_()
     older = torch.log1p((age + h) / (1 + h * V / D_C) / T_0)
-    friction = (0.5 + (MU - 0.5) / (1 + V / 5e-3)) * (1 + ageing / MU * older) * F_N
+    friction = (0.5 + (MU + ageing * older - 0.5) / (1 + V / 5e-3)) * F_N
     (falls,) = torch.autograd.grad(friction.sum(), V)
     slips = (V > 0).detach()
     assert by_E[slips].numpy() == pytest.approx((1 / (R + falls))[slips].numpy(), rel=1e-8)

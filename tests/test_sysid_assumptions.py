@@ -30,6 +30,7 @@ from torchsoft.sysid.assumptions import (
     with_loads,
 )
 from torchsoft.sysid.prediction import Frozen, Prediction, Readout, Signals, Term, lagged, predict
+from torchsoft.sysid.problem import DIFFERENCE
 from torchsoft.sysid.refits import assuming, begun
 from torchsoft.sysid.runs import Runner
 
@@ -37,7 +38,7 @@ E = "materials.rubber.E"
 SENSORS = {"x_C": Sensor(noise=1e-5), "effort_x": Sensor(noise=0.1), "effort_y": Sensor(noise=0.1)}
 
 
-def run_of(recording: Recording) -> Prediction:
+def run_of(recording: Recording, derived: bool = False, /) -> Prediction:
     return predict(recording.begin(), {}, recording.grid(True), (), 1e-6)
 
 
@@ -173,7 +174,7 @@ def test_a_channel_reads_a_part_of_another_and_a_camera_has_a_scale():
 
 def test_amounts_of_variations_are_coordinates_with_differences_as_derivatives():
     """Held at zero they change nothing; at an amount residuals are those of the varied recording,
-    and the column of a free one is the difference by its amount."""
+    and the column of a free one is a difference by a part of its amount."""
     data = strokes()
     problem = Problem([data], SENSORS, {E: Unknown()})
     known = {one.name: one for one in assumptions([data], {E}, SENSORS)}
@@ -186,17 +187,38 @@ def test_amounts_of_variations_are_coordinates_with_differences_as_derivatives()
     steps = base.steps
     at = other.residuals(other.runner(Runner([data])), x, which, steps, c.free)
     np.testing.assert_allclose(at.r, base.r, atol=1e-6)
-    thicker = resized(data, ["L", "U"], "height", 0.01)
+    thicker = resized(data, ["L", "U"], "height", 0.01 * DIFFERENCE)
     own = Problem([thicker], SENSORS, {E: Unknown()})
     moved = own.residuals(Runner([thicker]), problem.coordinates.start, which, steps)
     one = c.all[1]
-    np.testing.assert_allclose(at.J[:, 1] * one.to_x(1.0), moved.r - base.r, rtol=1e-9, atol=1e-9)
+    change = at.J[:, 1] * one.to_x(DIFFERENCE)
+    np.testing.assert_allclose(change, moved.r - base.r, rtol=1e-9, atol=1e-9)
     rows = len(data.samples["effort_x"][0])
     crossed = -1e-3 * data.samples["effort_y"][1] / 0.1
     column = at.J[rows : 2 * rows, 2] * c.all[2].to_x(0.1)
     np.testing.assert_allclose(column, -crossed, rtol=1e-6, atol=1e-9)
     held = assuming(problem, chosen, free=False)
     assert held.coordinates.free.tolist() == [True, False, False]
+
+
+def test_under_a_limit_derivatives_are_those_of_what_moves_it():
+    """Those of the largest effort without it, a part of which it is, by differences on the steps;
+    and what a tolerance chooses is what those steps are."""
+    data = strokes()
+    problem = Problem([data], SENSORS, {E: Unknown()})
+    known = {one.name: one for one in assumptions([data], {E}, SENSORS)}
+    other = assuming(problem, [known["limit of the controller x"]], free=True)
+    c, which, runner = other.coordinates, problem.names, other.runner(Runner([data]))
+    x = c.start.copy()
+    x[1] = c.all[1].to_x(10.0)
+    at = other.residuals(runner, x, which, 1e-5, c.free)
+    again = other.residuals(runner, x, which, at.steps)
+    np.testing.assert_allclose(again.r, at.r, atol=1e-9)
+    ahead, behind = (
+        other.residuals(runner, x + [step, 0.0], which, at.steps).r for step in (1e-4, -1e-4)
+    )
+    apart = at.J[:, 0] - (ahead - behind) / 2e-4
+    assert np.linalg.norm(apart) < 1e-2 * np.linalg.norm(at.J[:, 0])
 
 
 def test_a_reading_behind_a_low_pass_with_its_derivatives():

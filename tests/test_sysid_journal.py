@@ -200,6 +200,27 @@ def test_runs_of_varied_recordings_count_where_they_were_asked_for(monkeypatch):
     assert parent.work == child.work == (1 + 2 + 1) * steps
 
 
+def test_a_varied_run_is_as_much_work_as_all_of_its_runs(monkeypatch):
+    """But that of the recording as stated, which is made once for many."""
+    monkeypatch.setattr(runs, "simulated", lambda *_, **__: PREDICTION)
+    monkeypatch.setattr(runs, "rig_step", lambda rig, parameters: 1.0 + parameters)
+    one = {
+        "beginning": "", "fingerprint": "a", "duration": 1.0, "begin": lambda: None, "begins": 0.0,
+        "channels": ("x",), "tied": {}, "rig": None,
+    }  # fmt: skip
+    stated, other = SimpleNamespace(**one), SimpleNamespace(**one)
+    monkeypatch.setattr(runs, "between", lambda *_: None)
+
+    def late(recording, amount, run):
+        run(recording), run(other), run(other)
+        return other
+
+    runner = Runner([stated], variations={"late": late})  # pyright: ignore
+    for names in ((), ("pad.E",)):
+        runner.run([Job(0, {"pad.E": 1.0}, names, 1e-3, varied=(("late", 1.0),))])
+    assert runner.work == (3 + 4) * (len(PREDICTION.knots) - 1)
+
+
 def test_remembered_runs_are_as_much_work(tmp_path, monkeypatch):
     """So that what a bound on the work leaves out does not hang on an interruption."""
     monkeypatch.setattr(runs, "simulated", lambda *_: PREDICTION)

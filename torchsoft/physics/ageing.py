@@ -22,12 +22,11 @@ the relative error of the slope."""
 
 
 class AgeingSlip(SmoothSlip):
-    """Smooth slip under friction that is
+    """Smooth slip whose static friction is
 
-        1 + ageing / mu_s ln(1 + age / t_0),    age' = 1 - |gamma'| age / D_c
+        mu_s + ageing ln(1 + age / t_0),    age' = 1 - |gamma'| age / D_c
 
-    times as large, so that mu_s rises by `ageing` for every factor e of the time at rest beyond
-    t_0. The age is a state of every point [s], `age_0` at the start; apart from the body it goes to
+    so that it rises by `ageing` for every factor e of the time at rest beyond t_0. The age is a state of every point [s], `age_0` at the start; apart from the body it goes to
     t_0 within that time. Not smooth at slip onset. The slip rate is single-valued where the
     tangential spring outweighs the fall of friction with slip, K_t >= ageing F_N / D_c, beside what
     `SmoothSlip` needs. Without `ageing` it is that law.
@@ -55,6 +54,10 @@ class AgeingSlip(SmoothSlip):
         self.ageing = parameter(ageing)
         self.D_c, self.t_0, self.age_0 = (parameter(x, trained=False) for x in (D_c, t_0, age_0))
 
+    def at_rest(self) -> Tensor:
+        """Static friction [1] at the start of a run."""
+        return self.mu_s + self.ageing * torch.log1p(self.age_0 / self.t_0)
+
     def jumps(self, F_N: float, R_t: Tensor, K_t: Tensor) -> str:
         """Why the slip rate jumps under F_N [N] between a dashpot [N.s/m] and a spring [N/m]; empty
         if it does not."""
@@ -72,16 +75,16 @@ class AgeingSlip(SmoothSlip):
 
         age, presses = z[..., 0], F_N > 0
 
-        def slip(rate: Tensor) -> Tensor:
+        def at(rate: Tensor) -> Tensor:
             older = torch.log1p((age + stage) / (1 + stage * rate / self.D_c) / self.t_0)
-            return SmoothSlip.forward(self, E, (1 + self.ageing / self.mu_s * older) * F_N, R)
+            return self.slip(E, F_N, R, self.mu_s + self.ageing * older)
 
-        first = slip(torch.zeros_like(E))  # zero where a point that presses sticks
+        first = at(torch.zeros_like(E))  # zero where a point that presses sticks
         old, before, rate, secant = torch.zeros_like(E), first, first, torch.zeros_like(E)
         for left in reversed(range(ITERATIONS)):
             if left + 1 == DIFFERENTIATED:
                 old, before, rate, secant = (one.detach() for one in (old, before, rate, secant))
-            way, there = rate - old, slip(rate)
+            way, there = rate - old, at(rate)
             far = way.abs() > SETTLED * rate
             slope = (there - before) / torch.where(far, way, 1.0)
             secant = torch.where(far, slope.clamp(0.0, STEEP), secant)

@@ -189,6 +189,10 @@ class SmoothSlip(Friction):
         self.v_s = parameter(v_s)
         self.R_pad = None if R_pad is None else parameter(R_pad, trained=False)
 
+    def at_rest(self) -> Tensor:
+        """Static friction [1] at the start of a run."""
+        return self.mu_s
+
     def range(self, F_N: Tensor, R: Tensor) -> Tensor:
         """Slip speed [m/s] over which mu falls under F_N [N]."""
         if self.R_pad is None:
@@ -200,7 +204,7 @@ class SmoothSlip(Friction):
         """Why the slip rate jumps under F_N [N] between a dashpot [N.s/m] and a spring [N/m]; empty
         if it does not."""
         over = self.range(torch.tensor(F_N, dtype=torch.float64), R_t)
-        falls, damps = ((self.mu_s - self.mu_k) * F_N / over).item(), R_t.item()
+        falls, damps = ((self.at_rest() - self.mu_k) * F_N / over).item(), R_t.item()
         if damps >= falls:
             return ""
         return (
@@ -209,14 +213,18 @@ class SmoothSlip(Friction):
         )
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        return self.slip(E, F_N, R, self.mu_s)
+
+    def slip(self, E: Tensor, F_N: Tensor, R: Tensor, mu_s: Tensor) -> Tensor:
+        """Slip rate (...) [m/s] under a static friction mu_s (...) [1]."""
         v_s = self.range(F_N, R)
         b = R * v_s - (E - self.mu_k * F_N)
-        c = (v_s * (E - self.mu_s * F_N)).clamp(min=0.0)
+        c = (v_s * (E - mu_s * F_N)).clamp(min=0.0)
         root = torch.sqrt(b * b + 4 * R * c)
         rising = b >= 0  # two forms of the same root, neither of which cancels
         down = torch.where(rising & (root > 0), b + root, 1.0)
         rate = torch.where(rising, 2 * c / down, (root - b) / (2 * R))
-        return torch.where(self.mu_s * F_N <= E, rate, 0.0)
+        return torch.where(mu_s * F_N <= E, rate, 0.0)
 
 
 class Coulomb(Friction):

@@ -184,7 +184,6 @@ class Job(NamedTuple):
     varied: tuple[tuple[str, float], ...] = ()
 
 
-
 class Simulated(Protocol):
     """The run of a recording at the values of a job, with its derivatives if they are asked for.
     Raises `SimulationFailed`."""

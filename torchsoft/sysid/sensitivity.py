@@ -21,6 +21,10 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import columns
 from torchsoft.sysid.residual_tests import Verdict
 
+TEMPERED = 0.46
+"""Power of the likelihood in odds. Suspects only resemble what is wrong, so that one is named
+beside the best, with odds of 1 %, that leaves `EVIDENT` more of the sum of squares."""
+
 
 class Checked(NamedTuple):
     """All tests; columns (m, k) of the constants of the computation, and the Jacobian (m, n) of the
@@ -161,8 +165,8 @@ def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) 
 
 
 def compared(checked: Checked, judge: "Judge") -> Checked:
-    """Tests with odds: shares of the evidence, by Schwarz's criterion, of the suspects that pass
-    the tests of a fit, or of all where none does. A new fit with a law that holds or does not has
+    """Tests with odds: shares of the evidence, by Schwarz's criterion and `TEMPERED`, of the
+    suspects that pass the tests of a fit, or of all where none does. A new fit with a law that holds or does not has
     no amplitude."""
     out = list(checked.checks)
     favoured = [one for one in out if one.suspected]
@@ -178,7 +182,7 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
     ]
     left = np.array([one.left for one in some])
     score = left / rest + np.log(judge.dof) * np.array(amplitudes)
-    odds = np.exp(-0.5 * (score - score.min()))
+    odds = np.exp(-0.5 * TEMPERED * (score - score.min()))
     for one, share in zip(some, odds / odds.sum()):
         out[out.index(one)] = replace(one, odds=float(share))
     besides, alone, left = judge.besides(some[int(score.argmin())], out)
