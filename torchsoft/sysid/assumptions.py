@@ -46,6 +46,9 @@ RADIUS = 1e-3
 KNOWN = 1e-2
 """Relative variation of the other known parameters."""
 
+LENGTH = 1e-3
+"""Relative variation of a pad's length, by which its nodes move away from its first end."""
+
 FORCE = 0.5
 """Variation of feed-forward forces [N]."""
 
@@ -303,10 +306,10 @@ def of_pads(recording: Recording) -> Iterator[Variation]:
     groups = [blocks] if len(blocks) > 1 else []
     for names in (*groups, *([name] for name in blocks)):
         who = "pads" if len(names) > 1 else f"the pad {names[0]}"
-        for extent in ("height", "length"):
+        for extent, size, stays in (("height", KNOWN, "face"), ("length", LENGTH, "first end")):
             yield Variation(
                 f"{extent} of {who}", "known", f"the {extent} of {who} is as stated",
-                "it were more, faces being where they are", 100 * KNOWN, "%",
+                f"it were more, each {stays} being where it is", 100 * size, "%",
                 vary=lambda r, part, run, names=names, extent=extent: resized(
                     r, names, extent, 1e-2 * part
                 ),
@@ -574,14 +577,15 @@ def _scaled(recording: Recording, part: float, run: Simulated, name: str) -> Rec
 def resized(
     recording: Recording, names: Collection[str], extent: str, part: float
 ) -> Recording | None:
-    """Change the height or the length of blocks by a relative amount, about the middle of their
-    faces, which stay where they are; None where the start is a state of the pads as they were."""
+    """Change the height or the length of blocks by a relative amount; their faces, and the ends at
+    which their coordinates begin, stay where they are. None where the start is a state of the pads
+    as they were."""
 
     def other(pad: Pad) -> Pad:
         old = pad.mesh
         assert isinstance(old, PadMesh)
         mesh = replace(old, **{extent: (1 + part) * getattr(old, extent)})
-        corner = np.array([0.5 * (old.length - mesh.length), old.height - mesh.height])
+        corner = np.array([0.0, old.height - mesh.height])
         return pad.reshaped(mesh, pad.placed(corner))
 
     return with_pads(recording, names, other)
