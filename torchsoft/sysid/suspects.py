@@ -76,7 +76,7 @@ def assumption_doubts(checked: Checked) -> list[str]:
             f"something is not as stated, most like {favoured[0].name}: the sum of squares "
             f"{favoured[0].falls}{favoured[0].found}, which is more than chance. Residuals pass "
             "every test without it, so that nothing confirms the cause"
-            + (f"; as likely are {'; '.join(near[1:])}" if near[1:] else "")
+            + (f"; others may be it: {'; '.join(near[1:])}" if near[1:] else "")
         ]
     looks = "; ".join(SHORT[one.test].format(one.words) for one in checked.alarms[:WORST])
     if favoured:
