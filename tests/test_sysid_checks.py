@@ -641,6 +641,25 @@ def test_a_doubtful_fit_is_repeated_with_what_would_explain_most():
     assert found == [*names[:3], *names[4 : MOST + 1], "law"]
 
 
+@pytest.mark.parametrize(("left", "sd"), [(1000.0, 100.0), (50000.0, 0.032)])
+def test_a_new_fit_that_is_much_worse_tells_a_constant(left, sd):
+    """Though its estimates are far away: the data tell that the other constant is wrong."""
+    one = Variation("mesh", "numerical", "pads have 10 elements", "they had 20")
+    linear = AssumptionTest("mesh", "numerical", one.stated, one.otherwise, gain=-1e9)
+    made = lambda one, moves, gain, left, favoured, favoured_sd, *_: replace(
+        linear, favoured_sd=favoured_sd, refitted=True
+    )
+    end = SimpleNamespace(x=np.zeros(0), free=np.zeros(0, bool))
+    judge: Any = SimpleNamespace(
+        dof=1000, labels=(), end=end, sd=np.zeros(0), made=made, alarms=lambda r, J: []
+    )
+    again: Any = SimpleNamespace(square=left, by_label={}, converged=True, at=end, J=None)
+    again.at.r = None
+    stated: Any = SimpleNamespace(square=999.9999, at=end)
+    found = Judge.alone(judge, one, again, stated, linear)
+    assert found.favoured_sd == pytest.approx(sd, rel=0.02)
+
+
 def test_a_suspect_is_named_beside_another_unless_that_is_evidently_better():
     assert np.exp(-0.5 * TEMPERED * EVIDENT) == pytest.approx(LIKELY, rel=0.02)
 
@@ -665,9 +684,9 @@ def test_what_cannot_be_told_apart_is_named_with_its_odds(same):
     assert odds["c"] < 1e-8
     (said,) = notices(found)
     assert said == (
-        "the data contradict one of 2 assumptions and do not tell which: the sum of squares falls "
-        "by 300 in a new fit under a with a = 1.05 (+5 %, +- 0.5), odds 0.56; b with b = 1.05 (+5 "
-        "%, +- 0.5), odds 0.44"
+        "the data contradict one of 2 assumptions, or what acts alike, and do not tell which: the "
+        "sum of squares falls by 300 in a new fit under a with a = 1.05 (+5 %, +- 0.5), odds 0.56; "
+        "b with b = 1.05 (+5 %, +- 0.5), odds 0.44"
     )
     judge.besides = lambda best, every: ((), [ALARM], [ALARM])
     (said,) = notices(compared(same._replace(checks=tests, as_stated=(ALARM,)), judge))

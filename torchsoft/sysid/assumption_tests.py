@@ -323,7 +323,7 @@ class Judge:
             return linear
         rest = max(1.0, left / self.dof)
         moves = np.array([again.by_label[k] for k in self.labels]) - self.end.x[self.end.free]
-        favoured, sd = one.amount, (rest / max(gain, 1e-300)) ** 0.5 * abs(one.amount)
+        favoured, sd = one.amount, (rest / max(abs(gain), 1e-300)) ** 0.5 * abs(one.amount)
         if one.kind in ("known", "sensor"):
             place = again.labels.index(one.label)
             mine, x = again.coordinates[place], again.by_label[one.label]

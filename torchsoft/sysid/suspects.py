@@ -207,8 +207,8 @@ def contradictions(
         some = [best, *rivals]
         listed = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in some)
         return [
-            f"the data contradict one of {len(some)} assumptions and do not tell which: the sum of "
-            f"squares {best.falls} under {listed}{between(some)}"
+            f"the data contradict one of {len(some)} assumptions, or what acts alike, and do not "
+            f"tell which: the sum of squares {best.falls} under {listed}{between(some)}"
         ]
     label, move = best.shift
     text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
