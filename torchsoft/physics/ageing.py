@@ -26,10 +26,11 @@ class AgeingSlip(SmoothSlip):
 
         mu_s + ageing ln(1 + age / t_0),    age' = 1 - |gamma'| age / D_c
 
-    so that it rises by `ageing` for every factor e of the time at rest beyond t_0. The age is a state of every point [s], `age_0` at the start; apart from the body it goes to
-    t_0 within that time. Not smooth at slip onset. The slip rate is single-valued where the
-    tangential spring outweighs the fall of friction with slip, K_t >= ageing F_N / D_c, beside what
-    `SmoothSlip` needs. Without `ageing` it is that law.
+    so that it rises by `ageing` for every factor e of the time at rest beyond t_0. The age is a
+    state of every point [s], `age_0` at the start; apart from the body it goes to t_0 within that
+    time. Not smooth at slip onset. The slip rate is single-valued where the tangential spring
+    outweighs the fall of friction with slip, K_t >= ageing F_N / D_c, beside what `SmoothSlip`
+    needs. Without `ageing` it is that law.
     """
 
     states: ClassVar = {"age": OwnState("s", "age_0")}

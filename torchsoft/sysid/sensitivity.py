@@ -166,8 +166,8 @@ def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) 
 
 def compared(checked: Checked, judge: "Judge") -> Checked:
     """Tests with odds: shares of the evidence, by Schwarz's criterion and `TEMPERED`, of the
-    suspects that pass the tests of a fit, or of all where none does. A new fit with a law that holds or does not has
-    no amplitude."""
+    suspects that pass the tests of a fit, or of all where none does. A new fit with a law that
+    holds or does not has no amplitude."""
     out = list(checked.checks)
     favoured = [one for one in out if one.suspected]
     if not favoured:
