@@ -327,7 +327,7 @@ class Problem(Shown):
         """
         jobs = self.jobs(x, which, steps, free)
         if not isinstance(steps, Mapping) and any(job.varied for job in jobs):
-            plain = [job._replace(names=()) for job in jobs]
+            plain = self.jobs(x, which, steps, None)
             first = self.gather(x, plain, runner.run(plain))
             if first.failed:
                 return first

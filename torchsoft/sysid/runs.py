@@ -292,7 +292,7 @@ class Runner:
             made = simulated(one, one.begin(), job, grid=between(one, job) if fine else None)
             if isinstance(made, FailedRun):
                 raise SimulationFailed(made.reason, made.time)
-            if one is not stated or job.names:  # that as stated is made once
+            if one is not stated:  # which is made once for many
                 work += rig_step(one.rig, len(job.names))
             own = [one.channels.index(channel) for channel in stated.channels]  # of more actuators
             slopes = None if made.derivatives is None else made.derivatives[:, own]
