@@ -2,6 +2,7 @@
 an identification."""
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,16 +28,21 @@ def test_what_a_rig_may_be_extended_by():
             "laws.steel_on_rubber.friction.ageing",
         "contacts.L.friction_ratio", "contacts.U.friction_ratio",
         "guides.bracket.x.friction", "guides.bracket.x.damping", "guides.bracket.y.friction",
-        "guides.bracket.y.damping", "gravity_tilt",
+        "guides.bracket.y.damping", "actuators.lag", "actuators.x.lag", "actuators.y.lag",
+        "gravity_tilt",
     )  # fmt: skip
 
 
 def test_neutral_extensions_change_nothing():
-    """All of them at once."""
+    """All of them at once, at the ends of steps: between them an effort that may lag is a state,
+    and others follow from the coordinates."""
     built = paper(COARSE)
-    model, before = built.rig, built.run(times(0.3, 31))
+    knots = built.run(times(0.3, 31)).knots
+    before = simulate(built.rig, knots, y0=built.start(), knots=knots)
+    model = deepcopy(built.rig)
     extend(model, NAMES)
-    after = simulate(model, before.t, y0=built.start(), knots=before.knots)
+    start = replace(built, rig=model).start()
+    after = simulate(model, knots, y0=start, knots=knots)
     for channel in ("x_C", "y_C", "theta", "F_x", "F_y"):
         moved = (after[channel] - before[channel]).abs().max()
         assert float(moved) <= 1e-8 * float(before[channel].abs().max() + 1e-3), channel
@@ -59,7 +65,9 @@ def test_parts_that_are_shared_are_extended_once():
 def test_names_are_those_of_a_rig_file():
     rig = RigFile.ready("two_fingers").assemble()
     groups = {name.partition(".")[0] for name in extensions(rig)}
-    assert groups == {"materials", "laws", "contacts", "pads", "guides", "gravity_tilt"}
+    assert groups == {
+        "materials", "laws", "contacts", "pads", "guides", "actuators", "gravity_tilt"
+    }  # fmt: skip
     names = dict.fromkeys(name for name in extensions(rig) if name.endswith(".power"))
     extend(rig, list(names))
     for name in names:

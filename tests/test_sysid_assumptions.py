@@ -16,13 +16,11 @@ from torchsoft.sysid.assumptions import (
     COORDINATES,
     assumptions,
     at_finite_strain,
-    late_effort,
     lifted,
     limited,
     linear_pads,
     of_fifth_degree,
     off_centre,
-    pushed_late,
     read_across,
     rescaled,
     resized,
@@ -31,6 +29,7 @@ from torchsoft.sysid.assumptions import (
 )
 from torchsoft.sysid.prediction import Frozen, Prediction, Readout, Signals, Term, lagged, predict
 from torchsoft.sysid.problem import DIFFERENCE
+from torchsoft.sysid.recording import Grid, extended
 from torchsoft.sysid.refits import assuming, begun
 from torchsoft.sysid.runs import Runner
 
@@ -93,27 +92,25 @@ def test_a_load_along_a_run_adds_to_gravity():
     np.testing.assert_allclose(y, 2.0 + 1.0 * at.t - 9.81 * at.t**2, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["x", "y"])
-def test_a_controller_that_is_late_pushes_by_what_it_measured_before(name):
+@pytest.mark.parametrize(("parameter", "late"), [("actuators.lag", "xy"), ("actuators.y.lag", "y")])
+def test_a_controller_that_is_late_pushes_behind_a_low_pass(parameter, late):
     """The y loop has a feed-forward of its own beside it."""
-    late = pushed_late(strokes(), run_of, [name], 0.2)
-    at = run_of(late)
-    named = dict(zip(late.channels, at.signals.T))
-    actuator = late.rig.actuators[name]
-    reference = late.rig.reference(torch.from_numpy(at.t), [actuator.setpoint]).numpy()[:, 0]
-    body, axis = actuator.measured.split(".")
-    channel = f"{axis}_{late.rig.symbols[body]}"
-    law = actuator.law
-    effort = law.Kp.item() * (reference[:, 0] - named[channel])
-    effort += law.Kd.item() * (reference[:, 1] - named[f"v_{channel}"])
-    known = strokes().rig.actuators[name].feed_forward
-    if known is not None:
-        effort += late.rig.reference(torch.from_numpy(at.t), [known]).numpy()[:, 0, 0]
-    inside = (at.t > 0.05) & (at.t < 0.35)
-    apart = late_effort(at.t, effort, 0.2) - named[f"effort_{name}"]
-    change = late_effort(at.t, effort, 0.2) - effort
-    assert np.abs(change[inside]).max() > 0.02
-    assert np.sqrt(np.mean(apart[inside] ** 2)) < 0.1 * np.sqrt(np.mean(change[inside] ** 2))
+    made = extended(strokes(), [parameter])
+    torch.nn.init.constant_(made.rig.parameter(parameter), 5e-4)
+    fine = torch.arange(made.begins, 0.4, 1e-4, dtype=torch.float64)
+    at = predict(made.begin(), {}, Grid(fine, 0), (), 1e-6)
+    named = dict(zip(made.channels, at.signals.T))
+    for name, actuator in made.rig.actuators.items():
+        signals = made.rig.reference(torch.from_numpy(at.t), actuator.reads).numpy()
+        body, axis = actuator.measured.split(".")
+        channel, law = f"{axis}_{made.rig.symbols[body]}", strokes().rig.actuators[name].law
+        effort = law.Kp.item() * (signals[:, 0, 0] - named[channel])
+        effort += law.Kd.item() * (signals[:, 0, 1] - named[f"v_{channel}"])
+        effort += signals[:, 1:, 0].sum(1)
+        behind = lagged(at.t, effort, 5e-4 if name in late else 0.0)
+        changes = np.abs(lagged(at.t, effort, 5e-4) - effort).max()
+        assert changes > 0.05
+        assert np.abs(behind - named[f"effort_{name}"]).max() < 0.02 * changes, name
 
 
 @pytest.mark.parametrize("name", ["x", "y"])

@@ -540,6 +540,39 @@ def test_new_fits_end_with_the_effort(monkeypatch):
     assert "there was none with another b, c; a larger one tries them" in said
 
 
+@pytest.mark.parametrize(("before", "after", "tried"), [(1, 2, "a"), (1, 4, "ab"), (-4, 1, "ab")])
+def test_a_cause_that_moves_estimates_far_has_others_tried_that_act_alike_there(
+    before, after, tried, monkeypatch
+):
+    """By more than three standard deviations, to first order or in its new fit: b has no effect to
+    first order at the end of the first fit."""
+    a, b = (Variation(name, "known", "", "", vary=lambda r, amount, run: r) for name in "ab")
+    gains, moves = {"a": 90.0, "b": 2.0}, {"a": {"E": before}, "b": {"E": 0.0}}
+    checks = {
+        one.name: assumption_test(
+            one, gain=gains[one.name], favoured=1.0, moves=moves[one.name], suspected=True
+        )
+        for one in (a, b)
+    }
+    ends = dict[str, Any]()
+    judge: Any = SimpleNamespace(
+        square=1000.0, work={}, ends=ends, large_enough=lambda one: True,
+        nearly=lambda one: one.refitted, misfit=lambda left: left - 10.0,
+    )  # fmt: skip
+    end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=1.05)
+    end._replace = lambda **_: end
+
+    def fitted(fits: NewFits, some: list[Variation], *_: object) -> None:
+        name = some[0].name
+        ends[name] = SimpleNamespace(fit=end, tried=some)
+        fits.checks[name] = replace(fits.checks[name], refitted=True, moves={"E": after})
+
+    monkeypatch.setattr(new_fits, "refit", lambda *_: True)
+    monkeypatch.setattr(new_fits, "likeness", lambda end, cause, others: {"b": 0.9})
+    monkeypatch.setattr(NewFits, "fit", fitted)
+    assert [one.name for one in NewFits(end, [a], [a, b], judge, checks)] == [*tried]
+
+
 def test_suspects_of_a_joint_fit_complement_each_other():
     """A copy of the first one adds nothing; one that is one-sided counts on its side only."""
     e = np.eye(40)

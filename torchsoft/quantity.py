@@ -136,7 +136,7 @@ IntegralGain = Annotated[
     float, Quantity("N/(m.s), N/(rad.s), N.m/(rad.s)", 0.0, 1e12, "integral gain")
 ]
 
-Lag = Annotated[float, Quantity("s", 1e-9, 1e3, "time constant of the lag of an effort")]
+Lag = Annotated[float, Quantity("s", 0.0, 1e3, "time constant of the lag of an effort")]
 
 EffortLimit = Annotated[
     float, Quantity("N, N.m", 1e-9, 1e9, "largest size of an effort, at which it saturates")

@@ -200,7 +200,7 @@ def halved(
 
 
 FRICTION, CENTRE, HEIGHT = ("friction_ratio",), ("bodies.disc.centre",), ("height of", "thickness")
-LATE = ("delay of controllers", "delay of the controller")
+LATE = ("actuators.lag", "actuators.x.lag", "actuators.y.lag")
 """To first order a delay, a lag and half the period of a hold are the same."""
 
 PAIRS = (

@@ -14,7 +14,7 @@ from torch import nn
 from torchsoft.physics.ageing import AgeingSlip
 from torchsoft.physics.contact import REFERENCE_DEPTH, SmoothSlip, SoftContact
 from torchsoft.physics.material import Branch, Material
-from torchsoft.physics.parts import Actuator, Guide, Tilt
+from torchsoft.physics.parts import PD, Actuator, Guide, Lagging, Tilt
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import parameter
 
@@ -106,6 +106,14 @@ def extensions(rig: Rig) -> dict[str, Extension]:
                 f"its guide had a {kind} of {part * size:g} {unit}",
                 partial(_guide, coordinate=coordinate, kind=kind),
             )  # fmt: skip
+    loops = [name for name, one in rig.actuators.items() if isinstance(undelayed(one), PD)]
+    for names in (*([loops] if len(loops) > 1 else []), *([name] for name in loops)):
+        who = "controllers push" if len(names) > 1 else f"the controller {names[0]} pushes"
+        out[".".join(("actuators", *(names if len(names) == 1 else ()), "lag"))] = Extension(
+            0.0, 1e-4, 0.0, 0.02, "s", f"{who} without delay",
+            "it came late, by a lag, a delay or half the period of a hold",
+            partial(_lag, names=names),
+        )  # fmt: skip
     tilted = [name for name, body in rig.bodies.items() if body.weighted and _free(rig, name, "x")]
     if tilted and rig.gravity.item() > 0:
         out["gravity_tilt"] = Extension(
@@ -224,6 +232,31 @@ def _guide(rig: Rig, coordinate: str, kind: str) -> nn.Parameter:
             ),
         )
     return getattr(rig.actuators[name].law, kind)
+
+
+def undelayed(actuator: Actuator) -> object:
+    """The law of an actuator without its lags."""
+    law: object = actuator.law
+    while isinstance(law, Lagging):
+        law = law.law
+    return law
+
+
+def _lag(rig: Rig, names: Collection[str]) -> nn.Parameter:
+    """Let the efforts of some loops lag, all by one time. Numbers of their laws keep their
+    names."""
+    lag, known = parameter(0.0), {own: name for name, own in rig.names.items()}
+    for name in names:
+        actuator, here = rig.actuators[name], f"actuators.{name}.law."
+        every = [own for own, _ in rig.named_parameters(remove_duplicate=False)]
+        moved = {known.get(own, own): own for own in every if own.startswith(here)}
+        moved = {key: own.replace(here, f"{here}law.", 1) for key, own in moved.items()}
+        rig.extended = {key: moved.get(key, own) for key, own in rig.extended.items()}
+        rig.aliases = {**rig.aliases, **moved}
+        actuator.law = Lagging(actuator.law, 1.0)
+        actuator.law.lag = lag
+        actuator.elements = tuple(dict.fromkeys((*actuator.elements, "Se: lag")))
+    return lag
 
 
 def _tilt(rig: Rig, bodies: Collection[str]) -> nn.Parameter:

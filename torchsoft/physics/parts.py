@@ -184,6 +184,10 @@ class Integral(nn.Module):
         return self.law(w, w_dot, feed_forward, q, q_dot) + self.Ki * integral, error[..., None]
 
 
+INSTANT = 1e-12
+"""Time [s] that is added to a lag, so that there may be none."""
+
+
 class Lagging(nn.Module):
     """The effort F of a law after a first-order lag, as drives have it: lag F' = law - F. It begins
     with what the law says of the start."""
@@ -194,7 +198,9 @@ class Lagging(nn.Module):
 
     @property
     def states(self) -> dict[str, OwnState]:
-        return own_states(self.law) | {"effort": OwnState("F")}
+        own = own_states(self.law)
+        several = sum(name.startswith("effort") for name in own)
+        return own | {f"effort_{several + 1}" if several else "effort": OwnState("F")}
 
     def begin(self, *seen: Tensor) -> Tensor:
         """States (..., states) at the start."""
@@ -204,7 +210,7 @@ class Lagging(nn.Module):
     def forward(self, *given: Any) -> tuple[Tensor, Tensor]:
         *seen, z, stage = given
         wanted, rates = respond(self.law, seen, z[..., :-1], stage)
-        rate = (wanted - z[..., -1]) / (self.lag + stage)
+        rate = (wanted - z[..., -1]) / (self.lag + INSTANT + stage)
         return z[..., -1] + stage * rate, torch.cat((rates, rate[..., None]), -1)
 
 

@@ -268,9 +268,11 @@ def resting(
     while len(path) < ITERATIONS and not stalled(path, stride):
         with torch.enable_grad():
             x = q.expand(len(q), -1).clone().requires_grad_(True)  # a copy for each load
-            F = loads(x)
-            (rows,) = torch.autograd.grad(F.diagonal().sum(), x, materialize_grads=True)
-        F, K = F[0].detach(), -rows
+            net = loads(x)
+            (rows,) = torch.autograd.grad(
+                net.diagonal().sum(), x, materialize_grads=True, retain_graph=True
+            )
+        F, K = net[0].detach(), -rows
         size = float(F.norm())
         U, S, V = torch.linalg.svd(K)
         along = U.mT @ F
@@ -281,7 +283,7 @@ def resting(
         step = torch.linalg.solve(K + own, F - U[:, neutral] @ along[neutral])
         if float(step.norm()) <= residual:
             inverse = (V.mT[:, ~neutral] / S[~neutral]) @ U.mT[~neutral]
-            return poses(q + inverse @ (loads(q) if torch.is_grad_enabled() else F))
+            return poses(q + inverse @ (net[0] if torch.is_grad_enabled() else F))
         path.append((size, q))
         q = q + step
     worst = int(F.abs().argmax())

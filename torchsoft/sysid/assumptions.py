@@ -17,7 +17,7 @@ from scipy.interpolate import BPoly, CubicSpline, make_interp_spline
 from torch import Tensor, nn
 
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
-from torchsoft.physics.extensions import extensions
+from torchsoft.physics.extensions import extensions, undelayed
 from torchsoft.physics.hyperelastic import NeoHookean
 from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.mesh import PadMesh
@@ -347,19 +347,9 @@ def of_drifts(recording: Recording) -> Iterator[Variation]:
 
 
 def of_actuators(recording: Recording) -> Iterator[Variation]:
-    """What controllers do besides their law."""
-    loops = [name for name, one in recording.rig.actuators.items() if isinstance(one.law, PD)]
-    for names in (*([loops] if len(loops) > 1 else []), *([name] for name in loops)):
-        several = len(names) > 1
-        who = "controllers" if several else f"the controller {names[0]}"
-        yield Variation(
-            f"delay of {who}", "known", f"{who} {'push' if several else 'pushes'} without delay",
-            "it came late, by a lag, a delay or half the period of a hold", 0.1, "ms",
-            one_sided=True,
-            vary=lambda r, ms, run, names=names: pushed_late(r, run, names, ms),
-        )  # fmt: skip
-    for name in loops:
-        if recording.rig.actuators[name].limit is None:
+    """Limits of controllers."""
+    for name, one in recording.rig.actuators.items():
+        if isinstance(undelayed(one), PD) and one.limit is None:
             yield Variation(
                 f"limit of the controller {name}", "known",
                 f"the controller {name} does not saturate",
@@ -630,9 +620,6 @@ def with_pads(
 # runs with what it added before
 
 
-APART = 1e-6
-"""Least distance [s] between the knots of such a force and those of the signal that it adds to."""
-
 LEAST_EFFORT = 1e-6
 """Least limit [N or N.m] of a controller's effort."""
 
@@ -644,27 +631,6 @@ more. To first order in a fault once is exact."""
 def settled(now: Array, before: Array | None) -> bool:
     """Whether forces (..., G) have settled."""
     return before is not None and float(np.abs(now - before).max()) <= CLOSE * np.abs(now).max()
-
-
-def late_effort(t: Array, effort: Array, ms: float) -> Array:
-    """The effort some time [ms] ago."""
-    return CubicSpline(t, effort)(np.maximum(t - 1e-3 * ms, t[0]))
-
-
-def pushed_late(
-    recording: Recording, run: Simulated, names: Collection[str], ms: float
-) -> Recording:
-    """Controllers that push some time [ms] after their laws: what is missing is fed forward."""
-    columns = [recording.channels.index(effort_channel(name)) for name in names]
-    made, fed = recording, None
-    for _ in range(FIXED_POINT):
-        at, before = run(made), fed
-        own = at.signals[:, columns].T - (0.0 if before is None else before)
-        fed = np.stack([late_effort(at.t, one, ms) for one in own]) - own
-        made = with_efforts(recording, at.t, dict(zip(names, fed)))
-        if settled(fed, before):
-            break
-    return made
 
 
 def limited(recording: Recording, run: Simulated, name: str, part: float) -> Recording:
@@ -681,33 +647,6 @@ def limited(recording: Recording, run: Simulated, name: str, part: float) -> Rec
         rig.actuators[name].limit = parameter(limit)
 
     return replace(with_rig(recording, change), tied=tied)
-
-
-def with_efforts(recording: Recording, t: Array, fed: Mapping[str, Array]) -> Recording:
-    """More feed-forward (G,) [N or N.m] at times t (G,) [s] of some actuators. Raises `ValueError`
-    where one has a feed-forward that is not piecewise polynomial."""
-
-    def change(rig: Rig) -> None:
-        more = dict[str, nn.Module]()
-        for name, force in fed.items():
-            actuator, spline = rig.actuators[name], CubicSpline(t, force)
-            before, actuator.feed_forward = actuator.feed_forward, f"fed_{name}"
-            if before is None:
-                more[actuator.feed_forward] = signal(t, force)
-                continue
-            known = rig.reference[before]
-            if not isinstance(known, Piecewise):
-                raise ValueError(f"the signal `{before}` is not piecewise polynomial")
-            stops = known.stops.numpy()
-            inside = stops[(stops > t[0] + APART) & (stops < t[-1] - APART)]
-            alone = np.abs(t[:, None] - inside).min(1, initial=np.inf) > APART
-            every = np.sort(np.concatenate((t[alone], inside)))
-            value, rate = (x.detach().numpy() for x in known(torch.from_numpy(every)))
-            sums = value + spline(every), rate + spline(every, 1)
-            more[actuator.feed_forward] = signal(every, *sums)
-        follow_also(rig, more)
-
-    return with_rig(recording, change)
 
 
 def signal(t: Array, *columns: Array) -> Sampled:

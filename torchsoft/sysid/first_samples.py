@@ -17,6 +17,7 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.channels import measurable
 from torchsoft.physics.contact import cross, point_place, slip_of
+from torchsoft.physics.extensions import undelayed
 from torchsoft.physics.parts import COORDINATES, PD, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import above
@@ -211,9 +212,9 @@ def yielding(rig: Rig, coordinate: str) -> float:
     zero where no stiffness is known."""
     arm = reach(rig, *coordinate.split(".")) if coordinate.endswith(".theta") else 1.0
     gains = [
-        actuator.law.Kp.item()
+        law.Kp.item()
         for actuator in rig.actuators.values()
-        if isinstance(actuator.law, PD) and coordinate in dict(actuator.follows)
+        if isinstance(law := undelayed(actuator), PD) and coordinate in dict(actuator.follows)
     ]
     return max((arm / gain for gain in gains if gain > 0), default=0.0)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from tqdm import tqdm
 
 from torchsoft.display import hidden
-from torchsoft.sysid.assumption_tests import RIVAL, Again, AssumptionTest, Judge
+from torchsoft.sysid.assumption_tests import FIRST_ORDER, RIVAL, Again, AssumptionTest, Judge
 from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.fit import Fit
 from torchsoft.sysid.refits import (
@@ -215,17 +215,23 @@ class NewFits:
 
     def limit(self, some: Sequence[Variation]) -> None:
         """Leave out, where some suspects explain the misfit, those that gain much less: in short
-        fits or, where there were none and the first end was too far off, by what they can have of
-        the effect at the end of the first such fit."""
+        fits or, where there were none and the first end was too far off, or is too far from the
+        first such fit, by what they can have of the effect at the end of that."""
         name = named(some)
         gain = self.gain(some)
         first = len(some) == 1 and some[0].kind in ("known", "sensor") and not self.enough
-        if first and name in self.judge.ends and (self.far or self.linear[name].far):
+        if first and name in self.judge.ends and (self.far or self.left_behind(name)):
             gain = self.checks[name].gain
             if not self.short:
                 self.add_alike(name)
         self.enough = max(self.enough, RIVAL * gain)
         self.queue.sort(key=self.gain, reverse=True)
+
+    def left_behind(self, name: str) -> bool:
+        """Whether estimates under a suspect, by its test to first order or by its new fit, are too
+        far from the end of the first fit for tests to first order there."""
+        moves = (one[name].shift[1] for one in (self.linear, self.checks))
+        return any(abs(move) > FIRST_ORDER for move in moves)
 
     def add_alike(self, name: str) -> None:
         """Gains of all suspects by what they can have of the effect of the one that explains the

@@ -10,7 +10,7 @@ import numpy as np
 from torchsoft.sysid.assumptions import AMOUNTS, FAULT_BOUNDS, WIDEST, Variation
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
 from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, continued, default_plan
-from torchsoft.sysid.problem import Problem, check_possible
+from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Unknown
 
@@ -170,15 +170,17 @@ def impossible(problem: Problem, one: Variation) -> str:
 
 def difference(end: Fit, one: Variation) -> tuple[Array | None, str]:
     """Change of the residuals (m,) by a variation of runs, on the same steps, or None and the
-    reason."""
+    reason. That of a number of either sign is by a part of its amount: coordinates take most of an
+    effect, and what its curvature leaves must not hide the rest."""
     if end.at.failed:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
     other = assuming(end.problem, [one], free=False)
     c = other.coordinates
     x, i = c.begun(end.by_label), c.labels.index(one.label)
-    x[i] = c.all[i].to_x(one.amount)
+    part = 1.0 if one.one_sided or one.kind in ("numerical", "law") else DIFFERENCE
+    x[i] = c.all[i].to_x(part * one.amount)
     got = other.residuals(other.runner(end.runner), x, end.which, end.at.steps)
-    return (None, got.reason) if got.failed else (got.r - end.at.r, "")
+    return (None, got.reason) if got.failed else ((got.r - end.at.r) / part, "")
 
 
 def likeness(fit: Fit, cause: Variation, others: Sequence[Variation]) -> dict[str, float]:
