@@ -428,7 +428,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
         explained_chi2=100.0,
         misfit=lambda left: left - 10.0,
         nearly=lambda one: one.left < 100.0,
-        large_enough=lambda one: True,
+        of_size=lambda one: True,
         ends={},
         fit=fitted,
         at_rest=fitted,
@@ -475,7 +475,7 @@ def test_one_suspect_may_spare_the_joint_fit(kind, b, lefts, tried, ranked, monk
         explained_chi2=100.0,
         ends={},
         misfit=lambda left: left - 10.0,
-        large_enough=lambda one: True,
+        of_size=lambda one: True,
         nearly=lambda one: one.left < 100.0,
     )
     end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=9.0)
@@ -512,7 +512,7 @@ def test_new_fits_end_with_the_effort(monkeypatch):
         square=1000.0,
         work={"c": 0.1},
         ends={},
-        large_enough=lambda one: True,
+        of_size=lambda one: True,
         nearly=lambda one: False,
         misfit=lambda left: left - 10.0,
     )
@@ -556,7 +556,7 @@ def test_a_cause_that_moves_estimates_far_has_others_tried_that_act_alike_there(
     }
     ends = dict[str, Any]()
     judge: Any = SimpleNamespace(
-        square=1000.0, work={}, ends=ends, large_enough=lambda one: True,
+        square=1000.0, work={}, ends=ends, of_size=lambda one: True,
         nearly=lambda one: one.refitted, misfit=lambda left: left - 10.0,
     )  # fmt: skip
     end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=1.05)
@@ -571,6 +571,28 @@ def test_a_cause_that_moves_estimates_far_has_others_tried_that_act_alike_there(
     monkeypatch.setattr(new_fits, "likeness", lambda end, cause, others: {"b": 0.9})
     monkeypatch.setattr(NewFits, "fit", fitted)
     assert [one.name for one in NewFits(end, [a], [a, b], judge, checks)] == [*tried]
+
+
+def test_rivals_of_a_cause_have_no_second_start(monkeypatch):
+    taken = [Variation(name, "known", "", "", vary=lambda r, amount, run: r) for name in "ab"]
+    checks = {one.name: assumption_test(one, gain=90.0, suspected=True) for one in taken}
+    starts = list[bool]()
+
+    def refitted(end: Any, tried: Any, begin: Any = None, enough: float = 0.0, anew: bool = True):
+        starts.extend([anew] * len(tried))
+        return object()
+
+    judge: Any = SimpleNamespace(
+        square=1000.0, work={}, ends={}, explained_chi2=100.0, of_size=lambda one: True,
+        nearly=lambda one: one.refitted, misfit=lambda left: left - 10.0,
+        fit=lambda again, as_stated: replace(again.linear[0], refitted=True),
+        at_rest=lambda again, as_stated: replace(again.linear[0], refitted=True),
+    )  # fmt: skip
+    end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=1.05)
+    end._replace = lambda **_: end
+    monkeypatch.setattr(new_fits, "refit", refitted)
+    assert [one.name for one in NewFits(end, taken, taken, judge, checks)] == ["a", "b"]
+    assert starts == [True, False]
 
 
 def test_suspects_of_a_joint_fit_complement_each_other():
@@ -590,18 +612,20 @@ def test_suspects_of_a_joint_fit_complement_each_other():
 
 
 def test_a_cause_has_an_effect_of_the_size_of_the_misfit():
-    """Known of a mesh, or of what is costly; a number may be off by more than its variation."""
+    """Known of a mesh, or of what is costly, and of no law where it is ten times as large; a number
+    may be off by more than its variation."""
     e = np.eye(40)
     judge: Any = SimpleNamespace(
         Q=e[:, :1], square=140.0, misfit=lambda left: left - 40.0,
-        columns={"small": 5 * e[3] + 90 * e[0], "large": 6 * e[4]},
+        columns={"small": 5 * e[3] + 90 * e[0], "large": 6 * e[4], "huge": 101 * e[5]},
     )  # fmt: skip
 
     def large(name: str, **given: Any) -> bool:
-        return Judge.large_enough(judge, Variation(name, stated="", otherwise="", **given))
+        return Judge.of_size(judge, Variation(name, stated="", otherwise="", **given))
 
     assert [large(name, kind="numerical") for name in ("small", "large")] == [False, True]
     assert not large("small", kind="law", costly=True)
+    assert [large("huge", kind=kind) for kind in ("law", "numerical", "known")] == [0, 0, 1]
     assert large("small", kind="known")
     assert large("small", kind="law")
     assert large("not run", kind="numerical")

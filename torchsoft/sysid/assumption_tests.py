@@ -33,6 +33,10 @@ BY_CHANCE = 2.0
 RIVAL = 0.3
 """Fraction of the best suspect's gain to first order above which another one is its rival."""
 
+OVERSIZED = 100.0
+"""Square of the effect of a law or a constant of the computation, over the misfit, above which it
+is not the cause: new fits under such ones ended far above the one without."""
+
 FIRST_ORDER = 3.0
 """Standard deviations by which estimates may move in a test to first order."""
 
@@ -199,13 +203,16 @@ class Judge:
         """Whether with a suspected variation nothing is left."""
         return any(one.suspected and one.passed for one in checks)
 
-    def large_enough(self, one: Variation) -> bool:
-        """Whether what is costly, or a constant of the computation, could be the cause: it has an
-        effect of one size, which is to be that of the misfit, if it could be run."""
+    def of_size(self, one: Variation) -> bool:
+        """Whether a law or a constant of the computation could be the cause: it has an effect of
+        one size, which is to be that of the misfit, if it could be run. A law that is not costly
+        may be small at this end and large elsewhere."""
         d = self.columns.get(one.name)
-        if d is None or not (one.costly or one.kind == "numerical"):
+        if d is None or one.kind not in ("law", "numerical"):
             return True
-        return float(np.sum(across(d, self.Q) ** 2)) > RIVAL * self.misfit(self.square)
+        size, misfit = float(np.sum(across(d, self.Q) ** 2)), self.misfit(self.square)
+        least = RIVAL * misfit if one.costly or one.kind == "numerical" else 0.0
+        return least <= size <= OVERSIZED * max(misfit, EVIDENT)
 
     def complementary(self, some: Sequence[Variation], count: int) -> list[Variation]:
         """Some assumptions, as many as asked for: each explains most, to first order, of what those

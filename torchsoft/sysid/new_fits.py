@@ -119,7 +119,7 @@ class NewFits:
 
     def ordered(self, candidates: Sequence[Variation]) -> list[list[Variation]]:
         """Suspects in the order in which they are likely."""
-        large = [one for one in candidates if self.judge.large_enough(one)]
+        large = [one for one in candidates if self.judge.of_size(one)]
         return [[one] for one in sorted(large, key=lambda one: (one.costly, -self.gains[one.name]))]
 
     def evident(self) -> bool:
@@ -139,7 +139,7 @@ class NewFits:
         least = FAINT * self.judge.misfit(self.judge.square)
         left = [one for one in self.tested if one.name not in self.tried]
         left = [one for one in left if one.kind == "law" or self.linear[one.name].gain > least]
-        left = [one for one in left if self.judge.large_enough(one)]
+        left = [one for one in left if self.judge.of_size(one)]
         self.say("short fits with one suspect each")
         self.bar.total += len(left)
         fits = dict[Variation, Fit]()
@@ -204,7 +204,8 @@ class NewFits:
         name, linear = named(some), [self.checks[one.name] for one in some]
         tried = [one.within(test.favoured) for one, test in zip(some, linear)]
         begin, enough = near or self.short.get(name), self.judge.explained_chi2
-        if (fit := refit(self.end, tried, begin, enough, anew=near is None)) is None:
+        anew = near is None and not self.enough  # a second start is to find a cause
+        if (fit := refit(self.end, tried, begin, enough, anew)) is None:
             return
         again = Again(name, tried, linear, fit)
         found = self.judge.fit(again, as_stated)
