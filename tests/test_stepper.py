@@ -22,9 +22,10 @@ def test_second_order_on_a_smooth_motion(fidelity):
     assert min(orders) >= 1.8, (errors, orders)
 
 
-def test_an_unstable_loop_ends_in_an_error_that_says_so():
-    """E = 60 kPa, tau = 5 ms with the paper's gains."""
-    built = paper(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3})
+@pytest.mark.parametrize("states", [{}, {"actuators.y.lag": 1e-4, "actuators.x.Ki": 10.0}])
+def test_an_unstable_loop_ends_in_an_error_that_says_so(states):
+    """E = 60 kPa, tau = 5 ms with the paper's gains, and controllers with states of their own."""
+    built = paper(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3} | states)
     with pytest.raises(
         SimulationFailed, match=r"the run was lost at t = .* s: the closed loop is unstable"
     ) as caught:

@@ -41,6 +41,7 @@ from torchsoft.sysid.assumptions import (
     WIDEST,
     Variation,
     assumptions,
+    at_finite_strain,
     coulomb,
     delayed,
     remeshed,
@@ -49,7 +50,7 @@ from torchsoft.sysid.estimate import Quantity
 from torchsoft.sysid.fit import Check, Fit, standard_deviations
 from torchsoft.sysid.identification import notices_on, ordering_constraints
 from torchsoft.sysid.new_fits import MOST, NewFits, alike
-from torchsoft.sysid.plan import settle
+from torchsoft.sysid.plan import LOOSE, settle
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import extended
 from torchsoft.sysid.refits import (
@@ -290,6 +291,25 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew(
         sd = dict(zip(again.labels, standard_deviations(again.J)))[name]
         assert sd < 0.1
         assert again.by_label[name] == pytest.approx(np.log(value), abs=3 * sd)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("true", [False, True])
+def test_a_costly_law_is_fitted_finely_where_it_leaves_less(true):
+    """Neo-Hookean pads: E of linear ones is high where the data are of these."""
+    data = brief()
+    made = made_by(at_finite_strain(data) if true else data, data)
+    problem = Problem([made], SENSORS, {name: Unknown() for name in TRUTH})
+    start = dict(TRUTH) | ({E: 1.1 * TRUTH[E]} if true else {})
+    end = ended(problem, problem.coordinates.begun({k: np.log(v) for k, v in start.items()}))
+    every = assumptions(problem.recordings, set(TRUTH), problem.sensors)
+    fit = refit(end, [next(one for one in every if one.costly)])
+    assert fit.rtol == (RTOL if true else LOOSE)
+    assert (fit.square < end.square) == true
+    if true:
+        assert fit.chi2 < 1.2
+        sd = float(fit.sd[fit.labels.index(E)])
+        assert fit.by_label[E] == pytest.approx(np.log(TRUTH[E]), abs=4 * sd)
 
 
 @pytest.mark.slow

@@ -283,7 +283,8 @@ def instability(rig: Rig, run: Trajectory) -> str:
         bodies=rig.bodies, pads=soft.pads, contacts=rig.contacts, reference=rig.reference,
         gravity=float(rig.gravity), symbols=rig.symbols,
     )  # fmt: skip
-    alone = float(modes(free, y, still).values.real.amax()) if len(values) else 0.0
+    passive = y[: free.layout.size]  # without states of actuators, which come last
+    alone = float(modes(free, passive, still).values.real.amax()) if len(values) else 0.0
     if not len(values) or float(values[0].real) <= LOOPS * max(alone, NEUTRAL):
         return ""
     leading = complex(values[0])

@@ -381,9 +381,10 @@ def refit(
     cannot begin.
 
     It starts at the end of one `near`, or of the fit where that fails; ratios at a bound are
-    scanned again over their whole range. With a misfit above `FAR`, variations other than of a
-    sensor also start `anew`, where the first fit did, unless the sum of squares is below `enough`;
-    the better end counts.
+    scanned again over their whole range. Under what is costly it is fitted by the tolerance `LOOSE`
+    first, and no further where that leaves more than the end as stated. With a misfit above `FAR`,
+    variations other than of a sensor also start `anew`, where the first fit did, unless the sum of
+    squares is below `enough`; the better end counts.
     """
     try:
         other = assuming(end.problem, tried, free=True)
@@ -394,7 +395,14 @@ def refit(
         begin = under(end, other, begun(other, tried, end.by_label | there.by_label))
         stuck = [one for one in c.within(begin.free & c.at_bound(begin.x)) if one.ratio_to]
         scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-        if (fit := continued(begin, replace(begin.stage, scanned=scans))) is not None:
+        stage = replace(begin.stage, scanned=scans)
+        if any(one.costly for one in tried):
+            loose = max(LOOSE, end.rtol)
+            rough = continued(begin, replace(stage, rtol=loose))
+            if rough is None or rough.square >= np.sum(end.residuals(steps=loose).r ** 2):
+                return rough
+            begin = begin._replace(x=rough.x)
+        if (fit := continued(begin, stage)) is not None:
             break
     fits, explains = [fit], fit is not None and fit.square <= enough
     if anew and any(one.kind != "sensor" for one in tried) and far_off(end) and not explains:
