@@ -24,6 +24,7 @@ from torchsoft.sysid.assumptions import (
     read_across,
     rescaled,
     resized,
+    seen_askew,
     tilted,
     with_loads,
 )
@@ -173,6 +174,24 @@ def test_a_channel_reads_a_part_of_another_and_a_camera_has_a_scale():
     np.testing.assert_allclose(rescaled(data, "x_C", ["x_C"], 0.01), -0.01 * (place - place[0]))
     assert not rescaled(data, "effort_x", ["x_C"], 0.01).any()
     assert len(x) == len(fy)
+
+
+def test_a_camera_that_is_turned_mixes_coordinates_about_their_first_samples():
+    """Of a disc in the plane, at other times in one coordinate."""
+    t, late = np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 21)
+    path = {"x_disc": lambda t: 0.1 + t, "y_disc": lambda t: 2.0 - 3.0 * t}
+    at = {"x_disc": t, "y_disc": late}
+    c, s = np.cos(1e-3), np.sin(1e-3)
+    seen = {
+        "x_disc": (t, 0.1 + c * t - 3.0 * s * t),
+        "y_disc": (late, 2.0 - 3.0 * c * late - s * late),
+    }
+    data = replace(thrown(), samples=seen)
+    for channel in at:
+        lost = seen_askew(data, channel, ("x_disc", "y_disc"), 1e-3)
+        np.testing.assert_allclose(seen[channel][1] + lost, path[channel](at[channel]), atol=4e-6)
+    names = {one.name for one in assumptions([data], set(), dict.fromkeys(at, Sensor(noise=1e-5)))}
+    assert "angle of the camera on disc" in names
 
 
 def test_amounts_of_variations_are_coordinates_with_differences_as_derivatives():

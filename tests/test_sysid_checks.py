@@ -344,6 +344,8 @@ def test_kinds_of_faults_that_are_alike_to_first_order_are_all_tried():
     mixed = alike(candidates, ["lag x", "delay y"], gains)
     assert [[one.name for one in some] for some in mixed] == names
     assert alike(candidates, ["lag x", "bias y"], gains | {"bias y": 400.0}) == []
+    (both, _) = alike(candidates, ["lag x", "lag y", "delay y"], gains)  # each channel once
+    assert [one.name for one in both] == ["lag x", "lag y"]
 
 
 @pytest.mark.slow

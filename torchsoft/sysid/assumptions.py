@@ -383,6 +383,15 @@ def of_sensors(
             "they were all too large about their first sample", 100 * CROSSTALK, "%",
             read=lambda r, at, part: rescaled(r, at, places, 1e-2 * part),
         )  # fmt: skip
+    for body, symbol in recording.rig.symbols.items():
+        pair = f"x_{symbol}", f"y_{symbol}"
+        if {*pair} <= {*places}:
+            yield Variation(
+                f"angle of the camera on {body}", "sensor",
+                f"{pair[0]} and {pair[1]} are along the axes of the rig",
+                "their camera were turned anticlockwise about its own axis", 1e3 * TILT, "mrad",
+                read=lambda r, at, mrad, pair=pair: seen_askew(r, at, pair, 1e-3 * mrad),
+            )  # fmt: skip
 
 
 def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
@@ -722,3 +731,14 @@ def rescaled(recording: Recording, at: str, channels: Collection[str], part: flo
     """What a channel's samples lose, if they are too large about the first of them."""
     t, y = recording.samples[at]
     return -part * (y - y[0]) if at in channels else np.zeros(len(t))
+
+
+def seen_askew(recording: Recording, at: str, pair: tuple[str, str], angle: float) -> Array:
+    """What a channel's samples lose, if a camera that sees a `pair` of coordinates is turned
+    anticlockwise by an angle [rad], about where the first samples are."""
+    (x, y), (t, _) = pair, recording.samples[at]
+    other, part = {x: (y, -angle), y: (x, angle)}.get(at, (at, 0.0))
+    if part == 0.0 or other not in recording.samples:
+        return np.zeros(len(t))
+    times, z = recording.samples[other]
+    return part * (np.interp(t, times, z) - z[0])

@@ -278,9 +278,7 @@ def alike(
         return []
     out = list[list[Variation]]()
     for kind in dict.fromkeys(kind for _, kind in faults):
-        same = [faults.get((one.fault[0], kind)) for one in some if one.fault]
-        if all(
-            other and gains[other.name] > RIVAL * gains[one.name] for one, other in zip(some, same)
-        ):
-            out.append([one for one in same if one])
+        pairs = [(one, faults.get((one.fault[0], kind))) for one in some if one.fault]
+        if all(other and gains[other.name] > RIVAL * gains[one.name] for one, other in pairs):
+            out.append([*{other.name: other for _, other in pairs if other}.values()])
     return out
