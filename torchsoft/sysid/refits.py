@@ -247,9 +247,9 @@ def under(end: Fit, other: Problem, x: Array) -> Fit:
 
 
 def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | None:
-    """The fit with all suspects that are parameters or faults of sensors as unknowns; None where
-    there are none. It starts at the end of the first fit and, if the sum of squares stays above
-    `enough`, also at the start of that fit.
+    """The fit with all suspects that need no run of their own (numbers, sensors) as unknowns; None
+    where there are none. It starts at the end of the first fit and, if the sum of squares stays
+    above `enough`, also at the start of that fit.
 
     A fit with a wrong assumption may end far from the truth, where tests to first order rank
     suspects wrongly. The joint fit ends near it, where they rank them rightly. If the joint fit
@@ -258,7 +258,7 @@ def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | N
     other = end.problem
     for one in suspects:
         with suppress(ValueError):
-            if one.parameter or one.fault is not None:
+            if one.vary is None:
                 other = assuming(other, [one], free=True)
     if other is end.problem:
         return None
