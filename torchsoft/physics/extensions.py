@@ -253,7 +253,8 @@ def _lag(rig: Rig, names: Collection[str]) -> nn.Parameter:
         moved = {key: own.replace(here, f"{here}law.", 1) for key, own in moved.items()}
         rig.extended = {key: moved.get(key, own) for key, own in rig.extended.items()}
         rig.aliases = {**rig.aliases, **moved}
-        assert isinstance(law := actuator.law, nn.Module)
+        law = actuator.law
+        assert isinstance(law, nn.Module)
         actuator.law = Lagging(law, 1.0)
         actuator.law.lag = lag
         actuator.elements = tuple(dict.fromkeys((*actuator.elements, "Se: lag")))

@@ -161,7 +161,7 @@ class NewFits:
         the fit is returned if it explains the misfit."""
         end, judge, checks, left = self.end, self.judge, self.checks, self.candidates
         self.say("new fit with many suspects unknown at once")
-        every = [one for one in self.tested if one.vary is None]
+        every = [one for one in self.tested if one.parameter or one.fault is not None]
         numbers = judge.complementary(every, MOST)
         joint = joint_fit(end, numbers, judge.explained_chi2)
         explains = joint is not None and joint.square <= judge.explained_chi2
@@ -271,12 +271,11 @@ def alike(
     candidates: Sequence[Variation], together: Sequence[str], gains: Mapping[str, float]
 ) -> list[list[Variation]]:
     """The sensors whose faults explain the misfit `together`, with faults of one kind: of each kind
-    that explains about as much of it alone, since to first order a lag is a delay. Sensors with
-    other faults among them are taken as they are."""
+    that explains about as much of it alone, since to first order a lag is a delay."""
     some = [one for one in candidates if one.name in together]
     faults = {one.fault: one for one in candidates if one.fault is not None}
     if any(one.fault is None for one in some):
-        return [some] if all(one.kind == "sensor" for one in some) else []
+        return []
     out = list[list[Variation]]()
     for kind in dict.fromkeys(kind for _, kind in faults):
         pairs = [(one, faults.get((one.fault[0], kind))) for one in some if one.fault]

@@ -247,9 +247,9 @@ def under(end: Fit, other: Problem, x: Array) -> Fit:
 
 
 def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | None:
-    """The fit with all suspects that need no run of their own (numbers, sensors) as unknowns; None
-    where there are none. It starts at the end of the first fit and, if the sum of squares stays
-    above `enough`, also at the start of that fit.
+    """The fit with all suspects that are parameters or faults of sensors as unknowns; None where
+    there are none. It starts at the end of the first fit and, if the sum of squares stays above
+    `enough`, also at the start of that fit.
 
     A fit with a wrong assumption may end far from the truth, where tests to first order rank
     suspects wrongly. The joint fit ends near it, where they rank them rightly. If the joint fit
@@ -258,7 +258,7 @@ def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | N
     other = end.problem
     for one in suspects:
         with suppress(ValueError):
-            if one.vary is None:
+            if one.parameter or one.fault is not None:
                 other = assuming(other, [one], free=True)
     if other is end.problem:
         return None
@@ -382,9 +382,9 @@ def refit(
 
     It starts at the end of one `near`, or of the fit where that fails; ratios at a bound are
     scanned again over their whole range. Under what is costly it is fitted by the tolerance `LOOSE`
-    first, and no further where that leaves more than the end as stated. With a misfit above `FAR`,
-    variations other than of a sensor also start `anew`, where the first fit did, unless the sum of
-    squares is below `enough`; the better end counts.
+    first, and no further where that leaves more than a fit as stated by it. With a misfit above
+    `FAR`, variations other than of a sensor also start `anew`, where the first fit did, unless the
+    sum of squares is below `enough`; the better end counts.
     """
     try:
         other = assuming(end.problem, tried, free=True)
@@ -397,9 +397,12 @@ def refit(
         scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
         stage = replace(begin.stage, scanned=scans)
         if any(one.costly for one in tried):
-            loose = max(LOOSE, end.rtol)
-            rough = continued(begin, replace(stage, rtol=loose))
-            if rough is None or rough.square >= np.sum(end.residuals(steps=loose).r ** 2):
+            plain = under(end, end.problem, end.x)
+            stated, rough = (
+                continued(one, replace(own, rtol=max(LOOSE, end.rtol)))
+                for one, own in ((plain, plain.stage), (begin, stage))
+            )
+            if rough is None or (stated is not None and rough.square >= stated.square):
                 return rough
             begin = begin._replace(x=rough.x)
         if (fit := continued(begin, stage)) is not None:
