@@ -295,7 +295,7 @@ def shares(
     misfit = max(float(stated @ stated) - joint.square, 1e-300)
     effects = {name: unit(across(J[:, k], Q)) for name, k in tried.items()}
     parts = {name: float(d @ stated) ** 2 / misfit for name, d in effects.items()}
-    chance = EVIDENT * max(1.0, joint.chi2)
+    chance = (EVIDENT + len(tried)) * max(1.0, joint.chi2)  # each takes one of any noise
     enough = sorted(joint.square + left for left in (chance, (1 - NEARLY) * misfit))
     return parts, [fewest(effects, stated, one) for one in enough]
 
