@@ -107,9 +107,10 @@ def extensions(rig: Rig) -> dict[str, Extension]:
                 partial(_guide, coordinate=coordinate, kind=kind),
             )  # fmt: skip
     loops = [name for name, one in rig.actuators.items() if isinstance(undelayed(one), PD)]
-    for names in (*([loops] if len(loops) > 1 else []), *([name] for name in loops)):
+    several = {"actuators": loops} if len(loops) > 1 else {}
+    for stem, names in (several | {f"actuators.{name}": [name] for name in loops}).items():
         who = "controllers push" if len(names) > 1 else f"the controller {names[0]} pushes"
-        out[".".join(("actuators", *(names if len(names) == 1 else ()), "lag"))] = Extension(
+        out[f"{stem}.lag"] = Extension(
             0.0, 1e-4, 0.0, 0.02, "s", f"{who} without delay",
             "it came late, by a lag, a delay or half the period of a hold",
             partial(_lag, names=names),

@@ -231,8 +231,7 @@ class NewFits:
     def left_behind(self, name: str) -> bool:
         """Whether estimates under a suspect, by its test to first order or by its new fit, are too
         far from the end of the first fit for tests to first order there."""
-        moves = (one[name].shift[1] for one in (self.linear, self.checks))
-        return any(abs(move) > FIRST_ORDER for move in moves)
+        return self.linear[name].far or abs(self.checks[name].shift[1]) > FIRST_ORDER
 
     def add_alike(self, name: str) -> None:
         """Gains of all suspects by what they can have of the effect of the one that explains the
