@@ -349,6 +349,10 @@ SLOW = (
     "Ogden pads",
     "Mooney-Rivlin pads on turning bases",
     "neo-Hookean pads with inertia",
+    "network of energy",
+    "generalised Kelvin",
+    "superellipse",
+    "rounded polygon",
 )
 PARAMS = [
     pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in RIGS

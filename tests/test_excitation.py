@@ -26,7 +26,7 @@ def followed(built: BuiltRig, *times: float) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-@pytest.mark.parametrize("rig", ["paper", "ellipse"])
+@pytest.mark.parametrize("rig", ["paper", pytest.param("ellipse", marks=pytest.mark.slow)])
 def test_every_entry_of_the_catalogue_builds(rig, name):
     one = CATALOGUE[name]
     built = excite(coarse(rig), name).build()

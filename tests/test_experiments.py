@@ -365,6 +365,7 @@ def test_law_comparison_smoke(tmp_path):
     assert min(case["D"] for case in near) > 7.3 > 1 > max(far["D"], other["D"])
 
 
+@pytest.mark.slow
 def test_finite_strain_smoke(tmp_path):
     _, numbers = smoke("finite_strain", tmp_path)
     more = {name: row["more"] for name, row in numbers["layer"].items()}

@@ -2,6 +2,7 @@
 runs and files."""
 
 import ctypes
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ SKEWED = np.array([[[0.0, 0.0], [1.0, 0.02], [1.05, 1.0], [0.03, 0.9]]]) * 1e-3
 CONSTANTS = torch.from_numpy(element_constants(SKEWED)[0])
 
 
-@pytest.fixture(params=MATERIALS)
+@pytest.fixture(scope="module", params=MATERIALS)
 def material(request):
     return MATERIALS[request.param]()
 
@@ -57,6 +58,7 @@ def random(size: float, seed: int = 0, n: int = 8) -> Tensor:
     return size * torch.randn(n, generator=generator, dtype=torch.float64)
 
 
+@cache
 def law_of(material, lanes: int = 1):
     own = Factors(factors(material))
     function, parameters = as_law(element, {"material": material, "factors": own})
