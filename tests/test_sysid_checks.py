@@ -580,6 +580,7 @@ def test_a_cause_that_moves_estimates_far_has_others_tried_that_act_alike_there(
     judge: Any = SimpleNamespace(
         square=1000.0, work={}, ends=ends, of_size=lambda one: True,
         nearly=lambda one: one.refitted, misfit=lambda left: left - 10.0,
+        at_rest=lambda again, _: checks[again.tried[0].name],
     )  # fmt: skip
     end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=1.05)
     end._replace = lambda **_: end
@@ -593,6 +594,46 @@ def test_a_cause_that_moves_estimates_far_has_others_tried_that_act_alike_there(
     monkeypatch.setattr(new_fits, "likeness", lambda end, cause, others: {"b": 0.9})
     monkeypatch.setattr(NewFits, "fit", fitted)
     assert [one.name for one in NewFits(end, [a], [a, b], judge, checks)] == [*tried]
+
+
+@pytest.mark.parametrize(
+    ("lefts", "passes", "work", "rested"),
+    [
+        ((900.0, 910.0, 990.0), "abc", 0.0, "ab"),
+        ((900.0, 910.0, 990.0), "abc", 9.0, "ab"),
+        ((950.0, 910.0, 990.0), "c", 0.0, "bac"),
+        ((950.0, 910.0, 990.0), "c", 9.0, "ba"),
+        ((900.0, 960.0, 990.0), "b", 0.0, "ab"),
+        ((900.0, 960.0, 990.0), "", 0.0, "a"),
+    ],
+)
+def test_the_best_new_fits_go_on_until_they_are_at_rest(lefts, passes, work, rested, monkeypatch):
+    """The best first, and those that leave about as much, whatever that takes; one that passes its
+    tests goes on too while none that leaves less has passed, if the effort allows."""
+    taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "abc"]
+    checks = {
+        one.name: assumption_test(
+            one, left=left, refitted=True, suspected=True, passed=one.name in passes
+        )
+        for one, left in zip(taken, lefts)
+    }
+    done = list[str]()
+
+    def at_rest(name: str, _: object) -> AssumptionTest:
+        done.append(name)  # finer steps leave less
+        return replace(checks[name], left=checks[name].left - 300.0)
+
+    judge: Any = SimpleNamespace(
+        square=2000.0, work={}, ends={name: name for name in checks},
+        nearly=lambda one: one.refitted, at_rest=at_rest, misfit=lambda left: left - 10.0,
+    )  # fmt: skip
+    end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=1.0), chi2=1.05)
+    end._replace = lambda **_: end
+    fits = NewFits(end, [], taken, judge, checks, effort=2.0)
+    end.runner.work = work
+    with fits.bar:
+        fits.finish(end)
+    assert "".join(done) == rested
 
 
 def test_rivals_of_a_cause_have_no_second_start(monkeypatch):

@@ -12,6 +12,7 @@ from torchsoft.sysid.assumption_tests import FIRST_ORDER, RIVAL, Again, Assumpti
 from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.fit import Fit
 from torchsoft.sysid.refits import (
+    EVIDENT,
     carried_on,
     far_off,
     first_step,
@@ -36,6 +37,10 @@ LONGER = 4
 """Evaluations after the first step of the short fits by which suspects are ranked where the first
 fit ended far off: the true cause leads by them where tests to first order have it tenth."""
 
+COMPARABLE = 2 * EVIDENT
+"""Sum of squares by which new fits that explain the misfit may differ to be continued until they
+are at rest: the steps of the first fit may be wrong by some of it."""
+
 FAINT = 0.05
 """Part of a misfit that a suspect must explain to first order to have a short fit; those that were
 the cause had 0.16 and more."""
@@ -51,10 +56,10 @@ class NewFits:
     fits where the first was a sensor. Sensors that explain the misfit by one kind of fault then
     come first, in one fit; where the numbers leave more than `RIVAL` of the misfit, or are at rest
     far off, none is the cause alone, and they are left out. Effects too small for the misfit are
-    left out always. Where one suspect explains it the fit goes on until it is at rest; those with
-    much smaller gains are then left out, and costly ones. No fit is begun with which all would take
-    more than `effort` times the work of the fit itself: `late` has the names of the suspects that
-    are left.
+    left out always. Where one suspect explains it, those with much smaller gains are left out, and
+    costly ones. At the end the best go on until they are at rest. No fit is begun with which all
+    would take more than `effort` times the work of the fit itself: `late` has the names of the
+    suspects that are left.
     """
 
     def __init__(
@@ -209,8 +214,6 @@ class NewFits:
             return
         again = Again(name, tried, linear, fit)
         found = self.judge.fit(again, as_stated)
-        if self.judge.nearly(found):
-            found = self.judge.at_rest(again, as_stated)
         if found.refitted:
             self.checks[name] = found
 
@@ -248,17 +251,27 @@ class NewFits:
         self.bar.total += len(more)
 
     def finish(self, as_stated: Fit) -> None:
-        """Continue the fit of the likeliest suspect until it is at rest, where none explains the
-        misfit."""
-        checks, ends = self.checks, self.judge.ends
-        best = max(
-            (name for name, one in ends.items() if checks[name].suspected and not far_off(one.fit)),
-            key=lambda name: (checks[name].passed, checks[name].gain),
-            default="",
-        )
-        if best and not self.judge.nearly(checks[best]):
-            self.say(f"new fit with another {best}, by finer steps")
-            checks[best] = self.judge.at_rest(ends[best], as_stated)
+        """Continue new fits until they are at rest, the one that leaves least first: of suspects
+        that explain the misfit about as well as that one does and, while none has passed its tests,
+        of others that explain and passed them; where none explains it, of the likeliest alone."""
+        checks, ends, done = self.checks, self.judge.ends, list[str]()
+        explain = [name for name in ends if self.judge.nearly(checks[name])]
+        names = sorted(explain, key=lambda name: checks[name].left) or self.likeliest()
+        most = min((checks[name].left for name in names), default=0.0) + COMPARABLE
+        for name in names:
+            about = checks[name].left <= most
+            needed = checks[name].passed and not any(checks[one].passed for one in done)
+            if about or (needed and self.end.runner.work <= self.most):
+                self.say(f"new fit with another {name}, by finer steps")
+                checks[name] = self.judge.at_rest(ends[name], as_stated)
+                done.append(name)
+
+    def likeliest(self) -> list[str]:
+        """The suspect whose new fit gains most, if any may be the cause; those that pass their
+        tests come first."""
+        near = [name for name, one in self.judge.ends.items() if not far_off(one.fit)]
+        left = [name for name in near if self.checks[name].suspected]
+        return sorted(left, key=lambda k: (self.checks[k].passed, self.checks[k].gain))[-1:]
 
 
 def named(some: Sequence[Variation]) -> str:
