@@ -562,14 +562,18 @@ def test_new_fits_end_with_the_effort(monkeypatch):
     assert "there was none with another b, c; a larger one tries them" in said
 
 
-@pytest.mark.parametrize(("before", "after", "tried"), [(1, 2, "a"), (1, 4, "ab"), (-4, 1, "ab")])
-def test_a_cause_that_moves_estimates_far_has_others_tried_that_act_alike_there(
-    before, after, tried, monkeypatch
+@pytest.mark.parametrize(
+    ("before", "after", "passed", "tried"),
+    [(1, 2, True, "a"), (1, 4, True, "ab"), (-4, 1, True, "ab"), (1, 2, False, "ab")],
+)
+def test_others_are_tried_that_act_alike_at_the_end_of_a_new_fit(
+    before, after, passed, tried, monkeypatch
 ):
-    """By more than three standard deviations, to first order or in its new fit: b has no effect to
-    first order at the end of the first fit."""
+    """Where the cause moves estimates by more than three standard deviations, to first order or in
+    its new fit, or has not passed its tests: b has no effect to first order at the end of the first
+    fit."""
     a, b = (Variation(name, "known", "", "", vary=lambda r, amount, run: r) for name in "ab")
-    gains, moves = {"a": 90.0, "b": 2.0}, {"a": {"E": before}, "b": {"E": 0.0}}
+    gains, moves = {"a": 900.0, "b": 2.0}, {"a": {"E": before}, "b": {"E": 0.0}}
     checks = {
         one.name: assumption_test(
             one, gain=gains[one.name], favoured=1.0, moves=moves[one.name], suspected=True
@@ -588,7 +592,9 @@ def test_a_cause_that_moves_estimates_far_has_others_tried_that_act_alike_there(
     def fitted(fits: NewFits, some: list[Variation], *_: object) -> None:
         name = some[0].name
         ends[name] = SimpleNamespace(fit=end, tried=some)
-        fits.checks[name] = replace(fits.checks[name], refitted=True, moves={"E": after})
+        fits.checks[name] = replace(
+            fits.checks[name], refitted=True, passed=passed, moves={"E": after}
+        )
 
     monkeypatch.setattr(new_fits, "refit", lambda *_: True)
     monkeypatch.setattr(new_fits, "likeness", lambda end, cause, others: {"b": 0.9})

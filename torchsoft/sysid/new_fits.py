@@ -57,7 +57,8 @@ class NewFits:
     come first, in one fit; where the numbers leave more than `RIVAL` of the misfit, or are at rest
     far off, none is the cause alone, and they are left out. Effects too small for the misfit are
     left out always. Where one suspect explains it, those with much smaller gains are left out, and
-    costly ones. At the end the best go on until they are at rest. No fit is begun with which all
+    costly ones; where none has passed its tests, those that act like the likeliest are tried. At
+    the end the best go on until they are at rest. No fit is begun with which all
     would take more than `effort` times the work of the fit itself: `late` has the names of the
     suspects that are left.
     """
@@ -76,7 +77,7 @@ class NewFits:
         self.gains = {one.name: checks[one.name].gain for one in candidates}
         self.enough = 0.0
         """Least gain of a suspect that is tried, once one explains the misfit."""
-        self.candidates, self.tried = list(candidates), set[str]()
+        self.candidates, self.tried, self.likened = list(candidates), set[str](), False
         self.queue, self.short = list[list[Variation]](), dict[str, Fit]()
         ways: list[Callable[[], Fit | None]] = [self.screen, self.joint]
         self.rankings = ways if self.far else []
@@ -97,7 +98,7 @@ class NewFits:
                 self.rankings = self.rankings[self.queue[0][0].kind == "sensor" :]
             elif self.rankings:
                 near = self.rank()
-            while self.queue:
+            while self.queue or self.widened():
                 some = self.queue.pop(0)
                 if not self.promising(some):
                     continue
@@ -240,6 +241,7 @@ class NewFits:
         """Gains of all suspects by what they can have of the effect of the one that explains the
         misfit; the queue with the likeliest of those that were left out of it."""
         self.say(f"effects of the others under another {name}")
+        self.likened = True
         end, gain = self.judge.ends[name], self.checks[name].gain
         left = [one for one in self.tested if one.name not in self.tried]
         parts = likeness(end.fit, end.tried[0], left)
@@ -250,20 +252,36 @@ class NewFits:
         self.queue += [[one] for one in more]
         self.bar.total += len(more)
 
+    def widened(self) -> bool:
+        """Whether the queue has others, that act like the likeliest suspect tried: where that one
+        explains most of the misfit, none has passed its tests, and effort is left."""
+        names, late = self.explain() or self.likeliest(), self.end.runner.work > self.most
+        if late or self.likened or not names or any(self.checks[name].passed for name in names):
+            return False
+        one, *more = self.judge.ends[names[0]].tried
+        most = MOSTLY * self.judge.misfit(self.judge.square)
+        if not more and one.kind in ("known", "sensor") and self.checks[one.name].gain >= most:
+            self.add_alike(one.name)
+        return bool(self.queue)
+
+    def explain(self) -> list[str]:
+        """Suspects whose new fits explain the misfit, the one that leaves least first."""
+        names = [name for name in self.judge.ends if self.judge.nearly(self.checks[name])]
+        return sorted(names, key=lambda name: self.checks[name].left)
+
     def finish(self, as_stated: Fit) -> None:
         """Continue new fits until they are at rest, the one that leaves least first: of suspects
         that explain the misfit about as well as that one does and, while none has passed its tests,
         of others that explain and passed them; where none explains it, of the likeliest alone."""
-        checks, ends, done = self.checks, self.judge.ends, list[str]()
-        explain = [name for name in ends if self.judge.nearly(checks[name])]
-        names = sorted(explain, key=lambda name: checks[name].left) or self.likeliest()
+        checks, done = self.checks, list[str]()
+        names = self.explain() or self.likeliest()
         most = min((checks[name].left for name in names), default=0.0) + COMPARABLE
         for name in names:
             about = checks[name].left <= most
             needed = checks[name].passed and not any(checks[one].passed for one in done)
             if about or (needed and self.end.runner.work <= self.most):
                 self.say(f"new fit with another {name}, by finer steps")
-                checks[name] = self.judge.at_rest(ends[name], as_stated)
+                checks[name] = self.judge.at_rest(self.judge.ends[name], as_stated)
                 done.append(name)
 
     def likeliest(self) -> list[str]:
