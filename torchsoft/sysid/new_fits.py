@@ -38,8 +38,8 @@ LONGER = 4
 fit ended far off: the true cause leads by them where tests to first order have it tenth."""
 
 COMPARABLE = 2 * EVIDENT
-"""Sum of squares by which new fits that explain the misfit may differ to be continued until they
-are at rest: the steps of the first fit may be wrong by some of it."""
+"""Sum of squares that a new fit may leave beyond the best one and still go on until it is at rest:
+what is evident, and as much for the steps of the first fit, which are not its own."""
 
 FAINT = 0.05
 """Part of a misfit that a suspect must explain to first order to have a short fit; those that were
@@ -58,9 +58,9 @@ class NewFits:
     far off, none is the cause alone, and they are left out. Effects too small for the misfit are
     left out always. Where one suspect explains it, those with much smaller gains are left out, and
     costly ones; where none has passed its tests, those that act like the likeliest are tried. At
-    the end the best go on until they are at rest. No fit is begun with which all
-    would take more than `effort` times the work of the fit itself: `late` has the names of the
-    suspects that are left.
+    the end the best go on until they are at rest. No fit is begun with which all would take more
+    than `effort` times the work of the fit itself: `late` has the names of the suspects that are
+    left.
     """
 
     def __init__(
@@ -238,8 +238,8 @@ class NewFits:
         return self.linear[name].far or abs(self.checks[name].shift[1]) > FIRST_ORDER
 
     def add_alike(self, name: str) -> None:
-        """Gains of all suspects by what they can have of the effect of the one that explains the
-        misfit; the queue with the likeliest of those that were left out of it."""
+        """Gains of all suspects by what they can have of the effect of one that was tried; the queue
+        with the likeliest of those that were left out of it."""
         self.say(f"effects of the others under another {name}")
         self.likened = True
         end, gain = self.judge.ends[name], self.checks[name].gain
@@ -255,7 +255,7 @@ class NewFits:
     def widened(self) -> bool:
         """Whether the queue has others, that act like the likeliest suspect tried: where that one
         explains most of the misfit, none has passed its tests, and effort is left."""
-        names, late = self.explain() or self.likeliest(), self.end.runner.work > self.most
+        names, late = self.explaining() or self.likeliest(), self.end.runner.work > self.most
         if late or self.likened or not names or any(self.checks[name].passed for name in names):
             return False
         one, *more = self.judge.ends[names[0]].tried
@@ -264,7 +264,7 @@ class NewFits:
             self.add_alike(one.name)
         return bool(self.queue)
 
-    def explain(self) -> list[str]:
+    def explaining(self) -> list[str]:
         """Suspects whose new fits explain the misfit, the one that leaves least first."""
         names = [name for name in self.judge.ends if self.judge.nearly(self.checks[name])]
         return sorted(names, key=lambda name: self.checks[name].left)
@@ -274,7 +274,7 @@ class NewFits:
         that explain the misfit about as well as that one does and, while none has passed its tests,
         of others that explain and passed them; where none explains it, of the likeliest alone."""
         checks, done = self.checks, list[str]()
-        names = self.explain() or self.likeliest()
+        names = self.explaining() or self.likeliest()
         most = min((checks[name].left for name in names), default=0.0) + COMPARABLE
         for name in names:
             about = checks[name].left <= most
