@@ -238,8 +238,8 @@ class NewFits:
         return self.linear[name].far or abs(self.checks[name].shift[1]) > FIRST_ORDER
 
     def add_alike(self, name: str) -> None:
-        """Gains of all suspects by what they can have of the effect of one that was tried; the queue
-        with the likeliest of those that were left out of it."""
+        """Gains of all suspects by what they can have of the effect of one that was tried; the
+        queue with the likeliest of those that were left out of it."""
         self.say(f"effects of the others under another {name}")
         self.likened = True
         end, gain = self.judge.ends[name], self.checks[name].gain
