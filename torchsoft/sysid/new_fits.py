@@ -277,9 +277,8 @@ class NewFits:
         names = self.explaining() or self.likeliest()
         most = min((checks[name].left for name in names), default=0.0) + COMPARABLE
         for name in names:
-            about = checks[name].left <= most
             needed = checks[name].passed and not any(checks[one].passed for one in done)
-            if about or (needed and self.end.runner.work <= self.most):
+            if checks[name].left <= most or needed:
                 self.say(f"new fit with another {name}, by finer steps")
                 checks[name] = self.judge.at_rest(self.judge.ends[name], as_stated)
                 done.append(name)
