@@ -526,6 +526,24 @@ def test_one_suspect_may_spare_the_joint_fit(kind, b, lefts, tried, ranked, monk
     assert done == ranked
 
 
+def test_constants_of_the_computation_have_short_fits_however_they_begin(monkeypatch):
+    """A finer mesh moves the estimates, so that its first step is among the worst."""
+    numbers = [f"n{k}" for k in range(MOST + 2)]
+    taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in numbers]
+    taken.append(Variation("mesh", "numerical", "", "", vary=lambda r, amount, run: r))
+    checks = {one.name: assumption_test(one, gain=500.0, suspected=True) for one in taken}
+    judge: Any = SimpleNamespace(
+        square=1000.0, misfit=lambda left: left - 10.0, of_size=lambda one: True
+    )
+    end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=9.0)
+    end._replace = lambda **_: end
+    screened(monkeypatch, {one.name: 600.0 + k for k, one in enumerate(taken)})
+    fits = NewFits(end, [], taken, judge, checks)
+    with fits.bar:
+        fits.screen()
+    assert [*fits.short] == ["mesh", *numbers[:MOST]]
+
+
 def test_new_fits_end_with_the_effort(monkeypatch):
     """The first suspect is tried whatever it takes; those that are left then have names."""
     taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "abc"]

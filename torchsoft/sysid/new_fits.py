@@ -141,7 +141,7 @@ class NewFits:
 
     def screen(self) -> None:
         """Fill the queue by short fits: one step of every suspect, then more of the best, and of
-        laws, which begin far from where they end."""
+        laws and constants of the computation, which begin far from where they end."""
         least = FAINT * self.judge.misfit(self.judge.square)
         left = [one for one in self.tested if one.name not in self.tried]
         left = [one for one in left if one.kind == "law" or self.linear[one.name].gain > least]
@@ -154,7 +154,9 @@ class NewFits:
             if fit is not None:
                 fits[one] = fit
             self.bar.update()
-        best = sorted(fits, key=lambda one: (one.kind != "law", fits[one].square))[:MOST]
+        ranked = sorted(fits, key=lambda one: fits[one].square)
+        best = [one for one in ranked if one.kind in ("law", "numerical")]
+        best += [one for one in ranked if one not in best][:MOST]
         self.short = {one.name: carried_on(fits[one], LONGER) for one in best}
         square = self.judge.square
         self.gains |= {name: max(square - fit.square, 0.0) for name, fit in self.short.items()}
