@@ -11,7 +11,7 @@ what is wrong and not by luck. An interval holds the truth or not; a warning nam
 
 Command: .venv/bin/python experiments/validation/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"]
 [--workers 2] Expected: every interval holds, or a warning names the cause; no case is silent. About
-a quarter of an hour on two cores, the recordings included.
+an hour on two cores, the recordings included.
 """
 
 import sys
@@ -272,7 +272,7 @@ CASES = (
     Case("same assumptions, hard", excitations=("deep chirp", "light shaking", "light jerks")),
     Case("slip at 0.15 m/s", excitations=("deep pressing", "light shaking", "hard shaking")),
     Case("mesh 240 x 6", ("mesh", "element"), differs={"across": 240, "through": 6}),
-    Case("literal Coulomb", ("friction", "Coulomb", "slip law"), differs={"literal": True}),
+    Case("literal Coulomb", ("Coulomb", "slip law"), differs={"literal": True}),
     Case("x_C0 off by 40 um", ("disc begins",), differs={"x_C0": 60.34e-3}),
     Case("theta zeroed elsewhere", ("theta",), offset={"theta_C": 0.02}),
     Case("set-points at 200 Hz", ("set-point", "setpoint"), sparse=True),
