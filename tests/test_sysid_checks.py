@@ -651,7 +651,7 @@ def test_the_best_new_fits_go_on_until_they_are_at_rest(lefts, passes, rested, m
     )  # fmt: skip
     end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=1.0), chi2=1.05)
     end._replace = lambda **_: end
-    fits = NewFits(end, [], taken, judge, checks, effort=2.0)
+    fits = NewFits(end, [], taken, judge, checks)
     with fits.bar:
         fits.finish(end)
     assert "".join(done) == rested
