@@ -270,6 +270,43 @@ def test_a_reading_behind_a_low_pass_with_its_derivatives():
     assert float(np.sum(pulled * y)) == pytest.approx(float(v @ value), rel=1e-9)
 
 
+def test_a_reading_with_backlash_with_its_derivatives():
+    """A swing by its closed form; the derivative by the width by differences, at zero from one
+    side; weights pulled back by the transpose."""
+    t = np.linspace(0.0, 0.1, 401)
+    y = np.sin(60 * t)
+    signals, times = Signals(t, ("y",), y[:, None], y[:, None, None]), t[3:-3]
+
+    def read(backlash: float, lag: float = 0.0) -> Readout:
+        return Readout(
+            "y", 1.0, None, None, 1.2, 0.0, 0.0, 0.0, 0.05, (Term("y", 0, 1.0),), 0.0, lag, backlash
+        )
+
+    turns = 0.5 * np.pi / 60, 1.5 * np.pi / 60
+    swing, value = y[3:-3], read(0.2).expected(signals, times)[0] / 1.2
+    early = np.maximum(swing - 0.1, 0.0)  # from the middle of the play
+    falls = np.where(times < turns[0], early, np.minimum(swing + 0.1, 0.9))
+    whole = np.where(times < turns[1], falls, np.maximum(swing - 0.1, -0.9))
+    np.testing.assert_allclose(value, whole, atol=2e-3)
+    for width, lag in ((0.2, 0.0), (0.2, 4e-3)):
+        _, slopes, by = read(width, lag).expected(signals, times)
+        step = 1e-7
+        near = [read(width + part, lag).expected(signals, times)[0] for part in (step, -step)]
+        np.testing.assert_allclose(by["backlash"], (near[0] - near[1]) / (2 * step), atol=1e-6)
+        louder = Signals(t, ("y",), (1 + 1e-7) * y[:, None], None)
+        (more, _, _), (same, _, _) = (
+            read(width, lag).expected(one, times) for one in (louder, signals)
+        )
+        np.testing.assert_allclose(slopes[:, 0], (more - same) / 1e-7, atol=1e-5)
+        v = np.random.default_rng(0).standard_normal(len(times))
+        pulled = read(width, lag).pulled_back(signals, times, v)
+        assert float(np.sum(pulled[:, 0] * y)) == pytest.approx(float(v @ slopes[:, 0]), rel=1e-9)
+    value, _, by = read(0.0).expected(signals, times)
+    np.testing.assert_allclose(value, 1.2 * y[3:-3], rtol=1e-12)
+    ahead = (read(1e-5).expected(signals, times)[0] - value) / 1e-5
+    np.testing.assert_allclose(by["backlash"][10:], ahead[10:], atol=0.02)
+
+
 def test_a_number_that_recordings_state_otherwise_is_varied_in_each():
     first = strokes()
     mass = "bodies.disc.mass"

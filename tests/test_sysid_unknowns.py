@@ -200,5 +200,5 @@ def test_every_fault_of_a_sensor_has_a_unit():
     }
     assert found == {
         "bias": "rad", "delay": "s", "gain": "1", "drift": "rad/s", "misalignment": "rad",
-        "inertia": "kg", "clock": "1", "lag": "s",
+        "inertia": "kg", "clock": "1", "lag": "s", "backlash": "rad",
     }  # fmt: skip

@@ -30,7 +30,7 @@ from torchsoft.physics.shapes import parameter
 from torchsoft.sysid.initial_state import SETTLE, Standing
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Simulated, Vary
-from torchsoft.sysid.unknowns import Nuisance, Sensor
+from torchsoft.sysid.unknowns import ONE_SIDED, Nuisance, Sensor
 from torchsoft.tables import Number
 
 Kind = Literal["numerical", "known", "sensor", "law", "several"]
@@ -70,9 +70,10 @@ known parameter, and the largest factor on that range."""
 
 FAULT_BOUNDS = {
     "bias": 1e4, "delay": 0.02, "gain": 0.5, "drift": 1e4, "clock": 0.05, "lag": 0.05,
+    "backlash": 300.0,
 }  # fmt: skip
-"""Range of a sensor's fault: bias and drift [/s] over the noise, delay and lag [s], gain and clock
-[1]."""
+"""Range of a sensor's fault: bias, drift [/s] and backlash over the noise, delay and lag [s], gain
+and clock [1]."""
 
 
 class Fault(NamedTuple):
@@ -102,7 +103,7 @@ class Fault(NamedTuple):
             shown,
             nominal=float(kind == "gain"),
             step=self.size(sensor, recording),
-            one_sided=kind == "lag",
+            one_sided=kind in ONE_SIDED,
             fault=(channel, kind),
         )
 
@@ -114,6 +115,7 @@ FAULTS: dict[Nuisance, Fault] = {
     "drift": Fault(0.1, "noise/s", "drifted upwards"),
     "clock": Fault(1e-4, "1", "ran too fast"),
     "lag": Fault(1e-4, "s", "came through a low-pass"),
+    "backlash": Fault(0.1, "noise", "had backlash"),
 }
 """Faults of sensors that are tested where they are not unknowns."""
 

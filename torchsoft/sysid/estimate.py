@@ -195,6 +195,7 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
     own = problem.unit(one.name)
     units = {
         "bias": own,
+        "backlash": own,
         "drift": f"{own}/s",
         "delay": "s",
         "lag": "s",

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr
 from torch import Tensor
@@ -62,44 +63,54 @@ class Readout:
     terms: tuple[Term, ...]
     clock: float = 0.0
     lag: float = 0.0
+    backlash: float = 0.0
     colour: Autoregression | None = None
+
+    def quantity(self, signals: Signals, values: Array) -> Array:
+        """The measured quantity (G, ...) on the grid, from values (G, channels, ...)."""
+        parts = [
+            one.factor * slope(signals.t, values[:, signals.names.index(one.channel)], one.order)
+            for one in self.terms
+            if one.factor != 0.0
+        ]
+        return np.sum(parts, 0)
 
     def expected(
         self, signals: Signals, times: Array
     ) -> tuple[Array, Array | None, dict[Nuisance, Array]]:
         """Noiseless reading (k,) at `times`, its derivatives (k, n) by the parameters of the run's
         sensitivities, and those by the nuisances."""
-        y, rate, slopes = np.zeros(len(times)), np.zeros(len(times)), None
-        by: dict[Nuisance, Array] = {}
-        for term in self.terms:
-            j, at = signals.names.index(term.channel), self.own_times(times)
-            spline = CubicSpline(signals.t, lagged(signals.t, signals.values[:, j], self.lag))
-            part = spline(at, term.order)
-            y, rate = y + term.factor * part, rate + term.factor * spline(at, term.order + 1)
-            if self.lag > 0:
-                near = [
-                    lagged(signals.t, signals.values[:, j], (1 + part) * self.lag)
-                    for part in (-LAG_STEP, LAG_STEP)
-                ]
-                moved = CubicSpline(signals.t, (near[1] - near[0]) / (2 * LAG_STEP * self.lag))
-                by["lag"] = by.get("lag", 0.0) + self.gain * term.factor * moved(at, term.order)
-            if term.by is not None:
-                kind, slope = term.by
-                by[kind] = by.get(kind, 0.0) + self.gain * slope * part
-            if signals.derivatives is not None and term.factor != 0.0:
-                late = lagged(signals.t, signals.derivatives[:, j], self.lag)
-                more = term.factor * CubicSpline(signals.t, late)(at, term.order)
-                slopes = more if slopes is None else slopes + more
+        t, at, y = signals.t, self.own_times(times), self.quantity(signals, signals.values)
+        source, side = taken_up(y, self.backlash)
+        seen, by = y[source] - 0.5 * self.backlash * side, {"backlash": -0.5 * side}
+        for one in self.terms:
+            if one.by is not None:
+                (kind, factor), j = one.by, signals.names.index(one.channel)
+                more = factor * slope(t, signals.values[:, j], one.order)[source]
+                by[kind] = by.get(kind, 0.0) + more
+
+        def behind(columns: Array, lag: float = self.lag) -> CubicSpline:
+            return CubicSpline(t, lagged(t, columns, lag))
+
+        curves = behind(np.column_stack((seen, *by.values())))
+        y, *rows = curves(at).T
+        rate, slopes = curves(at, 1)[:, 0], None
+        by = {kind: self.gain * row for kind, row in zip(by, rows)}
+        later = -rate
+        if self.lag > 0:
+            less, more = (behind(seen, (1 + part) * self.lag)(at) for part in (-LAG_STEP, LAG_STEP))
+            later = (more - less) / (2 * LAG_STEP * self.lag)
         by |= {
             "gain": y,
             "bias": np.ones(len(times)),
             "drift": times - self.middle,
             "delay": -self.gain * rate,
             "clock": self.gain * rate * (self.middle - times),
+            "lag": self.gain * later,
         }
-        by.setdefault("lag", -self.gain * rate)
-        y = self.gain * y + self.bias + self.drift * (times - self.middle)
-        return y, None if slopes is None else self.gain * slopes, by
+        if signals.derivatives is not None:
+            slopes = self.gain * behind(self.quantity(signals, signals.derivatives)[source])(at)
+        return self.gain * y + self.bias + self.drift * (times - self.middle), slopes, by
 
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
         """Expected less measured values over the noise (k,), and the derivative by the expected
@@ -118,14 +129,15 @@ class Readout:
 
     def pulled_back(self, signals: Signals, times: Array, v: Array) -> Array:
         """Weights (G, channels) on the channels, from weights v (k,) on the expected reading."""
-        every = lagged(signals.t, np.eye(len(signals.t)), self.lag)
-        out, spline = np.zeros(signals.values.shape), CubicSpline(signals.t, every)
-        for term in self.terms:
-            if term.factor != 0.0:
-                j = signals.names.index(term.channel)
-                out[:, j] += (
-                    self.gain * term.factor * (v @ spline(self.own_times(times), term.order))
-                )
+        t, held = signals.t, np.zeros(len(signals.t))
+        source, _ = taken_up(self.quantity(signals, signals.values), self.backlash)
+        curves = CubicSpline(t, lagged(t, np.eye(len(t)), self.lag))
+        np.add.at(held, source, self.gain * (v @ curves(self.own_times(times))))
+        out = np.zeros(signals.values.shape)
+        for one in self.terms:
+            if one.factor != 0.0:
+                back = held @ slope(t, np.eye(len(t)), one.order)
+                out[:, signals.names.index(one.channel)] += one.factor * back
         return out
 
     def adjoint(
@@ -147,6 +159,30 @@ class Readout:
     def own_times(self, times: Array) -> Array:
         """Times (k,) [s] of the readings that the sensor stamps with `times`."""
         return times - self.delay - self.clock * (times - self.middle)
+
+
+def slope(t: Array, y: Array, order: int) -> Array:
+    """Derivative (G, ...) of some order of signals y (G, ...) at times t (G,) [s]."""
+    return CubicSpline(t, y)(t, order) if order else y
+
+
+STILL = 1e-6
+"""Least backlash over the range of a signal, by which its direction of motion is found."""
+
+
+def taken_up(y: Array, backlash: float) -> tuple[NDArray[np.intp], Array]:
+    """Where a reading with backlash stands: the sample (G,) of the signal y (G,) that moved it
+    last, and on which side, 1 for up and -1 for down; 0 before the play is taken up. Without
+    backlash every sample does. Not smooth where the direction changes."""
+    half, moved = 0.5 * max(backlash, STILL * float(np.ptp(y))), list[tuple[int, int]]()
+    k, way, at = 0, 0, float(y[0])
+    for i, value in enumerate(y.tolist()):
+        if abs(value - at) > half:
+            k, way = i, 1 if value > at else -1
+            at = value - half * way
+        moved.append((k, way))
+    source, side = np.array(moved).T
+    return (source if backlash > 0 else np.arange(len(y))), side.astype(float)
 
 
 LAG_STEP = 1e-4
@@ -250,6 +286,7 @@ def readout(
         tuple(terms),
         at["clock"],
         at["lag"],
+        at["backlash"],
         colour,
     )
 

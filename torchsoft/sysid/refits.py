@@ -87,6 +87,7 @@ def assuming(problem: Problem, some: Sequence[Variation], free: bool) -> Problem
             scales = {
                 "bias": sensors[channel].noise,
                 "drift": sensors[channel].noise,
+                "backlash": sensors[channel].noise,
                 "clock": 1.0 / longest,
             }
             most = FAULT_BOUNDS[kind] * scales.get(kind, 1.0)

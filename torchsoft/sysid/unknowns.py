@@ -92,9 +92,14 @@ class Unknown(Table):
         return self
 
 
-Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia", "clock", "lag"]
+Nuisance = Literal[
+    "bias", "delay", "gain", "drift", "misalignment", "inertia", "clock", "lag", "backlash"
+]
 NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
 """Faults of a sensor, in the order of a problem's coordinates."""
+
+ONE_SIDED: tuple[Nuisance, ...] = ("lag", "backlash")
+"""Faults that are not negative."""
 
 
 class Sensor(Table):
@@ -105,7 +110,8 @@ class Sensor(Table):
     [unit/s] from the middle of the recording on, its `misalignment` [rad] about the axis out of the
     plane; the `inertia` [kg] between a force sensor and the body that it pushes, whose acceleration
     it does not feel; the `clock` [1] that runs too fast, counted from the middle of the recording;
-    the `lag` [s], the time constant of a low-pass of first order that rests at the first sample.
+    the `lag` [s], the time constant of a low-pass of first order that rests at the first sample;
+    the `backlash` [unit], the width of the play of a gear, in the middle of which it begins.
     Zero leaves a fault out; others are identified, one for all recordings or one for each (`per`).
     Samples at `low` or `high` [unit] or beyond are saturated: they only say that value plus noise
     is there or beyond (Tobin's likelihood), and the noise must be white. Readings in steps of a
@@ -123,6 +129,7 @@ class Sensor(Table):
     inertia: float = Field(default=0.0, ge=0, le=1e5)
     clock: float = Field(default=0.0, ge=0, le=0.1)
     lag: float = Field(default=0.0, ge=0, le=REACH)
+    backlash: float = Field(default=0.0, ge=0, le=1e6)
     resolution: float = Field(default=0.0, ge=0, le=1e6)
     per: Per = "all"
     low: float | None = None
@@ -155,7 +162,7 @@ class Sensor(Table):
         for kind in NUISANCES:
             nominal, reach = float(kind == "gain"), float(getattr(self, kind))
             if nominal + reach > nominal:
-                least = 0.0 if kind == "lag" else nominal - reach
+                least = 0.0 if kind in ONE_SIDED else nominal - reach
                 out[kind] = least, nominal, nominal + reach
         return out
 
