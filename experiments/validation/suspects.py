@@ -252,12 +252,18 @@ PAIRS = (
            sensed=lambda size: scaled(size, "begin")),
 )  # fmt: skip
 
+PLAY, LESS_PLAY = halved(
+    (0.5, 0.25), "play of {} mrad in theta", ("backlash theta_C",),
+    sensed=lambda size: with_play("theta", 1e-3 * size),
+)  # fmt: skip
+
 DEPARTURES = (
     *(first for first, _ in PAIRS),
     Case("20 % of samples missing", alter=gaps(0.2)),
     Case("pink noise", words=("colour", "autocorrelat"), colour="pink"),
-    Case("play of 0.5 mrad in theta", sensed=with_play("theta", 5e-4)),
+    PLAY,
     *(second for _, second in PAIRS),
+    LESS_PLAY,
 )
 """Things that a laboratory would overlook, the whole sizes before the halves."""
 
