@@ -250,7 +250,7 @@ def under(end: Fit, other: Problem, x: Array) -> Fit:
 def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | None:
     """The fit with all suspects that are parameters or faults of sensors as unknowns; None where
     there are none. It starts at the end of the first fit and, if the sum of squares stays above
-    `enough`, also at the start of that fit.
+    `enough`, also at the start of that fit; the better of the two by the tolerance `LOOSE` goes on.
 
     A fit with a wrong assumption may end far from the truth, where tests to first order rank
     suspects wrongly. The joint fit ends near it, where they rank them rightly. If the joint fit
@@ -266,18 +266,13 @@ def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | N
     c, fits = other.coordinates, list[Fit]()
     for x in (c.begun(end.by_label), c.start):
         begin = under(end, other, x)
-        stage = replace(begin.stage, evaluations=ALL)
-        fit = continued(
-            begin,
-            *(
-                replace(stage, name=f"joint by rtol = {rtol:g}", rtol=rtol)
-                for rtol in (LOOSE, end.rtol)
-            ),
-        )
+        rough = replace(begin.stage, name="joint, roughly", rtol=LOOSE, evaluations=ALL)
+        fit = continued(begin, rough)
         fits += [fit] if fit is not None else []
         if fits and fits[-1].square <= enough:
             break
-    return min(fits, key=lambda fit: fit.chi2, default=None)
+    best = min(fits, key=lambda fit: fit.chi2, default=None)
+    return best and continued(best, replace(best.stage, name="joint", rtol=end.rtol))
 
 
 def shares(
