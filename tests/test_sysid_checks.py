@@ -2,9 +2,10 @@
 what they cannot tell."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import accumulate
 from types import SimpleNamespace
 from typing import Any
 
@@ -52,7 +53,7 @@ from torchsoft.sysid.identification import notices_on, ordering_constraints
 from torchsoft.sysid.new_fits import MOST, NewFits, alike
 from torchsoft.sysid.plan import LOOSE, settle
 from torchsoft.sysid.prediction import predict
-from torchsoft.sysid.recording import extended
+from torchsoft.sysid.recording import Array, extended
 from torchsoft.sysid.refits import (
     EVIDENT,
     assuming,
@@ -178,16 +179,37 @@ def turned(data: Recording) -> Recording:
     return replace(data, samples=data.samples | {"theta_C": (t, theta + 2e-3)})
 
 
-def late(
-    data: Recording, by: float, channels: Sequence[str], sensors: dict[str, Sensor] = SENSORS
-) -> Recording:
-    """The recording with channels that came late by a time [s], and noise as stated."""
+def read_by(
+    data: Recording, reading: Callable[[str, Array, Array], Array],
+    sensors: dict[str, Sensor] = SENSORS,
+) -> Recording:  # fmt: skip
+    """The recording with another reading (k,) of the exact samples by channel, and noise as
+    stated."""
     exact = record("exact", excited(STROKES, BASE), TRUTH, sensors, rtol=1e-6, noise=0.0)
     rng, samples = np.random.default_rng(4), {}
     for name, (t, y) in exact.samples.items():
-        true = CubicSpline(t, y)(t - by * (name in channels))
-        samples[name] = t, true + sensors[name].noise * rng.standard_normal(len(t))
+        noise = sensors[name].noise * rng.standard_normal(len(t))
+        samples[name] = t, reading(name, t, y) + noise
     return replace(data, samples=samples)
+
+
+def late(
+    data: Recording, by: float, channels: Sequence[str], sensors: dict[str, Sensor] = SENSORS
+) -> Recording:
+    """The recording with channels that came late by a time [s]."""
+    return read_by(data, lambda name, t, y: CubicSpline(t, y)(t - by * (name in channels)), sensors)
+
+
+def geared(data: Recording, backlash: float) -> Recording:
+    """The recording with theta_C behind a gear."""
+
+    def reading(name: str, t: Array, y: Array) -> Array:
+        if name != "theta_C":
+            return y
+        follow = lambda at, now: np.clip(at, now - backlash / 2, now + backlash / 2)
+        return np.array([*accumulate(y, follow)])
+
+    return read_by(data, reading)
 
 
 @pytest.mark.parametrize(
@@ -199,6 +221,8 @@ def late(
          "disc begins where the start says"),
         (lambda: turned(recorded()), "bias theta_C", 2e-3, "theta_C has no unknown bias"),
         (lambda: late(recorded(), 1e-3, ["x_C"]), "delay x_C", 1.0, "x_C has no unknown delay"),
+        (lambda: geared(recorded(), 1e-3), "backlash theta_C", 1e-3,
+         "theta_C has no unknown backlash"),
         (lambda: sampled({RATIO: 1.2}, excitation=HARD), RATIO, 20.0, f"{RATIO} is 1"),
         (lambda: sampled({RADIUS: 19.39e-3}), RADIUS, 0.103, f"{RADIUS} is 0.01937"),
     ],

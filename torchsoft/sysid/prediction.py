@@ -79,10 +79,15 @@ class Readout:
         self, signals: Signals, times: Array
     ) -> tuple[Array, Array | None, dict[Nuisance, Array]]:
         """Noiseless reading (k,) at `times`, its derivatives (k, n) by the parameters of the run's
-        sensitivities, and those by the nuisances."""
+        sensitivities, and those by the nuisances; by no backlash it is the secant to one as large
+        as the noise."""
         t, at, y = signals.t, self.own_times(times), self.quantity(signals, signals.values)
         source, side = taken_up(y, self.backlash)
-        seen, by = y[source] - 0.5 * self.backlash * side, {"backlash": -0.5 * side}
+        seen = y[source] - 0.5 * self.backlash * side
+        if self.backlash == 0.0:
+            other, side = taken_up(y, self.noise)
+            side -= 2 * (y[other] - y) / self.noise
+        by: dict[Nuisance, Array] = {"backlash": -0.5 * side}
         for one in self.terms:
             if one.by is not None:
                 (kind, factor), j = one.by, signals.names.index(one.channel)
@@ -166,23 +171,18 @@ def slope(t: Array, y: Array, order: int) -> Array:
     return CubicSpline(t, y)(t, order) if order else y
 
 
-STILL = 1e-6
-"""Least backlash over the range of a signal, by which its direction of motion is found."""
-
-
 def taken_up(y: Array, backlash: float) -> tuple[NDArray[np.intp], Array]:
     """Where a reading with backlash stands: the sample (G,) of the signal y (G,) that moved it
     last, and on which side, 1 for up and -1 for down; 0 before the play is taken up. Without
     backlash every sample does. Not smooth where the direction changes."""
-    half, moved = 0.5 * max(backlash, STILL * float(np.ptp(y))), list[tuple[int, int]]()
-    k, way, at = 0, 0, float(y[0])
+    moved, k, way, at = list[tuple[int, int]](), 0, 0, float(y[0])
     for i, value in enumerate(y.tolist()):
-        if abs(value - at) > half:
-            k, way = i, 1 if value > at else -1
-            at = value - half * way
+        if backlash == 0.0 or abs(value - at) > 0.5 * backlash:
+            k, way = i, int(value > at) - int(value < at)
+            at = value - 0.5 * backlash * way
         moved.append((k, way))
     source, side = np.array(moved).T
-    return (source if backlash > 0 else np.arange(len(y))), side.astype(float)
+    return source, side.astype(float)
 
 
 LAG_STEP = 1e-4
