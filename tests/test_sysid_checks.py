@@ -50,12 +50,13 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.estimate import Quantity
 from torchsoft.sysid.fit import Check, Fit, standard_deviations
 from torchsoft.sysid.identification import notices_on, ordering_constraints
-from torchsoft.sysid.new_fits import MOST, NewFits, alike
+from torchsoft.sysid.new_fits import MOST, TRIALS, NewFits, alike
 from torchsoft.sysid.plan import LOOSE, settle
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Array, extended
 from torchsoft.sysid.refits import (
     EVIDENT,
+    REFITS,
     assuming,
     difference,
     fewest,
@@ -681,13 +682,16 @@ def test_the_best_new_fits_go_on_until_they_are_at_rest(lefts, passes, rested, m
     assert "".join(done) == rested
 
 
-def test_rivals_of_a_cause_have_no_second_start(monkeypatch):
+def test_rivals_of_a_cause_have_no_second_start_and_fewer_evaluations(monkeypatch):
     taken = [Variation(name, "known", "", "", vary=lambda r, amount, run: r) for name in "ab"]
     checks = {one.name: assumption_test(one, gain=90.0, suspected=True) for one in taken}
-    starts = list[bool]()
+    starts = list[tuple[bool, int]]()
 
-    def refitted(end: Any, tried: Any, begin: Any = None, enough: float = 0.0, anew: bool = True):
-        starts.extend([anew] * len(tried))
+    def refitted(
+        end: Any, tried: Any, begin: Any = None, enough: float = 0.0, anew: bool = True,
+        evaluations: int = REFITS,
+    ) -> object:  # fmt: skip
+        starts.extend([(anew, evaluations)] * len(tried))
         return object()
 
     judge: Any = SimpleNamespace(
@@ -700,7 +704,7 @@ def test_rivals_of_a_cause_have_no_second_start(monkeypatch):
     end._replace = lambda **_: end
     monkeypatch.setattr(new_fits, "refit", refitted)
     assert [one.name for one in NewFits(end, taken, taken, judge, checks)] == ["a", "b"]
-    assert starts == [True, False]
+    assert starts == [(True, REFITS), (False, TRIALS)]
 
 
 def test_suspects_of_a_joint_fit_complement_each_other():

@@ -13,6 +13,7 @@ from torchsoft.sysid.assumptions import Variation
 from torchsoft.sysid.fit import Fit
 from torchsoft.sysid.refits import (
     EVIDENT,
+    REFITS,
     carried_on,
     far_off,
     first_step,
@@ -28,10 +29,12 @@ MOST = 12
 numbers of a joint fit."""
 
 MOSTLY = 0.5
-"""Part of a misfit that a suspect explains to first order with which new fits begin."""
+"""Part of a misfit that a suspect explains to first order with which new fits begin, and of the
+gain of the best short fit that another must have."""
 
 TRIALS = 10
-"""Evaluations that a new fit takes, as a rule."""
+"""Evaluations that a new fit takes, as a rule; more are not spent on the others once one suspect
+explains the misfit."""
 
 LONGER = 4
 """Evaluations after the first step of the short fits by which suspects are ranked where the first
@@ -213,7 +216,8 @@ class NewFits:
         tried = [one.within(test.favoured) for one, test in zip(some, linear)]
         begin, enough = near or self.short.get(name), self.judge.explained_chi2
         anew = near is None and not self.enough  # a second start is to find a cause
-        if (fit := refit(self.end, tried, begin, enough, anew)) is None:
+        most = TRIALS if self.enough else REFITS
+        if (fit := refit(self.end, tried, begin, enough, anew, most)) is None:
             return
         again = Again(name, tried, linear, fit)
         found = self.judge.fit(again, as_stated)
@@ -231,7 +235,8 @@ class NewFits:
             gain = self.checks[name].gain
             if not self.short:
                 self.add_alike(name)
-        self.enough = max(self.enough, RIVAL * gain)
+        part = MOSTLY if name in self.short else RIVAL
+        self.enough = max(self.enough, part * gain)
         self.queue.sort(key=self.gain, reverse=True)
 
     def left_behind(self, name: str) -> bool:

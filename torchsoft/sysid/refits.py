@@ -372,9 +372,10 @@ def refit(
     near: Fit | None = None,
     enough: float = 0.0,
     anew: bool = True,
+    evaluations: int = REFITS,
 ) -> Fit | None:
-    """The fit with some assumptions varied, or with all as stated, on its own steps; None where it
-    cannot begin.
+    """The fit with some assumptions varied, or with all as stated, on its own steps, by so many
+    `evaluations` at most; None where it cannot begin.
 
     It starts at the end of one `near`, or of the fit where that fails; ratios at a bound are
     scanned again over their whole range. Under what is costly it is fitted by the tolerance `LOOSE`
@@ -391,7 +392,7 @@ def refit(
         begin = under(end, other, begun(other, tried, end.by_label | there.by_label))
         stuck = [one for one in c.within(begin.free & c.at_bound(begin.x)) if one.ratio_to]
         scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-        stage = replace(begin.stage, scanned=scans)
+        stage = replace(begin.stage, scanned=scans, evaluations=evaluations)
         if any(one.costly for one in tried):
             plain = under(end, end.problem, end.x)
             stated, rough = (
