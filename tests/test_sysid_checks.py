@@ -207,8 +207,9 @@ def geared(data: Recording, backlash: float) -> Recording:
     def reading(name: str, t: Array, y: Array) -> Array:
         if name != "theta_C":
             return y
+        every = np.linspace(t[0], t[-1], 10 * len(t) - 9)
         follow = lambda at, now: np.clip(at, now - backlash / 2, now + backlash / 2)
-        return np.array([*accumulate(y, follow)])
+        return np.array([*accumulate(CubicSpline(t, y)(every), follow)])[::10]
 
     return read_by(data, reading)
 

@@ -187,7 +187,7 @@ class Problem(Shown):
             raise ValueError("there is nothing to identify: no unknown is free")
         check_ends(self.coordinates, recordings, held)
         self.interpolated = any(
-            c.kind in ("delay", "inertia", "clock", "lag") and not c.fixed
+            c.kind in ("delay", "inertia", "clock", "lag", "backlash") and not c.fixed
             for c in self.coordinates.all
         )
         self.noise = in_full(rigs, noise or {})
