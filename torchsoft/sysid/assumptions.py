@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from torchsoft.physics.shapes import parameter
 from torchsoft.sysid.initial_state import SETTLE, Standing
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Simulated, Vary
-from torchsoft.sysid.unknowns import ONE_SIDED, Nuisance, Sensor
+from torchsoft.sysid.unknowns import FAULTS, NUISANCES, Nuisance, Sensor
 from torchsoft.tables import Number
 
 Kind = Literal["numerical", "known", "sensor", "law", "several"]
@@ -67,57 +67,6 @@ AMOUNTS = 10.0
 NEAR, WIDEST = 5.0, 5.0
 """Number of variation amounts, by the test to first order, within which a new fit searches for a
 known parameter, and the largest factor on that range."""
-
-FAULT_BOUNDS = {
-    "bias": 1e4, "delay": 0.02, "gain": 0.5, "drift": 1e4, "clock": 0.05, "lag": 0.05,
-    "backlash": 300.0,
-}  # fmt: skip
-"""Range of a sensor's fault: bias, drift [/s] and backlash over the noise, delay and lag [s], gain
-and clock [1]."""
-
-
-class Fault(NamedTuple):
-    """A possible fault of a sensor that is not among the unknowns: its amount in a variation, the
-    unit of the amount, and its name in a sentence."""
-
-    amount: float
-    per: str
-    verb: str
-
-    def size(self, sensor: Sensor, recording: Recording) -> float:
-        """The amount in SI units."""
-        noise = {"noise": sensor.noise, "noise/s": sensor.noise / max(recording.duration, 1e-9)}
-        return self.amount * noise.get(self.per, 1.0)
-
-    def assumption(
-        self, channel: str, kind: Nuisance, unit: str, sensor: Sensor, recording: Recording
-    ) -> "Variation":
-        scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit)}
-        factor, shown = scale.get(self.per, (sensor.noise, f"{unit} over a recording"))
-        return Variation(
-            f"{kind} {channel}",
-            "sensor",
-            f"{channel} has no unknown {kind}",
-            f"{channel} {self.verb}",
-            factor * self.amount,
-            shown,
-            nominal=float(kind == "gain"),
-            step=self.size(sensor, recording),
-            one_sided=kind in ONE_SIDED,
-            fault=(channel, kind),
-        )
-
-
-FAULTS: dict[Nuisance, Fault] = {
-    "bias": Fault(0.1, "noise", "read too much"),
-    "delay": Fault(1e-4, "s", "came late"),
-    "gain": Fault(1e-3, "1", "were too sensitive"),
-    "drift": Fault(0.1, "noise/s", "drifted upwards"),
-    "clock": Fault(1e-4, "1", "ran too fast"),
-    "lag": Fault(1e-4, "s", "came through a low-pass"),
-    "backlash": Fault(0.1, "noise", "had backlash"),
-}
-"""Faults of sensors that are tested where they are not unknowns."""
 
 
 @dataclass(frozen=True)
@@ -365,10 +314,10 @@ def of_sensors(
 ) -> Iterator[Variation]:
     """Faults of single channels, and of those that share an instrument."""
     units = {channel: recording.units[channel] for channel in sensors if channel in recording.units}
-    for channel, sensor in sensors.items():
-        for kind, fault in FAULTS.items():
-            if channel in units and f"{kind} of {channel}" not in unknown:
-                yield fault.assumption(channel, kind, units[channel], sensor, recording)
+    for channel, unit in units.items():
+        for kind in NUISANCES:
+            if FAULTS[kind].clause and f"{kind} of {channel}" not in unknown:
+                yield with_fault(recording, channel, sensors[channel], kind)
     for channel, unit in units.items():
         for other in (one for one, its in units.items() if its == unit and one != channel):
             yield Variation(
@@ -394,6 +343,19 @@ def of_sensors(
                 "their camera were turned anticlockwise about its own axis", 1e3 * TILT, "mrad",
                 read=lambda r, at, mrad, pair=pair: seen_askew(r, at, pair, 1e-3 * mrad),
             )  # fmt: skip
+
+
+def with_fault(recording: Recording, channel: str, sensor: Sensor, kind: Nuisance) -> Variation:
+    """A fault of a channel's sensor."""
+    fault, duration = FAULTS[kind], max(recording.duration, 1e-9)
+    step, own = fault.amount * fault.scale(sensor, duration), recording.units[channel]
+    over = (duration, f"{own} over a recording") if fault.grows else (1.0, own)
+    factor, unit = {"s": (1e3, "ms"), "1": (1e2, "%")}.get(fault.unit, over)
+    return Variation(
+        f"{kind} {channel}", "sensor", f"{channel} has no unknown {kind}",
+        f"{channel} {fault.clause}", factor * step, unit, nominal=float(kind == "gain"), step=step,
+        one_sided=fault.one_sided, fault=(channel, kind),
+    )  # fmt: skip
 
 
 def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:

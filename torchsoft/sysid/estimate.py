@@ -14,7 +14,7 @@ from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import parts, whiteness
-from torchsoft.sysid.unknowns import Coordinate, Prior
+from torchsoft.sysid.unknowns import FAULTS, Coordinate, Prior
 from torchsoft.tables import Number
 
 CONFIDENCE = 0.95
@@ -192,17 +192,7 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
     if one.kind == "start":
         axis = one.name.split(".")[2]
         return ("rad" if axis.endswith("theta") else "m") + ("/s" if axis.startswith("v_") else "")
-    own = problem.unit(one.name)
-    units = {
-        "bias": own,
-        "backlash": own,
-        "drift": f"{own}/s",
-        "delay": "s",
-        "lag": "s",
-        "misalignment": "rad",
-        "inertia": "kg",
-    }
-    return units.get(one.kind, "1")
+    return FAULTS[one.kind].unit.format(problem.unit(one.name))
 
 
 def directions(labels: list[str], values: Array, vectors: Array) -> list[Direction]:

@@ -7,12 +7,12 @@ from itertools import chain
 
 import numpy as np
 
-from torchsoft.sysid.assumptions import AMOUNTS, FAULT_BOUNDS, WIDEST, Variation
+from torchsoft.sysid.assumptions import AMOUNTS, WIDEST, Variation
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
 from torchsoft.sysid.plan import ALL, LOOSE, SCANNED, USUAL, continued, default_plan
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
-from torchsoft.sysid.unknowns import Unknown
+from torchsoft.sysid.unknowns import FAULTS, Unknown
 
 REFITS, ROUGH = 20, 1e-3
 """Most evaluations of a repeated fit, and its relative tolerance: enough to see whether the misfit
@@ -84,13 +84,7 @@ def assuming(problem: Problem, some: Sequence[Variation], free: bool) -> Problem
             unknowns[one.parameter] = Unknown(nominal=one.nominal, low=low, high=high, scale=scale)
         elif one.fault is not None:
             channel, kind = one.fault
-            scales = {
-                "bias": sensors[channel].noise,
-                "drift": sensors[channel].noise,
-                "backlash": sensors[channel].noise,
-                "clock": 1.0 / longest,
-            }
-            most = FAULT_BOUNDS[kind] * scales.get(kind, 1.0)
+            most = FAULTS[kind].most * FAULTS[kind].scale(sensors[channel], longest)
             sensors[channel] = sensors[channel].model_copy(update={kind: most})
     more = [*problem.variations.values(), *(one for one in some if one.vary or one.read)]
     return Problem(problem.recordings, sensors, unknowns, problem.noise, more, held)

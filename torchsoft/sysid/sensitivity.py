@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from torchsoft.sysid.assumption_tests import RIVAL, AssumptionTest, Judge
-from torchsoft.sysid.assumptions import FAULTS, Variation, assumptions
+from torchsoft.sysid.assumptions import Variation, assumptions
 from torchsoft.sysid.fit import Fit, fisher
 from torchsoft.sysid.new_fits import MOST, NewFits
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import columns
 from torchsoft.sysid.residual_tests import Verdict
+from torchsoft.sysid.unknowns import NUISANCES
 
 TEMPERED = 0.46
 """Power of the likelihood in odds. Suspects only resemble what is wrong, so that one is named
@@ -96,7 +97,7 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, effort: float = 0.0) 
     candidates, late, problem = list[Variation](), list[str](), end.problem
     recordings = [recording for recording in problem.recordings if recording.name in end.which]
     c = problem.coordinates
-    faults = [f"{one.kind} of {one.name}" for one in c.all if one.kind in FAULTS]
+    faults = [f"{one.kind} of {one.name}" for one in c.all if one.kind in NUISANCES]
     every = assumptions(recordings, {*c.names, *faults}, problem.sensors)
     taken = [one for one in every if doubtful or not one.costly]
     checks, constants = dict[str, AssumptionTest](), list[Array]()

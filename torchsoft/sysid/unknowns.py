@@ -8,7 +8,7 @@ deviation is a relative one either way.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self, TypeVar, get_args
+from typing import Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -98,8 +98,36 @@ Nuisance = Literal[
 NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
 """Faults of a sensor, in the order of a problem's coordinates."""
 
-ONE_SIDED: tuple[Nuisance, ...] = ("lag", "backlash")
-"""Faults that are not negative."""
+
+class Fault(NamedTuple):
+    """A fault of a sensor: its unit, where {} is the channel's; if it is tested, the `clause` for
+    it, the `amount` of a variation and the range of a new fit, which count in `scale`. One that
+    `grows` does so along a recording; one that is `one_sided` is not negative."""
+
+    unit: str
+    clause: str = ""
+    amount: float = 0.0
+    most: float = 0.0
+    grows: bool = False
+    one_sided: bool = False
+
+    def scale(self, sensor: "Sensor", duration: float) -> float:
+        """The noise where the unit is the channel's, over a `duration` [s] where it grows."""
+        return (sensor.noise if "{}" in self.unit else 1.0) / (duration if self.grows else 1.0)
+
+
+FAULTS: dict[str, Fault] = {
+    "bias": Fault("{}", "read too much", 0.1, 1e4),
+    "delay": Fault("s", "came late", 1e-4, 0.02),
+    "gain": Fault("1", "were too sensitive", 1e-3, 0.5),
+    "drift": Fault("{}/s", "drifted upwards", 0.1, 1e4, grows=True),
+    "misalignment": Fault("rad"),
+    "inertia": Fault("kg"),
+    "clock": Fault("1", "ran too fast", 1e-4, 0.05, grows=True),
+    "lag": Fault("s", "came through a low-pass", 1e-4, 0.05, one_sided=True),
+    "backlash": Fault("{}", "had backlash", 0.1, 300.0, one_sided=True),
+}
+"""The faults of sensors; those with a clause are tested where they are not unknowns."""
 
 
 class Sensor(Table):
@@ -162,7 +190,7 @@ class Sensor(Table):
         for kind in NUISANCES:
             nominal, reach = float(kind == "gain"), float(getattr(self, kind))
             if nominal + reach > nominal:
-                least = 0.0 if kind in ONE_SIDED else nominal - reach
+                least = 0.0 if FAULTS[kind].one_sided else nominal - reach
                 out[kind] = least, nominal, nominal + reach
         return out
 
