@@ -445,21 +445,25 @@ def screened(monkeypatch: pytest.MonkeyPatch, left: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("joint_left", "rests", "lefts", "tried", "together"),
+    ("law", "joint_left", "rests", "lefts", "tried", "together"),
     [
-        (10.0, True, {"law": 50.0}, ["law"], ()),
-        (10.0, True, {"b": 50.0}, ["law", "b"], ()),
-        (10.0, True, {}, ["law", "b", "a"], ()),
-        (10.0, True, {}, ["law"], ("a", "b")),
-        (300.0, False, {}, ["law", "b", "a"], ("a", "b")),
-        (300.0, True, {}, ["law"], ("a", "b")),
-        (500.0, False, {}, ["law"], ("a", "b")),
+        (700.0, 10.0, True, {"law": 50.0}, ["law"], ()),
+        (700.0, 10.0, True, {"b": 50.0}, ["law", "b"], ()),
+        (700.0, 10.0, True, {}, ["law", "b", "a"], ()),
+        (700.0, 10.0, True, {}, ["law"], ("a", "b")),
+        (700.0, 300.0, False, {}, ["law"], ("a", "b")),
+        (1100.0, 300.0, False, {}, ["law", "b", "a"], ("a", "b")),
+        (1100.0, 300.0, True, {}, ["law"], ("a", "b")),
+        (1100.0, 500.0, False, {}, ["law"], ("a", "b")),
     ],
 )
-def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, together, monkeypatch):
+def test_a_joint_fit_decides_what_is_tried(
+    law, joint_left, rests, lefts, tried, together, monkeypatch
+):
     """After the best of short fits. Where it explains the data, those first that explain it
-    together, then numbers by their part; where not, those that are left by their short fits; and no
-    number at all where all of them leave much, or rest where much is left."""
+    together, then numbers by their part; where not, those that are left by their short fits, if
+    none of these explains most; and no number at all where all of them leave much, or rest where
+    much is left."""
     taken = [Variation(name, "sensor", "", "", fault=(name, "delay")) for name in "abc"]
     taken.append(Variation("law", "law", "", "", vary=lambda r, amount, run: r))
     gains = {"a": 300.0, "b": 200.0, "c": 40.0, "law": 10.0}
@@ -484,7 +488,7 @@ def test_a_joint_fit_decides_what_is_tried(joint_left, rests, lefts, tried, toge
     parts = {"a": 0.25, "b": 0.25 if together else 0.9}
     joint = SimpleNamespace(square=joint_left, converged=rests, chi2=9.0)
     # c explains too little to first order for a short fit
-    screened(monkeypatch, {"a": 1900.0, "b": 1800.0, "c": 2.0, "law": 700.0})
+    screened(monkeypatch, {"a": 1900.0, "b": 1800.0, "c": 2.0, "law": law})
     monkeypatch.setattr(new_fits, "joint_fit", lambda *given: joint)
     monkeypatch.setattr(new_fits, "shares", lambda *given: (parts, [["a", "law"], together]))
     monkeypatch.setattr(new_fits, "refit", lambda *given, **named: object())

@@ -144,7 +144,8 @@ class NewFits:
 
     def screen(self) -> None:
         """Fill the queue by short fits: one step of every suspect, then more of the best, and of
-        laws and constants of the computation, which begin far from where they end."""
+        laws and constants of the computation, which begin far from where they end. Where one
+        explains most of the misfit, the queue has laws and those that gain half as much."""
         least = FAINT * self.judge.misfit(self.judge.square)
         left = [one for one in self.tested if one.name not in self.tried]
         left = [one for one in left if one.kind == "law" or self.linear[one.name].gain > least]
@@ -161,8 +162,11 @@ class NewFits:
         best = [one for one in ranked if one.kind in ("law", "numerical")]
         best += [one for one in ranked if one not in best][:MOST]
         self.short = {one.name: carried_on(fits[one], LONGER) for one in best}
-        square = self.judge.square
+        square, misfit = self.judge.square, self.judge.misfit(self.judge.square)
         self.gains |= {name: max(square - fit.square, 0.0) for name, fit in self.short.items()}
+        most = max((self.gains[one.name] for one in best), default=0.0)
+        least = MOSTLY * most if most > MOSTLY * misfit else 0.0
+        best = [one for one in best if one.kind == "law" or self.gains[one.name] >= least]
         self.candidates = [*best, *(one for one in self.candidates if one.costly)]
         self.queue = self.ordered(self.candidates)
 
