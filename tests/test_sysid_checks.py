@@ -491,7 +491,7 @@ def test_a_joint_fit_decides_what_is_tried(
     screened(monkeypatch, {"a": 1900.0, "b": 1800.0, "c": 2.0, "law": law})
     monkeypatch.setattr(new_fits, "joint_fit", lambda *given: joint)
     monkeypatch.setattr(new_fits, "shares", lambda *given: (parts, [["a", "law"], together]))
-    monkeypatch.setattr(new_fits, "refit", lambda *given, **named: object())
+    monkeypatch.setattr(new_fits, "refit", lambda *given, **named: SimpleNamespace(square=1e3))
     problem: Any = ClosedForm(lambda x: 10.0 + x, 1)
     end = Fit(problem, Runner(()), np.zeros(1), Stage("far off", ("data",), ("p0",), RTOL)).begun()
     found = [one.name for one in NewFits(end, taken, taken, judge, checks)]
@@ -550,7 +550,7 @@ def test_one_suspect_may_spare_the_joint_fit(kind, b, lefts, tried, ranked, monk
     monkeypatch.setattr(NewFits, "screen", short)
     monkeypatch.setattr(new_fits, "joint_fit", joint_fit)
     monkeypatch.setattr(new_fits, "shares", lambda *_: ({"a": 0.1, "b": 0.1}, []))
-    monkeypatch.setattr(new_fits, "refit", lambda *_: True)
+    monkeypatch.setattr(new_fits, "refit", lambda *_: SimpleNamespace(square=1e3))
     monkeypatch.setattr(NewFits, "fit", fitted)
     assert [one.name for one in NewFits(end, taken, taken, judge, checks)] == tried
     assert done == ranked
@@ -565,7 +565,9 @@ def test_constants_of_the_computation_have_short_fits_however_they_begin(monkeyp
     judge: Any = SimpleNamespace(
         square=1000.0, misfit=lambda left: left - 10.0, of_size=lambda one: True
     )
-    end: Any = SimpleNamespace(progress=False, runner=SimpleNamespace(work=0.0), chi2=9.0)
+    end: Any = SimpleNamespace(
+        progress=False, runner=SimpleNamespace(work=0.0), chi2=9.0, square=1e3
+    )
     end._replace = lambda **_: end
     screened(monkeypatch, {one.name: 600.0 + k for k, one in enumerate(taken)})
     fits = NewFits(end, [], taken, judge, checks)

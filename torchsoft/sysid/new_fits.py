@@ -78,6 +78,8 @@ class NewFits:
         self.judge, self.tested, self.checks = judge, tested, checks
         self.linear, self.far, self.late = dict(checks), far_off(end), list[str]()
         self.gains = {one.name: checks[one.name].gain for one in candidates}
+        self.stated = end
+        """The new fit with all assumptions as stated."""
         self.enough = 0.0
         """Least gain of a suspect that is tried, once one explains the misfit."""
         self.candidates, self.tried, self.likened = list(candidates), set[str](), False
@@ -95,6 +97,7 @@ class NewFits:
             self.bar.update()
             if as_stated is None:
                 return
+            self.stated = as_stated
             self.queue = self.ordered(self.candidates)
             near = None
             if self.evident():  # a sensor: readings are linear in several faults
@@ -145,7 +148,8 @@ class NewFits:
     def screen(self) -> None:
         """Fill the queue by short fits: one step of every suspect, then more of the best, and of
         laws and constants of the computation, which begin far from where they end. Where one
-        explains most of the misfit, the queue has laws and those that gain half as much."""
+        explains most of what a new fit as stated leaves, the queue has laws and those that gain
+        half as much."""
         least = FAINT * self.judge.misfit(self.judge.square)
         left = [one for one in self.tested if one.name not in self.tried]
         left = [one for one in left if one.kind == "law" or self.linear[one.name].gain > least]
@@ -162,11 +166,12 @@ class NewFits:
         best = [one for one in ranked if one.kind in ("law", "numerical")]
         best += [one for one in ranked if one not in best][:MOST]
         self.short = {one.name: carried_on(fits[one], LONGER) for one in best}
-        square, misfit = self.judge.square, self.judge.misfit(self.judge.square)
+        square, stated = self.judge.square, min(self.judge.square, self.stated.square)
         self.gains |= {name: max(square - fit.square, 0.0) for name, fit in self.short.items()}
-        most = max((self.gains[one.name] for one in best), default=0.0)
-        least = MOSTLY * most if most > MOSTLY * misfit else 0.0
-        best = [one for one in best if one.kind == "law" or self.gains[one.name] >= least]
+        fell = {name: stated - fit.square for name, fit in self.short.items()}
+        most = max(fell.values(), default=0.0)
+        least = MOSTLY * most if most > MOSTLY * self.judge.misfit(stated) else 0.0
+        best = [one for one in best if one.kind == "law" or fell[one.name] >= least]
         self.candidates = [*best, *(one for one in self.candidates if one.costly)]
         self.queue = self.ordered(self.candidates)
 
