@@ -243,6 +243,17 @@ def test_under_a_limit_derivatives_are_those_of_what_moves_it():
     assert np.linalg.norm(apart) < 1e-2 * np.linalg.norm(at.J[:, 0])
 
 
+NOISE = 0.02
+
+
+def reading(lag: float = 0.0, backlash: float = 0.0) -> Readout:
+    """The channel y by a sensor with a gain of 1.2."""
+    return Readout(
+        "y", NOISE, None, None, gain=1.2, bias=0.0, drift=0.0, delay=0.0, middle=0.05,
+        terms=(Term("y", 0, 1.0),), lag=lag, backlash=backlash,
+    )  # fmt: skip
+
+
 def test_a_reading_behind_a_low_pass_with_its_derivatives():
     """A step and a ramp by their closed forms; the derivative by the time constant by differences,
     and at zero that of a delay; weights pulled back by the transpose."""
@@ -252,25 +263,16 @@ def test_a_reading_behind_a_low_pass_with_its_derivatives():
     np.testing.assert_allclose(lagged(t, ramp, 5e-3), exact, atol=1e-12)
     y = np.sin(60 * t)[:, None]
     signals, times = Signals(t, ("y",), y, y[..., None]), np.linspace(0.01, 0.09, 40)
-
-    def read(lag: float) -> Readout:
-        return Readout(
-            "y", 1.0, None, None, 1.2, 0.0, 0.0, 0.0, 0.05, (Term("y", 0, 1.0),), 0.0, lag
-        )
-
-    value, slopes, by = read(4e-3).expected(signals, times)
+    value, slopes, by = reading(4e-3).expected(signals, times)
     np.testing.assert_allclose(slopes[:, 0], value, rtol=1e-9)  # linear in the signal
     step = 1e-6
-    near = [read(4e-3 + part).expected(signals, times)[0] for part in (step, -step)]
+    near = [reading(4e-3 + part).expected(signals, times)[0] for part in (step, -step)]
     np.testing.assert_allclose(by["lag"], (near[0] - near[1]) / (2 * step), rtol=1e-5, atol=1e-3)
-    *_, still = read(0.0).expected(signals, times)
+    *_, still = reading(0.0).expected(signals, times)
     np.testing.assert_array_equal(still["lag"], still["delay"])
     v = np.random.default_rng(0).standard_normal(len(times))
-    pulled = read(4e-3).pulled_back(signals, times, v)
+    pulled = reading(4e-3).pulled_back(signals, times, v)
     assert float(np.sum(pulled * y)) == pytest.approx(float(v @ value), rel=1e-9)
-
-
-NOISE = 0.02
 
 
 def test_a_reading_with_backlash_with_its_derivatives():
@@ -279,47 +281,29 @@ def test_a_reading_with_backlash_with_its_derivatives():
     t = np.linspace(0.0, 0.1, 401)
     y = np.sin(60 * t)
     signals, times = Signals(t, ("y",), y[:, None], y[:, None, None]), t[3:-3]
-
-    def read(backlash: float, lag: float = 0.0) -> Readout:
-        return Readout(
-            "y",
-            NOISE,
-            None,
-            None,
-            1.2,
-            0.0,
-            0.0,
-            0.0,
-            0.05,
-            (Term("y", 0, 1.0),),
-            0.0,
-            lag,
-            backlash,
-        )
-
     turns = 0.5 * np.pi / 60, 1.5 * np.pi / 60
-    swing, value = y[3:-3], read(0.2).expected(signals, times)[0] / 1.2
+    swing, value = y[3:-3], reading(backlash=0.2).expected(signals, times)[0] / 1.2
     early = np.maximum(swing - 0.1, 0.0)  # from the middle of the play
     falls = np.where(times < turns[0], early, np.minimum(swing + 0.1, 0.9))
     whole = np.where(times < turns[1], falls, np.maximum(swing - 0.1, -0.9))
     np.testing.assert_allclose(value, whole, atol=2e-3)
     for width, lag in ((0.2, 0.0), (0.2, 4e-3)):
-        _, slopes, by = read(width, lag).expected(signals, times)
+        _, slopes, by = reading(lag, width).expected(signals, times)
         step = 1e-7
-        near = [read(width + part, lag).expected(signals, times)[0] for part in (step, -step)]
+        near = [reading(lag, width + part).expected(signals, times)[0] for part in (step, -step)]
         np.testing.assert_allclose(by["backlash"], (near[0] - near[1]) / (2 * step), atol=1e-6)
         louder = Signals(t, ("y",), (1 + 1e-7) * y[:, None], None)
         (more, _, _), (same, _, _) = (
-            read(width, lag).expected(one, times) for one in (louder, signals)
+            reading(lag, width).expected(one, times) for one in (louder, signals)
         )
         np.testing.assert_allclose(slopes[:, 0], (more - same) / 1e-7, atol=1e-5)
         v = np.random.default_rng(0).standard_normal(len(times))
-        pulled = read(width, lag).pulled_back(signals, times, v)
+        pulled = reading(lag, width).pulled_back(signals, times, v)
         assert float(np.sum(pulled[:, 0] * y)) == pytest.approx(float(v @ slopes[:, 0]), rel=1e-9)
-    value, _, by = read(0.0).expected(signals, times)
+    value, _, by = reading().expected(signals, times)
     np.testing.assert_allclose(value, 1.2 * y[3:-3], rtol=1e-12)
-    ahead = (read(NOISE).expected(signals, times)[0] - value) / NOISE  # a play that just shows
-    np.testing.assert_allclose(by["backlash"], ahead, atol=1e-9)
+    just_shown, *_ = reading(backlash=NOISE).expected(signals, times)
+    np.testing.assert_allclose(by["backlash"], (just_shown - value) / NOISE, atol=1e-9)
 
 
 def test_a_number_that_recordings_state_otherwise_is_varied_in_each():

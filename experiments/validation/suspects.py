@@ -250,20 +250,15 @@ PAIRS = (
     halved((1.002, 1.001), "camera's scale {} about the begin",
            ("gain x_C", "scale of the camera"),
            sensed=lambda size: scaled(size, "begin")),
-)  # fmt: skip
-
-PLAY, LESS_PLAY = halved(
-    (0.5, 0.25), "play of {} mrad in theta", ("backlash theta_C",),
-    sensed=lambda size: with_play("theta", 1e-3 * size),
+    halved((0.5, 0.25), "play of {} mrad in theta", ("backlash theta_C",),
+           sensed=lambda size: with_play("theta", 1e-3 * size)),
 )  # fmt: skip
 
 DEPARTURES = (
     *(first for first, _ in PAIRS),
     Case("20 % of samples missing", alter=gaps(0.2)),
     Case("pink noise", words=("colour", "autocorrelat"), colour="pink"),
-    PLAY,
     *(second for _, second in PAIRS),
-    LESS_PLAY,
 )
 """Things that a laboratory would overlook, the whole sizes before the halves."""
 

@@ -317,7 +317,7 @@ def of_sensors(
     for channel, unit in units.items():
         for kind in NUISANCES:
             if FAULTS[kind].clause and f"{kind} of {channel}" not in unknown:
-                yield with_fault(recording, channel, sensors[channel], kind)
+                yield of_fault(recording, channel, sensors[channel], kind)
     for channel, unit in units.items():
         for other in (one for one, its in units.items() if its == unit and one != channel):
             yield Variation(
@@ -345,7 +345,7 @@ def of_sensors(
             )  # fmt: skip
 
 
-def with_fault(recording: Recording, channel: str, sensor: Sensor, kind: Nuisance) -> Variation:
+def of_fault(recording: Recording, channel: str, sensor: Sensor, kind: Nuisance) -> Variation:
     """A fault of a channel's sensor."""
     fault, duration = FAULTS[kind], max(recording.duration, 1e-9)
     step, own = fault.amount * fault.scale(sensor, duration), recording.units[channel]

@@ -244,8 +244,7 @@ class NewFits:
             gain = self.checks[name].gain
             if not self.short:
                 self.add_alike(name)
-        part = MOSTLY if name in self.short else RIVAL
-        self.enough = max(self.enough, part * gain)
+        self.enough = max(self.enough, RIVAL * gain)
         self.queue.sort(key=self.gain, reverse=True)
 
     def left_behind(self, name: str) -> bool:

@@ -174,11 +174,14 @@ def slope(t: Array, y: Array, order: int) -> Array:
 def taken_up(y: Array, backlash: float) -> tuple[NDArray[np.intp], Array]:
     """Where a reading with backlash stands: the sample (G,) of the signal y (G,) that moved it
     last, and on which side, 1 for up and -1 for down; 0 before the play is taken up. Without
-    backlash every sample does. Not smooth where the direction changes."""
+    backlash every sample moves it, and there are no sides. Not smooth where the direction
+    changes."""
+    if backlash == 0.0:
+        return np.arange(len(y)), np.zeros(len(y))
     moved, k, way, at = list[tuple[int, int]](), 0, 0, float(y[0])
     for i, value in enumerate(y.tolist()):
-        if backlash == 0.0 or abs(value - at) > 0.5 * backlash:
-            k, way = i, int(value > at) - int(value < at)
+        if abs(value - at) > 0.5 * backlash:
+            k, way = i, 1 if value > at else -1
             at = value - 0.5 * backlash * way
         moved.append((k, way))
     source, side = np.array(moved).T
