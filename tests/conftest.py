@@ -2,7 +2,6 @@
 
 import gc
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import pytest
@@ -23,10 +22,8 @@ from torchsoft import (
     register_method,
 )
 from torchsoft.physics.state import State
-from torchsoft.rigs import build, course
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import good_sensors
-from torchsoft.sysid.recording import identity
 
 register_method()
 
@@ -242,24 +239,6 @@ def listed(given: Any) -> Any:
     if isinstance(given, list):
         return [*map(listed, given)]
     return given.tolist() if isinstance(given, Tensor) else given
-
-
-@pytest.fixture(scope="session", autouse=True)
-def balances_of_equal_rigs_are_found_once():
-    """Rigs with the same numbers are built and checked again and again: where their bodies are in
-    balance is kept."""
-    found = dict[Any, dict[str, Tensor]]()
-
-    def kept(own: Any, rig: Any, *how: Any, **more: Any) -> dict[str, Tensor]:
-        key = own.__name__, identity(rig), repr(listed([*how, more]))
-        if key not in found:
-            found[key] = {body: x.detach() for body, x in own(rig, *how, **more).items()}
-        return {body: x.clone() for body, x in found[key].items()}
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module, name in ((build, "placed"), (build, "resting"), (course, "resting")):
-            patch.setattr(module, name, partial(kept, getattr(module, name)))
-        yield
 
 
 @pytest.fixture(params=["massless", "inertial"])

@@ -22,12 +22,12 @@ FLOWS = {
     "physics": """
         arguments mesh shapes state contact rate_and_state ageing material hyperelastic elements
         pads balance multibond parts
-        names motion validity graph energy statics start channels namespace rig extensions setup .
+        names motion validity graph structure energy statics start channels namespace rig extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",
     "solve": """
-        kernel structure laws steps progress model system stepper trajectory gradients formats
+        kernel laws steps progress model system stepper trajectory gradients formats
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
@@ -40,7 +40,7 @@ FLOWS = {
     "testing": "energy laws gradients .",
     "plan": "knots problem search planning .",
     "rigs": """
-        fields places parts control motion outputs geometry built build excite written
+        fields places parts control motion outputs geometry initial built build excite written
         course recorded gripped alone check goal run .
     """,
     "cli": "results rigs plan identify design material dataset reduce plot .",
@@ -53,7 +53,7 @@ FLOWS = {
 own file imports."""
 APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets", "envs")
 """Folders over the engine; of these, only what is `SHARED` may be imported by another."""
-SHARED_RIGS = ("build", "built", "excite", "fields", "places", "written")
+SHARED_RIGS = ("build", "built", "excite", "fields", "initial", "places", "written")
 SHARED = ("plot", "materials.presets", *(f"rigs.{name}" for name in SHARED_RIGS))
 FACADES = {
     "solve.trajectory": (

@@ -12,7 +12,7 @@ from torchsoft import Trajectory, hold, simulate, simulate_batch
 from torchsoft.envs import reorient
 from torchsoft.solve import model as models
 from torchsoft.solve.model import forget
-from torchsoft.solve.structure import Structure, structure_of
+from torchsoft.physics.structure import Structure, structure_of
 from torchsoft.solve.system import Compiled
 
 T = times(0.02, 5)

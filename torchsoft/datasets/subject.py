@@ -28,6 +28,7 @@ from torchsoft.physics.channels import declared
 from torchsoft.physics.energy import Integrals, stores
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.initial import reference
 from torchsoft.rigs.places import unit
 from torchsoft.tables import line, shown
 
@@ -401,7 +402,8 @@ class Drawn(NamedTuple):
         try:
             file = self.file.override(values)
             rig = template if moves else file.assemble()
-            file.reference({name: np.zeros(3) for name in rig.bodies}, lambda *_: 0.0)
+            none = torch.zeros(3, dtype=torch.float64)
+            reference(file, dict.fromkeys(rig.bodies, none), lambda *_: none[0])
         except ValueError as error:
             return f"impossible: {error}"
         change = differs(template, rig)

@@ -16,7 +16,7 @@ from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.gradients import TAPE_BYTES, attached
-from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
+from torchsoft.solve.simulate import RunOutcome, Task, prepare, run, started
 from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.steps import check_knots
 from torchsoft.solve.trajectory import Touch, Trajectory
@@ -99,7 +99,8 @@ class Dynamics:
         goal: TargetPose | None, reward: Reward | None, begin: float, samples: int,
         solver: Mapping[str, Any], disturbances: Ranges,
     ) -> None:  # fmt: skip
-        self.rig, self._y0, self.solver = built.rig, built.y0, dict(solver)
+        self.rig, self._built, self.solver = built.rig, built, dict(solver)
+        self._reference = built.rig.reference
         self._stepper: ImplicitStepper | None = None
         self.goal, self.reward = goal, reward
         self.interval, self.samples = positive("interval", interval), whole("samples", samples, 1)
@@ -169,15 +170,19 @@ class Dynamics:
         """The moment at the time `begin`, after the rig's own motion, without disturbance. The
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
+        y0, self._reference = started(self.rig, self._built.initial, "discrete")
         with torch.enable_grad():  # a step may be differentiated, whatever is done here
-            task = prepare(self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver)
+            task = prepare(
+                self.rig, [0.0, 1.0], y0=y0, reference=self._reference, gradient="discrete",
+                **self.solver,
+            )  # fmt: skip
         self._stepper = task.stepper
-        own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
+        own, t = self._reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         set_by = [*self.actions, *self.disturbances]
         self._set = [self.rig.signals.index(name) for name in set_by]
         lines = torch.zeros(len(set_by), 2, dtype=torch.float64)
         self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
-        rows = attached([self._run(t, self._y0, None).solved])[0]
+        rows = attached([self._run(t, y0, None).solved])[0]
         there = -1 if self.start else 0
         with torch.no_grad():
             now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
@@ -237,7 +242,7 @@ class Dynamics:
         parts = [y[self._state], self._sums @ now.recorded[: self._sums.shape[1]]]
         if self._other:
             t = torch.tensor(self.start + now.steps * self.interval, dtype=torch.float64)
-            signals = rig.follow(t) if stepper is None else stepper.signals_now(t)
+            signals = rig.follow(t, self._reference) if stepper is None else stepper.signals_now(t)
             seen = Seen(rig, rig.unpack(y, signals), signals)
             for name, own in self._other.items():
                 touch = own is None
@@ -267,14 +272,14 @@ class Dynamics:
             return now.peaks
         steps = now.steps + torch.arange(2)
         t = self.start + self.interval * steps.double()
-        own = torch.stack([self.rig.reference(x, list(self.disturbances))[:, 0] for x in t], -1)
+        own = torch.stack([self._reference(x, list(self.disturbances))[:, 0] for x in t], -1)
         when, peak = now.peaks[:, :1], now.peaks[:, 1:]
         return own + torch.where((when == steps) & (steps > 0), peak, 0.0)
 
     def _following(self, times: Tensor, values: Tensor) -> Reference:
         """The rig's own reference, with lines between two values each (signals, 2) for signals set
         by actions or disturbances."""
-        own = {name: self.rig.reference[name] for name in self.rig.signals}
+        own = {name: self._reference[name] for name in self.rig.signals}
         lines = [Lines(times, row) for row in values]
         return Reference(**own | dict(zip((*self.actions, *self.disturbances), lines)))
 
@@ -293,7 +298,7 @@ class Dynamics:
         elif values is not None:
             stepper = stepper.following(self._following(t[[0, -1]], values))
         else:
-            stepper = stepper.following(self.rig.reference)
+            stepper = stepper.following(self._reference)
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)

@@ -1,8 +1,9 @@
 """Reference of a rig: signals of time, such as the paper's 7th-order profiles (Eq. 20-29)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from copy import copy
 from math import ceil, comb, perm
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -81,6 +82,13 @@ class Piecewise(nn.Module):
     def control(self) -> Tensor:
         """Control points of every piece's polynomial, in Bernstein's form (k - 1, degree + 1)."""
         raise NotImplementedError
+
+    def with_values(self, values: Tensor) -> Self:
+        """The same signal through other values (k,), whose graph it keeps."""
+        out = copy(self)
+        out._parameters = {k: x for k, x in self._parameters.items() if k != "values"}
+        out.__dict__["values"] = values
+        return out
 
     def pieces(self) -> "Pieces":
         """The polynomials, one at least; constant before the first and after the last."""
@@ -275,8 +283,9 @@ class Later(nn.Module):
 
 class Sampled(Piecewise):
     """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates
-    (k,), or with those of the natural choice, a cubic spline; constant before the first and after
-    the last. A step chosen by tolerances passes `KNOTS_PER_STEP` knots at most."""
+    (k,), or with those of a cubic spline, which is at rest at both ends if `clamped`; constant
+    before the first and after the last. A step chosen by tolerances passes `KNOTS_PER_STEP` knots
+    at most."""
 
     KNOTS_PER_STEP: ClassVar = 4
     given: Tensor | None
@@ -286,8 +295,10 @@ class Sampled(Piecewise):
         times: Sequence[float] | Tensor,
         values: Sequence[float] | Tensor,
         rates: Sequence[float] | Tensor | None = None,
+        clamped: bool = False,
     ) -> None:
         super().__init__(times, values)
+        self.clamped = clamped
         slope = None if rates is None else torch.as_tensor(rates, dtype=torch.float64)
         if slope is not None and (
             slope.shape != self.times.shape or not bool(torch.isfinite(slope).all())
@@ -301,7 +312,9 @@ class Sampled(Piecewise):
     def rates(self) -> Tensor:
         """Rates (k,) at the knots: the given ones, or the spline's through the values as they are
         now."""
-        return spline_rates(self.times, self.values) if self.given is None else self.given
+        if self.given is not None:
+            return self.given
+        return (clamped_rates if self.clamped else spline_rates)(self.times, self.values)
 
     @property
     def stops(self) -> Tensor:
@@ -335,17 +348,38 @@ def spline_rates(t: Tensor, y: Tensor) -> Tensor:
     return Tridiagonal.apply(lower, diagonal, upper, torch.cat((begin, 3 * inner, end)))  # pyright: ignore[reportReturnType]
 
 
+def clamped_rates(t: Tensor, y: Tensor) -> Tensor:
+    """Rates (k,) at the knots of the cubic spline through y (k,) at times t (k,) [s] that is at
+    rest at both ends. Differentiable in both."""
+    h, none = t.diff(), y.new_zeros(1)
+    if len(t) < 3:
+        return torch.zeros_like(y)
+    slope = y.diff() / h
+    inner = h[1:] * slope[:-1] + h[:-1] * slope[1:]
+    lower, upper = torch.cat((h[1:], none)), torch.cat((none, h[:-1]))
+    diagonal = torch.cat((none + 1, 2 * (h[:-1] + h[1:]), none + 1))
+    return Tridiagonal.apply(lower, diagonal, upper, torch.cat((none, 3 * inner, none)))  # pyright: ignore[reportReturnType]
+
+
 class Tridiagonal(torch.autograd.Function):
     """The solution x (k,) of a tridiagonal system with right-hand side b (k,): O(k), differentiable
     in everything."""
 
     @staticmethod
-    def forward(ctx: Any, lower: Tensor, diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def forward(lower: Tensor, diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         bands = np.zeros((3, len(b)))
         bands[0, 1:], bands[1], bands[2, :-1] = upper.numpy(), diagonal.numpy(), lower.numpy()
-        x = torch.from_numpy(solve_banded((1, 1), bands, b.numpy()))
-        ctx.save_for_backward(lower, diagonal, upper, x)
-        return x
+        return torch.from_numpy(solve_banded((1, 1), bands, b.numpy()))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:3], output)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, *inputs: Tensor) -> tuple[Tensor, int]:
+        """Solutions of one system for a batch of right-hand sides."""
+        *system, b = inputs
+        return Tridiagonal.forward(*system, b.movedim(in_dims[3], 1)), 1
 
     @staticmethod
     def backward(ctx: Any, x_bar: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -449,6 +483,14 @@ class Reference(nn.Module):
 
     def __getitem__(self, name: str) -> nn.Module:
         return self.signals[name.replace(".", ":")]
+
+    def replaced(self, signals: Mapping[str, nn.Module]) -> "Reference":
+        """The same with other signals by these names; itself where there are none."""
+        if not signals:
+            return self
+        out, own = copy(self), {name.replace(".", ":"): one for name, one in signals.items()}
+        out._modules = self._modules | {"signals": nn.ModuleDict({**self.signals, **own})}
+        return out
 
 
 class _Since(Reference):

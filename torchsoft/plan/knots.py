@@ -156,9 +156,10 @@ class Moves:
                 at += count
         return out
 
-    def reference(self, z: Tensor) -> Reference:
-        """The motion, differentiable by z."""
-        signals = {name.replace(":", "."): signal for name, signal in self.given.signals.items()}
+    def reference(self, z: Tensor, given: Reference | None = None) -> Reference:
+        """The motion, by default of the given reference, with the free knots z, differentiable with
+        respect to z."""
+        signals = dict[str, Profile]()
         for name, (times, values) in self.split(z).items():
             known_times, known_values, first = self.knots[name]
             moved = times if isinstance(times, Tensor) else torch.from_numpy(times)
@@ -166,7 +167,7 @@ class Moves:
                 torch.cat((torch.from_numpy(known_times[:first]), moved)),
                 torch.cat((torch.from_numpy(known_values[:first]), values)),
             )
-        return Reference(**signals)
+        return (self.given if given is None else given).replaced(signals)
 
     def _excess(self, z: Array) -> Array:
         """Excess over the constraints, not positive where they are kept: bounds of values, speed,

@@ -21,6 +21,7 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.plan.problem import Evaluation, Evaluator, Free, Term, Terms, Variables
 from torchsoft.plan.search import SLACK, Search, Stopped, Visit
+from torchsoft.solve.simulate import Start, started
 from torchsoft.solve.trajectory import Trajectory
 
 RTOL = 1e-4
@@ -90,13 +91,15 @@ class Plan(Shown):
 def plan(
     rig: Rig, t: Numbers, free: Free, *, objective: Term | None = None,
     targets: Mapping[str, Term] | None = None, limits: Mapping[str, Term] | None = None,
-    y0: Numbers, reference: Reference | None = None, over: Mapping[str, Numbers] | None = None,
+    y0: Numbers | Start, reference: Reference | None = None,
+    over: Mapping[str, Numbers] | None = None,
     robust: Robust = "mean", method: Method = "slsqp", iterations: int = 50, rate: float = 0.02,
     starts: int = 1, change: float | None = None, seconds: float = float("inf"),
     rtol: float = RTOL, threads: int | None = None, seed: int = 0, progress: bool = False,
 ) -> Plan:  # fmt: skip
     """Choose the free variables of a rig so that its run from y0 (size,) over the times t (T,) [s]
-    reaches all targets within all limits.
+    reaches all targets within all limits. A `y0` that is a function of the rig, such as
+    `BuiltRig.initial`, is evaluated at the parameters of every run.
 
     `free` names motions, with `Bounds` of their knots, and parameters of any shape, with their
     least and largest value (infinite ones are allowed). `objective` (a number, which is lowered),
@@ -119,7 +122,7 @@ def plan(
 
     Raises `ValueError` for arguments that do not fit together, and where no start can be run.
     """
-    t, y0 = tensor("t", t), tensor("y0", y0)
+    t, y0 = tensor("t", t), y0 if callable(y0) else tensor("y0", y0)
     for name, given, known in (
         ("method", method, ("slsqp", "adam")),
         ("robust", robust, ("mean", "worst")),
@@ -212,14 +215,15 @@ def finished(
         ]
         reasons += [*search.evaluator.variables.active(z), *slips(run)]
         reasons += [f"further on a run fails: {reason}" for reason in search.failures[-1:]]
-    now = torch.from_numpy(z)
-    reference = evaluator.variables.reference(now)
+    now, start = torch.from_numpy(z), evaluator.starts[0]
     parameters = evaluator.variables.parameters(now)
     planned = deepcopy(rig)
-    planned.reference = reference
     with torch.no_grad():
         for name, value in parameters.items():
             planned.parameter(name).copy_(value)
+    start = started(planned, start, "none") if callable(start) else start
+    reference = evaluator.variables.reference(now, start.reference)
+    planned.reference = reference
     combined = evaluation.value.max() if search.robust == "worst" else evaluation.value.mean()
     return Plan(
         rig=planned, reference=reference, parameters=parameters, trajectory=run,

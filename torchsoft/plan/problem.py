@@ -14,7 +14,8 @@ from torchsoft.display import suggestion
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.plan.knots import Array, Bounds, Moves
-from torchsoft.solve.batch import Batch, simulate_batch
+from torchsoft.solve.batch import Batch, own_values, simulate_batch
+from torchsoft.solve.simulate import Initial, Start, started
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.tables import Table
 
@@ -167,9 +168,9 @@ class Variables:
         self.A = np.pad(self.moves.A, ((0, 0), (0, self.n - self.moves.n)))
         self.b = self.moves.b
 
-    def reference(self, z: Tensor) -> Reference:
-        """The motion, differentiable by z (n,)."""
-        return self.moves.reference(z[: self.moves.n])
+    def reference(self, z: Tensor, given: Reference | None = None) -> Reference:
+        """The motion, by default of the given reference, differentiable with respect to z (n,)."""
+        return self.moves.reference(z[: self.moves.n], given)
 
     def parameters(self, z: Tensor) -> dict[str, Tensor]:
         """Parameters by name for one or more z (..., n), differentiable by z."""
@@ -283,23 +284,43 @@ class Evaluation:
 
 class Evaluator:
     """Evaluation of plans by runs. `over` holds draws of parameters by name (draws, ...), y0 their
-    initial states (size,) or (draws, size)."""
+    initial states (size,) or (draws, size), or a start as a function of the rig."""
 
     def __init__(
-        self, rig: Rig, t: Tensor, variables: Variables, terms: Terms, y0: Tensor,
+        self, rig: Rig, t: Tensor, variables: Variables, terms: Terms, y0: Tensor | Start,
         over: Mapping[str, Tensor], rtol: float, threads: int | None,
     ) -> None:  # fmt: skip
         if twice := set(over) & set(variables.shapes):
             raise ValueError(f"`{min(twice)}` is both free and drawn; leave it out of one of them")
         counts = {name: len(values) for name, values in over.items()}
-        if y0.ndim == 2:
+        if isinstance(y0, Tensor) and y0.ndim == 2:
             counts["y0"] = len(y0)
         if len(set(counts.values())) > 1:
             listed = ", ".join(f"{name} {count}" for name, count in counts.items())
             raise ValueError(f"every draw needs one entry, but there are: {listed}")
         self.draws = next(iter(counts.values()), 1)
-        self.rig, self.t, self.variables, self.terms, self.y0 = rig, t, variables, terms, y0
+        self.rig, self.t, self.variables, self.terms = rig, t, variables, terms
         self.over, self.rtol, self.threads, self.evaluations = dict(over), rtol, threads, 0
+        self.starts = self._starts(y0)
+
+    def _starts(self, y0: Tensor | Start) -> list[Initial | Start]:
+        """Start of every draw: a function of the rig where free parameters may change it."""
+        if isinstance(y0, Tensor):
+            rows = y0.expand(self.draws, -1)
+            return [Initial(row, self.variables.moves.given) for row in rows]
+        if self.variables.shapes:
+            return [y0] * self.draws
+        values = [own_values(self.rig, self.over, i) for i in range(self.draws)]
+        return [started(self.rig, y0, "none", values=one) for one in values]
+
+    def _planned(self, z: Tensor, start: Initial | Start) -> Initial | Start:
+        """A start, with the motion of a plan at z."""
+        if callable(start):
+            return lambda rig: self._moving(z, start(rig))
+        return self._moving(z, start)
+
+    def _moving(self, z: Tensor, start: Initial) -> Initial:
+        return start._replace(reference=self.variables.reference(z, start.reference))
 
     def evaluate(self, z: Array, rtol: float | None = None, *, gradient: bool = True) -> Evaluation:
         """The plan at z, with the evaluator's relative tolerance or another. Raises `ValueError`
@@ -310,7 +331,7 @@ class Evaluator:
         with warnings.catch_warnings(action="ignore"):
             batch = simulate_batch(
                 self.rig, self.t, parameters=self.over | self.variables.parameters(rows),
-                reference=[self.variables.reference(row) for row in rows], y0=self.y0,
+                y0=[self._planned(*one) for one in zip(rows, self.starts)],
                 rtol=self.rtol if rtol is None else rtol, threads=self.threads,
                 gradient="discrete" if gradient else "none",
             )  # fmt: skip

@@ -5,9 +5,8 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar, cast
 
-import numpy as np
 import torch
 from pydantic import Field, PrivateAttr, model_validator
 from torch import nn
@@ -15,21 +14,24 @@ from torch import nn
 from torchsoft.display import Shown, suggestion
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.channels import units
-from torchsoft.physics.graph import Graph
-from torchsoft.physics.mesh import Array
-from torchsoft.physics.motion import Piecewise, Reference
+from torchsoft.physics.motion import Piecewise
 from torchsoft.physics.names import check_names
 from torchsoft.physics.parts import COORDINATES, ORDERS, PD, Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.start import REST, NoPlace, Starts, moving, placed, warn_of_moments
-from torchsoft.physics.statics import NoEquilibrium, net_loads, resting, standing
+from torchsoft.physics.start import REST, moving, warn_of_moments
 from torchsoft.physics.validity import check_numbers, sound
 from torchsoft.quantity import Gravity
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.fields import Group, at_field, called_alike, with_entry
-from torchsoft.rigs.geometry import at
-from torchsoft.rigs.motion import HELD, MotionContext, MotionTable, flattened
+from torchsoft.rigs.initial import (
+    holding_effort,
+    initial_poses,
+    reference,
+    settled_pads,
+    signal,
+)
+from torchsoft.rigs.motion import MotionTable, flattened
 from torchsoft.rigs.outputs import OutputsTable, SolverTable
 from torchsoft.rigs.parts import (
     AnyPad,
@@ -74,11 +76,6 @@ Names = Annotated[tuple[str, ...], LISTED, Field(min_length=1)]
 def ready() -> list[str]:
     """Names of the ready rigs."""
     return sorted(path.stem for path in READY.glob("*.toml"))
-
-
-STIFF = 100.0
-"""Largest stiffness of a contact, over that of a point of its pad, at which a failed equilibrium is
-not blamed on the contact."""
 
 
 class RigFile(Shown, Group):
@@ -518,81 +515,20 @@ class RigFile(Shown, Group):
         """
         rig = self.assemble(parts)
         starts = {name: body.given for name, body in self.bodies.items()}
-        pose = self._starts(rig, starts)
-        rig.reference = self.reference(pose, lambda *arguments: self._held(rig, pose, *arguments))
-        try:
-            y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
-        except NoEquilibrium as error:
-            raise ValueError(
-                too_stiff(self, rig)
-                or f"bodies: the pads cannot settle where bodies start: {error}"
-            ) from None
+        driven = [f"{body}.{axis}" for body, axis, kind in self.coordinates() if kind == "driven"]
+        poses = initial_poses(self, rig, {name: signal(self, name) for name in driven})
+        rig.reference = reference(self, poses, partial(holding_effort, self, rig, poses))
+        y0 = settled_pads(self, rig, poses)
         warn_of_moments(rig, y0, starts)
-        solver = self.solver.model_dump(exclude_none=True)
-        return BuiltRig(rig, moving(rig, y0, starts), self.outputs.times(), starts, solver)
-
-    def reference(
-        self, pose: Mapping[str, Array], held: Callable[[str, float], float]
-    ) -> Reference:
-        """All motions, for bodies that start at `pose` (3,); `held` gives the effort that holds a
-        coordinate at a time [s]. Raises `ValueError` naming the field."""
-        return Reference(**{name: self._signal(name, pose, held) for name in self.motion})
-
-    def _signal(
-        self, name: str, pose: Mapping[str, Array] | None = None,
-        held: Callable[[str, float], float] | None = None,
-    ) -> Piecewise:  # fmt: skip
-        roles: dict[str, set[str]] = {}
-        for role, coordinate in self.followers()[name]:
-            roles.setdefault(role, set()).add(coordinate)
-        (follows, *more), (fed, *others) = (
-            sorted(roles.get(role, ())) or [""] for role in ("setpoint", "feed_forward")
-        )
-        body, axis = at(follows) if follows and not more else ("", 0)
-        start = float(pose[body][axis]) if pose is not None and body else None
-        effort = partial(held, fed) if held and fed and not others else None
-        context = MotionContext(
-            name, self.unit(name), start, effort, self.outputs.duration, self.folder
-        )
-        try:
-            return self.motion[name].build(context)
-        except ValueError as error:
-            prefix = "" if str(error).startswith("motion.") else f"motion.{name}: "
-            raise ValueError(f"{prefix}{error}") from None
-
-    def _follow(
-        self, pose: dict[str, Array], time: float, roles: Collection[str],
-        start: Mapping[str, Array] | None = None,
-    ) -> set[tuple[str, int]]:  # fmt: skip
-        """Set the coordinates that follow motions in these roles to the motions' values at a time
-        [s]; returns those coordinates."""
-        moved = set[tuple[str, int]]()
-        for name, users in self.followers().items():
-            for body, axis in (at(coordinate) for role, coordinate in users if role in roles):
-                value, _ = self._signal(name, start)(torch.tensor(time, dtype=torch.float64))
-                pose[body][axis] = float(value)
-                moved.add((body, axis))
-        return moved
-
-    def _starts(self, rig: Rig, starts: Starts) -> dict[str, Array]:
-        """Initial poses (3,) [m, m, rad] by body. Raises `ValueError` naming the field."""
-        held = {name: np.zeros(3) for name in self.bodies}
-        for name, axis, kind in self.coordinates():
-            if not isinstance(kind, str):
-                held[name][COORDINATES.index(axis)] = kind
-        self._follow(held, 0.0, ("driven",))
-        try:
-            pose = placed(rig, starts, {name: torch.from_numpy(x) for name, x in held.items()})
-        except NoPlace as error:
-            raise ValueError(f"bodies.{error.body}.start.{error.axis}: {error.reason}") from None
-        except NoEquilibrium as error:
-            name, (axis, *_) = next(iter(self.rests().items()))
-            weight = self.bodies[name].weighted * rig.bodies[name].mass.item() * rig.gravity.item()
-            reason = f"no rest under its weight of {weight:.3g} N is found; {error}"
-            raise ValueError(
-                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {reason}"
-            ) from None
-        return {name: x.numpy() for name, x in pose.items()}
+        followed = {
+            name: (one, one.values.detach().clone())
+            for name, motion in self.motion.items() if motion.follows_start
+            for one in [cast(Piecewise, rig.reference[name])]
+        }  # fmt: skip
+        solver, y0 = self.solver.model_dump(exclude_none=True), moving(rig, y0, starts)
+        built = BuiltRig(rig, y0, self.outputs.times(), self, followed, solver)
+        built.last["start"] = built.key(rig), y0, {k: values for k, (_, values) in followed.items()}
+        return built
 
     def rests(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
         """Coordinates with the start "rest", by body, without those in `but`."""
@@ -603,35 +539,6 @@ class RigFile(Shown, Group):
             if rests and (name, i) not in but:
                 out.setdefault(name, []).append(i)
         return out
-
-    def _rested(
-        self, rig: Graph, pose: Mapping[str, Array], axes: Mapping[str, list[int]]
-    ) -> dict[str, Array]:
-        """Poses with these coordinates in equilibrium, without efforts of actuators. Raises
-        `NoEquilibrium`."""
-        if not axes:
-            return dict(pose)
-        places = {name: torch.from_numpy(x) for name, x in pose.items()}
-        still = torch.zeros(len(rig.signals), 2).double()
-        found = resting(rig, places, axes, signals=still, actuators=())
-        return {name: x.numpy() for name, x in found.items()}
-
-    def _held(self, rig: Rig, start: Mapping[str, Array], coordinate: str, time: float) -> float:
-        """The effort [N, N.m] that holds a coordinate, without friction, with bodies at their
-        set-points at a time [s], or else where they rest or start. Raises `ValueError`."""
-        pose = {name: x.copy() for name, x in start.items()}
-        known = self._follow(pose, time, ("driven", "setpoint"), start)
-        body, axis = at(coordinate)
-        still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
-        try:
-            pose = self._rested(rig, pose, self.rests(known))
-            y = standing(rig, {name: torch.from_numpy(x) for name, x in pose.items()})
-        except NoEquilibrium as error:
-            raise ValueError(
-                f'"{HELD}" asks for balance where set-points are at t = {time:g} s, and there is '
-                f"none: {error}"
-            ) from None
-        return -float(net_loads(rig, rig.unpack(y, still), still, ())[body][axis])
 
 
 def checked(part: M) -> M:
@@ -680,21 +587,6 @@ def own_name(file: RigFile, rig: Rig, group: str, part: str = "", *rest: str) ->
         rest = rest[1:] if rest[-1].startswith("centre_") else rest
     last = ["inertia" if name == "own_inertia" else name for name in rest]
     return ".".join([group, part, *last] if part else [group])
-
-
-def too_stiff(file: RigFile, rig: Rig) -> str:
-    """Error message on a contact too stiff for its pad to be solved; empty if there is none."""
-    for name, contact in rig.contacts.items():
-        give = float(rig.pads[contact.pad].compliance().diagonal().max())
-        ratio = float((rig.weight(name) * contact.law.K_n).max()) * give
-        if ratio > STIFF:
-            law, K_n = file.contacts[name].law, contact.law.K_n.item()
-            return (
-                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as "
-                f"the pad `{contact.pad}` that it presses; take {K_n * STIFF / ratio:.1g} N/m or "
-                "less, the pad gives way long before the contact does"
-            )
-    return ""
 
 
 def _again(kind: type[RigFile], tree: Any, folder: Path) -> RigFile:

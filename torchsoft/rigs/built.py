@@ -1,48 +1,125 @@
 """A rig that is ready to run."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
+from torchsoft.parallel import single_threaded
 from torchsoft.physics.arguments import Numbers
+from torchsoft.physics.motion import Piecewise
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.start import Starts, start
-from torchsoft.solve.simulate import simulate
+from torchsoft.physics.start import Starts, moving
+from torchsoft.physics.structure import values_of
+from torchsoft.physics.validity import check_values
+from torchsoft.rigs.initial import initial_poses, settled_pads, started_values
+from torchsoft.solve.simulate import Initial, simulate
 from torchsoft.solve.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from torchsoft.rigs.build import RigFile
 
 STEPPING = ("rtol", "atol", "step", "knots")
 """Arguments of `simulate` that choose the steps."""
 
+SAME = 1e-9
+"""Relative difference of values below which a set-point is the one that its rig starts with."""
+
 
 @dataclass(frozen=True)
 class BuiltRig:
-    """A rig with the reference that it follows, its state y0 (size,) at the start, and the times t
-    (T,) [s] of the outputs, the last of which is the end of the motion.
+    """A rig with the reference that it follows, the state y0 (size,) with which it was built, and
+    the times t (T,) [s] of the outputs, the last of which is the end of the motion.
 
-    `starts` are the coordinates and rates from which `y0` was made, by body, and `solver` the
-    choice of steps. Unpacks to rig, y0, t.
+    `file` is the rig file that it was built from, and `solver` the choice of steps. `followed`
+    holds the motions that have a value given as "start" or "held", by name, and their values (k,)
+    as built; `last` the last start that was computed. Unpacks to rig, y0, t.
     """
 
     rig: Rig
     y0: Tensor
     t: Tensor
-    starts: Starts = field(default_factory=dict, repr=False)
+    file: RigFile = field(repr=False)
+    followed: Mapping[str, tuple[Piecewise, Tensor]] = field(repr=False)
     solver: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    last: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.rig, self.y0, self.t))
 
+    @property
+    def starts(self) -> Starts:
+        """Coordinates and rates at which bodies start, by body, as the file gives them."""
+        return {name: body.given for name, body in self.file.bodies.items()}
+
+    @single_threaded()
+    def initial(self, rig: Rig | None = None) -> Initial:
+        """The state at the start and the reference, for the parameters that the rig has now, or a
+        copy of it with others, and differentiable in them.
+
+        Values of motions given as "start" or "held" follow the start; what was added to them in
+        place is kept. Raises `ValueError` naming the field where there is no equilibrium.
+        """
+        own = self.rig.reference
+        rig = self.rig if rig is None else rig
+        check_values(rig)
+        y0, now = self._started(rig)
+        signals = {}
+        for name, (signal, built) in self.followed.items():
+            if name.replace(".", ":") in own.signals and own[name] is signal:
+                signals[name] = signal.with_values(following(signal.values, built, now[name]))
+        return Initial(y0, own.replaced(signals))
+
+    def _started(self, rig: Rig) -> tuple[Tensor, dict[str, Tensor]]:
+        """The state at the start, and the values of the motions that follow it; the last ones again
+        for the same rig where no gradient is wanted."""
+        key = () if torch.is_grad_enabled() else self.key(rig)
+        known = self.last.get("start")
+        if key and known is not None and known[0] == key:
+            return known[1].clone(), known[2]
+        poses = initial_poses(self.file, rig, self.driven)
+        y0 = moving(rig, settled_pads(self.file, rig, poses), self.starts)
+        now = started_values(self.file, rig, poses)
+        if key:
+            self.last["start"] = key, y0.clone(), now
+        return y0, now
+
+    def key(self, rig: Rig) -> tuple[Any, ...]:
+        """All that the start of a rig depends on; empty where that is not known."""
+        none = torch.zeros((), dtype=torch.float64)
+        return values_of(rig, *(signal(none)[0] for signal in self.driven.values()))
+
+    @property
+    def driven(self) -> dict[str, Piecewise]:
+        """Motions of driven coordinates, by name."""
+        kinds = self.file.coordinates()
+        names = [f"{body}.{axis}" for body, axis, kind in kinds if kind == "driven"]
+        return {name: self.rig.reference[name] for name in names}  # pyright: ignore[reportReturnType]
+
     def start(self) -> Tensor:
         """The state (size,) at the start, for the parameters that the rig has now, which it is
-        differentiable in. Raises `NoEquilibrium`."""
-        return start(self.rig, self.starts)
+        differentiable in. Raises `ValueError`."""
+        return self.initial().y0
 
     def run(self, t: Numbers | None = None, **options: Any) -> Trajectory:
-        """The run, by `simulate` with its `options`: over the times t, from `y0` and by steps as
-        the rig file chooses them, where they are not given."""
+        """The run, by `simulate` with its `options`: over the times t, by steps as the rig file
+        chooses them, and from the start that the rig's present parameters have, where they are not
+        given. A state `y0` that is given is constant, and so are the set-points."""
         own = STEPPING if any(options.get(name) is not None for name in STEPPING) else ()
         solver = {name: value for name, value in self.solver.items() if name not in own}
-        given: dict[str, Any] = {"y0": self.y0} | solver | options
+        given: dict[str, Any] = {"y0": self.initial} | solver | options
         return simulate(self.rig, self.t if t is None else t, **given)
+
+
+def following(values: Tensor, built: Tensor, now: Tensor) -> Tensor:
+    """Values (k,) of a motion whose start moved from `built` to `now`: what was added to them in
+    place since is kept, but those that are at the present start already, such as of a loaded state
+    dict, are left there. Other knots than those that were built follow nothing."""
+    if values.shape != built.shape:
+        return values
+    there = (values != built) & torch.isclose(values, now, rtol=SAME, atol=0.0)
+    return now + torch.where(there, values - now.detach(), values - built)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
+from torchsoft.physics.rig import Rig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
 from torchsoft.plan.planning import RTOL, Method, Robust
 from torchsoft.plan.problem import Free, Terms
 from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
@@ -71,32 +71,29 @@ class Planned(NamedTuple):
 
 def drawn(
     file: RigFile, goal: Goal, count: int, seed: int, known: Draws | None = None
-) -> tuple[BuiltRig, dict[str, Tensor], Tensor]:
-    """The rig with the stated parameters; draws (1 + count, ...) of the uncertain ones by name, the
-    stated values first, with the draws of `known` as given; and the initial states (1 + count,
-    size). Raises `ValueError`."""
-    rng, every, known = np.random.default_rng(seed), list[BuiltRig](), known or {}
+) -> dict[str, Tensor]:
+    """Draws (1 + count, ...) of the uncertain parameters by name, the stated values first, with the
+    draws of `known` as given. Raises `ValueError`."""
+    rng, every, known = np.random.default_rng(seed), list[Rig](), known or {}
     if twice := known.keys() & goal.uncertain.keys():
         raise ValueError(f"uncertain.{min(twice)} is drawn by the identification; leave it out")
     for i in range(1 + count):
         values = {name: rng.uniform(one.low, one.high) for name, one in goal.uncertain.items()}
         values = (values if i else {}) | {name: float(one[i]) for name, one in known.items()}
         with at_field("uncertain"):
-            every.append(file.override(values).build())
-    over = {
-        name: torch.stack([one.rig.parameter(name).detach() for one in every])
+            every.append(file.override(values).assemble())
+    return {
+        name: torch.stack([one.parameter(name).detach() for one in every])
         for name in (*goal.uncertain, *known)
     }
-    return every[0], over, torch.stack([one.y0 for one in every])
 
 
 def plan_file(
     file: RigFile, goal: Goal, known: Draws | None = None, *, progress: bool = False
 ) -> Planned:
-    """The plan that reaches a goal, and the rig file with it. Free parameters of materials and laws
-    do not change the initial state. `known` are draws of the parameters that an identification of
-    the file left uncertain (`IdentificationResult.draws`), `goal.draws` of them after the
-    estimates; the written file has the estimates.
+    """The plan that reaches a goal, and the rig file with it. `known` are draws of the parameters
+    that an identification of the file left uncertain (`IdentificationResult.draws`), `goal.draws`
+    of them after the estimates; the written file has the estimates.
 
     Raises `ValueError` for names that the rig or its run does not have, and where no start can be
     run.
@@ -104,15 +101,13 @@ def plan_file(
     if known:
         with at_field("uncertain"):
             file = file.override({name: float(one[0]) for name, one in known.items()})
-    if goal.uncertain or known:
-        built, over, y0 = drawn(file, goal, goal.draws, goal.seed, known)
-    else:
-        built = file.build()
-        over, y0 = {}, built.y0
+    over = drawn(file, goal, goal.draws, goal.seed, known) if goal.uncertain or known else {}
+    built = file.build()
     found = plan(
-        built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits, y0=y0,
-        over=over, robust=goal.robust, method=goal.method, iterations=goal.iterations,
-        starts=goal.starts, seconds=goal.seconds, rtol=goal.rtol, seed=goal.seed, progress=progress,
+        built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits,
+        y0=built.initial, over=over, robust=goal.robust, method=goal.method,
+        iterations=goal.iterations, starts=goal.starts, seconds=goal.seconds, rtol=goal.rtol,
+        seed=goal.seed, progress=progress,
     )  # fmt: skip
     moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
     numbers = {name: value.tolist() for name, value in found.parameters.items()}

@@ -4,10 +4,12 @@ coordinates."""
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
+import torch
 from pydantic import Field, model_validator
+from torch import Tensor
 
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
@@ -40,21 +42,21 @@ Frequency = Annotated[float, Quantity("Hz", 1e-6, 1e5)]
 
 
 class MotionContext(NamedTuple):
-    """Context of a motion: its name and unit; the initial value of the one free coordinate that
-    follows it (None if there is none); the effort, at a time [s], that holds the one coordinate to
-    which it is fed forward (None if there is none); the end of the run [s]; and the folder of the
-    rig file."""
+    """Context of a motion: its name and unit; the initial value () of the one free coordinate that
+    follows it (None if there is none); the effort (), at a time [s], that holds the one coordinate
+    to which it is fed forward (None if there is none); the end of the run [s]; and the folder of
+    the rig file."""
 
     name: str
     unit: str
-    start: float | None
-    held: Callable[[float], float] | None
+    start: Tensor | None
+    held: Callable[[float], Tensor] | None
     end: float
     folder: Path
 
-    def value(self, field: str, value: float | str, time: float = 0.0) -> float:
-        """The number of a field, which may be the word "start", or "held" at a time [s]. Raises
-        `ValueError`."""
+    def value(self, field: str, value: float | str, time: float = 0.0) -> Any:
+        """The number of a field, which may be the word "start", or "held" at a time [s]: a tensor
+        then, with its graph. Raises `ValueError`."""
         if not isinstance(value, str):
             return value
         if value == HELD:
@@ -85,6 +87,12 @@ class Motion(Group):
     def fastest(self) -> float:
         """Highest frequency [Hz], 0 for motions without waves."""
         return 0.0
+
+    @property
+    def follows_start(self) -> bool:
+        """Whether a value is given as "start" or "held"."""
+        own = getattr(self, "value", None), getattr(self, "offset", None)
+        return any(isinstance(x, str) for x in (*own, *getattr(self, "values", ())))
 
 
 class HoldTable(Motion):
@@ -125,8 +133,8 @@ class Knots(Motion):
                 raise ValueError(f"times must increase, but {after:g} s follows {before:g} s")
         return self
 
-    def knots(self, context: MotionContext) -> tuple[list[float], list[float]]:
-        """Times and values as numbers."""
+    def knots(self, context: MotionContext) -> tuple[list[float], list[Any]]:
+        """Times, and values as numbers or tensors."""
         offset = context.value("offset", self.offset)
         known = zip(self.values, self.times)
         return list(self.times), [offset + context.value("values", *one) for one in known]
@@ -177,13 +185,8 @@ class SplineTable(Knots):
     kind: Literal["spline"] = "spline"
 
     def build(self, context: MotionContext) -> Piecewise:
-        from scipy.interpolate import CubicSpline  # which takes a fifth of a second
-
         times, values = self.knots(context)
-        if len(times) == 1:
-            return Profile(times, values)
-        slopes = CubicSpline(times, values, bc_type="clamped").derivative()(times)
-        return Sampled(times, values, slopes.tolist())
+        return Sampled(times, values, clamped=True) if len(times) > 1 else Profile(times, values)
 
 
 class ModulatedMotion(Knots):
@@ -322,9 +325,8 @@ class CsvTable(Motion):
             raise ValueError(f"motion.{context.name}.file: {error}") from None
         offset = context.value("offset", self.offset)
         since = times[0] if self.from_first else 0.0
-        return Sampled(
-            [time - since for time in times], [offset + self.scale * value for value in values]
-        )
+        at, measured = torch.tensor([times, values], dtype=torch.float64)
+        return Sampled(at - since, offset + self.scale * measured)
 
 
 def quantum(values: np.ndarray) -> float:

@@ -17,12 +17,12 @@ from torchsoft.parallel import cores, parallel_map, single_threaded, ungraphed
 from torchsoft.physics.arguments import Numbers, tensor, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.structure import Structure
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import TAPE_BYTES, attached
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import RunOutcome, prepare, run
-from torchsoft.solve.structure import Structure
+from torchsoft.solve.simulate import Initial, RunOutcome, Start, prepare, run
 from torchsoft.solve.trajectory import Trajectory
 
 
@@ -136,7 +136,7 @@ class Batch(Shown):
 @ungraphed
 def simulate_batch(
     rig: Rig | Sequence[Rig], t: Numbers, *,
-    parameters: Mapping[str, Numbers] | None = None, y0: Numbers,
+    parameters: Mapping[str, Numbers] | None = None, y0: Numbers | Start | list[Initial | Start],
     reference: Reference | Sequence[Reference] | None = None, knots: Sequence[Tensor] | None = None,
     dy0: Numbers | None = None, threads: int | None = None,
     progress: bool = False, **options: Any,
@@ -145,9 +145,11 @@ def simulate_batch(
 
     Arguments that differ from run to run have one entry for each: `parameters` by name (runs, ...),
     y0 (runs, size), dy0 (runs, size, n), `reference`, t, `knots`, and even the rig; shared ones are
-    given once: one rig, t (T,), y0 (size,), one reference. Results do not depend on the number of
-    threads. `options` are those of `simulate`, the same for every run. With gradient="discrete"
-    tensors computed from the batch have a gradient by `parameters`, y0 and other inputs; the
+    given once: one rig, t (T,), y0 (size,), one reference. A `y0` that is a function of the rig,
+    such as `BuiltRig.initial`, is evaluated at the parameters of every run. Results do not depend
+    on the number of threads. `options` are those of `simulate`, the same for every run. With
+    gradient="discrete" tensors computed from the batch have a gradient by `parameters`, y0 and
+    other inputs; the
     backward sweeps run in threads too.
 
     A run that fails, or that cannot begin with its own parameters, is reported in `failures` and by
@@ -161,14 +163,15 @@ def simulate_batch(
         parameters = {k: tensor(f"parameters[{k!r}]", x) for k, x in parameters.items()}
         for name, values in parameters.items():
             check_array(f"parameters[{name!r}]", values)
-    t, y0, dy0 = (_rows(name, x) for name, x in (("t", t), ("y0", y0), ("dy0", dy0)))
+    t, dy0 = _rows("t", t), _rows("dy0", dy0)
+    begun: Any = y0 if starts(y0) else _rows("y0", y0)
     # a single rig is a module, single times a vector, a single start too, a single reference a
     # module
     runs = _spread(
         parameters,
         rig=(rig, isinstance(rig, nn.Module)),
         t=(t, isinstance(t, Tensor) and t.ndim == 1),
-        y0=(y0, isinstance(y0, Tensor) and y0.ndim == 1),
+        y0=(begun, callable(begun) or (isinstance(begun, Tensor) and begun.ndim == 1)),
         reference=(reference, reference is None or isinstance(reference, nn.Module)),
         knots=(knots, knots is None),
         dy0=(dy0, dy0 is None or (isinstance(dy0, Tensor) and dy0.ndim == 2)),
@@ -187,7 +190,7 @@ def simulate_batch(
 
     def work(i: int) -> RunOutcome | Trajectory | Exception:
         try:
-            own = _own(runs[i]["rig"], parameters or {}, i)
+            own = own_values(runs[i]["rig"], parameters or {}, i)
             structure = structures.get(id(runs[i]["rig"]))
             task = prepare(**runs[i], structure=structure, values=own, **options)
             outcome = run(task, budget, explained=False)
@@ -241,6 +244,13 @@ def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> No
         warnings.warn(f"{label}: {runs[first]}", stacklevel=3)
 
 
+def starts(y0: Any) -> bool:
+    """Whether a start is a function of the rig, or a list of starts with their references."""
+    return callable(y0) or (
+        isinstance(y0, list) and all(callable(one) or isinstance(one, Initial) for one in y0)
+    )
+
+
 def _rows(name: str, given: Any) -> Any:
     """One tensor of numbers, or the entries of a list of several."""
     several = isinstance(given, list | tuple) and any(
@@ -284,7 +294,7 @@ def _spread(
     ]
 
 
-def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> dict[int, Tensor]:
+def own_values(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> dict[int, Tensor]:
     """Row i of the parameters, by the id of the rig's own that they take the place of."""
     values: dict[int, Tensor] = {}
     for name, rows in parameters.items():

@@ -249,14 +249,39 @@ def directions(value: Tensor, wrt: Sequence[Tensor]) -> Array:
     return out
 
 
+def signal_directions(
+    stepper: ImplicitStepper, times: Array, wrt: Sequence[Tensor], columns: int
+) -> Array:
+    """Derivatives (stages, 2 signals, columns) of the values and rates of the signals at stages, by
+    the scalar tensors `wrt`; none, (0, 0, columns), where no signal depends on them. Raises
+    `ValueError` where bodies are driven by signals that do."""
+    start = stepper.signals_at_start
+    if not start.requires_grad or not any(
+        one is not None
+        for one in torch.autograd.grad(start.sum(), wrt, retain_graph=True, allow_unused=True)
+    ):
+        return np.zeros((0, 0, columns))
+    signals = stepper.signals_at(times)
+    out = np.zeros((*signals.shape[:2], 2, columns))
+    out[..., : len(wrt)] = directions(signals, wrt)
+    driving = stepper.compiled.system.body_signal
+    if out[:, driving[driving >= 0]].any():
+        raise ValueError(
+            "gradient='forward' has no derivatives by parameters that move fixed or driven bodies; "
+            "take gradient='discrete'"
+        )
+    return out.reshape(len(times), -1, columns)
+
+
 def iterate(
     stepper: ImplicitStepper, y0: Tensor, t: Tensor, wrt: Sequence[Tensor], dy0: Tensor | None,
-    columns: list[int], sums: Sums,
+    columns: list[int], sums: Sums, of_signals: Sequence[Tensor] = (),
 ) -> Iterator[Solved]:  # fmt: skip
     """The run with derivatives (T, components, n) of the states by the scalar tensors `wrt`, and
     those of sums of forces (T, sums, n), as it grows; `columns` are the components of the state
     that are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its
-    columns beyond those of `wrt` are directions of the start alone."""
+    columns beyond those of `wrt` are directions of the start alone. `of_signals` are the tensors
+    `wrt` of which the reference was made."""
     size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wrt))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
@@ -271,9 +296,10 @@ def iterate(
             segment = segments.pop(0)
             plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
             rows = np.empty((len(plan.out_step), size, n))
+            along = signal_directions(stepper, plan.stage_times.ravel(), of_signals, n)
             sweep = Forward(
                 room.system, work, tangents, tape, plan.h, segment.stages, plan.out_step,
-                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, rows,
+                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, along, rows,
                 felt[segment.rows],
             )  # fmt: skip
             with released_turn():

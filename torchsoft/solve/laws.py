@@ -33,9 +33,9 @@ from torchsoft.physics.material import Material
 from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.shapes import Shape
 from torchsoft.physics.state import own_states
+from torchsoft.physics.structure import copied, structure_of
 from torchsoft.physics.validity import tried
 from torchsoft.solve.kernel.arrays import LANES, MOTION, WRENCH
-from torchsoft.solve.structure import copied, structure_of
 
 
 class LawSet(NamedTuple):

@@ -26,6 +26,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
+from torchsoft.physics.structure import Copies, Structure, structure_of
 from torchsoft.physics.validity import (
     LARGEST,
     MISSING,
@@ -65,7 +66,6 @@ from torchsoft.solve.laws import (
     weight_law,
 )
 from torchsoft.solve.steps import CHUNK, ErrorParts, Followed
-from torchsoft.solve.structure import Copies, Structure, structure_of
 
 NOMINAL = 1e-3
 """Stage length a h [s] at which slip laws of users are tried."""

@@ -3,7 +3,7 @@
 
 import time as clock
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, get_args
@@ -21,6 +21,7 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import State
+from torchsoft.physics.structure import Copies, Structure
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts, instability
 from torchsoft.solve.gradients import (
@@ -28,14 +29,26 @@ from torchsoft.solve.gradients import (
     Rows,
     Solved,
     attached,
+    directions,
     iterate,
     march,
     without_gradient,
 )
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.solve.structure import Structure
+from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory
+
+
+class Initial(NamedTuple):
+    """The state y0 (size,) at the start of a run, and the reference that the run follows."""
+
+    y0: Tensor
+    reference: Reference
+
+
+Start = Callable[[Rig], Initial]
+"""Start of a run as a function of the rig, differentiable in the rig's parameters."""
 
 Route = Literal["none", "discrete", "forward"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`."""
@@ -57,14 +70,15 @@ class Interrupted(KeyboardInterrupt):
 @ungraphed
 @one_torch_thread()
 def simulate(
-    rig: Rig, t: Numbers, *, y0: Numbers, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers | Initial | Start, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
     touch: Sequence[str] = (), progress: bool = False,
 ) -> Trajectory:  # fmt: skip
     """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s]: tensors, numpy's arrays
-    or lists, which are computed with in float64.
+    or lists, which are computed with in float64. A `y0` that is a function of the rig, such as
+    `BuiltRig.initial`, is evaluated at the rig's present parameters, and differentiated.
 
     `reference` is followed by the rig, its own by default.
 
@@ -120,10 +134,12 @@ class Task(NamedTuple):
     rigid: bool
     touch: tuple[str, ...]
     rig: Rig | None = None
+    leaves: tuple[Tensor, ...] = ()
+    """The parameters `wrt`, of which the start and the reference were made."""
 
 
 def prepare(
-    rig: Rig, t: Numbers, *, y0: Numbers, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers | Initial | Start, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
@@ -133,12 +149,22 @@ def prepare(
     """Checks the arguments of `simulate`, and takes `values` in the place of some parameters of
     the rig of a `structure`, by their id; raises its `ValueError`s."""
     t = tensor("t", t)
-    start = tensor("y0", y0)
     knots, dy0 = (
         x if x is None else tensor(name, x) for name, x in (("knots", knots), ("dy0", dy0))
     )
-    check_array("y0", start)
     _check_wanted(gradient, wrt, dy0, rigid, touch)
+    leaves = tuple((values or {}).get(id(x), x) for x in map(rig.parameter, wrt))
+    if callable(y0):
+        if dy0 is not None:
+            raise ValueError(
+                "`dy0` is the derivative of a start that is a state; give the state as `y0`, too"
+            )
+        y0 = started(rig, y0, gradient, structure, values)
+        dy0 = torch.from_numpy(directions(y0.y0, leaves)) if leaves else None
+    if isinstance(y0, Initial):
+        y0, reference = y0.y0, y0.reference if reference is None else reference
+    start = tensor("y0", y0)
+    check_array("y0", start)
     ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
     if len(given) > 1:
@@ -161,8 +187,24 @@ def prepare(
     stepper.check(start, t)
     felt = _channels_of_touch(rig, touch)
     return Task(
-        stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid, felt, rig
-    )
+        stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid, felt, rig,
+        leaves,
+    )  # fmt: skip
+
+
+def started(
+    rig: Rig, start: Start, gradient: Route, structure: Structure | None = None,
+    values: Mapping[int, Tensor] | None = None,
+) -> Initial:  # fmt: skip
+    """The start of a rig with `values` in the place of some parameters, by their id, with a graph
+    where the route to a gradient needs one."""
+    if values:
+        structure = structure or Structure(rig)
+        given = [values.get(id(x), x) for x in structure.parameters]
+        rig = Copies(structure).made(given)[0]
+    wanted = gradient == "forward" or (gradient == "discrete" and torch.is_grad_enabled())
+    with torch.set_grad_enabled(wanted), independent():
+        return start(rig)
 
 
 class RunOutcome(NamedTuple):
@@ -306,7 +348,7 @@ def _growing(task: Task, tape_bytes: float) -> Iterator[Solved]:
             raise ValueError("`dy0` must be finite, but has a component that is not")
     kept = stepper.layout.measured if task.rigid else list(range(size))
     sums = Touch(stepper.rig).sums(task.touch)
-    return iterate(stepper, task.y0, task.t, leaves, dy0, kept, sums)
+    return iterate(stepper, task.y0, task.t, leaves, dy0, kept, sums, task.leaves)
 
 
 def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:

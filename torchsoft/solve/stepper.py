@@ -12,6 +12,7 @@ from torchsoft.parallel import released_turn
 from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import CLOSEST, Reference
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.structure import Structure
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.kernel.arrays import (
     CONVERGED,
@@ -39,7 +40,6 @@ from torchsoft.solve.steps import (
     equal_steps,
     given_steps,
 )
-from torchsoft.solve.structure import Structure
 from torchsoft.solve.system import Compiled
 
 HALVINGS = 6

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.motion import Reference, polynomial
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.structure import Copies, Structure, copied, described
 from torchsoft.physics.validity import check_place, check_values, ordinary
 from torchsoft.solve.kernel import arrays
 from torchsoft.solve.kernel.arrays import Limits, scratch
@@ -24,7 +25,6 @@ from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.model import computed, model_of, prepared_shapes
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.steps import Followed, own_units
-from torchsoft.solve.structure import Copies, Structure, copied, described
 
 
 @contextmanager

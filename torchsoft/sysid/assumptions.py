@@ -624,7 +624,8 @@ def limited(recording: Recording, run: Simulated, name: str, part: float) -> Rec
 
 def signal(t: Array, *columns: Array) -> Sampled:
     """A signal through values, with rates if they are given, at times t (G,) [s]."""
-    return Sampled(*(torch.from_numpy(np.array(one, dtype=np.float64)) for one in (t, *columns)))
+    at, values, *rates = (torch.tensor(one, dtype=torch.float64) for one in (t, *columns))
+    return Sampled(at, values, rates[0] if rates else None)
 
 
 def off_centre(

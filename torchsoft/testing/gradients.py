@@ -15,8 +15,10 @@ from torch import Tensor
 from torchsoft.display import Shown
 from torchsoft.physics.arguments import Numbers, tensor
 from torchsoft.physics.rig import Rig
+from torchsoft.solve.gradients import directions
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import RTOL, simulate
+from torchsoft.solve.simulate import RTOL, Initial, simulate, started
+from torchsoft.solve.simulate import Start as Begin
 from torchsoft.solve.trajectory import Touch, Trajectory
 from torchsoft.testing.energy import conclude
 
@@ -129,12 +131,13 @@ class GradientCheck(Shown):
 
 
 def check_gradients(
-    rig: Rig, t: Numbers, y0: Numbers, *, wrt: Sequence[str] | None = None,
+    rig: Rig, t: Numbers, y0: Numbers | Begin, *, wrt: Sequence[str] | None = None,
     of: Value | Sequence[str] | None = None, rtol: float = RTOL, bound: float = BOUND,
     dy0: Numbers | None = None, each: bool = True, step_error: bool = True, centres: bool = False,
 ) -> GradientCheck:  # fmt: skip
     """Compare the derivatives of a run from y0 (size,) through the times t (T,) [s] three ways: the
     discrete adjoint, forward sensitivities, and central differences of runs along the same steps.
+    A `y0` that is a function of the rig, such as `BuiltRig.initial`, is differentiated, too.
 
     Of what: names of channels, whose last values are differentiated, or a function of the run that
     gives a number; by default a random sum of the bodies' motion, and one of all forces, loads and
@@ -157,23 +160,34 @@ def check_gradients(
 
 
 class Start(NamedTuple):
-    """Times (T,), the initial state, and a run from it: its states (T, size) and its steps."""
+    """Times (T,), the initial state, as a function of the rig, and a run from it: its states
+    (T, size) and its steps."""
 
     t: Tensor
-    y0: Tensor
+    begin: Begin
     y: Tensor
     knots: Tensor
 
+    @property
+    def y0(self) -> Tensor:
+        """The initial state (size,) of the run."""
+        return self.y[0]
 
-def _start(rig: Rig, t: Numbers, y0: Numbers, rtol: float) -> Start:
+
+def constant(state: Tensor) -> Begin:
+    """The start at a state (size,), whatever the rig's parameters are."""
+    return lambda rig: Initial(state, rig.reference)
+
+
+def _start(rig: Rig, t: Numbers, y0: Numbers | Begin, rtol: float) -> Start:
     run = simulate(rig, t, y0=y0, rtol=rtol, tolerance=NEWTON)
-    first = tensor("y0", y0).detach()
+    first = y0 if callable(y0) else constant(tensor("y0", y0).detach())
     # rounding may keep Newton from solving a step where a law bends, which is then halved
     for _ in range(REPEATS):
         run = _along(rig, run.t, run.knots, y0=first)
         if run.stats.failed_steps == 0:
             break
-    return Start(run.t, first, run.y, run.knots)
+    return Start(run.t, first, run.y.detach(), run.knots)
 
 
 def _along(rig: Rig, t: Tensor, knots: Tensor, **how: Any) -> Trajectory:
@@ -260,8 +274,9 @@ def _checked(
     kick, generator = leaves.get("start"), torch.Generator().manual_seed(1)
     shake = _direction(rig, start) if dy0 is None else tensor("dy0", dy0).detach()
 
-    def begin() -> Tensor:
-        return start.y0 if kick is None else start.y0 + kick * shake
+    def begin(rig: Rig) -> Initial:
+        initial = start.begin(rig)
+        return initial if kick is None else initial._replace(y0=initial.y0 + kick * shake)
 
     ways: Leaves = {}
     for name, p in leaves.items():
@@ -283,14 +298,14 @@ def _checked(
             found[kind] = {name: float((slope * ways[name]).sum()) for name, slope in pairs}
         return found
 
-    made = _along(rig, start.t, start.knots, y0=begin(), gradient="discrete")
+    made = _along(rig, start.t, start.knots, y0=begin, gradient="discrete")
     own = shares(made)
     finer = {}
     if step_error:
         try:
             finer = shares(
                 simulate(
-                    rig, start.t, y0=begin(), rtol=0.1 * rtol, tolerance=NEWTON, gradient="discrete"
+                    rig, start.t, y0=begin, rtol=0.1 * rtol, tolerance=NEWTON, gradient="discrete"
                 )
             )
         except SimulationFailed as failed:
@@ -309,7 +324,7 @@ def _checked(
         for h in (by, -by):
             moved = {name: h * way for name, way in along.items()}
             with _moved(leaves, moved):
-                ended = _along(rig, start.t, start.knots, y0=begin())
+                ended = _along(rig, start.t, start.knots, y0=begin)
             failed = ended.stats.failed_steps > 0
             ends.append({k: np.nan if failed else float(v) for k, v in values(ended).items()})
         return {kind: (ends[0][kind] - ends[1][kind]) / (2 * by) for kind in ends[0]}
@@ -445,10 +460,11 @@ def _forward(
     kicked = "start" in leaves
     if by_forward is None or not (wanted or kicked):
         return {}
-    dy0 = torch.zeros(len(start.y0), len(wanted), dtype=torch.float64)
+    initial = started(rig, start.begin, "forward")
+    dy0 = torch.from_numpy(directions(initial.y0, [*map(rig.parameter, wanted)]))
     felt = felt_channels(rig, centres)
     run = _along(
-        rig, start.t, start.knots, y0=start.y0, gradient="forward", wrt=wanted, touch=felt,
+        rig, start.t, start.knots, y0=initial, gradient="forward", wrt=wanted, touch=felt,
         dy0=torch.cat((dy0, shake[:, None]), -1),
     )  # fmt: skip
     if run.stats.failed_steps or run.sensitivities is None:

@@ -510,6 +510,7 @@ class Forward(NamedTuple):
     sum_weight: Array
     dy: Matrix
     dp: Matrix
+    dsignals: Cube
     dys: Cube
     dsums: Cube
 

@@ -38,8 +38,9 @@ def law_derivatives(
 
 @compiled
 def push_bodies(
-    rig: Any, work: Any, tangents: Any, y: Array, a: float, signals: Array, dy: Array, dp: Array
-) -> None:
+    rig: Any, work: Any, tangents: Any, y: Array, a: float, signals: Array, dy: Array, dp: Array,
+    dsignals: Array,
+) -> None:  # fmt: skip
     """Tangents of the bodies' equations without contact, at the same velocities, into
     tangents.r."""
     r = tangents.r
@@ -58,15 +59,22 @@ def push_bodies(
             tangents, rig.source_pullback[i], work.effort_x, rig.p[own], dp[own], 1, tangents.change
         )
         add(1.0, tangents.change[0], r[number])
-        push_inputs(rig, work, i, 0, dy, r[number])
+        push_inputs(rig, work, i, 0, dy, dsignals, r[number])
 
 
 @compiled
-def push_inputs(rig: Any, work: Any, i: int, o: int, dy: Array, out: Array) -> None:
-    """Add the tangents (m,) of output o of source i at the same velocities, by coordinates and its
-    states, to out."""
+def push_inputs(
+    rig: Any, work: Any, i: int, o: int, dy: Array, dsignals: Array, out: Array
+) -> None:
+    """Add the tangents (m,) of output o of source i at the same velocities, by signals dsignals
+    (2 signals, m), coordinates and its states, to out."""
     n, columns = first_coordinate(rig, i), first_state(rig, i) + rig.source_states[i]
     J = work.effort_J[o * columns : (o + 1) * columns]
+    first = rig.source_signal_start[i]
+    for k in range(first, rig.source_signal_start[i + 1] if dsignals.shape[0] > 0 else first):
+        signal = rig.source_signal[k]
+        add(J[2 * (k - first)], dsignals[2 * signal], out)
+        add(J[2 * (k - first) + 1], dsignals[2 * signal + 1], out)
     for j in range(rig.source_coordinate_start[i], rig.source_coordinate_start[i + 1]):
         measured = rig.body_free[rig.source_coordinate[j]]
         if measured >= 0:
@@ -78,8 +86,9 @@ def push_inputs(rig: Any, work: Any, i: int, o: int, dy: Array, out: Array) -> N
 
 @compiled
 def push_source_states(
-    rig: Any, work: Any, tangents: Any, y: Array, a: float, signals: Array, dy: Array, dp: Array
-) -> None:
+    rig: Any, work: Any, tangents: Any, y: Array, a: float, signals: Array, dy: Array, dp: Array,
+    dsignals: Array,
+) -> None:  # fmt: skip
     """Tangents of the sources' states at the stage's end, by those of its velocities,
     tangents.V."""
     for i in range(rig.source_pushed.size):
@@ -93,7 +102,7 @@ def push_source_states(
             tangents, pullback, work.effort_x, rig.p[own], dp[own], rows, tangents.change
         )
         for o in range(1, rows):
-            push_inputs(rig, work, i, o, dy, tangents.change[o])
+            push_inputs(rig, work, i, o, dy, dsignals, tangents.change[o])
             n, J = first_coordinate(rig, i), work.effort_J[o * columns : (o + 1) * columns]
             for j in range(rig.source_coordinate_start[i], rig.source_coordinate_start[i + 1]):
                 measured = rig.body_free[rig.source_coordinate[j]]
@@ -181,16 +190,17 @@ def add_loads(rig: Any, work: Any, tangents: Any, c: int, first: int, change: Ar
 @compiled
 def stage_tangent(
     rig: Any, work: Any, tangents: Any, tape: Any, row: int, a: float, signals: Array, dy: Array,
-    dp: Array, felt: bool,
+    dp: Array, dsignals: Array, felt: bool,
 ) -> None:  # fmt: skip
     """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place, or if `felt`
-    leave it and put those of its forces into tangents.recorded; dp (parameters, m)."""
+    leave it and put those of its forces into tangents.recorded; dp (parameters, m), dsignals (2
+    signals, m), or (0, m) where no signal changes."""
     y, m, Rv, r, dV = tape.y[row], dy.shape[1], work.Rv, tangents.r, tangents.V
     pads.restore(rig, work, tape, row, a, felt)
     if felt:
         tangents.recorded[:] = 0.0
     balance(rig, work, y, signals, a, work.r, Rv)
-    push_bodies(rig, work, tangents, y, a, signals, dy, dp)
+    push_bodies(rig, work, tangents, y, a, signals, dy, dp, dsignals)
     for pad in range(rig.pad_base.size):
         pads.assemble(rig, work, pad, y, a, Rv)
         pads.push(rig, work, tangents, pad, y, dy, dp, a, r)
@@ -209,7 +219,7 @@ def stage_tangent(
             push_states(rig, work, tangents, pad, y, a, dy, dp)
             pads.push_state(rig, work, tangents, pad, y, a, dy, dp)
     if not felt:
-        push_source_states(rig, work, tangents, y, a, signals, dy, dp)
+        push_source_states(rig, work, tangents, y, a, signals, dy, dp, dsignals)
     for i in range(0 if felt else dV.shape[0]):
         add(a, dV[i], dy[rig.body_q_start + i])
         put(dV[i], dy[rig.body_V_start + i])
@@ -325,6 +335,7 @@ def read(call: Any, i: int) -> None:
         call.out_signals[i],
         call.dys[i],
         call.dp,
+        call.dsignals[0, :0],
         True,
     )
     for c in range(out.shape[0]):
@@ -347,6 +358,7 @@ def forward(call: Any) -> None:
         call.signals,
     )
     out_step, dy, dp, dys, row = call.out_step, call.dy, call.dp, call.dys, 0
+    dsignals = call.dsignals
     if out_step.size > 0 and out_step[0] < 0:  # the start
         put(dy, dys[0])
         if call.out_tape.y.shape[0] > 0:
@@ -358,12 +370,16 @@ def forward(call: Any) -> None:
         if step % RESCAN == 0:
             pads.find_spans(rig, tape.y[2 * step], dy, tangents.span)
         put(dy, tangents.before)
-        stage_tangent(rig, work, tangents, tape, 2 * step, a, signals[2 * step], dy, dp, False)
+        stage_tangent(
+            rig, work, tangents, tape, 2 * step, a, signals[2 * step], dy, dp, dsignals[2 * step],
+            False,
+        )  # fmt: skip
         put(dy, tangents.first)
         mix(1.0 - MIX, tangents.before, MIX, tangents.first, 0.0, dy, dy)
         stage_tangent(
-            rig, work, tangents, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp, False
-        )
+            rig, work, tangents, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp,
+            dsignals[2 * step + 1], False,
+        )  # fmt: skip
         while row < out_step.size and out_step[row] == step:
             at_start, at_first, at_end = dense_states(call.out_part[row])
             mix(at_start, tangents.before, at_first, tangents.first, at_end, dy, dys[row])

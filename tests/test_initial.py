@@ -1,0 +1,133 @@
+"""A run of a built rig starts from the equilibrium of its present parameters, and is differentiated
+with its start: every value is that of the rig built anew."""
+
+import copy
+
+import pytest
+import torch
+
+from torchsoft import BuiltRig, RigFile, Trajectory, simulate, simulate_batch
+from torchsoft.plan import Target, plan
+from torchsoft.testing import check_gradients
+
+E, MASS, TAU = "materials.rubber.E", "bodies.disc.mass", "materials.rubber.tau"
+COARSE = {f"pads.{pad}.elements_{axis}": n for pad in ("lower", "upper")
+          for axis, n in (("x", 30), ("y", 1))}  # fmt: skip
+PRESSED = {"x": 60.3e-3, "y": {"force": 4.0}}
+FILE = RigFile.ready("light_grasp").override(
+    COARSE | {"bodies.bracket.start": PRESSED},
+    motion={
+        "y_d": {"kind": "spline", "times": [0.0, 0.05, 0.1], "values": ["start", 49.6e-3, "start"]},
+        "x_d": {"kind": "profile", "offset": "start", "times": [0.0, 0.1], "values": [0.0, 4e-3]},
+        "F_ff": {"kind": "hold", "value": "held"},
+    },
+    outputs={"duration": 0.1, "interval": 5e-3, "snapshots": []},
+)
+"""A rig pressed together, whose set-points follow the start and whose feed-forward holds it."""
+CHANNELS = "x_disc", "y_disc", "y_bracket", "effort_y"
+
+
+def anew(values: dict[str, float], **options: object) -> Trajectory:
+    return FILE.override(values).build().run(**options)
+
+
+def changed(values: dict[str, float]) -> BuiltRig:
+    built = FILE.build()
+    with torch.no_grad():
+        for name, value in values.items():
+            built.rig.parameter(name).fill_(value)
+    return built
+
+
+def assert_same(run: Trajectory, expected: Trajectory) -> None:
+    for channel in CHANNELS:
+        size = (expected[channel] - expected[channel][0]).abs().max()
+        assert (run[channel] - expected[channel]).abs().max() < 1e-6 * size, channel
+
+
+def test_a_run_starts_from_the_equilibrium_of_the_present_parameters():
+    values = {E: 0.3e6, MASS: 0.6}
+    built, expected = changed(values), anew(values)
+    assert_same(built.run(knots=expected.knots), expected)
+    assert (built.run().y[0] - built.y0).abs().max() > 1e-5  # the start did move
+    other = FILE.build()
+    other.rig.load_state_dict(FILE.override(values).build().rig.state_dict())
+    for one in (other, copy.deepcopy(built)):
+        assert_same(one.run(knots=expected.knots), expected)
+
+
+def test_a_set_point_changed_in_place_keeps_its_change():
+    built = changed({E: 0.3e6})
+    with torch.no_grad():
+        built.rig.reference["y_d"].values[1] -= 1e-4
+    expected = anew({E: 0.3e6, "motion.y_d.values": ["start", 49.5e-3, "start"]})
+    assert_same(built.run(knots=expected.knots), expected)
+
+
+@pytest.mark.parametrize("channel", ["y_disc", "effort_y"])
+def test_gradients_include_the_start_the_set_points_and_the_feed_forward(channel):
+    built, names = FILE.build(), [E, MASS, TAU]
+    run = built.run(gradient="discrete")
+    run[channel][-1].backward()
+    for name in names:
+        value = built.rig.parameter(name)
+        high, low = (
+            anew({name: value.item() * (1 + h)}, knots=run.knots)[channel][-1]
+            for h in (1e-4, -1e-4)
+        )
+        assert value.grad.item() == pytest.approx(float(high - low) / (2e-4 * value.item()), 1e-4)
+
+
+def test_forward_sensitivities_are_those_of_the_adjoint():
+    built, names = FILE.build(), [E, MASS, "actuators.y.Kp"]
+    run = built.run(gradient="discrete")
+    ahead = built.run(gradient="forward", wrt=names, knots=run.knots)
+    at = built.rig.layout.slices["pose", "disc"].start + 1
+    slopes = torch.autograd.grad(run["y_disc"][-1], [*map(built.rig.parameter, names)])
+    assert ahead.sensitivities[-1, at].tolist() == pytest.approx([*map(float, slopes)], rel=1e-7)
+
+
+def test_a_given_start_is_held_constant():
+    built = FILE.build()
+    run = built.run(y0=built.y0, gradient="discrete")
+    run["y_disc"][0].backward()
+    assert not built.rig.parameter(E).grad
+    assert_same(run, simulate(built.rig, built.t, y0=built.y0, **built.solver))
+
+
+def test_every_run_of_a_batch_starts_at_its_own_parameters():
+    built, moduli = FILE.build(), torch.tensor([0.4e6, 0.9e6], dtype=torch.float64)
+    moduli.requires_grad_()
+    batch = simulate_batch(
+        built.rig, built.t, y0=built.initial, parameters={E: moduli}, gradient="discrete", threads=1
+    )
+    batch["y_disc"][:, -1].sum().backward()
+    for i, value in enumerate(moduli.tolist()):
+        alone = FILE.override({E: value}).build()
+        run = alone.run(gradient="discrete")
+        run["y_disc"][-1].backward()
+        assert (batch["y_disc"][i] - run["y_disc"]).abs().max() < 1e-8
+        assert moduli.grad[i].item() == pytest.approx(alone.rig.parameter(E).grad.item(), rel=1e-6)
+
+
+def test_a_check_of_gradients_moves_the_start():
+    built = FILE.build()
+    checked = check_gradients(
+        built.rig, built.t, built.initial, wrt=[E], of=["y_disc"], step_error=False
+    )
+    (one,) = checked.derivatives
+    assert one.difference == pytest.approx(one.adjoint, rel=1e-4)
+    run = built.run(gradient="discrete", rtol=checked.rtol)
+    run["y_disc"][-1].backward()
+    assert one.adjoint == pytest.approx(built.rig.parameter(E).grad.item() * 0.75e6, rel=1e-2)
+
+
+def test_a_plan_for_a_parameter_moves_the_start():
+    built, goal = FILE.build(), float(anew({E: 0.5e6})["y_disc"][-1])
+    target = Target(channel="y_disc", value=goal, tolerance=1e-7)
+    found = plan(
+        built.rig, built.t, {E: (0.3e6, 0.9e6)}, targets={"y": target}, y0=built.initial,
+        iterations=8, threads=1,
+    )  # fmt: skip
+    assert found.reached
+    assert float(found.parameters[E]) == pytest.approx(0.5e6, rel=1e-3)
