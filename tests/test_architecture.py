@@ -21,7 +21,7 @@ FLOWS = {
     "codegen": "graph operations trace emit . stops",
     "physics": """
         arguments mesh shapes state contact rate_and_state ageing material hyperelastic elements
-        pads balance multibond parts
+        pads matched balance multibond parts
         names motion validity graph structure energy statics start channels namespace rig extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",

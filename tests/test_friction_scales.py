@@ -11,6 +11,7 @@ import torch
 
 from torchsoft import simulate
 from torchsoft.cli import main
+from torchsoft.physics.extensions import extend
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.check import check
 from torchsoft.rigs.written import to_toml
@@ -102,7 +103,8 @@ def test_auto_takes_springs_and_dashpots_from_the_pad():
     file = box(20, 0.15, "smooth", **dict.fromkeys(("K_n", "R_n", "K_t", "R_t"), "auto"))
     rig = file.build().rig
     spring = 10 * 0.15e6 / (1 - 0.45**2) * 40e-3 * 1e-3 / 2e-3  # elements of 2 mm, per mm
-    got = {name: rig.parameter(f"laws.dry.{name}").item() for name in ("K_n", "K_t", "R_n", "R_t")}
+    law = rig.contacts["ground"].law
+    got = {name: getattr(law, name).item() for name in ("K_n", "K_t", "R_n", "R_t")}
     assert got["K_n"] == pytest.approx(spring, rel=0.02)  # a point at either end has half of it
     assert got["K_t"] == got["K_n"]
     assert got["R_n"] == got["R_t"] == pytest.approx(1e-3 * got["K_n"])
@@ -114,7 +116,32 @@ def test_auto_takes_springs_and_dashpots_from_the_pad():
 
 def test_a_dashpot_that_is_auto_follows_a_spring_that_is_given():
     rig = box(20, 0.15, "smooth", R_t="auto").build().rig
-    assert rig.parameter("laws.dry.R_t").item() == pytest.approx(1e-3 * 5e4)
+    assert rig.contacts["ground"].law.R_t.item() == pytest.approx(1e-3 * 5e4)
+
+
+def test_springs_and_dashpots_that_are_auto_follow_the_pad():
+    """In place, in gradients and where a law is extended: as in the rig built anew."""
+    auto = dict.fromkeys(("K_n", "R_n", "K_t", "R_t"), "auto")
+    file, name = box(20, 0.15, "smooth", **auto), "materials.gel.E"
+    file = file.override(outputs={"duration": 0.02, "interval": 5e-3})
+    built = file.build()
+    law, E = built.rig.contacts["ground"].law, built.rig.parameter(name)
+    nominal, K_n = E.item(), law.K_n.item()
+    run = built.run(gradient="discrete")
+    run["x_box"][-1].backward()
+    anew = lambda E: file.override({name: E}).build().run(knots=run.knots)["x_box"]
+    high, low = (anew(nominal * (1 + h))[-1] for h in (1e-4, -1e-4))
+    assert E.grad.item() == pytest.approx(float(high - low) / (2e-4 * nominal), rel=1e-4)
+    with torch.no_grad():
+        E.mul_(4.0)
+    assert law.K_n.item() == pytest.approx(4 * K_n)
+    assert (built.run(knots=run.knots)["x_box"] - anew(4 * nominal)).abs().max() < 1e-12
+    assert built.rig.description()["parameters"]["laws.dry.K_n"] == pytest.approx(4 * K_n)
+    with pytest.raises(ValueError, match=r"laws\.dry\.K_n` is \"auto\".*override"):
+        built.rig.parameter("laws.dry.K_n")
+    extend(built.rig, ["laws.dry.K_n"])
+    assert built.rig.parameter("laws.dry.K_n").item() == pytest.approx(4 * K_n)
+    assert (built.run(knots=run.knots)["x_box"] - anew(4 * nominal)).abs().max() < 1e-12
 
 
 def test_springs_that_soften_a_contact_are_noted():

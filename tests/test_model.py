@@ -10,9 +10,9 @@ from conftest import coarse, f64, grasped, still, times
 
 from torchsoft import Trajectory, hold, simulate, simulate_batch
 from torchsoft.envs import reorient
+from torchsoft.physics.structure import Structure, structure_of
 from torchsoft.solve import model as models
 from torchsoft.solve.model import forget
-from torchsoft.physics.structure import Structure, structure_of
 from torchsoft.solve.system import Compiled
 
 T = times(0.02, 5)

@@ -9,7 +9,8 @@ nearest to the pad's instead of the first one touched. None has a length, a forc
 own: the law is the same at every load and size.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -138,7 +139,39 @@ FallingSpeed = Annotated[
 ]
 
 
-class Friction(nn.Module):
+class LawPart(nn.Module):
+    """A part of a contact law, some of whose numbers may follow from other parts of the rig."""
+
+    matched: tuple[str, ...] = ()
+    """Names of these numbers; one that has a parameter has its value."""
+
+    def match(self, source: Any, names: Sequence[str]) -> None:
+        """Let numbers follow from a `source`, whose `value` gives them by their names."""
+        for name in names:
+            self.__dict__.pop(name, None)
+            self._parameters[name] = None
+        self.source, self.matched = source, tuple(names)
+
+    def __getattr__(self, name: str) -> Any:
+        known = self.__dict__
+        if name in known.get("matched", ()) and known["_parameters"].get(name) is None:
+            return self.source.value(self, name)
+        return super().__getattr__(name)
+
+    def prepared(self) -> Self:
+        """The same with its numbers as they are now; itself if it has all of them."""
+        names = [name for name in self.matched if self._parameters.get(name) is None]
+        parts = {key: part.prepared() if isinstance(part, LawPart) else part
+                 for key, part in self._modules.items() if key != "source"}  # fmt: skip
+        if not names and all(part is self._modules[key] for key, part in parts.items()):
+            return self
+        out = copy(self)
+        values: Any = {name: getattr(self, name) for name in names}
+        out._parameters, out._modules, out.matched = self._parameters | values, parts, ()
+        return out
+
+
+class Friction(LawPart):
     """A static and a kinetic coefficient of friction [1]."""
 
     ordered: ClassVar = ("mu_k", "mu_s")
@@ -256,7 +289,7 @@ ADHERING_DEPTH = 1e-6
 """Penetration [m] at which half of the adhesion acts, which sets in smoothly."""
 
 
-class SoftContact(nn.Module):
+class SoftContact(LawPart):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
     R_n, R_t [N.s/m], and a friction law. `weight` scales them to the length of surface that a point
     stands for. With a `power` m [1] the normal spring's force is K_n g_0 (g / g_0)^m, g_0 being

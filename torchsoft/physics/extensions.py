@@ -6,6 +6,7 @@ for granted; each may be one of its unknowns.
 """
 
 from collections.abc import Callable, Collection
+from copy import copy
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -80,6 +81,13 @@ def extensions(rig: Rig) -> dict[str, Extension]:
             f"a point that touches adhered with 0.001 N per {1e3 * law.node_spacing:g} mm",
             partial(_of_law, stem=stem, name="adhesion", neutral=0.0),
         )  # fmt: skip
+        for key in law.matched:
+            value = float(getattr(law, key).detach())
+            out[f"{stem}.{key}"] = Extension(
+                value, 0.01 * value, 0.01 * value, 100.0 * value, "N/m" if "K" in key else "N.s/m",
+                f"{key} of {stem} is matched to the pads", f"it were {1.01 * value:.6g}",
+                partial(_of_law, stem=stem, name=key, neutral=value),
+            )  # fmt: skip
         friction = law.friction  # of this class, and none that a user derives from it
         if type(friction) is SmoothSlip and friction.R_pad is None:
             out[f"{stem}.friction.ageing"] = Extension(
@@ -140,11 +148,11 @@ def extend(rig: Rig, names: Collection[str]) -> None:
 
 def _shared(rig: Rig, kind: type[M]) -> list[tuple[str, M]]:
     """The rig's parts of a kind, each once, with the stem of their parameters' names."""
-    aliases = {own: name for name, own in rig.aliases.items()}
+    aliases = {own: name for name, own in {**rig.aliases, **rig.matched}.items()}
     found = []
     for own, module in rig.named_modules():
         if isinstance(module, kind):
-            mine = (f"{own}.{key}" for key, _ in module.named_parameters(recurse=False))
+            mine = (f"{own}.{key}" for key in module._parameters)
             name = next((aliases[one] for one in mine if one in aliases), f"{own}.")
             found.append((name.rpartition(".")[0], module))
     return found
@@ -182,7 +190,8 @@ def _branch(rig: Rig, stem: str, time: float) -> nn.Parameter:
 
 def same_law(one: SoftContact, other: SoftContact) -> bool:
     """Whether two laws have the same numbers, but for the ratio of friction."""
-    return one.K_n is other.K_n
+    parts = [(law._parameters["K_n"], law._modules.get("source")) for law in (one, other)]
+    return all(mine is theirs for mine, theirs in zip(*parts))
 
 
 def _of_law(rig: Rig, stem: str, name: str, neutral: float) -> nn.Parameter:
@@ -206,13 +215,8 @@ def _ageing(rig: Rig, stem: str) -> nn.Parameter:
 
 def _friction_ratio(rig: Rig, name: str) -> nn.Parameter:
     """Give a contact a law of its own, of the same parameters and the same friction."""
-    shared = rig.contacts[name].law
-    law = SoftContact(
-        1.0, 0.0, 1.0, 1.0, friction=shared.friction, node_spacing=shared.node_spacing,
-        friction_ratio=1.0,
-    )  # fmt: skip
-    for key, value in shared._parameters.items():
-        setattr(law, key, value)
+    law = copy(rig.contacts[name].law)
+    law._parameters, law._modules = dict(law._parameters), dict(law._modules)
     law.friction_ratio = parameter(1.0)
     rig.contacts[name].law = law
     return law.friction_ratio

@@ -379,7 +379,7 @@ class Tridiagonal(torch.autograd.Function):
     def vmap(info: Any, in_dims: Any, *inputs: Tensor) -> tuple[Tensor, int]:
         """Solutions of one system for a batch of right-hand sides."""
         *system, b = inputs
-        return Tridiagonal.forward(*system, b.movedim(in_dims[3], 1)), 1
+        return Tridiagonal.forward(*system, b.movedim(in_dims[3], 1)), 1  # pyright: ignore[reportCallIssue]
 
     @staticmethod
     def backward(ctx: Any, x_bar: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -37,6 +37,10 @@ class Rig(Shown, Graph):
     short: Mapping[str, str] = {}
     """Parameters and channels by their short names; a convenience of typing, in no result."""
 
+    matched: Mapping[str, str] = {}
+    """Numbers of laws that follow from the pads ("auto"), by their names in the file: their names
+    in the module."""
+
     tables: Mapping[str, Any] | None = None
     """Tables of the rig file that it was built from, None for a rig with other parts."""
 
@@ -69,6 +73,12 @@ class Rig(Shown, Graph):
         one that is not there."""
         known, name = dict(self.named_parameters(remove_duplicate=False)), self.full(name)
         found = known.get(self.names.get(name, name), known.get(name))
+        if found is None and name in self.matched:
+            raise ValueError(
+                f'`{name}` is "auto", a function of the parameters of its pads, such as E, and no '
+                f"parameter; to change it alone, build the rig with a number: override({{{name!r}: "
+                f"{self.matched_value(name):.4g}}})"
+            )
         if found is None:
             mine = {own: other for other, own in self.names.items()}
             names = dict.fromkeys(mine.get(own, own) for own, _ in self.named_parameters())
@@ -77,6 +87,11 @@ class Rig(Shown, Graph):
                 f"`{name}` is not a parameter of this rig; {suggestion(name, names, 'known:')}"
             )
         return found
+
+    def matched_value(self, name: str) -> float:
+        """The present value of a number that follows from the pads."""
+        owner, _, key = self.matched[name].rpartition(".")
+        return float(getattr(self.get_submodule(owner), key).detach())
 
     def quantity(self, name: str) -> Quantity | None:
         """Unit, bounds and meaning of a parameter by its name, where its part declares them."""
@@ -110,6 +125,7 @@ class Rig(Shown, Graph):
                 last = last.partition(".")[0]
                 own, value = f"{owner}.{last}", getattr(self.get_submodule(owner), last)
             values[names.get(own, own)] = value.detach().tolist()
+        values |= {name: self.matched_value(name) for name in self.matched}
         return {
             "parameters": values,
             "friction": {

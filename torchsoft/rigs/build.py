@@ -461,12 +461,9 @@ class RigFile(Shown, Group):
 
         def law(name: str, table: Any) -> Any:
             pressed = [pads[c.pad] for c in self.contacts.values() if c.law == name]
-            sized, friction = table.numbers(pressed), left.pop(f"laws.{name}.friction", None)
-            if friction is None:
-                return sized.build(folder)
             with at_field("friction"):
-                own = checked(friction)
-            return table.part(**dict(sized.arguments(folder)) | {"friction": own})
+                friction = checked(left.pop(f"laws.{name}.friction", None))
+            return table.matched_to(pressed, folder, friction)
 
         def shape(body: str) -> Any:
             with at_field("shape"):
@@ -498,6 +495,10 @@ class RigFile(Shown, Group):
         named = {own_name(self, rig, *name.split(".")): name for name, _ in rig.named_parameters()}
         rig.aliases = {alias: name for alias, name in named.items() if alias != name}
         rig.short = short_names(self, rig, named)
+        rig.matched = {
+            f"laws.{self.contacts[name].law}.{key}": f"contacts.{name}.law.{key}"
+            for name, contact in rig.contacts.items() for key in contact.law.matched
+        }  # fmt: skip
         if not parts:
             rig.tables = self.model_dump(mode="json", exclude_unset=True)
         return rig

@@ -1,10 +1,8 @@
 """A rig that is ready to run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,12 +14,9 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import Starts, moving
 from torchsoft.physics.structure import values_of
 from torchsoft.physics.validity import check_values
-from torchsoft.rigs.initial import initial_poses, settled_pads, started_values
+from torchsoft.rigs.initial import RigFile, initial_poses, settled_pads, started_values
 from torchsoft.solve.simulate import Initial, simulate
 from torchsoft.solve.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from torchsoft.rigs.build import RigFile
 
 STEPPING = ("rtol", "atol", "step", "knots")
 """Arguments of `simulate` that choose the steps."""

@@ -1,11 +1,9 @@
 """Where the bodies of a rig file start and which motions its rig follows: functions of the rig's
 parameters, differentiable in them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +16,8 @@ from torchsoft.physics.statics import NoEquilibrium, net_loads, resting, standin
 from torchsoft.rigs.geometry import at
 from torchsoft.rigs.motion import HELD, MotionContext
 
-if TYPE_CHECKING:
-    from torchsoft.rigs.build import RigFile
+RigFile = Any
+"""A `RigFile`, whose module imports this one."""
 
 Held = Callable[[str, float], Tensor]
 """Effort () [N, N.m] that holds a coordinate at a time [s]."""

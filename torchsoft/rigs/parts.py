@@ -10,7 +10,6 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-import torch
 from pydantic import BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
 from torchsoft.display import suggestion
@@ -18,6 +17,7 @@ from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.physics.ageing import AgeingSlip
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.hyperelastic import KINDS
+from torchsoft.physics.matched import Matched
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, PadMesh, QuadMesh
 from torchsoft.physics.pads import Pad, Taxels
@@ -483,59 +483,32 @@ class CodeTable(PartTable):
             return found() if isinstance(found, type) else found
 
 
-STIFFER = 10.0
-"""Spring "auto" over the plane-strain stiffness of a pad's surface on the length of one contact
-point (assumed): springs then take about one per cent of the give of a contact of ten points."""
-
-
 class SpringsTable(PartTable):
-    """A law of contact points. A spring "auto" is `STIFFER` times as stiff as the stiffest pad that
-    has the law; a dashpot "auto" gives way within that pad's shortest retardation time. Smooth
-    friction on a pad whose instantaneous dashpot is that of `tau_instant`, a regularisation, falls
-    with slip no faster than this dashpot balances (`SmoothSlip.R_pad`)."""
+    """A law of contact points. A spring "auto" is `STIFFER` times as stiff as the surface of the
+    stiffest pad that has the law; a dashpot "auto" is that pad's shortest retardation time times
+    its spring. Both follow the pad's parameters (`Matched`). Smooth friction on a pad whose
+    instantaneous dashpot is that of `tau_instant`, a regularisation, falls with slip no faster than
+    this dashpot balances (`SmoothSlip.R_pad`)."""
 
-    def numbers(self, pads: Sequence[Pad]) -> Self:
-        """The table with a number in place of every "auto", for the pads that have the law; without
-        pads, as when a file is read, any."""
-        friction = self.friction  # pyright: ignore[reportAttributeAccessIssue]
-        soft = [surface_dashpot(pad) for pad in pads if hasattr(pad.material, "tau_instant")]
-        if soft and friction.kind == "smooth" and friction.R_pad is None:
-            per_spacing = min(soft) * self.node_spacing  # pyright: ignore[reportAttributeAccessIssue]
-            friction = friction.model_copy(update={"R_pad": per_spacing})
-            return self.model_copy(update={"friction": friction}).numbers(pads)
-        names = [name for name in signature(self.part).parameters if getattr(self, name) == AUTO]
-        if not names:
-            return self
-        stiffness, tau = max(surface(pad) for pad in pads) if pads else (1.0, 1.0)
-        spring = STIFFER * stiffness * self.node_spacing  # pyright: ignore[reportAttributeAccessIssue]
-        given: dict[str, float] = {"K_n": spring, "K_t": spring}
-        for dashpot, beside in (("R_n", "K_n"), ("R_t", "K_t")):
-            K = getattr(self, beside)
-            given[dashpot] = tau * (spring if K == AUTO else K)
-        return self.model_copy(update={name: given[name] for name in names})
+    def matched_to(self, pads: Sequence[Pad], folder: Path, friction: Any = None) -> SoftContact:
+        """The law of contacts with these pads, with another friction if one is given."""
+        given = {} if friction is None else {"friction": friction}
+        law: SoftContact = self.part(**dict(self.arguments(folder)) | given)
+        law.match(Matched(pads, law.node_spacing), self.auto)
+        soft = [pad for pad in pads if hasattr(pad.material, "tau_instant")]
+        slip = law.friction
+        if soft and friction is None and type(slip) is SmoothSlip and slip.R_pad is None:
+            slip.match(Matched(soft, law.node_spacing), ["R_pad"])
+        return law
+
+    @property
+    def auto(self) -> list[str]:
+        """Names of the numbers that are "auto"."""
+        return [name for name in signature(self.part).parameters if getattr(self, name) == AUTO]
 
     def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
-        return super(SpringsTable, self.numbers(())).arguments(folder)
-
-
-@torch.no_grad()
-def surface(pad: Pad) -> tuple[float, float]:
-    """Plane-strain stiffness of a pad's surface over the length of a contact point [N/m2], and the
-    pad's shortest retardation time [s]."""
-    material = pad.material
-    modulus = material.E / (1 - material.nu**2) * material.depth
-    length = float(pad.point_lengths.mean())
-    return float(modulus) / length, float(material.whole_chain()[1].min())
-
-
-@torch.no_grad()
-def surface_dashpot(pad: Pad) -> float:
-    """Instantaneous dashpot of a pad's surface over the length of a contact point [N.s/m2], where
-    all of it slides: one node, which its neighbours do not help to move, has some ten times as
-    much."""
-    J, tau = pad.material.whole_chain()
-    mobility = pad.compliance()[::2, ::2].abs().sum(1).max() * (J / tau).sum()
-    return float(1 / mobility) / float(pad.point_lengths.mean())
+        given = super().arguments(folder)
+        return tuple((name, 1.0 if name in self.auto else value) for name, value in given)
 
 
 if TYPE_CHECKING:

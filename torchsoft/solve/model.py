@@ -159,7 +159,8 @@ class Model:
         self.errors = ErrorParts(rig)
         self._known: dict[tuple[int, int], LawSet] = {}
         self._shapes, self._index = prepared_shapes(rig), list[int]()
-        self._made = computed(rig, self._shapes)
+        self._matched = prepared_laws(rig)
+        self._made = computed(rig, self._shapes, self._matched)
         self._places: dict[int, int] = {}
         count = 0
         for value in (*values, *self._made.values()):
@@ -187,7 +188,7 @@ class Model:
             self.layout.size, len(self.integrals.names), recorded_size(none),
             int(none.nodal_dof_start[-1]),
         )  # fmt: skip
-        del self._made, self._places, self._shapes, self._known, self._index
+        del self._made, self._places, self._shapes, self._matched, self._known, self._index
 
     def displaced(self, p: Array, y: Array) -> dict[str, float]:
         """Largest displacements of the loaded nodes of condensed pads [m] in states y (T, size)."""
@@ -384,7 +385,7 @@ class Model:
                 one = torch.ones(()).double()
                 slip_rates(name, slip, one, one, stiffness)
             self._known[key] = contact_laws(
-                law, self._shapes.get(self.rig.contacts[name].body, shape)
+                self._matched[name], self._shapes.get(self.rig.contacts[name].body, shape)
             )
             faults = list[str]()
             if own:
@@ -488,7 +489,15 @@ def prepared_shapes(rig: Rig) -> dict[str, Shape]:
     return {name: shape for name, shape in made.items() if shape is not shapes[name]}
 
 
-def computed(rig: Rig, shapes: Mapping[str, Shape]) -> dict[tuple[str, str], Tensor]:
+def prepared_laws(rig: Rig) -> dict[str, SoftContact]:
+    """The laws of the contacts, those that are matched to pads with their present numbers."""
+    made = {id(one.law): one.law.prepared() for one in rig.contacts.values()}
+    return {name: made[id(one.law)] for name, one in rig.contacts.items()}
+
+
+def computed(
+    rig: Rig, shapes: Mapping[str, Shape], laws: Mapping[str, SoftContact]
+) -> dict[tuple[str, str], Tensor]:
     """Numbers that the kernels read and that are made of parameters, by kind and part."""
     out = {("masses", name): torch.stack(body.masses) for name, body in rig.bodies.items()}
     out |= {
@@ -503,6 +512,9 @@ def computed(rig: Rig, shapes: Mapping[str, Shape]) -> dict[tuple[str, str], Ten
         else:
             own = torch.stack((1 / (pad.E * material.depth), material.nu))
             out["chain", name] = torch.cat((*pad.chain(), own))
+    for name, law in laws.items():
+        if law is not rig.contacts[name].law:
+            out |= {(f"law of {name}", key): x for key, x in law.named_parameters()}
     for name, shape in shapes.items():
         out |= {(f"shape of {name}", key): x for key, x in shape.named_parameters()}
     return out
@@ -526,7 +538,8 @@ def derived(modules: Sequence[Any]) -> list[tuple[int, str, float, float]]:
     """Numbers with a range that are made of parameters: of which module, names and ranges."""
     out = []
     for i, module in enumerate(modules):
-        for name in quantities(type(module)).keys() - module._parameters.keys():
+        own = {name for name, value in module._parameters.items() if value is not None}
+        for name in sorted(quantities(type(module)).keys() - own):
             if isinstance(getattr(module, name, None), Tensor):
                 known = quantity_of(module, name)
                 assert known is not None

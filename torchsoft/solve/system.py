@@ -22,7 +22,7 @@ from torchsoft.solve.kernel import arrays
 from torchsoft.solve.kernel.arrays import Limits, scratch
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.model import computed, model_of, prepared_shapes
+from torchsoft.solve.model import computed, model_of, prepared_laws, prepared_shapes
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.steps import Followed, own_units
 
@@ -83,7 +83,7 @@ class Compiled:
                 return
         if not model.within(modules, values):
             check_values(self.rig)
-        made = computed(self.rig, prepared_shapes(self.rig)).values()
+        made = computed(self.rig, prepared_shapes(self.rig), prepared_laws(self.rig)).values()
         whole = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
         self.p, self.units = whole[model.index], own_units(self.rig, model.smallest)
         self.numbers = self.p.detach().numpy()
