@@ -22,7 +22,8 @@ FLOWS = {
     "physics": """
         arguments mesh shapes state contact rate_and_state ageing material hyperelastic elements
         pads matched balance multibond parts
-        names motion validity graph structure energy statics start channels namespace rig extensions setup .
+        names motion validity graph structure energy statics start channels namespace rig
+        extensions setup .
     """,
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",

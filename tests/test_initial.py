@@ -3,11 +3,15 @@ with its start: every value is that of the rig built anew."""
 
 import copy
 
+import numpy as np
 import pytest
 import torch
 
 from torchsoft import BuiltRig, RigFile, Trajectory, simulate, simulate_batch
 from torchsoft.plan import Target, plan
+from torchsoft.sysid import Standing
+from torchsoft.sysid.prediction import predict
+from torchsoft.sysid.recording import Grid, Recording
 from torchsoft.testing import check_gradients
 
 E, MASS, TAU = "materials.rubber.E", "bodies.disc.mass", "materials.rubber.tau"
@@ -131,3 +135,23 @@ def test_a_plan_for_a_parameter_moves_the_start():
     )  # fmt: skip
     assert found.reached
     assert float(found.parameters[E]) == pytest.approx(0.5e6, rel=1e-3)
+
+
+def test_identification_follows_the_start_and_its_set_points():
+    """With springs that are "auto", a bracket that touches, and set-points that follow it."""
+    auto = {f"laws.wet.{name}": "auto" for name in ("K_n", "R_n", "K_t", "R_t")}
+    file = FILE.override(auto | {"bodies.bracket.start.y": "touch", "motion.F_ff.value": -4.0})
+    built = file.build()
+    samples = {name: (built.t.numpy(), built.t.numpy()) for name in ("y_bracket", "effort_y")}
+    made = Recording("bench", built.rig, samples, Standing.built(built, 0.0))
+    begun, grid, at = made.begin(), Grid(built.t, 0), 0.5e6
+    found = predict(begun, {E: at}, grid, [E], 1e-6)
+    knots = torch.from_numpy(found.knots)
+    anew = lambda value: file.override({E: value}).build().run(knots=knots)
+    expected, high, low = (anew(value) for value in (at, at * (1 + 1e-4), at * (1 - 1e-4)))
+    for name in samples:
+        column, size = made.channels.index(name), float(np.ptp(expected[name].numpy()))
+        assert found.signals[:, column] == pytest.approx(expected[name].numpy(), abs=1e-6 * size)
+        slope = ((high[name] - low[name]) / (2e-4 * at)).numpy()
+        error = np.abs(found.derivatives[:, column, 0] - slope).max()
+        assert error < 1e-3 * np.abs(slope).max(), name

@@ -1,7 +1,7 @@
 """States from coordinates of bodies: placed, moving, at rest on pads, touching or pressing."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -140,7 +140,17 @@ def placed(rig: Graph, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
     still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
     if rests:
         places = resting(rig, places, rests, signals=still, actuators=())
-    pushed: Poses = {}
+    return pressed(rig, places, presses, rests)
+
+
+def pressed(
+    rig: Graph, pose: Poses, presses: Mapping[str, Any], rests: Mapping[str, Sequence[int]]
+) -> Poses:
+    """Poses of bodies whose pads come down upon others until they touch, and are pressed by a depth
+    or a force, {"bracket": {"depth": 1e-3}}; the coordinates `rests` give way. Raises as
+    `placed`."""
+    places, pushed = dict(pose), dict[str, Tensor]()
+    still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
     for name, value in presses.items():
         height = upon(rig, places, name)
         if isinstance(value, Mapping) and "force" in value:
@@ -150,7 +160,7 @@ def placed(rig: Graph, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
             height = height - scalar(f"{name}.y.depth", value["depth"])
         places[name] = at_height(places[name], height)
     if any(value != TOUCH for value in presses.values()):
-        free = rests | {name: sorted({*rests.get(name, ()), 1}) for name in pushed}
+        free = {**rests} | {name: sorted({*rests.get(name, ()), 1}) for name in pushed}
         places = resting(rig, places, free, signals=still, actuators=(), pushed=pushed)
     return places
 

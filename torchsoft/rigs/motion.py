@@ -89,10 +89,21 @@ class Motion(Group):
         return 0.0
 
     @property
+    def words(self) -> tuple[Any, ...]:
+        """The offset, and the values at the knots, as they are given."""
+        values = (self.value,) if isinstance(self, HoldTable) else getattr(self, "values", (0.0,))
+        return getattr(self, "offset", 0.0), *values
+
+    @property
     def follows_start(self) -> bool:
         """Whether a value is given as "start" or "held"."""
-        own = getattr(self, "value", None), getattr(self, "offset", None)
-        return any(isinstance(x, str) for x in (*own, *getattr(self, "values", ())))
+        return any(isinstance(x, str) for x in self.words)
+
+    @property
+    def start_weights(self) -> list[float]:
+        """Derivatives (k,), or (1,) for all alike, of the values with respect to the start."""
+        offset, *values = self.words
+        return [float(offset == START) + float(x == START) for x in values]
 
 
 class HoldTable(Motion):

@@ -285,7 +285,7 @@ def planned(
     if plan.duration is not None:
         built = replace(built, t=torch.tensor([0.0, plan.duration]).double())
     lead = start.lead if isinstance(start, Rest) else 0.0
-    at_rest = Standing.of(built.rig, built.y0, lead, file.rests())
+    at_rest = Standing.built(built, lead)._replace(followed={})
     return record(
         name, built, {}, stated.sensors, start=at_rest, rate=plan.rate, rtol=rtol, **options
     )

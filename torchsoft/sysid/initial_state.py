@@ -9,7 +9,7 @@ differentiable in both.
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -17,10 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.display import suggestion
+from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.start import REST, pressed
 from torchsoft.physics.statics import NoEquilibrium, resting, settled, standing
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.progress import SimulationFailed
 
 Array = NDArray[np.float64]
@@ -78,6 +81,15 @@ class Start(Protocol):
         ...
 
 
+class FollowedStart(NamedTuple):
+    """A motion that follows where a coordinate starts, such as "bracket.y": the place [m, rad] at
+    which its values were made, and their derivatives (k,) or (1,) with respect to it."""
+
+    coordinate: str
+    place: float
+    weights: tuple[float, ...]
+
+
 class Standing(NamedTuple):
     """Bodies stand at known places, `lead` [s] before the first sample, and pads have settled
     around them.
@@ -85,13 +97,40 @@ class Standing(NamedTuple):
     `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s]; `rests` by body
     the numbers of the coordinates that are in balance instead, no actuator pushing; `position_sd`
     the standard deviations of coordinates such as "disc.x" [m, rad], which are coordinates of the
-    start. Rest and pads are those of the present parameters, not of the nominal ones.
+    start; `presses` the bodies whose pads come down upon others, and how far, as a rig file says
+    it; `followed` the motions whose values follow a coordinate that rests or presses. All are those
+    of the present parameters, not of the nominal ones.
     """
 
     bodies: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
     lead: float = SETTLE
     rests: Mapping[str, Sequence[int]] = MappingProxyType({})
     position_sd: Mapping[str, float] = MappingProxyType({})
+    presses: Mapping[str, Any] = MappingProxyType({})
+    followed: Mapping[str, FollowedStart] = MappingProxyType({})
+
+    @classmethod
+    def built(
+        cls, built: BuiltRig, lead: float = SETTLE, position_sd: Mapping[str, float] | None = None
+    ) -> "Standing":
+        """Bodies where a rig file starts them, at rest or pressed with the present parameters."""
+        file, rig = built.file, built.rig
+        out, rests = cls.of(rig, built.y0, lead, file.rests(), position_sd), file.rests()
+        presses = {
+            name: given["y"] for name, given in built.starts.items()
+            if isinstance(given.get("y"), str | Mapping) and given["y"] != REST
+        }  # fmt: skip
+        solved = [f"{name}.{COORDINATES[i]}" for name, axes in rests.items() for i in axes]
+        solved += [f"{name}.y" for name in presses]
+        followed = {}
+        for name in built.followed:
+            (coordinate, *more) = sorted(
+                {at for role, at in file.followers()[name] if role == "setpoint"}
+            ) or [""]
+            if coordinate in solved and not more and any(file.motion[name].start_weights):
+                place, weights = out.place(coordinate), file.motion[name].start_weights
+                followed[name] = FollowedStart(coordinate, place, tuple(weights))
+        return out._replace(presses=presses, followed=followed)
 
     @classmethod
     def of(
@@ -113,7 +152,8 @@ class Standing(NamedTuple):
 
     def __repr__(self) -> str:
         rests, sd = dict(self.rests), dict(self.position_sd)
-        return f"Standing({dict(self.bodies)}, {self.lead}, {rests}, {sd})"
+        more = "".join(f", {dict(one)}" for one in (self.presses, self.followed) if one)
+        return f"Standing({dict(self.bodies)}, {self.lead}, {rests}, {sd}{more})"
 
     def __str__(self) -> str:
         return f"{self.lead:g} s early, bodies at known places, pads settled around them"
@@ -157,6 +197,7 @@ class Standing(NamedTuple):
                     pose = resting(
                         rig, pose, self.rests, signals=still, actuators=(), residual=BALANCED
                     )
+                pose = pressed(rig, pose, self.presses, self.rests)
                 found = rig.unpack(standing(rig, pose, at))
             except NoEquilibrium as error:
                 raise SimulationFailed(f"the run cannot begin there: {error}", at) from None
@@ -184,6 +225,18 @@ class Known(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.lead:g} s early, in a known state"
+
+
+def reference_from(rig: Rig, start: Start, y0: Tensor) -> Reference:
+    """The reference of a run from y0 (size,), whose set-points follow the start."""
+    signals, pose = {}, rig.unpack(y0).pose
+    for name, (coordinate, place, weights) in getattr(start, "followed", {}).items():
+        body, axis = coordinate.split(".")
+        moved = pose[body][COORDINATES.index(axis)] - place
+        signal: Piecewise = rig.reference[name]  # pyright: ignore[reportAssignmentType]
+        values = signal.values + moved * torch.tensor(weights, dtype=torch.float64)
+        signals[name] = signal.with_values(values)
+    return rig.reference.replaced(signals)
 
 
 def warn_of_memory(rig: Rig, lead: float) -> None:

@@ -121,7 +121,8 @@ def rig_recording(
 ) -> Recording:
     """The recording that tables hold, of the rig of a file. Raises `ValueError` naming row and
     column, or the file's field."""
-    rig, y0, _ = file.build()
+    built = file.build()
+    rig, y0, _ = built
     sensors, own = by_channel([rig], sensors), rig.reference
     check_clock(file, rig, tables, start)
     check_plausible(rig, rig.unpack(y0), tables)
@@ -129,7 +130,9 @@ def rig_recording(
     if isinstance(start, Moving):
         begins = Standing.of(rig, y0)
     else:
-        begins = Standing.of(rig, y0, start.lead, file.rests(), start.position_sd)
+        begins = Standing.built(built, start.lead, start.position_sd)
+        mine = {name: one for name, one in begins.followed.items() if name not in tables}
+        begins = begins._replace(followed=mine)
     made = Recording(name, rig, measured_samples(tables, sensors), begins)
     if not isinstance(start, Moving):
         check_start(made, y0, own, tables, sensors)

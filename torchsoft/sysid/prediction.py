@@ -14,13 +14,14 @@ from scipy.special import log_ndtr
 from torch import Tensor
 
 from torchsoft.physics.channels import Seen, measurable, read
+from torchsoft.physics.motion import Reference
 from torchsoft.physics.names import effort_channel, rate_channel
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import unjudged
 from torchsoft.solve.trajectory import Trajectory
-from torchsoft.sysid.initial_state import PREFIX
+from torchsoft.sysid.initial_state import PREFIX, reference_from
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.recording import REACH, SAME, Array, Grid, RunContext
 from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
@@ -376,20 +377,20 @@ def prepared(
     return begun.y0(at), inputs
 
 
-def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
+def derivatives(rig: Rig, run: Trajectory, names: Sequence[str], reference: Reference) -> Array:
     """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start. Those
     of touch come from the run; others follow from the sensitivities of the bodies' motion, and from
-    the controllers' own parameters."""
+    the controllers' own parameters and set-points, of the `reference`."""
     slopes = {name: slope.numpy() for name, slope in run.touch_sensitivities.items()}
     if moved := [name for name in names if name not in slopes]:
-        slopes |= dict(zip(moved, by_motion(rig, run, moved).swapaxes(0, 1)))
+        slopes |= dict(zip(moved, by_motion(rig, run, moved, reference).swapaxes(0, 1)))
     return np.stack([slopes[name] for name in names], 1)
 
 
-def by_motion(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
+def by_motion(rig: Rig, run: Trajectory, names: Sequence[str], reference: Reference) -> Array:
     """Derivatives (T, channels, n) of channels that the bodies' motion determines."""
     assert run.sensitivities is not None
-    signals = rig.follow(run.t, rig.reference).detach()
+    signals = rig.follow(run.t, reference)
     along = [
         torch.zeros((), dtype=torch.float64, requires_grad=True)
         for _ in range(run.sensitivities.shape[-1])
@@ -437,12 +438,16 @@ def predict(
     set_parameters(rig, values)
     touch = [key for key in keys if key not in measurable(rig)] if names else ()
     wrt = tuple(name for name in names if not name.startswith(PREFIX))
+    leaves = [rig.parameter(name) for name in wrt]
+    along = torch.stack([x - x.detach() for x in leaves]) if leaves else y0.new_zeros(0)
+    reference = reference_from(rig, begun.start, y0 + dy0[:, : len(wrt)] @ along)
     if begun.drift.changes:
-        return drifting(begun, grid, names, steps, y0, dy0, wrt, touch)
+        return drifting(begun, grid, names, steps, y0, dy0, wrt, touch, reference)
     out = unjudged(
         rig,
         grid.t,
         y0=y0,
+        reference=reference,
         gradient="forward" if names else "none",
         wrt=wrt,
         dy0=dy0 if names else None,
@@ -451,7 +456,7 @@ def predict(
         **choice(steps),
     )
     rows = slice(grid.early, None)
-    slopes = derivatives(rig, out, keys)[rows] if names else None
+    slopes = derivatives(rig, out, keys, reference)[rows] if names else None
     knots = None if isinstance(steps, Frozen) else out.knots.numpy()
     return Prediction(
         grid.t[rows].numpy(),
@@ -467,7 +472,8 @@ def run_doubts(
     """Warnings of the run at the end of a fit, which those on the way to it do not give. Raises
     `SimulationFailed`."""
     y0, _ = prepared(begun, values, ())
-    run = unjudged(begun.rig, grid.t, y0=y0.detach(), **choice(steps))
+    reference = reference_from(begun.rig, begun.start, y0.detach())
+    run = unjudged(begun.rig, grid.t, y0=y0.detach(), reference=reference, **choice(steps))
     return list(doubts(run, begun.rig, differentiated=True).values())
 
 
@@ -477,13 +483,14 @@ PIECES = 24
 
 def drifting(
     begun: RunContext, grid: Grid, names: Sequence[str], steps: Steps, y: Tensor, dy: Tensor,
-    wrt: Sequence[str], touch: Sequence[str],
+    wrt: Sequence[str], touch: Sequence[str], reference: Reference,
 ) -> Prediction:  # fmt: skip
     """`predict` from the state y (size,) with derivatives dy (size, n), of a run whose rig drifts:
     piece after piece, by the frozen steps, or by those that a tolerance chooses without drift."""
     rig, keys, drift, t = begun.rig, begun.channels, begun.drift, grid.t.numpy()
     if not isinstance(steps, Frozen):
-        steps = Frozen(unjudged(rig, grid.t, y0=y, **choice(steps)).knots.numpy())
+        chosen = unjudged(rig, grid.t, y0=y, reference=reference, **choice(steps))
+        steps = Frozen(chosen.knots.numpy())
     knots, stated = steps.knots, {name: rig.parameter(name).item() for name in drift.changes}
     ends = np.searchsorted(knots, np.linspace(drift.first, drift.last, PIECES + 1)[1:-1])
     values, slopes = list[Array](), list[Array]()
@@ -495,15 +502,15 @@ def drifting(
         own = t[(t > knots[first] + SAME) & (t <= end + SAME)]
         between = [knots[first], *own, *([] if own.size and end - own[-1] <= SAME else [end])]
         out = unjudged(
-            rig, between, y0=y, gradient="forward" if names else "none", wrt=wrt,
-            dy0=dy / torch.from_numpy(scale) if names else None, touch=touch,
+            rig, between, y0=y, reference=reference, gradient="forward" if names else "none",
+            wrt=wrt, dy0=dy / torch.from_numpy(scale) if names else None, touch=touch,
             **choice(Frozen(knots[first : last + 1])),
         )  # fmt: skip
         rows = np.isin(out.t.numpy(), t if first == 0 else own)
         values.append(out.together(*keys).detach().numpy()[rows])
         y = out.y[-1].detach()
         if out.sensitivities is not None:
-            slopes.append(derivatives(rig, out, keys)[rows] * scale)
+            slopes.append(derivatives(rig, out, keys, reference)[rows] * scale)
             dy = out.sensitivities[-1] * torch.from_numpy(scale)
     set_parameters(rig, stated)
     rows = slice(grid.early, None)
@@ -527,7 +534,10 @@ def misfit(
         by = np.einsum("gc,gcn->n", weights, np.array(made.derivatives))
         return Misfit(loss, by, nuisances)
     y0, inputs = prepared(begun, values, names)
-    out = unjudged(begun.rig, grid.t, y0=y0, gradient="discrete", **choice(steps))
+    reference = reference_from(begun.rig, begun.start, y0)
+    out = unjudged(
+        begun.rig, grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps)
+    )
     keys, rows = begun.channels, slice(grid.early, None)
     signals = out.together(*keys)[rows]
     loss, weights, nuisances = judge(

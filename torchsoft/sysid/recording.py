@@ -57,6 +57,7 @@ class RunContext(NamedTuple):
     what drifts."""
 
     rig: Rig
+    start: Start
     y0: Begin
     channels: tuple[str, ...]
     drift: Drift
@@ -176,7 +177,8 @@ class Recording:
         for name, value in rig.named_parameters():
             value.requires_grad_(not name.startswith("reference."))
         drift = Drift(self.drifts, *self.times[[0, -1]].tolist())
-        return RunContext(rig, self.start.begin(rig, self.samples), self.channels, drift)
+        begin = self.start.begin(rig, self.samples)
+        return RunContext(rig, self.start, begin, self.channels, drift)
 
     def on_a_grid(self, interpolated: bool) -> bool:
         """Whether to simulate a regular grid, every `BETWEEN`, in place of the samples' own times:

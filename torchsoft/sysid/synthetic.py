@@ -8,9 +8,7 @@ import numpy as np
 import torch
 
 from torchsoft.physics.channels import measurable, units
-from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.start import REST
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.sysid.initial_state import Standing, Start
 from torchsoft.sysid.prediction import predict
@@ -56,13 +54,9 @@ def record(
     holds nothing of the truth but the samples. Raises `ValueError` for an unknown name or channel,
     and `SimulationFailed`.
     """
-    rig, y0, t = planned
+    rig, _, t = planned
     sensors = by_channel([rig], sensors)
-    rests = {
-        name: [COORDINATES.index(axis) for axis, value in given.items() if value == REST]
-        for name, given in planned.starts.items()
-    }
-    begins = start or Standing.of(rig, y0, rests=rests)
+    begins = start or Standing.built(planned)
     at = np.arange(float(t[0]), float(t[-1]) + 0.5 / rate, 1.0 / rate)
     made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)
     begun, early = made.begin(), int(begins.lead > 0)
