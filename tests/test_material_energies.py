@@ -144,7 +144,7 @@ def test_unphysical_energies_are_rejected(tmp_path):
         write(soft, tmp_path, {"nu": 0.49, "rho": 1e3, "tau": 0.01, "depth": 0.04}, {})
 
 
-TRELOAR = (0.0, 0.25739, 0.420847, 0.518429, 0.609233, 0.659472, 0.725627, 0.756164, 0.812768,
+STIFFENING = (0.0, 0.25739, 0.420847, 0.518429, 0.609233, 0.659472, 0.725627, 0.756164, 0.812768,
     0.834691, 0.889458, 0.909682, 0.968974, 0.993877, 1.064964, 1.101971, 1.194328, 1.252889,
     1.379243, 1.471617, 1.648954, 1.790940, 2.041571)  # fmt: skip
 """Stress [MPa] at stretches from 1 to 7.38, which stiffens as natural rubber does."""
@@ -163,8 +163,8 @@ def test_ogden_takes_few_evaluations(terms, evaluations, rms, tmp_path, monkeypa
         return nominal_stress(*arguments)
 
     monkeypatch.setattr(energies, "nominal_stress", counted)
-    x = np.linspace(0, 6.38, len(TRELOAR))
-    pull = Pull(tmp_path / "pull.csv", "tension", x, 1e6 * np.array(TRELOAR), (0.0, 6.38), ())
+    x = np.linspace(0, 6.38, len(STIFFENING))
+    pull = Pull(tmp_path / "pull.csv", "tension", x, 1e6 * np.array(STIFFENING), (0.0, 6.38), ())
     found = fit_energy([pull], "ogden", nu=0.49, terms=terms)
     assert found.rms < rms
     assert len(calls) < evaluations
@@ -214,8 +214,8 @@ def relaxation(path):
     """A relaxation test of a rubber with two terms, a third and a sixth of its relaxed modulus."""
     t = np.geomspace(1e-3, 100, 200)
     modulus = 5e5 * (1 + np.exp(-t / 0.1) / 3 + np.exp(-t / 4.0) / 6)
-    rows = "\n".join(f"{a!r},{b!r}" for a, b in zip(t.tolist(), (1e-6 * modulus).tolist()))
-    path.write_text(f"t [s],modulus [MPa]\n{rows}\n")
+    rows = "\n".join(f"{a!r},5,{b!r}" for a, b in zip(t.tolist(), (5e-8 * modulus).tolist()))
+    path.write_text(f"t [s],strain [%],stress [MPa]\n{rows}\n")
     return path
 
 

@@ -59,7 +59,8 @@ FLOWING = 0.8
 """Power of time above which creep at the end of a test is a flow: 1 is a dashpot's."""
 
 ROUNDED = 1e-6
-"""Strain by which a range counts as wider, so that its ends are inside in spite of rounding."""
+"""Part of the largest strain by which a range counts as wider: its ends are inside in spite of
+rounding."""
 
 INSTANT_PART = 0.1
 """Largest retardation time of the instantaneous spring, over the shortest time of the series."""
@@ -377,7 +378,8 @@ def pulled(
             f"{path}, row {rows[turned[0]]}: the strain goes back by {back.max():.2g} on its way "
             f"to the largest one, {up[-1]:.2g}: keep the rows of one loading"
         )
-    below, above = up < low - ROUNDED, up > high + ROUNDED
+    rounding = ROUNDED * up[-1]
+    below, above = up < low - rounding, up > high + rounding
     inside = ~(below | above)
     if not low < high or inside.sum() < LEAST:
         raise ValueError(
@@ -392,7 +394,7 @@ def pulled(
             f"{path}, row {numbers_inside[last + 1]}: the stress falls from {y[last]:.4g} Pa at a "
             f"strain of {x[last]:.6g}{stretch} on, as where a specimen tears or slips: leave out "
             f"rows {numbers_inside[last + 1]} to {numbers_inside[-1]} by a range of strains, "
-            f"--range {low:g} {x[last]:.6g}"
+            f"--range {round(low, 4):g} {x[last]:.6g}"
         )
     left_out = (
         (numbers[: largest + 1][below], f"strains below {low:g}"),
