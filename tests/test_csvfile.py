@@ -8,7 +8,7 @@ import pytest
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
 
-KNOWN = {"t": UNITS["s"], "force": UNITS["N"], "x": UNITS["m"]}
+KNOWN = {"t": UNITS["s"], "force": UNITS["N"], "x": UNITS["m"], "strain": {"1": 1.0, "%": 0.01}}
 T, FORCE, X = [0.0, 0.5, 1.25], [1.5, -2.0, 3e3], [1e-3, 2e-3, 4e-3]
 
 PLAIN = "t [s],force [N],x [mm]\n0,1.5,1\n0.5,-2,2\n1.25,3e3,4\n"
@@ -75,6 +75,72 @@ def test_workbooks(tmp_path):
     book.copy_worksheet(sheet)
     book.save(path)
     with pytest.raises(ValueError, match="a table in each of the sheets Data, Data Copy: keep one"):
+        read(path)
+
+
+@pytest.mark.parametrize("state", ["hidden", "veryHidden"])
+def test_hidden_worksheets_are_not_read(state, tmp_path):
+    from openpyxl import Workbook
+
+    path, book = tmp_path / "test.xlsx", Workbook()
+    for sheet, rows in (
+        (book.worksheets[0], [["t [s]", "x [mm]"], [0, 1], [1, 2]]),
+        (book.create_sheet("old"), [["t [s]", "x [mm]", "force [N]"], [0, 7, 7], [1, 8, 8]]),
+    ):
+        for row in rows:
+            sheet.append(row)
+    book["old"].sheet_state = state
+    book.create_chartsheet("chart")
+    book.save(path)
+    values = read(path).values
+    assert values.keys() == {"t", "x"}
+    assert values["x"] == pytest.approx([1e-3, 2e-3])
+    book.remove(book.worksheets[0])
+    book.active = 1
+    book.save(path)
+    with pytest.raises(ValueError, match=r"no visible worksheet .* unhide old"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("heading", "form", "value", "expected"),
+    [
+        ("strain [%]", "0.0%", 0.01, 0.01),
+        ("strain [1]", "0.0%", 0.01, 0.01),
+        ("strain [1]", '0.0"%"', 1, 0.01),
+        ("strain [%]", '0.0"%"', 1, 0.01),
+        ("strain [%]", "0.00", 1, 0.01),
+        ("force [N]", "#,##0.0", 1500, 1500),
+        ("x [mm]", "0%", 0.01, "row 3, column `x`: '1%' .* plain numbers in mm"),
+        ("force [kN]", "0.0,", 1500, "row 3, column `force`: '1500 .displayed in thousands"),
+    ],
+)
+def test_cells_of_workbooks_mean_what_they_display(heading, form, value, expected, tmp_path):
+    from openpyxl import Workbook
+
+    path, book = tmp_path / "test.xlsx", Workbook()
+    sheet = book.worksheets[0]
+    for row in (["t [s]", heading], [0, 0], [1, value]):
+        sheet.append(row)
+    sheet["B3"].number_format = form
+    book.save(path)
+    if isinstance(expected, str):
+        with pytest.raises(ValueError, match=expected):
+            read(path)
+    else:
+        assert read(path).values[heading.split()[0]][1] == pytest.approx(expected, rel=1e-14)
+
+
+def test_a_hundred_thousand_columns(tmp_path):
+    """Longer rows than the largest cell of Python's reader, which the wrong separators meet."""
+    path = tmp_path / "test.csv"
+    others = [f"c{i}" for i in range(100_000)]
+    path.write_text("\n".join([",".join(["t [s]", *others]), "0.5" + ",1" * len(others)]))
+    table = read(path, ignore=None)
+    assert table.values["t"] == 0.5
+    assert len(table.ignored) == len(others)
+    path.write_text('t [s],x [m]\n0,"1' + "0" * 140_000)
+    with pytest.raises(ValueError, match=r"row 2: a cell has more than .* quotation mark"):
         read(path)
 
 

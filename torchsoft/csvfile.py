@@ -3,16 +3,18 @@ them, read in SI units, or written.
 
 Read are CSV with commas, semicolons or tabs, in UTF-8, UTF-16 or Windows-1252, and Excel workbooks;
 rows of text before the heading; units in the heading or in the row below it; decimal points, and
-decimal commas where these separate no columns. Every error is a `ValueError` in a sentence that
-names the file, the row (as an editor counts them) and the column.
+decimal commas where these separate no columns. Of a workbook only visible sheets are read, and a
+cell displayed as `1 %` is one percent: 0.01 under `strain [1]`, 1 under `strain [%]`. Every error
+is a `ValueError` that names the file, the row (as an editor counts them) and the column.
 """
 
 import csv
 import math
 import re
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +56,12 @@ DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 CONTROL = r"[\x00-\x08\x0e-\x1f]"
 """Characters that no text has."""
 
+LITERAL = r'"[^"]*"|\\.|_.|\*.|\[[^\]]*\]'
+"""Parts of Excel's number formats that display text, colours, space or a currency."""
+
+THOUSANDS = r"[0#?],+([^0#?,]|$)"
+"""Commas by which Excel's number formats divide by thousands."""
+
 Units = Mapping[str, float]
 """Units that a column may have, and what they are in SI."""
 
@@ -62,6 +70,16 @@ Hint = Callable[[str, int], str]
 
 Rows = list[tuple[int, list[str]]]
 """Number in the file and cells of every row that is not empty."""
+
+
+class Column(NamedTuple):
+    """A known column: its name, its unit, and the size in SI units of that unit and of one percent,
+    NaN where the column has a dimension."""
+
+    name: str
+    unit: str
+    size: float
+    percent: float
 
 
 class Numbers(NamedTuple):
@@ -107,15 +125,15 @@ def read(
             raise ValueError(
                 f"{path}, row {row} has {len(others)} cells, but there are {len(head)} columns"
             )
-        used = [(*one, cell) for one, cell in zip(head, others) if one]
-        values.append([number(path, row, name, cell, comma) * unit for name, unit, cell in used])
+        used = [(one, cell) for one, cell in zip(head, others) if one]
+        values.append([number(path, row, one, cell, comma) for one, cell in used])
         if comma and len(marks) < 2:
-            marks.update(mark for _, _, cell in used for mark in ",." if mark in cell)
+            marks.update(mark for _, cell in used for mark in ",." if mark in cell)
     if len(marks) > 1:
         raise ValueError(f"{path} has decimal commas and decimal points: write all with points")
     columns = np.array(values).reshape(len(places), sum(one is not None for one in head)).T
     left_out = tuple(name_and_unit(cell)[0] for cell, one in zip(cells, head) if one is None)
-    by_name = dict(zip((one[0] for one in head if one), columns))
+    by_name = dict(zip((one.name for one in head if one), columns))
     return Numbers(by_name, [row for row, _ in places], left_out, first)
 
 
@@ -129,7 +147,7 @@ def table(path: Path, names: Collection[str]) -> tuple[Rows, bool]:
         raise ValueError(f"{path} is a workbook of an old Excel: save it as .xlsx or as CSV")
     else:
         lines = decoded(path).splitlines(keepends=True)
-        heads = {one: separated(path, lines[:PREAMBLE], one) for one in SEPARATORS}
+        heads = {one: first_rows(path, lines, one) for one in SEPARATORS}
         separator = max(
             SEPARATORS, key=lambda one: (begin(heads[one], names)[0], widest(heads[one]))
         )
@@ -171,36 +189,87 @@ def decoded(path: Path) -> str:
     raise ValueError(f"{path} is not a table of text in UTF-8, UTF-16 or Windows-1252")
 
 
+def first_rows(path: Path, lines: Sequence[str], separator: str) -> Rows:
+    """Rows in which the heading is looked for; none where another separator must be the right one,
+    since with this one a cell is too long."""
+    try:
+        return separated(path, lines[:PREAMBLE], separator)
+    except ValueError:
+        return []
+
+
 def separated(path: Path, lines: Sequence[str], separator: str) -> Rows:
     """Rows of a text. Raises `ValueError` where it is no CSV."""
     reader = csv.reader(lines, delimiter=separator)
     try:
         return [(reader.line_num, cells) for cells in reader if any(x.strip() for x in cells)]
-    except csv.Error as error:
-        raise ValueError(f"{path} is not a CSV file: {line(error)}") from None
+    except csv.Error:
+        raise ValueError(
+            f"{path}, row {reader.line_num}: a cell has more than {csv.field_size_limit()} "
+            "characters: separate columns with commas, semicolons or tabs, and look for a "
+            "quotation mark that is not closed"
+        ) from None
 
 
 def sheet(path: Path, names: Collection[str]) -> Rows:
-    """Rows of the sheet of an Excel workbook with the heading. Raises `ValueError`."""
+    """Rows of the visible sheet of an Excel workbook with the heading. Raises `ValueError`."""
     try:
-        book = needed("openpyxl", "excel").load_workbook(path, read_only=True, data_only=True)
-        sheets = {
-            one.title: [
-                (i, ["" if x is None else str(x) for x in cells])
-                for i, cells in enumerate(one.iter_rows(values_only=True), 1)
-                if any(x is not None for x in cells)
-            ]
-            for one in book.worksheets
-        }
+        with warnings.catch_warnings(action="ignore"):  # of styles that openpyxl does not know
+            book = opened(path)
+            sheets = {
+                one.title: [
+                    (i, [displayed(cell) for cell in cells])
+                    for i, cells in enumerate(one.iter_rows(), 1)
+                    if any(cell.value is not None for cell in cells)
+                ]
+                for one in book.worksheets
+                if one.sheet_state == "visible"
+            }
+        hidden = [one.title for one in book.worksheets if one.title not in sheets]
     except ModuleNotFoundError as missing:
         raise ValueError(f"{path} is an Excel workbook: {missing}, or save it as CSV") from None
     except Exception as error:  # of zip files, of XML, of whatever is in them
         raise ValueError(f"{path} is not an Excel workbook: {line(error)}") from None
     counts = {name: begin(rows, names)[0] for name, rows in sheets.items()}
-    best = [name for name, count in counts.items() if count == max(counts.values())]
-    if len(best) > 1 and counts[best[0]]:
+    most = max(counts.values(), default=0)
+    best = [name for name, count in counts.items() if count == most]
+    if not sheets or (hidden and not most):
+        left_out = f"; hidden sheets are not read: unhide {' or '.join(hidden)}" if hidden else ""
+        raise ValueError(f"{path} has no visible worksheet with a known column{left_out}")
+    if len(best) > 1 and most:
         raise ValueError(f"{path} has a table in each of the sheets {', '.join(best)}: keep one")
     return sheets[best[0]]
+
+
+def opened(path: Path) -> Any:
+    """An Excel workbook, its chart sheets empty: openpyxl fails where it does not know a drawing.
+    Raises `ModuleNotFoundError`, and what openpyxl raises."""
+    excel = needed("openpyxl.reader.excel", "excel")
+    chartsheet = needed("openpyxl.chartsheet", "excel").Chartsheet
+
+    class Reader(excel.ExcelReader):
+        def read_chartsheet(self, sheet: Any, rel: Any) -> None:
+            self.wb._add_sheet(chartsheet(parent=self.wb, title=sheet.name))
+
+    reader = Reader(path, read_only=True, data_only=True)
+    reader.read()
+    return reader.wb
+
+
+def displayed(cell: Any) -> str:
+    """The text of a cell of a workbook: a number that Excel displays as a percentage is one. A
+    number displayed in thousands is no plain number either, and is for `number` to reject."""
+    value, form = cell.value, cell.number_format
+    if value is None:
+        return ""
+    if type(value) not in (int, float) or form == "General":
+        return str(value)
+    codes = re.sub(LITERAL, "", form)
+    if "%" in codes:
+        return f"{100 * value:.15g}%"
+    if "%" in form:  # as text, which does not scale the number
+        return f"{value}%"
+    return f"{value} (displayed in thousands)" if re.search(THOUSANDS, codes) else str(value)
 
 
 def unit_row(cells: Sequence[str], below: Sequence[str]) -> bool:
@@ -233,10 +302,9 @@ def heading(
     names: Mapping[str, str],
     hint: Hint,
     ignore: Collection[str] | None,
-) -> list[tuple[str, float] | None]:
-    """Name of each column, and what its unit is in SI; None for those left out. Raises `ValueError`
-    naming the column."""
-    out: list[tuple[str, float] | None] = []
+) -> list[Column | None]:
+    """The columns; None for those left out. Raises `ValueError` naming the column."""
+    out: list[Column | None] = []
     for cell in cells:
         written, unit = name_and_unit(cell)
         where = f"{row}, column `{line(written, 80)}`"
@@ -252,33 +320,39 @@ def heading(
             raise ValueError(
                 f"{where} cannot be in {shown(unit)}; it can be in {', '.join(known[name])}"
             )
-        if name in (one[0] for one in out if one):
+        if name in (one.name for one in out if one):
             raise ValueError(f"{where} is there twice")
-        out.append((name, known[name][unit]))
+        percent = 0.01 * known[name].get("1", math.nan)
+        out.append(Column(name, unit, known[name][unit], percent))
     return out
 
 
 def numeric(cell: str) -> bool:
-    """Whether a cell is of a number, its decimals after a point or a comma."""
+    """Whether a cell is of a number or a percentage, its decimals after a point or a comma."""
     try:
-        float(cell.replace(",", ".", 1))
+        float(cell.strip().removesuffix("%").replace(",", ".", 1))
     except ValueError:
         return False
     return True
 
 
-def number(path: Path, row: int, column: str, cell: str, comma: bool = False) -> float:
-    """A finite number, or NaN for an empty cell."""
+def number(path: Path, row: int, column: Column, cell: str, comma: bool = False) -> float:
+    """A finite number in SI units, or NaN for an empty cell."""
     if not (text := cell.strip()):
         return math.nan
-    plain = text.replace(",", ".") if comma and DECIMAL_COMMA.fullmatch(text) else text
+    plain, size = text, column.size
+    if text.endswith("%"):
+        plain, size = text[:-1].rstrip(), column.percent
+    if comma and DECIMAL_COMMA.fullmatch(plain):
+        plain = plain.replace(",", ".")
     try:
-        value = float(plain) if plain.isascii() and "_" not in plain else math.nan
+        value = float(plain) * size if plain.isascii() and "_" not in plain else math.nan
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise ValueError(
-            f"{path}, row {row}, column `{column}`: {shown(text)} is not a finite number; leave "
-            "the cell empty where a sample is missing"
+            f"{path}, row {row}, column `{column.name}`: {shown(text)} is not a finite number; "
+            "leave the cell empty where a sample is missing, and write plain numbers in "
+            f"{column.unit} elsewhere"
         )
     return value

@@ -222,7 +222,7 @@ def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "En
         if options.fast:
             raise ValueError("--fast is against a relaxation test: say which, --relaxation FILE")
         return found
-    given |= {"whole": False, "true": False}
+    given |= {"whole": False, "true": False, "strains": None}
     over_time = read(options.relaxation, test="relaxation", **given)
     assert isinstance(over_time, Measured)
     return found.relaxing(fit(over_time), options.fast)

@@ -1,9 +1,13 @@
 """Strain energies fitted to pulls, compressions and shears: least squares of the nominal stress,
 dW / d(stretch) of the incompressible material, in every table at once.
+
+The stress is linear in all coefficients but Ogden's exponents: the iteration is over these alone,
+the others are solved for (variable projection).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,10 +18,17 @@ from torch import Tensor
 from torchsoft.materials.fit import UNSURE, Fit
 from torchsoft.materials.kinds import ENERGIES
 from torchsoft.materials.measured import Array, Pull, instant_time
-from torchsoft.physics.hyperelastic import KINDS, Hyperelastic
+from torchsoft.physics.hyperelastic import KINDS, Hyperelastic, Ogden
+from torchsoft.quantity import quantities
 
 EXPONENTS = (2.0, -2.0, 5.0, -5.0, 1.0)
-"""Exponents of Ogden's terms that a fit begins from, turned round for each of its beginnings."""
+"""Exponents of Ogden's terms that a fit starts from, rotated for each of its starts."""
+
+STEP = 1e-4
+"""Change of an exponent by which the derivative of stresses is taken."""
+
+DEPENDENT = 1e-10
+"""Relative singular value below which coefficients count as dependent."""
 
 SMALLEST = 0.5
 """Smallest stretch, and the inverse of the largest, in which stability is looked for, if the tables
@@ -141,7 +152,7 @@ def fit_energy(
     modulus.
 
     Raises `ValueError` for `terms` of another kind, for more of them than the rows tell, and where
-    no fit has a positive shear modulus.
+    the shear modulus of the best fit is not positive.
     """
     if terms is not None and kind != "ogden":
         raise ValueError(f"`terms` are those of ogden, but the energy is {kind}")
@@ -149,62 +160,71 @@ def fit_energy(
     rows = sum(len(pull.strain) for pull in pulls)
     if rows < 2 * count or not 1 <= (terms or 1) <= len(EXPONENTS):
         raise ValueError(f"{rows} rows do not tell {count} coefficients; take fewer terms")
-    x = [stretches(pull) for pull in pulls]
-    sizes = [float(np.abs(pull.stress).max()) for pull in pulls]
-    units = scales(kind, pulls[0], count, nu)
+    sizes = np.concatenate([np.full(len(p.stress), np.abs(p.stress).max()) for p in pulls])
+    target = np.concatenate([pull.stress for pull in pulls]) / sizes
 
-    def material(z: Array) -> Hyperelastic:
-        table = arguments(kind, (z * units).tolist())
-        return made(kind, table, nu=nu, rho=1e3, tau=1.0, depth=1.0)
+    def material(values: Sequence[float]) -> Hyperelastic:
+        return made(kind, arguments(kind, values), nu=nu, rho=1e3, tau=1.0, depth=1.0)
 
-    def stresses(z: Array) -> list[Array]:
-        own = material(z)
-        signs = [-1.0 if pull.test == "compression" else 1.0 for pull in pulls]
-        return [s * nominal_stress(own, p.test, at) for s, p, at in zip(signs, pulls, x)]
+    @cache
+    def column(*values: float) -> Array:
+        return measured_stress(material(values), pulls) / sizes
 
-    def residuals(z: Array) -> Array:
-        parts = zip(stresses(z), pulls, sizes)
-        return np.concatenate([(own - pull.stress) / size for own, pull, size in parts])
+    def columns(exponents: Array) -> Array:
+        """Stresses per coefficient in which they are linear, over `sizes`: (rows, coefficients)."""
+        units = [(1.0, alpha) for alpha in exponents] if kind == "ogden" else np.eye(count).tolist()
+        return np.stack([column(*one) for one in units], 1)
 
-    found = [
-        done
-        for begin in beginnings(kind, count)
-        for done in [least_squares(residuals, begin, x_scale="jac", max_nfev=500)]
-        if np.isfinite(done.fun).all() and done.x[: (count + 1) // 2].sum() > 0
-    ]
-    if not found:
-        raise ValueError(f"{pulls[0].path}: no {kind} energy with a positive modulus fits")
-    best = min(found, key=lambda one: one.cost)
-    _, s, V = np.linalg.svd(best.jac, full_matrices=False)
+    def solved(A: Array) -> Array:
+        scale = np.linalg.norm(A, axis=0)
+        return np.linalg.lstsq(A / scale, target, DEPENDENT)[0] / scale
+
+    def residuals(exponents: Array) -> Array:
+        A = columns(exponents)
+        return A @ solved(A) - target
+
+    exponents = np.empty(0)
+    if kind == "ogden":
+        allowed = quantities(Ogden)["alpha"]
+        bounds = allowed.low, allowed.high
+        starts = [np.roll(EXPONENTS, -k)[: terms or 1] for k in range(len(EXPONENTS))]
+        found = [least_squares(residuals, start, bounds=bounds, max_nfev=100) for start in starts]
+        exponents = min(found, key=lambda one: (solved(columns(one.x)).sum() <= 0, one.cost)).x
+    A = columns(exponents)
+    linear = solved(A)
+    best = [*linear.tolist(), *exponents.tolist()]
+    energy, fitted = material(best), A @ linear
+    if not (shear := energy.shear.item()) > 0:
+        raise ValueError(
+            f"{pulls[0].path}: the {kind} energy that fits best has a shear modulus of "
+            f"{shear:.4g} Pa at small strains, but it must be positive: take another "
+            "energy or fewer terms, or look at the stresses of the smallest strains"
+        )
+    jacobian = A
+    if kind == "ogden":
+        slopes = (columns(exponents + STEP) - columns(exponents - STEP)) / (2 * STEP) * linear
+        jacobian = np.column_stack((A, slopes))
+    unit = np.linalg.norm(jacobian, axis=0)
+    _, s, V = np.linalg.svd(jacobian / unit, full_matrices=False)
     spread = ((V.T / np.maximum(s, 1e-300)) ** 2).sum(1)
-    sd = units * np.sqrt(spread * 2 * best.cost / max(rows - count, 1))
+    sd = np.sqrt(spread * ((fitted - target) ** 2).sum() / max(rows - count, 1)) / unit
     half = range(1, count // 2 + 1)
     names = (
         [f"{symbol}_{k}" for symbol in ENERGIES[kind] for k in half]
         if kind == "ogden"
         else list(ENERGIES[kind])
     )
-    own = dict(zip(names, (best.x * units).tolist())), dict(zip(names, sd.tolist()))
-    said = tuple(notices(pulls, material(best.x), *own))
-    return EnergyFit(tuple(pulls), kind, *own, tuple(stresses(best.x)), said)
+    values, deviations = dict(zip(names, best)), dict(zip(names, sd.tolist()))
+    curves = np.split(fitted * sizes, np.cumsum([len(pull.stress) for pull in pulls])[:-1])
+    sentences = tuple(notices(pulls, energy, values, deviations))
+    return EnergyFit(tuple(pulls), kind, values, deviations, tuple(curves), sentences)
 
 
-def scales(kind: str, pull: Pull, count: int, nu: float) -> Array:
-    """Units of the coefficients: the pull's modulus [Pa], for E what it is at Poisson's ratio nu,
-    and 1 for exponents."""
-    modulus = np.full(count, float(pull.strain @ pull.stress / (pull.strain @ pull.strain)))
-    if kind == "ogden":
-        modulus[count // 2 :] = 1.0
-    return modulus * (1 + nu) if kind == "neo_hookean" else modulus
-
-
-def beginnings(kind: str, count: int) -> list[Array]:
-    """Coefficients, in their units, that a fit begins from."""
-    if kind != "ogden":
-        return [np.concatenate(([0.3], np.full(count - 1, 0.01)))]
-    terms = count // 2
-    mu = np.concatenate(([0.3], np.full(terms - 1, 0.02)))
-    return [np.concatenate((mu, np.roll(EXPONENTS, -k)[:terms])) for k in range(len(EXPONENTS))]
+def measured_stress(material: Hyperelastic, pulls: Sequence[Pull]) -> Array:
+    """Nominal stress [Pa] of a material in the rows of all tables, in the direction of the load."""
+    signs = [-1.0 if pull.test == "compression" else 1.0 for pull in pulls]
+    parts = [nominal_stress(material, pull.test, stretches(pull)) for pull in pulls]
+    return np.concatenate([sign * part for sign, part in zip(signs, parts)])
 
 
 def notices(
@@ -216,6 +236,7 @@ def notices(
         x = stretches(pull)
         what = "amounts of shear" if pull.test == "shear" else "stretches"
         yield f"{pull.test}: {what} from {x.min():.3g} to {x.max():.3g}; beyond them W is a guess"
+        yield from (f"{pull.test}: {notice}" for notice in pull.notices)
     if len({pull.test for pull in pulls}) == 1 and len(values) > 1:
         yield (
             "one kind of test does not tell an energy of several coefficients in others: a pad "
@@ -235,6 +256,12 @@ def notices(
     if unsure:
         names = ", ".join(unsure)
         yield f"hardly determined, with a standard deviation above {UNSURE:.0%}: {names}"
+    limit = quantities(Ogden)["alpha"].high
+    extreme = [
+        name for name in values if name.startswith("alpha") and abs(values[name]) > 0.99 * limit
+    ]
+    if extreme:
+        yield f"at the limit of exponents, {limit:g}: {', '.join(extreme)}; take fewer terms"
     yield (
         "the specimen counts as incompressible and at the speed of the test: what the rubber does "
         "over time is of a relaxation, a creep or a frequency test"

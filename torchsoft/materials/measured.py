@@ -42,6 +42,9 @@ KNOWN: dict[str, csvfile.Units] = {
 }
 """Columns, and the units that each may have."""
 
+POSITIVE = {"modulus", "compliance", "frequency", *SWEPT, *SWEPT.values(), "tan_delta"}
+"""Columns without negative values; only a modulus or a compliance may be zero at first."""
+
 LEAST = 8
 """Rows that a file needs; of a sweep, which has two numbers in each, half as many."""
 
@@ -55,8 +58,16 @@ DECADE = 10.0
 FLOWING = 0.8
 """Power of time above which creep at the end of a test is a flow: 1 is a dashpot's."""
 
+ROUNDED = 1e-6
+"""Part of the largest strain by which a range counts as wider: its ends are inside in spite of
+rounding."""
+
 INSTANT_PART = 0.1
 """Largest retardation time of the instantaneous spring, over the shortest time of the series."""
+
+NOISES = 12.0
+"""Fall of a quantity that must grow, over the standard deviation of its noise, up to which it may
+be noise."""
 
 SMALL_STRAIN = 0.1
 """Strain up to which a linear material is taken at its word."""
@@ -173,15 +184,15 @@ class Spectrum:
 @dataclass(frozen=True)
 class Pull:
     """A pull or a compression up to its largest strain: strain (n,) [1] and nominal stress (n,)
-    [Pa] in the direction of the load, the strains between which they are taken, and how many rows
-    after the largest strain are left out."""
+    [Pa] in the direction of the load, the strains between which they are taken, and notices on
+    rows that are left out."""
 
     path: Path
     test: PullTest
     strain: Array
     stress: Array
     strains: tuple[float, float]
-    unloading: int
+    notices: tuple[str, ...]
 
 
 def read(
@@ -205,7 +216,8 @@ def read(
 
     Without `test` a table with `frequency` is a sweep, one without `t` a pull, and one over time
     controls what it holds over the second half. Raises `ValueError` naming file, row and column,
-    or where none was held, and `OSError`.
+    for what no rubber does (a negative modulus, compression to nothing, a stress or storage modulus
+    that falls), or where none was held, and `OSError`.
     """
     path = Path(path)
     table = csvfile.read(path, KNOWN, hint, ignore, headings)
@@ -217,7 +229,7 @@ def read(
                 raise ValueError(f"{path}: a sweep needs no `{name}`")
         if test not in (None, "sweep"):
             raise ValueError(f"{path}: `frequency` is of a sweep, not of a {test} test")
-        return sweep(path, values, nu)
+        return sweep(path, table, nu)
     if test == "sweep":
         raise ValueError(f"{path} has no column `frequency`{hint('frequency', 2)}")
     if alone := {"modulus", "compliance"} & values.keys():
@@ -231,6 +243,8 @@ def read(
         for name, given in (("length", length), ("area", area)):
             if given is not None:
                 raise ValueError(f"{path}: nothing is to be divided by the `{name}`")
+        if not values[min(alone)].any():
+            raise ValueError(f"{path}: the {min(alone)} is zero throughout")
         one = np.ones_like(values["t"])
         if own == "relaxation":
             return Measured(path, "relaxation", values["t"], one, values["modulus"], True)
@@ -246,11 +260,24 @@ def read(
         raise ValueError(
             f"{path}: strain and stress are opposite; is one of them positive in compression?"
         )
+    if test == "compression" and strain[np.abs(strain).argmax()] > 0:
+        if "stretch" in values:
+            raise ValueError(
+                f"{path}: stretches go up to {values['stretch'].max():.4g}, but those of a "
+                "compression test are below 1: a tension test?"
+            )
+        strain, stress = -strain, -stress
+    if test != "shear" and (gone := np.flatnonzero(strain <= -1)).size:
+        raise ValueError(
+            f"{path}, row {table.rows[gone[0]]}: the strain is {strain[gone[0]]:.4g}, but a "
+            "specimen that is compressed to nothing has -1: look at the unit of the column, at "
+            "the gauge length, and at the test"
+        )
     if true and test != "shear":
         stress = stress / (1 + strain)
     pull: PullTest | None = next((one for one in PULLS if one == test), None)
     if pull is not None:
-        return pulled(path, pull, strain, stress, strains, whole)
+        return pulled(path, pull, table.rows, strain, stress, strains, whole)
     if "t" not in values:
         raise ValueError(
             f"{path} has no column `t`: over time it would be a relaxation or a creep test; for a "
@@ -276,9 +303,20 @@ def held(path: Path, strain: Array, stress: Array) -> Literal["relaxation", "cre
     return "relaxation" if change[0] <= change[1] else "creep"
 
 
-def sweep(path: Path, values: Mapping[str, Array], nu: float | None) -> Spectrum:
+def falling(values: Array) -> int | None:
+    """The row after which values (n,) that must grow fall, by more than `HELD` of the largest and
+    more than `NOISES` times their noise, which second differences show; None where they do not."""
+    second = np.sort(np.abs(np.diff(values, 2)))
+    noise = float(second[3 * (len(second) - 1) // 4]) / (1.15 * np.sqrt(6))  # upper quartile
+    fall = np.maximum.accumulate(values) - values
+    fallen = np.flatnonzero(fall > max(HELD * values.max(), NOISES * noise))
+    return int(values[: fallen[0]].argmax()) if fallen.size else None
+
+
+def sweep(path: Path, table: csvfile.Numbers, nu: float | None) -> Spectrum:
     """A frequency sweep, from moduli of tension, or of shear with Poisson's ratio. Raises
-    `ValueError` for other columns."""
+    `ValueError` for other columns, and for a storage modulus that falls."""
+    values = table.values
     ways = {
         frozenset((one, loss)): one for one, own in SWEPT.items() for loss in (own, "tan_delta")
     }
@@ -298,26 +336,33 @@ def sweep(path: Path, values: Mapping[str, Array], nu: float | None) -> Spectrum
     lost = values[min(there - {one})]
     loss = storage * lost if "tan_delta" in there else factor * lost
     order = np.argsort(values["frequency"])
-    for name, x in (("frequency", values["frequency"]), ("storage", storage), ("loss", loss)):
-        if not (x > 0).all():
-            raise ValueError(f"{path}: column of {name}: all must be above zero")
+    if (last := falling(storage[order])) is not None:
+        raise ValueError(
+            f"{path}, row {table.rows[order[last + 1]]}: the storage modulus falls from "
+            f"{storage[order[last]]:.4g} Pa although the frequency grows, which no relaxation "
+            "does: leave out rows near a resonance or where the specimen slipped"
+        )
     return Spectrum(path, values["frequency"][order], storage[order], loss[order])
 
 
 def pulled(
     path: Path,
     test: PullTest,
+    rows: Sequence[int],
     strain: Array,
     stress: Array,
     strains: tuple[float, float] | None,
     whole: bool = False,
 ) -> Pull:
     """A pull up to its largest strain. Raises `ValueError` without a range that the rows cover, for
-    loads in the other direction, and where the strain goes back."""
+    loads in the other direction, and where the strain goes back or the stress falls."""
     largest = int(np.argmax(np.abs(strain)))
     sign = -1.0 if strain[largest] < 0 else 1.0
-    if test == "tension" and sign < 0:
-        raise ValueError(f"{path}: the strain is negative: a compression test?")
+    if test not in ("compression", "shear") and sign < 0:
+        raise ValueError(
+            f"{path}, row {rows[largest]}: the strain is negative, {strain[largest]:.4g}: a "
+            "compression test?"
+        )
     up, load = sign * strain[: largest + 1], sign * stress[: largest + 1]
     if strains is None and whole:
         strains = float(up.min()), float(up[-1])
@@ -327,19 +372,41 @@ def pulled(
             f"{up[0]:.3g} to {up[-1]:.3g}"
         )
     low, high = strains
-    back = float((np.maximum.accumulate(up) - up).max())
-    if back > HELD * up[-1]:
+    back = np.maximum.accumulate(up) - up
+    if (turned := np.flatnonzero(back > HELD * up[-1])).size:
         raise ValueError(
-            f"{path}: the strain goes back by {back:.2g} on its way to the largest one, "
-            f"{up[-1]:.2g}: keep the rows of one loading"
+            f"{path}, row {rows[turned[0]]}: the strain goes back by {back.max():.2g} on its way "
+            f"to the largest one, {up[-1]:.2g}: keep the rows of one loading"
         )
-    inside = (up >= low) & (up <= high)
+    rounding = ROUNDED * up[-1]
+    below, above = up < low - rounding, up > high + rounding
+    inside = ~(below | above)
     if not low < high or inside.sum() < LEAST:
         raise ValueError(
             f"{path} has {inside.sum()} rows with strains from {low:g} to {high:g}, but needs at "
             f"least {LEAST}; strains go from {up[0]:.3g} to {up[-1]:.3g}"
         )
-    return Pull(path, test, up[inside], load[inside], (low, high), len(strain) - largest - 1)
+    numbers = np.array(rows)
+    x, y, numbers_inside = up[inside], load[inside], numbers[: largest + 1][inside]
+    if (last := falling(y)) is not None:
+        stretch = "" if test == "shear" else f" (a stretch of {1 + np.copysign(x[last], sign):.6g})"
+        raise ValueError(
+            f"{path}, row {numbers_inside[last + 1]}: the stress falls from {y[last]:.4g} Pa at a "
+            f"strain of {x[last]:.6g}{stretch} on, as where a specimen tears or slips: leave out "
+            f"rows {numbers_inside[last + 1]} to {numbers_inside[-1]} by a range of strains, "
+            f"--range {round(low, 4):g} {x[last]:.6g}"
+        )
+    left_out = (
+        (numbers[: largest + 1][below], f"strains below {low:g}"),
+        (numbers[: largest + 1][above], f"strains above {high:g}"),
+        (numbers[largest + 1 :], "after the largest strain"),
+    )
+    notices = tuple(
+        f"left out are {len(some)} rows from row {some[0]} to row {some[-1]}: {why}"
+        for some, why in left_out
+        if len(some)
+    )
+    return Pull(path, test, x, y, (low, high), notices)
 
 
 def nominal(
@@ -365,7 +432,8 @@ def nominal(
 
 
 def check_rows(path: Path, table: csvfile.Numbers) -> None:
-    """Raises `ValueError` for too few rows, empty cells, and times that do not grow from zero."""
+    """Raises `ValueError` for too few rows, empty cells, negative moduli, and times that do not
+    grow from zero."""
     least = LEAST // 2 if "frequency" in table.values else LEAST
     if len(table.rows) < least:
         raise ValueError(
@@ -374,6 +442,14 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
     for name, column in table.values.items():
         if (empty := np.flatnonzero(np.isnan(column))).size:
             raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
+        bad = column < 0 if name in ("modulus", "compliance") else column <= 0
+        if name in POSITIVE and bad.any():
+            unit = next(unit for unit, size in KNOWN[name].items() if size == 1)
+            raise ValueError(
+                f"{path}, row {table.rows[bad.argmax()]}, column `{name}`: "
+                f"{column[bad.argmax()]:.4g} {unit} is not above zero: look at the signs and the "
+                "offsets of the sensors, and leave out rows of noise alone"
+            )
     if "t" not in table.values:
         return
     t = table.values["t"]

@@ -43,18 +43,21 @@ class Modulus:
 
 def modulus(pull: Pull) -> Modulus:
     """The modulus of a pull. Raises `ValueError` where the stress does not grow with strain."""
+    if pull.test not in ("tension", "compression"):
+        raise ValueError(
+            f"{pull.path}: the modulus of a {pull.test} test is not E; say --energy neo_hookean"
+        )
     x, y = pull.strain, pull.stress
     (E, offset), spread = np.polyfit(x, y, 1, cov="unscaled")
     fitted = E * x + offset
     sd = float(np.sqrt(spread[0, 0] * ((y - fitted) ** 2).sum() / (len(x) - 2)))
     if E <= 0:
-        raise ValueError(f"{pull.path}: the stress does not grow with the strain in this range")
+        raise ValueError(
+            f"{pull.path}: the slope of the stress is {E:.4g} Pa between strains of "
+            f"{pull.strains[0]:g} and {pull.strains[1]:g}, but must be positive: take another range"
+        )
     curve = np.polyder(np.polyfit(x, y, 2))
     ends = (float(np.polyval(curve, x[0])), float(np.polyval(curve, x[-1])))
-    if pull.test not in ("tension", "compression"):
-        raise ValueError(
-            f"{pull.path}: the modulus of a {pull.test} test is not E; say --energy neo_hookean"
-        )
     return Modulus(pull, {"E": float(E)}, {"E": sd}, fitted, ends, tuple(notices(pull, E, ends)))
 
 
@@ -79,6 +82,4 @@ def notices(pull: Pull, E: float, ends: tuple[float, float]) -> list[str]:
             "between plates that hold its ends a specimen is stiffer than its rubber, the flatter "
             "the more: lubricate them, or take a tall one"
         )
-    if pull.unloading:
-        sentences.append(f"{pull.unloading} rows after the largest strain are left out")
-    return sentences
+    return [*sentences, *pull.notices]

@@ -17,6 +17,8 @@ from torchsoft.materials.energies import EnergyFit, stretches
 from torchsoft.materials.fit import Fit
 from torchsoft.materials.measured import Spectrum
 from torchsoft.materials.modulus import Modulus
+from torchsoft.physics.hyperelastic import KINDS
+from torchsoft.physics.validity import check_numbers, sound
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, new_figure, save
 from torchsoft.plot.scene import INK
 from torchsoft.tables import toml_row
@@ -53,7 +55,17 @@ def write(
     found: Found, folder: Path, assumed: Mapping[str, float], options: Mapping[str, object]
 ) -> None:
     """Write `FILES`. `assumed` are coefficients that the file does not tell; `options` are those of
-    the command. Each file appears whole or not at all."""
+    the command. Each file appears whole or not at all. Raises `ValueError` for coefficients that no
+    material has."""
+    try:
+        material = KINDS[found.kind](**found.table(), **assumed)
+        check_numbers(material)
+        sound(material)
+    except ValueError as error:
+        raise ValueError(
+            f"{source(found)[0]}: the {found.kind} material of this fit is not physical: {error}; "
+            "look at the units and the signs of the columns"
+        ) from None
     save_text(folder / "material.toml", toml(found, assumed))
     write_json(folder / "summary.json", summary(found, assumed, options))
     save(drawn(found), folder / "fit.png")
