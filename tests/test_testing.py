@@ -75,7 +75,7 @@ def test_every_derivative_has_its_own_difference_and_the_rig_is_left_as_it_was()
         assert one.uncertainty < 1e-4 * abs(one.adjoint)
         assert one.forward == pytest.approx(one.adjoint, rel=1e-6)
     assert not checked.unclear
-    assert re.match(r"\d+% stick, \d+% slip, \d+% are apart; \d+ touch down", checked.regime)
+    assert re.match(r"\d+% stick, \d+% slip, \d+% out of contact; \d+ touch down", checked.regime)
     assert "motion by rubber.E" in repr(checked)
     assert all(torch.equal(p, before[name]) for name, p in rig.named_parameters())
 
