@@ -97,9 +97,9 @@ def left_out(
         return evaluate(law, x, parameters, np.linspace(0.5, 1.7, law.outputs))
 
     whole, own = made(opened()), made(Trace)
-    by_input = _differ(own.by_input, whole.by_input).any((0, 1))
+    by_input = np.asarray(_differ(own.by_input, whole.by_input).any((0, 1)))
     if conjugates is not None:  # the forces are derivatives themselves
-        by_input[:conjugates] |= _differ(own.value, whole.value).any(0)[:conjugates]
+        by_input[:conjugates] |= np.any(_differ(own.value, whole.value), axis=0)[:conjugates]
     inputs = tuple(np.flatnonzero(by_input).tolist())
     entries = np.any(_differ(own.by_parameter, whole.by_parameter), axis=0).tolist()
     names, start = list[str](), 0

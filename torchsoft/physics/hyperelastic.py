@@ -200,7 +200,8 @@ class Hyperelastic(OneTime):
             turned = self._stress((plane(R) @ F).flatten(0, 1))[0].detach()
         off = turned.reshape(len(TURNS), -1, 2, 2) - R @ P.unflatten(-1, (2, 2))
         off = off.abs().amax((0, 2, 3)).nan_to_num(torch.inf)
-        if float(off.max()) <= ALIKE * max(float(self.shear), float(P.abs().max())):
+        largest = max(float(self.shear.detach()), float(P.abs().max()))
+        if float(off.max()) <= ALIKE * largest:
             return ""
         k = int(off.argmax())
         return (

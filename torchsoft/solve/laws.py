@@ -218,11 +218,12 @@ def outputs_of(law: Callable[..., Any], x: Tensor) -> Tensor:
     if isinstance(law, Actuator):
         out = response_of(law, x)
     elif own_states(law):
-        out = slip_of(law, *x[..., :3].unbind(-1), x[..., 3:-1], x[..., -1])
+        E, F_N, R, *_ = x.unbind(-1)
+        out = slip_of(law, E, F_N, R, x[..., 3:-1], x[..., -1])
     else:
         out = law(x) if isinstance(law, Shape) else law(*x.unbind(-1))
     parts = out if isinstance(out, tuple) else (out,)
-    return torch.cat([part.reshape(-1) for part in parts])
+    return torch.cat([part.reshape(-1) for part in parts if part is not None])
 
 
 def tried_efforts(slip: Any, R: float) -> Tensor:

@@ -200,12 +200,15 @@ def check_gradients(
     Every difference is taken at two lengths that agree; how much they disagree is its uncertainty.
     A derivative may miss its difference by `bound` of the larger of the two and twice the
     uncertainty. Parameters whose derivatives are zero throughout, such as coefficients of friction
-    in a run without slip, were not checked: that is a fault of those in `wrt`, and a warning where
-    all parameters are differentiated, since a limit that is not reached has no effect. Without
-    `each` there is one for all parameters, along a direction in which they weigh equally: few
-    runs, and no word on which parameter is wrong. With `step_error` one more run, at a tenth of
-    `rtol`, says how much of each derivative is that of the steps; a warning names those whose sign
-    depends on it.
+    in a run without slip, were not checked: for those in `wrt` that is a fault. By default, where a
+    parameter may have no effect, such as a limit that is not reached, the result lists them as
+    `without_effect`, and a warning names them if no contact point touches, sticks or slips in the
+    run.
+
+    Without `each` there is one difference for all parameters, along a direction in which they weigh
+    equally: few runs, and no word on which parameter is wrong. With `step_error` one more run, at a
+    tenth of `rtol`, says how much of each derivative is that of the steps; a warning names those
+    whose sign depends on it.
 
     Raises `CheckFailed` with a message on every fault, `ValueError` for names that are not known.
     """
@@ -216,6 +219,7 @@ def check_gradients(
     if idle and (wrt is not None or len(idle) == len(leaves)):
         faults.append(_unchecked(check, idle))
     conclude(faults)
+    idle = idle if {"touch", "stick", "slip"} & {*check.absent} else ()
     for names in filter(None, (idle, check.unchecked)):
         warnings.warn(_unchecked(check, names), stacklevel=2)
     for one in check.unsigned:
@@ -396,7 +400,7 @@ def _checked(
 
     derivatives = []
     for name in leaves:
-        judged: dict[str, Any] = dict.fromkeys(own, (None, None))
+        judged: Mapping[str, tuple[float | None, float | None]] = dict.fromkeys(own, (None, None))
         if each:
             much = factor(name, own)
             expected = {kind: found[name] for kind, found in own.items()}
