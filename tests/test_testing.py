@@ -144,11 +144,11 @@ def test_a_wrong_derivative_is_found_beside_larger_ones():
     derivative of 1e4."""
     run = simulate(thrown(), times(0.1, 2), y0=torch.zeros(6).double())
     wrong = gradients.Derivative("value", "c", 0.0, None, 0.0435, 9e-9, None, 0.0435)
-    for scale in (0.0435, 1e4):
-        check = gradients.GradientCheck((wrong._replace(scale=scale),), run, 1e-5)
+    for by, scale in (("c", 0.0435), ("c", 1e4), (gradients.TOGETHER, 0.0)):
+        check = gradients.GradientCheck((wrong._replace(by=by, scale=scale),), run, 1e-5)
         assert (check.unclear, check.without_effect, check.unchecked) == ((), (), ())
         (fault,) = gradients._faults(check, 1e-5)
-        assert "`c` is 0 by the adjoint and 0.0435" in fault
+        assert f"`{by}` is 0 by the adjoint and 0.0435" in fault
     vague = gradients.GradientCheck((wrong._replace(uncertainty=1e-2),), run, 1e-5)
     assert (len(vague.unclear), vague.unchecked) == (1, ("c",))
     noise = gradients.GradientCheck((wrong._replace(difference=9e-9, scale=1.0),), run, 1e-5)

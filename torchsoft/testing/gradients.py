@@ -74,10 +74,10 @@ class Derivative(NamedTuple):
 
     @property
     def size(self) -> float:
-        """What its errors are relative to: the larger of the adjoint and the difference."""
-        if self.by == TOGETHER:
-            return self.scale
-        return max(abs(self.adjoint), abs(self.difference or 0.0))
+        """What its errors are relative to: the larger of adjoint and difference, whose parts
+        may cancel where all parameters are taken together."""
+        together = self.scale if self.by == TOGETHER else 0.0
+        return max(abs(self.adjoint), abs(self.difference or 0.0), together)
 
     @property
     def zero(self) -> bool:
