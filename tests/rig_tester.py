@@ -2,6 +2,7 @@
 rig is made of."""
 
 import pickle
+import warnings
 from copy import deepcopy
 
 import pytest
@@ -157,10 +158,12 @@ def assert_gradients_exact(
     """A run whose ledger closes and whose forces are the module's, and `check_gradients` of it
     along one direction of the start, of every parameter and of every value of the reference."""
     rig, y0 = start
-    checked = check_gradients(
-        rig, t, y0, rtol=rtol, bound=bound, dy0=at_random(start, 0) - y0, each=False,
-        step_error=False, centres=centres,
-    )  # fmt: skip
+    with warnings.catch_warnings():  # some parameters have no effect
+        warnings.filterwarnings("ignore", "the derivatives by .* were not checked")
+        checked = check_gradients(
+            rig, t, y0, rtol=rtol, bound=bound, dy0=at_random(start, 0) - y0, each=False,
+            step_error=False, centres=centres,
+        )  # fmt: skip
     made = checked.run
     assert made.energy_residual_rel < 2e-3
     if not any(isinstance(part, Coulomb) for part in rig.modules()):  # on which side of its jump?

@@ -2,6 +2,8 @@
 runs and files."""
 
 import ctypes
+import re
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -12,6 +14,8 @@ from conftest import PAPER, RUBBER, f64, paper
 from torch import Tensor
 
 from torchsoft import (
+    Body,
+    Circle,
     Hyperelastic,
     KelvinVoigt,
     MooneyRivlin,
@@ -19,6 +23,7 @@ from torchsoft import (
     Ogden,
     Pad,
     PadMesh,
+    Rig,
     Trajectory,
     Yeoh,
     simulate,
@@ -26,11 +31,12 @@ from torchsoft import (
 from torchsoft.codegen import compile_law
 from torchsoft.physics import elements
 from torchsoft.physics.elements import element_constants, element_potentials
-from torchsoft.physics.hyperelastic import again, described, invariants
+from torchsoft.physics.hyperelastic import again, described, invariants, plane
 from torchsoft.physics.setup import PadSetup
 from torchsoft.physics.statics import net_loads, settled, unstretched
 from torchsoft.solve.kernel.arrays import LANES
 from torchsoft.solve.laws import Factors, as_law, element
+from torchsoft.testing import CheckFailed, check_energy
 
 REST = {"nu": 0.45, "rho": 1100.0, "tau": 0.01, "depth": 0.044}
 MATERIALS = {
@@ -217,23 +223,71 @@ def test_moduli_of_small_strains_are_those_of_the_energy(material):
 
 
 class Bent(Hyperelastic):
-    """An energy with faults."""
+    """A neo-Hookean energy with another term."""
 
-    def __init__(self, slope: float, factor: float) -> None:
+    def __init__(self, term: Callable[[Tensor], Tensor]) -> None:
         super().__init__(**RUBBER, tau=0.01)
-        self.slope, self.factor = slope, factor
+        self.term = term
 
     def distortion(self, F: Tensor) -> Tensor:
-        I1, _, _ = invariants(F)
-        return 0.5 * self.factor * self.shear * (I1 - 3) + self.slope * (F[..., 0, 0] - 1)
+        return 0.5 * self.shear * (invariants(F)[0] - 3) + self.term(F)
 
 
-def test_an_energy_that_is_not_its_moduli_is_refused():
-    assert Bent(0.0, 1.0).well_posed() == ""
-    assert "has a stress without strain" in Bent(100.0, 1.0).well_posed()
-    assert "make them agree" in Bent(0.0, 1.5).well_posed()
+def green(F: Tensor, i: int, j: int) -> Tensor:
+    """An entry of C = F^T F."""
+    return (F[..., i] * F[..., j]).sum(-1)
+
+
+FAULTS = {
+    "has a stress without strain": lambda F: 100.0 * (F[..., 0, 0] - 1),
+    r"P_xx by F_xx .* 3.20038e\+06 Pa, but 2.84483e\+06 Pa": (
+        lambda F: 1e6 / 7.5 * (invariants(F)[0] - 3)
+    ),
+    "changes with a rotation": lambda F: 3e5 * F[..., 1, 0] ** 2,
+    "changes with a rotation .*F = ": lambda F: 3e5 * (F[..., 1, 1] - 1) ** 2,
+    "changes with a rotation .* C = ": lambda F: 1e7 * F[..., 1, 0] ** 4,
+    "P_yy by F_yy .* make them agree": lambda F: 3e4 * (green(F, 1, 1) - 1) ** 2,
+    "P_xy by F_xy .* make them agree": lambda F: 3e4 * green(F, 0, 1) ** 2,
+    r"not stable at F = \[\[0.98, 0.1\]": lambda F: -1e7 * (invariants(F)[0] - 3) ** 2,
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_an_energy_that_is_no_isotropic_objective_stable_one_is_rejected(fault):
+    assert re.search(fault, Bent(FAULTS[fault]).well_posed())
+
+
+def test_energies_that_are_right_pass_and_a_negative_modulus_is_rejected():
+    for term in (lambda F: 0 * F[..., 0, 0], lambda F: 1e5 * (green(F, 1, 1) - 1) ** 4):
+        assert Bent(term).well_posed() == ""
     soft = MooneyRivlin(C10=1e4, C01=-2e4, **REST)
     assert "make it positive" in soft.well_posed()
+
+
+def test_an_energy_that_collapses_at_the_strains_of_a_run_fails_check_energy():
+    """In simple shear s the modulus of Yeoh's energy is 2 C10 + 12 C20 s^2: negative from 0.236 on
+    with C20 = -3 C10."""
+    rubber = Yeoh(C10=1.3e5, C20=-3.9e5, **REST)
+    modulus = lambda s: 2 * 1.3e5 - 12 * 3.9e5 * s**2
+    F = plane(f64(1.0, 0.3, 0.0, 1.0).reshape(1, 2, 2))
+    assert float(rubber.stress_and_moduli(F)[1][0, 1, 1]) == pytest.approx(modulus(0.3), rel=1e-9)
+    assert rubber.well_posed() == ""
+    mesh = PadMesh(length=8e-3, height=2e-3, elements_x=4, elements_y=2)
+    bodies = {"free": Body(1.0, Circle(1e-3), weighted=False)}
+    rig = Rig(bodies=bodies, pads={"P": Pad(mesh, rubber)}, contacts={})
+
+    def sheared(s: float) -> Tensor:
+        y = torch.zeros(rig.layout.size, dtype=torch.float64)
+        u = np.outer(mesh.nodes[mesh.free, 1], [s, 0.0]).ravel()
+        y[rig.layout.slices["pads", "P"]] = torch.from_numpy(u)
+        return y
+
+    run = {"rig": rig, "t": f64(0.0, 1e-6)}
+    check_energy(**run, y0=sheared(0.2))
+    with pytest.raises(CheckFailed, match=r"`P`: the energy is not stable at F = .*0\.3") as failed:
+        check_energy(**run, y0=sheared(0.3))
+    least = float(re.search(r"stiffness is (\S+) Pa", str(failed.value))[1])
+    assert least == pytest.approx(modulus(0.3), rel=0.1)
 
 
 def test_ogdens_sums_are_smooth_where_stretches_are_equal():
@@ -357,7 +411,7 @@ def test_cauchys_stress_is_that_of_theory():
     U = setup.strain(u)[0] + [1, 1, 0]
     stretches = np.linalg.eigvalsh([[U[0], U[2]], [U[2], U[1]]])
     assert stretches == pytest.approx(np.sort(np.linalg.svd(F)[1]), rel=1e-10)
-    own = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), Bent(0.0, 1.0)))
+    own = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), Bent(lambda F: F[..., 0, 0])))
     with pytest.raises(ValueError, match="one of your own"):
         own.stress(u)
 

@@ -3,6 +3,7 @@
 import re
 import warnings
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -10,15 +11,18 @@ from conftest import COARSE, PAPER, coarse, excited, f64, grasped, still, times,
 from torch import Tensor, nn
 
 from torchsoft import (
+    PD,
     Actuator,
     Body,
     Circle,
     Contact,
     Coulomb,
+    Hyperelastic,
     KelvinVoigt,
     Pad,
     PadMesh,
     Profile,
+    Reference,
     Rig,
     SmoothSlip,
     SoftContact,
@@ -26,6 +30,8 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
+from torchsoft.physics.hyperelastic import invariants
+from torchsoft.physics.state import OwnState
 from torchsoft.rigs.excite import CATALOGUE
 from torchsoft.solve.diagnostics import RESIDUAL, doubts
 
@@ -218,6 +224,73 @@ def test_controllers_and_shapes_and_materials_that_detach_are_told_of():
         strict=True,
     ):
         assert re.match(rf"the gradient of {what} wrong", text), text
+
+
+class Gel(Hyperelastic):
+    """A neo-Hookean energy and another term."""
+
+    def __init__(self, term: Callable[[Tensor, Tensor], Tensor]) -> None:
+        super().__init__(E=7.5e5, nu=0.45, rho=1100.0, tau=0.01, depth=0.044)
+        self.c, self.term = nn.Parameter(f64(2e5)[0]), term
+
+    def distortion(self, F: Tensor) -> Tensor:
+        I1, _, _ = invariants(F)
+        return 0.5 * self.shear * (I1 - 3) + self.term(self.c, I1 - 3)
+
+
+class Wiping(nn.Module):
+    """Friction that falls with the way slid; its rate detaches `gain`."""
+
+    states: ClassVar = {"way": OwnState("m")}
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(f64(1.0)[0])
+
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor, z: Tensor, stage: Tensor) -> Any:
+        slip = (E - (0.4 + 0.1 * torch.exp(-z[..., 0] / 1e-3)) * F_N).clamp(min=0.0) / R
+        return slip, (self.gain.detach() * torch.where(F_N > 0, slip, 0.0))[..., None]
+
+
+class Swing(nn.Module):
+    """A set-point whose amplitude is `made` of a parameter."""
+
+    def __init__(self, made: Callable[[Tensor], Any]) -> None:
+        super().__init__()
+        self.amplitude, self.made = nn.Parameter(f64(1e-3)[0]), made
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        a = self.made(self.amplitude)
+        return 0.02 + a * torch.sin(20 * t), 20 * a * torch.cos(20 * t)
+
+
+@pytest.mark.parametrize(
+    ("parts", "names"),
+    [
+        ({"material": lambda: Gel(lambda c, x: c.detach() * x**2)}, "`c`"),
+        ({"material": lambda: Gel(lambda c, x: c * x.detach() * x)}, r"F_xx \(a stress\).*`c`"),
+        ({"material": lambda: Gel(lambda c, x: c * x**2)}, ""),
+        ({"friction": Wiping}, "`gain`"),
+        ({"signal": lambda: Swing(lambda a: a.detach())}, "`signals.x_d.amplitude`"),
+        ({"signal": lambda: Swing(Tensor.item)}, "`signals.x_d.amplitude`"),
+        ({"signal": lambda: Swing(lambda a: a)}, ""),
+    ],
+)
+def test_energies_states_and_signals_that_detach_are_named(parts, names):
+    made = {name: make() for name, make in parts.items()}
+    friction = made.get("friction", SmoothSlip(0.8, 0.7, 0.05))
+    material = made.get("material", KelvinVoigt(7.5e5, 0.45, 1100.0, 0.01, 0.044))
+    contact = SoftContact(1e5, 400.0, 1e5, 400.0, friction=friction)
+    rig = Rig(
+        bodies={"disc": Body(0.4, Circle(0.02))},
+        pads={"P": Pad(PadMesh(0.04, 4e-3, 8, 2), material)},
+        contacts={"c": Contact("P", "disc", contact)},
+        actuators={"a": Actuator("disc.x", "disc.x", PD(1e3, 10.0), setpoint="x_d")},
+        reference=Reference(x_d=made["signal"]) if "signal" in made else hold(x_d=0.02),
+    )  # fmt: skip
+    said = told(rig, t=times(1e-3, 2), y0=rig.state(disc={"x": 0.02, "y": 23.9e-3}))
+    sentence = f"the gradient of .* is not that of its value.*derivatives by {names} are wrong"
+    assert [bool(re.match(sentence, text)) for text in said] == [True] * bool(names), said
 
 
 def test_a_pad_pressed_flat_is_told_of():

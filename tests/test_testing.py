@@ -23,6 +23,7 @@ from torchsoft import (
     SmoothSlip,
     SoftContact,
     hold,
+    simulate,
 )
 from torchsoft.physics.multibond import Junction, Transformer
 from torchsoft.testing import (
@@ -75,7 +76,7 @@ def test_every_derivative_has_its_own_difference_and_the_rig_is_left_as_it_was()
         assert one.uncertainty < 1e-4 * abs(one.adjoint)
         assert one.forward == pytest.approx(one.adjoint, rel=1e-6)
     assert not checked.unclear
-    assert re.match(r"\d+% stick, \d+% slip, \d+% are apart; \d+ touch down", checked.regime)
+    assert re.match(r"\d+% stick, \d+% slip, \d+% out of contact; \d+ touch down", checked.regime)
     assert "motion by rubber.E" in repr(checked)
     assert all(torch.equal(p, before[name]) for name, p in rig.named_parameters())
 
@@ -136,6 +137,40 @@ def test_noise_that_agrees_by_chance_does_not_make_a_derivative_wrong():
     ((found, by),) = gradients._judged(differenced, {"value": slope}, {"value": 1.0}, 1e-5).values()
     assert abs(found - slope) <= 2 * by
     assert by < 1e-4
+
+
+def test_a_wrong_derivative_is_found_beside_larger_ones():
+    """Zero by the adjoint, 0.0435 by differences: of itself all of it is wrong, alone or beside a
+    derivative of 1e4."""
+    run = simulate(thrown(), times(0.1, 2), y0=torch.zeros(6).double())
+    wrong = gradients.Derivative("value", "c", 0.0, None, 0.0435, 9e-9, None, 0.0435)
+    for by, scale in (("c", 0.0435), ("c", 1e4), (gradients.TOGETHER, 0.0)):
+        check = gradients.GradientCheck((wrong._replace(by=by, scale=scale),), run, 1e-5)
+        assert (check.unclear, check.without_effect, check.unchecked) == ((), (), ())
+        (fault,) = gradients._faults(check, 1e-5)
+        assert f"`{by}` is 0 by the adjoint and 0.0435" in fault
+    vague = gradients.GradientCheck((wrong._replace(uncertainty=1e-2),), run, 1e-5)
+    assert (len(vague.unclear), vague.unchecked) == (1, ("c",))
+    noise = gradients.GradientCheck((wrong._replace(difference=9e-9, scale=1.0),), run, 1e-5)
+    assert (noise.unclear, noise.without_effect) == ((), ("c",))
+
+
+def test_parameters_without_effect_fail_where_they_are_named_and_are_reported_elsewhere():
+    """In 1 ms of the grasp no point slips: nothing depends on friction."""
+    rig, y0 = grip()
+    friction = [f"contact.friction.{name}" for name in ("mu_s", "mu_k", "v_s")]
+    run = {"rig": rig, "t": times(1e-3, 3), "y0": y0, "step_error": False}
+    with pytest.raises(CheckFailed, match=r"`contact.friction.mu_s`.*zero.*never slip") as failed:
+        check_gradients(**run, wrt=["rubber.E", *friction])
+    assert "rubber.E" not in str(failed.value)
+    with pytest.warns(UserWarning, match=r"`contact.friction.mu_s`.*were not checked.*never slip"):
+        checked = check_gradients(**run)
+    assert set(friction) <= set(checked.without_effect)
+    assert "slip" in checked.absent
+    y0 = torch.zeros(6, dtype=torch.float64)
+    wrt, of = ["gravity", "bodies.disc.mass"], ["y_disc"]
+    with pytest.raises(CheckFailed, match=r"`gravity`, `bodies.disc.mass` were not checked"):
+        check_gradients(thrown(), times(0.1, 2), y0, wrt=wrt, of=of, each=False)
 
 
 @pytest.mark.parametrize("of", ["x_disc", 3.0])

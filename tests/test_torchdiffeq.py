@@ -41,6 +41,22 @@ def test_torchdiffeq_runs_the_stepper():
     assert torch.equal(solution[:, 1].detach(), simulate(model, t, y0=y0[1], step=2e-3).y)
 
 
+@pytest.mark.parametrize("verb", [odeint, odeint_adjoint])
+def test_decreasing_times_are_rejected(verb):
+    model = coarse()
+    y0 = grasped(model, (0.01, 0.0))
+    with pytest.raises(ValueError, match=r"`t` must increase strictly.*\[0.5, 0.48\]"):
+        verb(model, y0, f64(0.5, 0.48, 0.46), method=METHOD)
+
+
+@torch.no_grad()
+def test_explicit_methods_warn_of_decreasing_times_without_a_graph():
+    model = coarse()
+    y0 = grasped(model, (0.01, 0.0))
+    with pytest.warns(UserWarning, match="integrated backwards.*use increasing times"):
+        odeint(model, y0, f64(2e-5, 0.0), method="rk4", options={"step_size": 5e-6})
+
+
 @pytest.mark.slow
 def test_an_explicit_integration_backwards_is_warned_about_once():
     """Pads decay, and backwards they grow; forwards, with a graph or without, nothing is said."""

@@ -78,23 +78,29 @@ def evaluate(law: Law, x: Tensor, parameters: Mapping[str, Tensor], weights: Arr
     return Evaluated(out, J, p_bar)
 
 
-def left_out(function: Function, x: Tensor, parameters: Mapping[str, Tensor]) -> LeftOut | None:
+def left_out(
+    function: Function, x: Tensor, parameters: Mapping[str, Tensor], conjugates: int | None = None
+) -> LeftOut | None:
     """What function(x, parameters) leaves out of its derivatives at samples x (samples, inputs), by
-    the inputs and by the parameters that require a gradient; None where it leaves out nothing.
+    the inputs and by the parameters that require a gradient; None where it leaves out nothing. With
+    `conjugates`, as `compile_law` has them, of the forces and of their derivatives.
 
     Raises `UnknownOperation` as `compile_law` does.
     """
     every = opened()
-    outputs = len(traced(Graph(), function, x[0], parameters, kind=every))
+    traced(Graph(), function, x[0], parameters, kind=every)
     if not every.lines:
         return None
-    weights = np.linspace(0.5, 1.7, outputs)
 
     def made(kind: type[Trace]) -> Evaluated:
-        return evaluate(compile_law(function, x[0], parameters, kind=kind), x, parameters, weights)
+        law = compile_law(function, x[0], parameters, kind=kind, conjugates=conjugates)
+        return evaluate(law, x, parameters, np.linspace(0.5, 1.7, law.outputs))
 
     whole, own = made(opened()), made(Trace)
-    inputs = tuple(np.flatnonzero(_differ(own.by_input, whole.by_input).any((0, 1))).tolist())
+    by_input = np.asarray(_differ(own.by_input, whole.by_input).any((0, 1)))
+    if conjugates is not None:  # the forces are derivatives themselves
+        by_input[:conjugates] |= np.any(_differ(own.value, whole.value), axis=0)[:conjugates]
+    inputs = tuple(np.flatnonzero(by_input).tolist())
     entries = np.any(_differ(own.by_parameter, whole.by_parameter), axis=0).tolist()
     names, start = list[str](), 0
     for name, p in parameters.items():
@@ -107,7 +113,7 @@ def left_out(function: Function, x: Tensor, parameters: Mapping[str, Tensor]) ->
     guilty = []
     for line in every.lines:
         alone = made(opened(frozenset({line})))
-        pairs = zip(alone[1:], whole[1:])
+        pairs = zip(alone, whole)
         if any(_differ(one, other).any() for one, other in pairs):
             guilty.append(line)
     return LeftOut(inputs, tuple(names), tuple(guilty or every.lines))

@@ -43,8 +43,23 @@ Moduli = Annotated[
 Times = Annotated[Iterable[float], Quantity("s", 1e-9, 1e6, "relaxation times, no two equal")]
 
 ALIKE = 1e-6
-"""Largest relative difference between the moduli that a material states and those of its energy,
-and largest stress of the undeformed material over its shear modulus."""
+"""Largest difference, over the shear modulus, between the moduli that a material states and those
+of its energy, between its stresses before and after a rotation, and of the undeformed material's
+stress from zero."""
+
+ENTRIES = "xx", "xy", "yx", "yy"
+"""Entries of a deformation gradient, or of a stress, in the plane."""
+
+TRIED = torch.tensor(
+    [[[1.0, 0.0], [0.0, 1.0]], [[1.1, 0.0], [0.0, 0.95]], [[0.98, 0.1], [0.03, 0.9]]]
+).double()
+"""Deformation gradients in the plane at which an energy is checked when it is built."""
+
+TURNS = 0.3, -1.2, 2.5
+"""Angles [rad] of rotations that must not change an energy."""
+
+DIRECTIONS = 12
+"""Directions in which the stiffness of an energy is checked."""
 
 SERIES, SMALL = 8, 0.005
 """Terms of the series for sums of powers of two stretches, and up to what difference between them
@@ -60,10 +75,11 @@ class Hyperelastic(OneTime):
     retardation time tau [s] is that of the relaxed energy. Raises `ValueError` unless there are as
     many moduli as times.
 
-    A material of one's own gives `distortion`, for example a network of `invariants`, without
-    stress at F = 1 and with the shear modulus E / (2 (1 + nu)) there. What depends on the volume
-    should stand in `dilatation`, which elements take at their centre: elsewhere it makes nearly
-    incompressible elements too stiff.
+    A custom material defines `distortion`, for example a network of `invariants`, without stress
+    at F = 1 and with the shear modulus E / (2 (1 + nu)) there, in every direction. A rotation R
+    must not change it: `distortion`(R F) = `distortion`(F). What depends on the volume belongs in
+    `dilatation`, which elements take at their centre: elsewhere it makes nearly incompressible
+    elements too stiff.
     """
 
     lists: ClassVar[Mapping[str, str]] = {"E": "moduli", "tau": "times"}
@@ -126,29 +142,90 @@ class Hyperelastic(OneTime):
         return GeneralisedKelvin(E, nu, rho, depth, J[1:], tau, first)
 
     def well_posed(self) -> str:
+        shear, bulk = float(self.shear.detach()), float(self.bulk.detach())
+        if not shear > 0:
+            return f"the shear modulus of small strains is {shear:.6g} Pa; make it positive"
+        times = [tau.item() for _, tau in self.relaxation()]
+        if len(set(times)) < len(times):
+            return "two relaxation times are equal"
+        F = plane(TRIED)
+        P, A = self.stress_and_moduli(F)
+        if not float(P[0].abs().max()) <= ALIKE * shear:
+            return "the energy has a stress without strain; make its slope zero at F = 1"
+        if wrong := self._rotation_fault(F, P):
+            return wrong
+        one = torch.eye(2, dtype=torch.float64)
+        own = torch.einsum("ij,kl->ijkl", one, one) * (bulk - 2 / 3 * shear)
+        own = own + shear * torch.einsum("ik,jl->ijkl", one, one)
+        own = (own + shear * torch.einsum("il,jk->ijkl", one, one)).reshape(4, 4)
+        off = (A[0] - own).abs().nan_to_num(torch.inf)
+        if not float(off.max()) <= ALIKE * shear:
+            i, j = divmod(int(off.argmax()), 4)
+            return (
+                f"the energy's modulus of the stress P_{ENTRIES[i]} by F_{ENTRIES[j]} at small "
+                f"strains is {A[0, i, j]:.6g} Pa, but {own[i, j]:.6g} Pa of its E and nu; make "
+                "them agree"
+            )
+        return self._stability_fault(F, A)
+
+    def fault_at(self, F: Tensor) -> str:
+        """Fault of the energy at F (n, 3, 3): a rotation changes it, or it is not stable there;
+        empty where there is none."""
+        P, A = self.stress_and_moduli(F)
+        return self._rotation_fault(F, P) or self._stability_fault(F, A)
+
+    def stress_and_moduli(self, F: Tensor) -> tuple[Tensor, Tensor]:
+        """P = dW/dF (n, 4) and dP/dF (n, 4, 4) [Pa] at F (n, 3, 3), with the entries xx, xy, yx
+        and yy."""
         with torch.enable_grad():
-            shear, bulk = float(self.shear.detach()), float(self.bulk.detach())
-            if not shear > 0:
-                return f"the shear modulus of small strains is {shear:.6g} Pa; make it positive"
-            F = torch.eye(3, dtype=torch.float64, requires_grad=True)
-            (P,) = torch.autograd.grad(self.energy(F), F, create_graph=True)
-            if float(P.detach().abs().max()) > ALIKE * shear:
-                return "the energy has a stress without strain; make its slope zero at F = 1"
-            times = [tau.item() for _, tau in self.relaxation()]
-            if len(set(times)) < len(times):
-                return "two relaxation times are equal"
-            found = {}
-            for name, (i, j) in {"xx": (0, 0), "xy": (0, 1)}.items():
-                (row,) = torch.autograd.grad(P[i, j], F, retain_graph=True)
-                found[name] = float(row[i, j])
-        own = {"xx": bulk + 4 / 3 * shear, "xy": shear}
-        for name, modulus in own.items():
-            if not abs(found[name] - modulus) <= ALIKE * modulus:
-                return (
-                    f"the energy's modulus in {name} at small strains is {found[name]:.6g} Pa, but "
-                    f"{modulus:.6g} Pa of its E and nu; make them agree"
-                )
-        return ""
+            P, F = self._stress(F)
+            rows = [torch.autograd.grad(p.sum(), F, retain_graph=True)[0] for p in P.unbind(-1)]
+        return P.detach(), torch.stack([row[:, :2, :2].flatten(1) for row in rows], 1)
+
+    def _stress(self, F: Tensor) -> tuple[Tensor, Tensor]:
+        """P (n, 4) [Pa] with its graph, and the F (n, 3, 3) that it is of."""
+        F = F.detach().requires_grad_()
+        (P,) = torch.autograd.grad(self.energy(F).sum(), F, create_graph=True)
+        return P[:, :2, :2].flatten(1), F
+
+    def _rotation_fault(self, F: Tensor, P: Tensor) -> str:
+        """Whether P (n, 4) is not that of an energy of which rotations change nothing: P(R F) = R
+        P(F). The package's energies are functions of invariants."""
+        if type(self).__module__.startswith("torchsoft."):
+            return ""
+        angle = torch.tensor(TURNS, dtype=torch.float64)
+        c, s = angle.cos(), angle.sin()
+        R = torch.stack((c, -s, s, c), -1).unflatten(-1, (2, 2))[:, None]
+        with torch.enable_grad():
+            turned = self._stress((plane(R) @ F).flatten(0, 1))[0].detach()
+        off = turned.reshape(len(TURNS), -1, 2, 2) - R @ P.unflatten(-1, (2, 2))
+        off = off.abs().amax((0, 2, 3)).nan_to_num(torch.inf)
+        largest = max(float(self.shear.detach()), float(P.abs().max()))
+        if float(off.max()) <= ALIKE * largest:
+            return ""
+        k = int(off.argmax())
+        return (
+            f"the energy changes with a rotation of the material: after one, the stress at "
+            f"{shown(F[k])} is off by {float(off[k]):.3g} Pa; make the energy a function of "
+            "C = F^T F, or of `invariants`(F)"
+        )
+
+    def _stability_fault(self, F: Tensor, A: Tensor) -> str:
+        """Whether A (n, 4, 4) resists no further strain in some direction: strong ellipticity."""
+        angle = torch.pi / DIRECTIONS * torch.arange(DIRECTIONS, dtype=torch.float64)
+        n = torch.stack((angle.cos(), angle.sin()), -1)
+        A = A.unflatten(2, (2, 2)).unflatten(1, (2, 2))
+        xx, xy, yx, yy = torch.einsum("eijkl,nj,nl->iken", A, n, n).flatten(0, 1)
+        least = 0.5 * (xx + yy) - torch.hypot(0.5 * (xx - yy), 0.5 * (xy + yx))
+        least = least.amin(-1).nan_to_num(-torch.inf)
+        if float(least.min()) > 0:
+            return ""
+        k = int(least.argmin())
+        return (
+            f"the energy is not stable at {shown(F[k])}: in some direction its stiffness is "
+            f"{float(least[k]):.3g} Pa, but must be positive; take other coefficients, or let it "
+            "be strained less"
+        )
 
 
 class NeoHookean(Hyperelastic):
@@ -266,6 +343,18 @@ def _cosh_multiple(k: Tensor, x: Tensor) -> Tensor:
     away = torch.where(small, SMALL, x)
     r = power(1 + away + torch.sqrt(away * (2 + away)), k)
     return torch.where(small, series, 0.5 * (r + 1 / r))
+
+
+def plane(F: Tensor) -> Tensor:
+    """Deformation gradients (..., 3, 3) in plane strain of those in the plane (..., 2, 2)."""
+    whole = torch.eye(3, dtype=torch.float64).repeat(*F.shape[:-2], 1, 1)
+    whole[..., :2, :2] = F
+    return whole
+
+
+def shown(F: Tensor) -> str:
+    """The entries of one deformation gradient in the plane, in words."""
+    return f"F = {[[float(f'{x:.4g}') for x in row] for row in F[:2, :2].tolist()]}"
 
 
 def power(x: Tensor, exponent: Tensor | float) -> Tensor:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
 from torchsoft.physics.channels import declared
-from torchsoft.physics.hyperelastic import Hyperelastic, again, described
+from torchsoft.physics.hyperelastic import Hyperelastic, again, described, plane
 from torchsoft.physics.mesh import Array, Mesh, StoredMesh, dofs_of, lame_moduli
 from torchsoft.physics.mesh.mesh import gradients, strains
 from torchsoft.physics.names import effort_channel
@@ -173,8 +173,7 @@ class PadSetup:
                 "the strain energy of the pad is one of your own, which runs do not hold, so that "
                 "its stresses are not known; plot something else"
             )
-        whole = torch.eye(3, dtype=torch.float64).repeat(*F.shape[:-2], 1, 1)
-        whole[..., :2, :2] = torch.from_numpy(F)
+        whole = plane(torch.from_numpy(F))
         with torch.enable_grad():
             W = again(self.energy).energy(whole.requires_grad_()).sum()
             (P,) = torch.autograd.grad(W, whole)

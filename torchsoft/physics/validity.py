@@ -347,16 +347,16 @@ def slip_rates(where: str, law: Any, E: Tensor, F_N: Tensor, R: float) -> Tensor
 
 
 class Backwards:
-    """Watch of a rig's right-hand side: warns once where a solver integrates it backwards while a
-    graph is recorded, as `odeint_adjoint` does with an explicit method: pads decay, and backwards
-    they grow."""
+    """Watch of a rig's right-hand side: warns once where a solver integrates it backwards, as
+    torchdiffeq's explicit methods do through decreasing times and in `odeint_adjoint`: pads decay,
+    and backwards they grow."""
 
     def __init__(self) -> None:
         self.last, self.falls, self.said = -math.inf, 0, False
 
     def see(self, t: Tensor | float) -> None:
         """An evaluation at a time [s]."""
-        if self.said or not torch.is_grad_enabled():
+        if self.said:
             return
         if isinstance(t, Tensor):
             if t.ndim or is_functorch_wrapped_tensor(t):
@@ -367,9 +367,9 @@ class Backwards:
         if self.falls >= FALLS:
             self.said = True
             warnings.warn(
-                "the rig is integrated backwards, where its stiff pads grow: gradients of "
-                "`odeint_adjoint` with an explicit method may be wrong by any factor; say "
-                'method="sdirk2" (after `torchsoft.register_method()`), or use `odeint` or '
-                "`torchsoft.simulate`",
+                "the rig is integrated backwards, where its stiff pads grow: states at decreasing "
+                "times, and gradients of `odeint_adjoint` with an explicit method, may be wrong by "
+                'any factor; use increasing times and method="sdirk2" (after '
+                "`torchsoft.register_method()`), or `torchsoft.simulate`",
                 stacklevel=2,
             )

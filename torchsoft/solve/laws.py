@@ -28,11 +28,12 @@ from torchsoft.physics.contact import (
     stored_law,
 )
 from torchsoft.physics.elements import CONSTANTS, CORNERS, element_potentials
-from torchsoft.physics.hyperelastic import Hyperelastic
+from torchsoft.physics.hyperelastic import Hyperelastic, invariants
 from torchsoft.physics.material import Material
+from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.shapes import Shape
-from torchsoft.physics.state import own_states
+from torchsoft.physics.state import begin_states, own_states
 from torchsoft.physics.structure import copied, structure_of
 from torchsoft.physics.validity import tried
 from torchsoft.solve.kernel.arrays import LANES, MOTION, WRENCH
@@ -143,13 +144,29 @@ def compiled_law(
 
 # Laws of users whose derivative is not that of their value, since they detach what it is made of.
 
+REMEDY = "or call requires_grad_(False) on a parameter that is to be held"
 
-def gradient_fault(what: str, law: Any, x: Tensor, inputs: Sequence[str]) -> str:
-    """Sentence on the derivatives that a law of `inputs` leaves out at samples x (samples, inputs),
-    by them and by its parameters that require a gradient; empty where there are none."""
+STEP, UNLIKE, ROUNDED = 1e-6, 1e-3, 1e-7
+"""Relative change of a parameter by which outputs are differenced, relative error of a derivative
+from which on it is wrong, and rounding of a derivative, over the output's size."""
+
+SMALL_STATE = 1e-3
+"""State of a friction law at which it is tried, where it starts at zero."""
+
+SHARES = 0.0713, 0.2391, 0.3907, 0.5579, 0.7187, 0.9103
+"""Parts of a run's time at which signals are tried, off the knots that they are likely to have."""
+
+
+def gradient_fault(
+    what: str, law: Any, x: Tensor, inputs: Sequence[str],
+    outputs: Callable[..., Tensor] | None = None, conjugates: int | None = None,
+) -> str:  # fmt: skip
+    """Message on the derivatives that a compiled law of `inputs` leaves out at samples x (samples,
+    inputs), with respect to them and to its parameters that require a gradient; empty where there
+    are none. `conjugates` are those of `compile_law`."""
     with _compiling:
-        function, parameters = as_law(outputs_of, {"law": law})
-        found = left_out(function, x, parameters)
+        function, parameters = as_law(outputs or outputs_of, {"law": law})
+        found = left_out(function, x, parameters, conjugates)
     if found is None:
         return ""
     names = [inputs[i] for i in found.inputs]
@@ -157,34 +174,74 @@ def gradient_fault(what: str, law: Any, x: Tensor, inputs: Sequence[str]) -> str
     return (
         f"the gradient of {what} is not that of its value: torch is told to record none at "
         f"{found.lines[0]}, so that derivatives by {', '.join(names)} are wrong; take detach() or "
-        "torch.no_grad() out there, or call requires_grad_(False) on a parameter that is to be held"
+        f"torch.no_grad() out there, {REMEDY}"
+    )
+
+
+def difference_fault(what: str, part: nn.Module, outputs: Callable[[Any], Tensor]) -> str:
+    """The same of `outputs`, a tensor of a part that torch evaluates as it is written, by
+    differences with respect to every parameter that requires a gradient."""
+    law, parameters = as_law(lambda part, _: outputs(part).flatten(), {"part": part})
+    generator, none = torch.Generator().manual_seed(0), torch.zeros(0, dtype=torch.float64)
+    asked = {name: p for name, p in parameters.items() if p.requires_grad}
+    if not asked:
+        return ""
+    with torch.enable_grad():
+        given = {name: p.detach().clone().requires_grad_() for name, p in parameters.items()}
+        here, wrong = law(none, given), list[str]()
+        sizes = here.detach().abs()
+        weights = torch.linspace(0.5, 1.7, len(here)).double() / torch.where(sizes > 0, sizes, 1.0)
+        total = (weights * here).sum() + 0.0 * sum(p.sum() for p in given.values())
+        slopes = torch.autograd.grad(total, [given[name] for name in asked])
+    with torch.no_grad():
+        for (name, p), slope in zip(asked.items(), slopes):
+            way = torch.randn(p.shape, generator=generator, dtype=torch.float64).sign()
+            way = way * torch.where(p == 0, 1.0, p)
+            ends = [law(none, {**given, name: p + h * way}) for h in (STEP, -STEP)]
+            after, before = ((weights * (end - here)).sum() / STEP for end in ends)
+            expected = (slope * way).sum()
+            differences = torch.stack((0.5 * (after - before), after, -before))  # one at a kink
+            allowed = UNLIKE * torch.maximum(differences.abs(), expected.abs())
+            if not bool(((differences - expected).abs() <= allowed + ROUNDED * len(here)).any()):
+                wrong.append(f"`{name.removeprefix('part.')}`")
+    if not wrong:
+        return ""
+    return (
+        f"the gradient of {what} is not that of its value: derivatives by {', '.join(wrong)} are "
+        "wrong; compute it from the parameters with torch's operations, without detach(), "
+        f"torch.no_grad() and numbers that are read into Python, {REMEDY}"
     )
 
 
 def outputs_of(law: Callable[..., Any], x: Tensor) -> Tensor:
-    """Outputs of a law of tensors, of an actuator or a shape; the chain of a material."""
-    if isinstance(law, Material):
-        out = law.chain()
-    elif isinstance(law, Actuator):
+    """Outputs of a law of tensors, of an actuator or a shape."""
+    if isinstance(law, Actuator):
         out = response_of(law, x)
     elif own_states(law):
-        out, _ = slip_of(law, *x.unbind(-1))
+        E, F_N, R, *_ = x.unbind(-1)
+        out = slip_of(law, E, F_N, R, x[..., 3:-1], x[..., -1])
     else:
         out = law(x) if isinstance(law, Shape) else law(*x.unbind(-1))
     parts = out if isinstance(out, tuple) else (out,)
-    return torch.cat([part.reshape(-1) for part in parts])
+    return torch.cat([part.reshape(-1) for part in parts if part is not None])
 
 
-def tried_efforts(R: float) -> Tensor:
-    """Efforts, normal forces and the dashpot R (samples, 3) at which slip laws are tried."""
+def tried_efforts(slip: Any, R: float) -> Tensor:
+    """Efforts, normal forces and the dashpot R, for a slip law with states these and the stage's
+    length too, (samples, inputs) at which it is tried."""
     E, F_N = tried()
-    return torch.stack((E, F_N, torch.full_like(E, R)), -1)
+    x = torch.stack((E, F_N, torch.full_like(E, R)), -1)
+    if not own_states(slip):
+        return x
+    z = begin_states(slip, E.shape).detach()
+    share = torch.linspace(0.5, 1.5, len(E), dtype=torch.float64)[:, None]
+    return torch.cat((x, torch.where(z == 0, SMALL_STATE, z) * share, 1e-3 * share), -1)
 
 
 def friction_fault(where: str, slip: Any, R: float) -> str:
     """`gradient_fault` of a slip law with the dashpot R [N.s/m]."""
-    inputs = ("the effort", "the normal force", "the dashpot")
-    return gradient_fault(f"the slip law of `{where}`", slip, tried_efforts(R), inputs)
+    inputs = ("the effort", "the normal force", "the dashpot", *own_states(slip), "the stage")
+    return gradient_fault(f"the slip law of `{where}`", slip, tried_efforts(slip, R), inputs)
 
 
 def tried_states(actuator: Actuator) -> Tensor:
@@ -214,10 +271,39 @@ def shape_fault(body: str, shape: Shape) -> str:
 
 
 def material_fault(pad: str, material: Material) -> str:
-    """`gradient_fault` of a material's chain."""
-    with suppress(UnknownOperation):  # it is not compiled, so that it may do what it likes
-        return gradient_fault(f"the material of `{pad}`", material, torch.zeros(1, 0).double(), ())
-    return ""
+    """`gradient_fault` of the energy of a material at finite strain; else `difference_fault` of its
+    chain and its numbers."""
+    what = f"the material of `{pad}`"
+    if isinstance(material, Hyperelastic):
+        generator = torch.Generator().manual_seed(0)
+        x = 0.1 * torch.randn(8, 8, generator=generator, dtype=torch.float64)
+        names = [f"F_{name} (a stress)" for name in ("xx", "xy", "yx", "yy")]
+        with suppress(UnknownOperation):  # `element_law` raises it
+            if wrong := gradient_fault(what, material, x, names, energy_of, conjugates=4):
+                return wrong
+    return difference_fault(what, material, numbers_of)
+
+
+def energy_of(material: Hyperelastic, x: Tensor) -> Tensor:
+    """Potentials, as those of an element, of F - 1 in plane strain and its rate, x (8,)."""
+    none, one = torch.zeros_like(x[0]), torch.ones_like(x[0])
+    rows = (1 + x[0], x[1], none), (x[2], 1 + x[3], none), (none, none, one)
+    F = torch.stack([torch.stack(row) for row in rows])
+    return torch.stack((material.distortion(F) + material.dilatation(invariants(F)[2]), none))
+
+
+def numbers_of(material: Material) -> Tensor:
+    """The numbers (n,) of a material that runs read."""
+    parts = [*material.chain(), material.E, material.nu, material.rho, material.depth]
+    if isinstance(material, Hyperelastic):
+        parts += [material.tau, *(part for branch in material.relaxation() for part in branch)]
+    return torch.cat([part.reshape(-1) for part in parts])
+
+
+def reference_fault(reference: Reference, names: Sequence[str], t: Tensor) -> str:
+    """`difference_fault` of the signals called `names`, in a run through the times t."""
+    at = t[0] + (t[-1] - t[0]) * torch.tensor(SHARES, dtype=torch.float64)
+    return difference_fault("the reference", reference, lambda own: own(at, names))
 
 
 def response_of(actuator: Actuator, x: Tensor) -> tuple[Tensor, ...]:

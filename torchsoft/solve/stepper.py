@@ -1,5 +1,6 @@
 """The implicit stepper: the compiled kernels fed from a rig, chunk by chunk."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from typing import Any
@@ -30,6 +31,7 @@ from torchsoft.solve.kernel.arrays import (
 )
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
+from torchsoft.solve.laws import reference_fault
 from torchsoft.solve.progress import Progress, RunState, Segment, SimulationFailed
 from torchsoft.solve.steps import (
     LONGEST,
@@ -159,7 +161,7 @@ class ImplicitStepper:
 
     def check(self, y0: Tensor, t: Tensor) -> None:
         """Raises `ValueError` unless a run can go from y0, one finite state of this rig, through
-        the times t."""
+        the times t; warns of signals whose gradient is not that of their values."""
         check_times(t, self.step)
         check_array("y0", y0)
         self.layout.check(y0)
@@ -171,6 +173,10 @@ class ImplicitStepper:
         if not (finite := np.isfinite(y0.detach().numpy())).all():
             first = np.flatnonzero(~finite)[0]
             raise ValueError(f"`y0` must be finite, but component {first} is not")
+        if self.reference.plain(self.rig.signals) is None and (
+            wrong := reference_fault(self.reference, self.rig.signals, t)
+        ):
+            warnings.warn(wrong, stacklevel=2)
 
     def integrate(
         self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None,

@@ -52,7 +52,7 @@ class TorchdiffeqSolver:
     depends on its neighbours. rtol and atol are those of `simulate`; torchdiffeq's own
     defaults (1e-7, 1e-9) are strict for a motion with contact. Options: `step_size` [s] for equal
     steps instead, and the stepper's own, such as Newton's `tolerance` [N]. Raises `TypeError` for
-    dynamics that are not a `Rig`'s.
+    dynamics that are not a `Rig`'s, `ValueError` for times that do not increase.
     """
 
     theirs: Any = None
@@ -89,7 +89,7 @@ class TorchdiffeqSolver:
                 f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, "
                 f"{', '.join(sorted(known))}"
             )
-        self.model, self.y0 = model, y0
+        self.model, self.y0, self.negated = model, y0, _negates_time(func)
         self.adjoint_params: tuple[Tensor, ...] | None = augmented.get("adjoint_params")
         with (
             torch.enable_grad()
@@ -101,6 +101,7 @@ class TorchdiffeqSolver:
     def integrate(self, t: Tensor) -> Tensor:
         if self.adjoint_params is not None:
             return self._augmented(t, self.adjoint_params)
+        t = -t if self.negated else t  # the caller's times, which decrease: `check` rejects them
         samples = self.y0.reshape(-1, self.y0.shape[-1])
         runs: list[Any] = [None] * len(samples)
 
@@ -185,6 +186,15 @@ def _augmented(func: Any) -> dict[str, Any]:
 def _rig_behind(func: Any) -> Any:
     """The dynamics, inside any wrappers of torchdiffeq."""
     return _innermost(_augmented(func).get("func", _innermost(func)))
+
+
+def _negates_time(func: Any) -> bool:
+    """Whether a wrapper of torchdiffeq turns decreasing times round."""
+    while hasattr(func, "base_func"):
+        if getattr(func, "mul", 1.0) < 0:
+            return True
+        func = func.base_func
+    return False
 
 
 def _innermost(func: Any) -> Any:

@@ -1,11 +1,14 @@
 """Whether a rig keeps the balance of power: at states, and over a run."""
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
 from torchsoft.physics.arguments import Numbers, tensor
 from torchsoft.physics.contact import turned
 from torchsoft.physics.energy import dissipated, stored, supplied
+from torchsoft.physics.hyperelastic import Hyperelastic, plane
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.diagnostics import missing_energy
@@ -52,8 +55,10 @@ def check_energy(
     rig: Rig, t: Numbers, y0: Numbers, *, rtol: float | None = None,
     residual: float = RESIDUAL,
 ) -> Trajectory:  # fmt: skip
-    """A run from y0 through the times t whose energies are to balance within `residual` of what was
-    stored at the start and injected since, with `check_power` at some of its outputs.
+    """A run from y0 through the times t whose energies must balance within `residual` of what was
+    stored at the start and injected since, with `check_power` at some of its outputs. Strain
+    energies of pads must not change with a rotation, and must be stable, at the strains of these
+    outputs.
 
     Returns the run; raises `CheckFailed`.
     """
@@ -65,13 +70,25 @@ def check_energy(
             f"or too much, and {residual:.2%} may be: take a smaller `rtol`, or see whether a law "
             "of yours supplies power"
         )
-    for k in torch.linspace(0, len(run.t) - 1, min(STATES, len(run.t))).round().long():
+    rows = torch.linspace(0, len(run.t) - 1, min(STATES, len(run.t))).round().long()
+    faults += _strain_energy_faults(rig, run, rows)
+    for k in rows:
         try:
             check_power(rig, run.y[k], float(run.t[k]))
         except CheckFailed as failed:
             faults += str(failed).splitlines()
     conclude(faults)
     return run
+
+
+def _strain_energy_faults(rig: Rig, run: Trajectory, rows: Tensor) -> Iterator[str]:
+    """Faults of the energies of pads at finite strain at some outputs of a run."""
+    for name, pad in rig.pads.items():
+        if isinstance(pad.material, Hyperelastic):
+            setup, u = run.setup.pads[name], run.displacement[name][rows].detach().numpy()
+            F = torch.from_numpy(setup.gradient(setup.displacement(u)))
+            if wrong := pad.material.fault_at(plane(F.flatten(0, 1))):
+                yield f"the material of `{name}`: {wrong}"
 
 
 def _power_faults(rig: Rig, y: Tensor, t: float) -> list[str]:

@@ -39,12 +39,10 @@ WEAK = 100.0
 """Most by which a parameter that matters less than others is moved further."""
 
 BOUND = 1e-5
-"""Part of the largest derivative by which a derivative may miss its difference, beyond the
-difference's own uncertainty."""
+"""Relative error of a derivative beside its difference, beyond the difference's own uncertainty."""
 
 UNCLEAR = 1e-2
-"""Part of the largest derivative beyond which a difference's uncertainty leaves nothing to compare
-with."""
+"""Relative uncertainty of a difference beyond which there is nothing to compare with."""
 
 TOGETHER = "all together"
 """Name of the direction in which all parameters weigh alike, as far as they weigh at all."""
@@ -53,8 +51,9 @@ REST = 1.0 / (1.0 - 0.1 ** (2.0 / 3.0))
 """Error of the steps over the change by a tenth of the tolerance: that of a method of second order
 falls with the tolerance to the power of two thirds."""
 
-NOTHING = 1e-9
-"""Part of the largest derivative below which one is rounding."""
+NOTHING, NOISE = 1e-9, 1e-6
+"""Parts of the largest derivative, or of the value, below which an adjoint is rounding, and a
+difference noise."""
 
 
 class Derivative(NamedTuple):
@@ -63,7 +62,8 @@ class Derivative(NamedTuple):
     forward (None: of values of one's own, and of parameters of several entries), by central
     differences with their uncertainty (None: taken together only), and its error by the steps, as
     the change at a tenth of the tolerance shows it (None: not asked for). `scale` is the largest
-    derivative of the value."""
+    derivative of the value, by adjoint or by differences, or the value where it is larger; of all
+    together, the sum of their sizes."""
 
     value: str
     by: str
@@ -75,9 +75,27 @@ class Derivative(NamedTuple):
     scale: float
 
     @property
+    def size(self) -> float:
+        """What its errors are relative to: the larger of adjoint and difference, whose parts
+        may cancel where all parameters are taken together."""
+        together = self.scale if self.by == TOGETHER else 0.0
+        return max(abs(self.adjoint), abs(self.difference or 0.0), together)
+
+    @property
+    def zero(self) -> bool:
+        """Whether the parameter has no effect on the value: adjoint and difference are rounding."""
+        difference, uncertainty = abs(self.difference or 0.0), self.uncertainty or 0.0
+        rounding = NOTHING * self.scale
+        return (
+            abs(self.adjoint) <= rounding
+            and difference <= rounding + 2 * uncertainty
+            and uncertainty <= NOISE * self.scale
+        )
+
+    @property
     def clear(self) -> bool:
         """Whether differences say what it is."""
-        return self.uncertainty is None or self.uncertainty <= UNCLEAR * self.scale
+        return self.zero or self.uncertainty is None or self.uncertainty <= UNCLEAR * self.size
 
     @property
     def signed(self) -> bool:
@@ -105,19 +123,56 @@ class GradientCheck(Shown):
         """Derivatives whose sign depends on the steps."""
         return tuple(one for one in self.derivatives if not one.signed)
 
+    def _throughout(self, holds: Callable[[Derivative], bool]) -> tuple[str, ...]:
+        """Parameters of which something holds for the derivatives of all values."""
+        found = {one.by: True for one in self.derivatives if one.by != TOGETHER}
+        for one in self.derivatives:
+            if one.by in found:
+                found[one.by] = found[one.by] and holds(one)
+        return tuple(name for name, holding in found.items() if holding)
+
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        """Parameters whose derivatives are all zero, so that nothing about them was checked."""
+        return self._throughout(lambda one: one.zero)
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """Parameters that have an effect, but no difference to compare with."""
+        vague = self._throughout(lambda one: one.zero or not one.clear)
+        return tuple(name for name in vague if name not in self.without_effect)
+
+    def _regime(self) -> tuple[dict[str, float], dict[str, int]]:
+        """Shares of the contact points' time in every state, and how often they touch down and
+        leave."""
+        states = torch.cat([x.flatten(1) for x in self.run.contact_state.values()], 1)
+        kinds = {"stick": 1, "slip": 2, "out of contact": 0}
+        shares = {name: float((states == kind).double().mean()) for name, kind in kinds.items()}
+        on = states > 0
+        touched, left = (int(x.sum()) for x in (on[1:] & ~on[:-1], on[:-1] & ~on[1:]))
+        return shares, {"touch down": touched, "leave": left}
+
     @property
     def regime(self) -> str:
         """What the contact points did in the run."""
-        states = torch.cat([x.flatten(1) for x in self.run.contact_state.values()], 1)
-        on = states > 0
-        shares = [float((states == kind).double().mean()) for kind in (1, 2, 0)]
-        touched, left = (int(x.sum()) for x in (on[1:] & ~on[:-1], on[:-1] & ~on[1:]))
-        names = ("stick", "slip", "are apart")
-        parts = ", ".join(f"{share:.0%} {name}" for share, name in zip(shares, names))
-        return f"{parts}; {touched} touch down, {left} leave"
+        shares, changes = self._regime()
+        parts = ", ".join(f"{share:.0%} {name}" for name, share in shares.items())
+        return f"{parts}; {', '.join(f'{count} {name}' for name, count in changes.items())}"
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """What the contact points never did in the run; empty for a rig without contacts."""
+        if not self.run.contact_state:
+            return ()
+        shares, changes = self._regime()
+        if shares["out of contact"] == 1.0:
+            return ("touch",)
+        return tuple(name for name, much in (shares | changes).items() if not much)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         rows = [("contact points", self.regime)] if self.run.contact_state else []
+        for label, names in (("without effect", self.without_effect), ("unclear", self.unchecked)):
+            rows += [(label, ", ".join(names))] if names else []
         for one in self.derivatives:
             text = f"{one.adjoint:.6g} adjoint"
             text += "" if one.forward is None else f", {one.forward:.6g} forward"
@@ -146,17 +201,38 @@ def check_gradients(
     "reference.NAME.values"; by default all that require a gradient, the start and the knots.
 
     Every difference is taken at two lengths that agree; how much they disagree is its uncertainty.
-    Without `each` there is one for all parameters, along a direction in which they weigh alike:
-    few runs, and no word on which parameter is wrong. With `step_error` one more run, at a tenth of
-    `rtol`, says how much of each derivative is that of the steps; a warning names those whose sign
-    depends on it.
+    A derivative may miss its difference by `bound` of the larger of the two and twice the
+    uncertainty. Parameters whose derivatives are zero throughout, such as coefficients of friction
+    in a run without slip, were not checked: for those in `wrt` that is a fault. By default, where a
+    parameter may have no effect, such as a limit that is not reached, the result lists them as
+    `without_effect`, and a warning names them if no contact point touches, sticks or slips in the
+    run.
 
-    Raises `CheckFailed` with a sentence on every derivative that misses its difference by more than
-    `bound` of the largest and twice the uncertainty, `ValueError` for names that are not known.
+    Without `each` there is one difference for all parameters, along a direction in which they weigh
+    equally: few runs, and no word on which parameter is wrong. With `step_error` one more run, at a
+    tenth of `rtol`, says how much of each derivative is that of the steps; a warning names those
+    whose sign depends on it.
+
+    Raises `CheckFailed` with a message on every fault, `ValueError` for names that are not known.
     """
     start = _start(rig, t, y0, rtol)
     with _leaves(rig, start, wrt) as leaves:
-        return _checked(rig, start, leaves, of, rtol, bound, dy0, each, step_error, centres)
+        check = _checked(rig, start, leaves, of, rtol, bound, dy0, each, step_error, centres)
+    faults, idle = _faults(check, bound), check.without_effect
+    if idle and (wrt is not None or len(idle) == len(leaves)):
+        faults.append(_unchecked(check, idle))
+    conclude(faults)
+    idle = idle if {"touch", "stick", "slip"} & {*check.absent} else ()
+    for names in filter(None, (idle, check.unchecked)):
+        warnings.warn(_unchecked(check, names), stacklevel=2)
+    for one in check.unsigned:
+        warnings.warn(
+            f"the sign of the derivative of `{one.value}` by `{one.by}` depends on the steps: it "
+            f"is {one.adjoint:.3g} with an error of {one.step_error:.3g} at rtol = {rtol:g}; take "
+            "a smaller `rtol`",
+            stacklevel=2,
+        )
+    return check
 
 
 class Start(NamedTuple):
@@ -317,6 +393,7 @@ def _checked(
     ahead = _forward(rig, start, leaves, shake, ways, by_forward, centres)
 
     largest = {kind: max(map(abs, found.values()), default=0.0) for kind, found in own.items()}
+    sizes = {kind: abs(float(value.detach())) for kind, value in values(made).items()}
 
     def differenced(by: float, along: Leaves) -> dict[str, float]:
         """Central differences of all values; not a number where a step was halved."""
@@ -338,18 +415,21 @@ def _checked(
 
     derivatives = []
     for name in leaves:
-        judged = dict.fromkeys(own, (None, None))
+        judged: Mapping[str, tuple[float | None, float | None]] = dict.fromkeys(own, (None, None))
         if each:
             much = factor(name, own)
+            expected = {kind: found[name] for kind, found in own.items()}
             judged = _judged(
-                lambda h, name=name, much=much: differenced(h * much, {name: ways[name]}),
-                {kind: found[name] for kind, found in own.items()}, largest, bound,
+                lambda h, name=name, much=much: differenced(h * much, {name: ways[name]}), expected,
+                {kind: max(abs(x), largest[kind] / WEAK) for kind, x in expected.items()}, bound,
             )  # fmt: skip
         for kind, found in own.items():
             change = REST * abs(finer[kind][name] - found[name]) if finer else None
             forward = ahead.get(kind, {}).get(name)
-            one = Derivative(kind, name, found[name], forward, *judged[kind], change, largest[kind])
+            one = Derivative(kind, name, found[name], forward, *judged[kind], change, 0.0)
             derivatives.append(one)
+            sizes[kind] = max(sizes[kind], one.size - (one.uncertainty or 0.0), abs(one.adjoint))
+    derivatives = [one._replace(scale=sizes[one.value]) for one in derivatives]
     for kind, found in {} if each else own.items():
         factors = {name: factor(name, [kind]) for name in leaves}
         along = {name: much * ways[name] for name, much in factors.items()}
@@ -359,33 +439,25 @@ def _checked(
         judged = _judged(lambda h, along=along: differenced(h, along), {kind: whole}, scale, bound)
         one = Derivative(kind, TOGETHER, whole, None, *judged[kind], None, scale[kind])
         derivatives.append(one)
-    check = GradientCheck(tuple(derivatives), made, rtol)
-    conclude(_faults(check, bound))
-    for one in check.unsigned:
-        warnings.warn(
-            f"the sign of the derivative of `{one.value}` by `{one.by}` depends on the steps: it "
-            f"is {one.adjoint:.3g} with an error of {one.step_error:.3g} at rtol = {rtol:g}; take "
-            "a smaller `rtol`",
-            stacklevel=3,
-        )
-    return check
+    return GradientCheck(tuple(derivatives), made, rtol)
 
 
 def _judged(
     differenced: Callable[[float], Mapping[str, float]],
     expected: Mapping[str, float],
-    largest: Mapping[str, float],
+    scale: Mapping[str, float],
     bound: float,
 ) -> dict[str, tuple[float, float]]:
     """Of every value the difference and its uncertainty, from the two neighbouring lengths that
     agree best: their distance, or the noise of shorter lengths, which falls with the length, since
-    noise may agree by chance. No further length is tried once the `expected` values are met."""
+    noise may agree by chance. No further length is tried once the `expected` values are met, to
+    `bound` of their `scale`."""
     found: dict[float, Mapping[str, float]] = {}
     best: dict[str, tuple[float, float]] = {}
     for length in LENGTHS:
         found[length] = differenced(length)
         ordered, best = sorted(found), {}
-        for kind in largest:
+        for kind in scale:
             noise = 0.0  # of the value itself, from lengths up to b
             for a, b in pairwise(ordered):
                 spread, uncertainty = abs(found[a][kind] - found[b][kind]), np.inf
@@ -395,8 +467,8 @@ def _judged(
                 if kind not in best or uncertainty < best[kind][1]:
                     best[kind] = found[b][kind], uncertainty
         if best and all(
-            uncertainty <= 0.1 * bound * largest[kind]
-            and abs(value - expected[kind]) <= bound * largest[kind]
+            uncertainty <= 0.1 * bound * scale[kind]
+            and abs(value - expected[kind]) <= bound * scale[kind]
             for kind, (value, uncertainty) in best.items()
         ):
             break
@@ -410,7 +482,7 @@ def _faults(check: GradientCheck, bound: float) -> list[str]:
         if not np.isfinite(one.adjoint):
             faults.append(f"{what}, which is no number")
         elif one.difference is not None and one.uncertainty is not None and one.clear:
-            allowed = bound * one.scale + 2 * one.uncertainty
+            allowed = bound * one.size + NOTHING * one.scale + 2 * one.uncertainty
             if not abs(one.adjoint - one.difference) <= allowed:
                 faults.append(
                     f"{what} and {one.difference:.8g} +- {one.uncertainty:.1g} by differences: a "
@@ -421,6 +493,20 @@ def _faults(check: GradientCheck, bound: float) -> list[str]:
         ):
             faults.append(f"{what} and {one.forward:.8g} forward")
     return faults
+
+
+def _unchecked(check: GradientCheck, names: Sequence[str]) -> str:
+    """Message on parameters whose derivatives were compared with nothing."""
+    if set(names) <= {*check.without_effect}:
+        reason = "they are zero throughout"
+        if check.absent:
+            reason += f" (contact points never {' or '.join(check.absent)}: {check.regime})"
+    else:
+        reason = f"their differences are uncertain by more than {UNCLEAR:.0%}"
+    return (
+        f"the derivatives by {', '.join(f'`{name}`' for name in names)} were not checked: "
+        f"{reason}; choose a run in which they have a clear effect, or leave them out of `wrt`"
+    )
 
 
 def _direction(rig: Rig, start: Start) -> Tensor:

@@ -58,7 +58,7 @@ def _friction_faults(slip: Any, R: float) -> Iterator[str]:
         yield str(error)
         return
     yield from filter(None, (wrong, _jump(name, slip, R), friction_fault(name, slip, R)))
-    yield from _otherwise(f"the slip law of `{name}`", slip, tried_efforts(R))
+    yield from _otherwise(f"the slip law of `{name}`", slip, tried_efforts(slip, R))
 
 
 def _actuator_faults(name: str, actuator: Actuator) -> Iterator[str]:
