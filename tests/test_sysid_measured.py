@@ -2,6 +2,7 @@
 command continues."""
 
 import csv
+import math
 import re
 import runpy
 from collections.abc import Callable
@@ -179,8 +180,12 @@ BAD: dict[str, tuple[Change, str]] = {
     "moving": (
         lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i,
         cells in enumerate(table[1:])],
-        r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = "
-        r"\{kind = \"moving\"\}",
+        r"row 3, column `x_C` moves already, by 0.0003 m: a recording must begin at rest,.* or say "
+        r"start = \{kind = \"moving\"\}",
+    ),
+    "degrees under radians": (
+        lambda table: [scale(THETA, 0.18 / math.pi)(table), put(1, THETA, "theta [rad]")(table)],
+        r"column `theta_C` moves already, by .* rad: is its unit right \(degrees taken for radians",
     ),
     "turning": (
         lambda table: [cells.__setitem__(THETA, f"{15.0 * i}") for i,

@@ -8,6 +8,7 @@ Tests are of one channel in one recording where possible:
     white     Ljung and Box: no correlation is left from sample to sample
     motion    F: no correlation with the predicted reading, its rates, or other channels
     channels  Bartlett: no correlation between channels at one time
+    onset     Mann and Whitney: residuals are not larger from a certain time on
     outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
     priors    normal: estimates are where their priors expect them
 
@@ -129,7 +130,11 @@ MOST = 3
 MEDIAN = 0.37
 """Efficiency of the level by the median residual, relative to the mean square."""
 
-Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
+SUDDEN, BEFORE = 3.0, 2.0
+"""Least ratio of rms residuals after a time to those before it at which a misfit begins there, and
+largest rms residual before it, over the noise."""
+
+Test = Literal["level", "white", "motion", "channels", "onset", "outliers", "priors"]
 
 
 @dataclass(frozen=True)
@@ -188,7 +193,9 @@ def judge_residuals(
             continue
         out.append(white(part, r))
         out += lines_up(part, [p for p in parts if p.recording == part.recording], r, Q)
-        if not robust:
+        if (begins := onset(part)) is not None:  # what follows are no outliers
+            out.append(begins)
+        elif not robust:
             out.append(outliers(part, r))
     for recording in dict.fromkeys(part.recording for part in parts):
         out += together(recording, [part for part in parts if part.recording == recording], r, Q)
@@ -322,6 +329,28 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
     return out
 
 
+def onset(part: Part) -> Verdict | None:
+    """Test of a misfit that begins at a certain time: the change of the variance of the raw
+    residuals with the largest likelihood, with at least `LAGS` samples on either side, tested by
+    ranks, so that single outliers do not count. None where there is no large change."""
+    m, squares = len(part.raw), np.cumsum(part.raw**2)
+    if m < 2 * LAGS:
+        return None
+    k = np.arange(LAGS, m - LAGS + 1)
+    before, after = squares[k - 1] / k, (squares[-1] - squares[k - 1]) / (m - k)
+    least = 1e-300  # of noise-free residuals
+    likely = k * np.log(before + least) + (m - k) * np.log(after + least)
+    i = int(np.argmin(likely))
+    low, high = float(before[i]) ** 0.5, float(after[i]) ** 0.5
+    if low > BEFORE or high < SUDDEN * max(low, 1.0):
+        return None
+    size = np.abs(part.raw)
+    rank = stats.mannwhitneyu(size[: k[i]], size[k[i] :], alternative="less")
+    words = f"at t = {part.t[k[i]]:.4g} s ({low:.2g} times the noise before, {high:.2g} times after)"
+    verdict = part.verdict("onset", min(1.0, len(k) * float(rank.pvalue)), high, words)
+    return verdict if verdict.p < LEVEL else None
+
+
 def outliers(part: Part, r: Array) -> Verdict:
     """Tests of the largest residual (Grubbs), and of heavy tails (Anscombe and Glynn)."""
     rows = r[part.rows]
@@ -377,6 +406,8 @@ def contradicted(name: str, r: float, q: Array) -> Verdict:
 
 
 SENTENCES: dict[str, str] = {
+    "onset": "the misfit begins in {}: look for what happened then (samples lost, a clock that "
+    "jumped, a knock, a motion that the model does not describe), or fit the data before it",
     "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or "
     "the noise larger",
     "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or "
