@@ -225,7 +225,9 @@ def test_a_misfit_that_begins_at_a_certain_time_is_named_with_that_time():
         assert time == pytest.approx(240 * H, abs=2 * H)
         assert found.size == pytest.approx((1 + 18) ** 0.5, rel=0.15)
         assert not alarms(verdicts, "outliers")
-        assert residual_notices(verdicts)["onset"].startswith("the misfit begins in `run 0` at t = ")
+        assert residual_notices(verdicts)["onset"].startswith(
+            "the misfit begins in `run 0` at t = "
+        )
     for other in (wave, 30.0 * (np.arange(300) >= 295)):
         assert not alarms(Case(4, fault={("run 0", "theta_C"): other}).judged(), "onset")
 
