@@ -1,7 +1,6 @@
 """A rig file as an environment of gymnasium; vectors of environments, and their pictures."""
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -19,6 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.display import suggestion
 from torchsoft.envs.dynamics import (
     Dynamics,
@@ -211,7 +211,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                     raise ValueError(f"{message}; see `begin`") from None
                 continue
             if message:
-                warnings.warn(f"{message}; others were drawn", RedrawnStart, stacklevel=3)
+                warn(f"{message}; others were drawn", RedrawnStart)
             return start
         raise ValueError(f"{message}; narrow the ranges of `parameters`")
 

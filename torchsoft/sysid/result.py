@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter
 
+from torchsoft.caller import warn
 from torchsoft.display import Shown, suggestion
 from torchsoft.files import check_file, finite, save_text
 from torchsoft.physics.arguments import whole
@@ -320,10 +321,9 @@ class IdentificationResult(Shown):
                 f"{name} is {shown(mine.get(name))} and was {shown(one.known[name])}"
                 for name in other
             )
-            warnings.warn(
+            warn(
                 "this rig is not the one of the fit, so its values may mislead: "
                 f"{line(changes, 300)}",
-                stacklevel=2,
             )
         rig = deepcopy(rig)
         set_parameters(rig, one.identified)
@@ -380,7 +380,7 @@ class IdentificationResult(Shown):
             and (c.name in named or not self.unknowns[c.name].fixed)
         }
         if weak:
-            warnings.warn(undetermined(weak), stacklevel=3)
+            warn(undetermined(weak))
         return identifiable
 
     def to_json(self) -> str:

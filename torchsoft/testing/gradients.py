@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.display import Shown
 from torchsoft.physics.arguments import Numbers, tensor
 from torchsoft.physics.rig import Rig
@@ -294,10 +295,9 @@ def _checked(
                 )
             )
         except SimulationFailed as failed:
-            warnings.warn(
+            warn(
                 f"the error of the steps is not known, since a run at a tenth of rtol = {rtol:g} "
                 f"failed: {failed}",
-                stacklevel=3,
             )
     ahead = _forward(rig, start, leaves, shake, ways, by_forward, centres)
 
@@ -347,11 +347,10 @@ def _checked(
     check = GradientCheck(tuple(derivatives), made, rtol)
     conclude(_faults(check, bound))
     for one in check.unsigned:
-        warnings.warn(
+        warn(
             f"the sign of the derivative of `{one.value}` by `{one.by}` depends on the steps: it "
             f"is {one.adjoint:.3g} with an error of {one.step_error:.3g} at rtol = {rtol:g}; take "
             "a smaller `rtol`",
-            stacklevel=3,
         )
     return check
 
