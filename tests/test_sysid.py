@@ -426,7 +426,7 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes):
         (lambda: sampled(""), "no samples"),
         (lambda: sampled("x", t, y), "`x` is not a channel"),
         (lambda: sampled("x_C", t, y[1:]), "times and values alike"),
-        (lambda: sampled("x_C", t[::-1], y), "increasing times"),
+        (lambda: sampled("x_C", t[::-1], y), "must increase, but .* sort the samples"),
         (lambda: sampled("x_C", t, np.full_like(y, np.nan)), "finite values"),
     ]
     for made, message in refused:

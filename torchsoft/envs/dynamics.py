@@ -1,7 +1,7 @@
 """A rig under actions at a control rate, in torch: from a state and an action to the next state, an
 observation and a reward, all differentiable."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -160,7 +160,9 @@ class Dynamics:
             )
         goal_at = [free[f"{body}.{axis}"] for axis in target]
         self._goal_at = torch.tensor(goal_at, dtype=torch.int64)
-        ends = [x if isinstance(x, tuple) else (x, x) for x in target.values()]
+        drawn = {axis: x for axis, x in target.items() if isinstance(x, Sequence)}
+        ends = target | checked("goal.target", drawn, target, "")
+        ends = [x if axis in drawn else (x, x) for axis, x in ends.items()]
         self.targets = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
         scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in target] if goal else []
         self._scale = torch.tensor(scale, dtype=torch.float64)
@@ -169,14 +171,8 @@ class Dynamics:
         """The moment at the time `begin`, after the rig's own motion, without disturbance. The
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
-        with torch.enable_grad():  # a step may be differentiated, whatever is done here
-            task = prepare(self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver)
-        self._stepper = task.stepper
+        self._read_parameters()
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
-        set_by = [*self.actions, *self.disturbances]
-        self._set = [self.rig.signals.index(name) for name in set_by]
-        lines = torch.zeros(len(set_by), 2, dtype=torch.float64)
-        self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
         rows = attached([self._run(t, self._y0, None).solved])[0]
         there = -1 if self.start else 0
         with torch.no_grad():
@@ -185,6 +181,20 @@ class Dynamics:
         reached = (now - self._low) / self._half - 1
         none = torch.zeros(len(self.disturbances), 2, dtype=torch.float64)
         return Moment(rows.y[there], reached, 0, target, none, rows.recorded[there])
+
+    def _read_parameters(self) -> ImplicitStepper:
+        """The stepper of the rig as it is."""
+        with torch.enable_grad():  # a step may be differentiated, whatever is done here
+            task = prepare(self.rig, [0.0, 1.0], y0=self._y0, gradient="discrete", **self.solver)
+        self._stepper, set_by = task.stepper, [*self.actions, *self.disturbances]
+        self._set = [self.rig.signals.index(name) for name in set_by]
+        t, lines = torch.tensor([0.0, LOOK]).double(), torch.zeros(len(set_by), 2).double()
+        self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
+        return task.stepper
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the stepper: a copy reads the parameters of its own rig."""
+        return self.__dict__ | {"_stepper": None, "_motion": None}
 
     def step(self, now: Moment, action: Tensor, knots: Tensor | None = None) -> Transition:
         """The transition from a moment to the next control time, with an action (actions,) in [-1,
@@ -283,9 +293,8 @@ class Dynamics:
     ) -> RunOutcome:
         """A run with lines between `values` (signals, 2) for signals set by actions or
         disturbances, or by the rig's own motion."""
-        if self._stepper is None:
-            raise ValueError("the parameters have not been read; call `begin` first")
-        stepper, given = self._stepper, knots is not None or self._stepper.step is not None
+        stepper = self._stepper or self._read_parameters()
+        given = knots is not None or stepper.step is not None
         if values is not None and self._motion.known and not (given or torch.is_grad_enabled()):
             times = t.numpy()
             motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
@@ -317,7 +326,7 @@ def checked(field: str, ranges: Ranges, known: Iterable[str], listed: str) -> Ra
             low, high = 0.0, 0.0
         if not -float("inf") < low < high < float("inf"):
             raise ValueError(
-                f"`{field}[{name!r}]` must be a pair of finite numbers, low and high, but is "
+                f"`{field}[{name!r}]` must be a pair of finite numbers, low below high, but is "
                 f"{given!r}"
             )
     return dict(ranges)

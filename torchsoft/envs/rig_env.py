@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -305,7 +307,14 @@ class RigVectorEnv(SyncVectorEnv):
         threads = cores() if threads is None else whole("threads", threads, 1)
         super().__init__(make, autoreset_mode=autoreset_mode)
         self._threads = min(threads, len(make))
-        self._pool = executor(self._threads)
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return executor(self._threads)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the threads: a copy has threads of its own."""
+        return {name: value for name, value in vars(self).items() if name != "_pool"}
 
     def step(self, actions: Any) -> Any:
         """Step all environments, as gymnasium's `SyncVectorEnv` does."""
