@@ -151,7 +151,7 @@ def main(config: Config) -> None:
     if config.smoke:
         catalogue, config = SMOKE, replace(config, rtol=1e-4, longest=2.0, most=2)
     single, usable = list[Row](), dict[str, Information]()
-    for name, excitation in tqdm(catalogue.items(), desc="excitations"):
+    for name, excitation in tqdm(catalogue.items(), desc="excitations", disable=None):
         try:
             found = assess(excitation, config.rtol)
         except SimulationFailed as failure:

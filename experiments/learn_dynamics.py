@@ -206,7 +206,7 @@ class Residual:
         steps = config.sweeps * max(len(given.references) // 16, 1)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
         draws, losses = np.random.default_rng(config.seed), list[float]()
-        for _ in tqdm(range(config.sweeps), desc="sweeps of the residual"):
+        for _ in tqdm(range(config.sweeps), desc="sweeps of the residual", disable=None):
             order, found = draws.permutation(len(given.references)), list[float]()
             for part in np.array_split(order, max(len(order) // 16, 1)):
                 optimiser.zero_grad()
@@ -326,7 +326,7 @@ def trained(config: Config, x: Tensor, target: Tensor) -> Surrogate:
     network = Surrogate(x.shape[-1], config.hidden)
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.epochs)
-    for _ in tqdm(range(config.epochs), desc="epochs of the surrogate"):
+    for _ in tqdm(range(config.epochs), desc="epochs of the surrogate", disable=None):
         for part in torch.randperm(len(x)).split(128):
             optimiser.zero_grad()
             (network(x[part]) - target[part]).square().mean().backward()

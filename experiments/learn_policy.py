@@ -119,7 +119,9 @@ class Training:
     def __init__(self, config: Config, method: str, seed: int, env: RigEnv) -> None:
         self.config, self.env, self.history = config, env, History(method, seed)
         self._begin, self._next = process_time(), 0
-        self._bar = tqdm(total=round(config.seconds), desc=f"{method} {seed}", unit="s")
+        self._bar = tqdm(
+            total=round(config.seconds), desc=f"{method} {seed}", unit="s", disable=None
+        )
 
     @property
     def late(self) -> bool:

@@ -385,7 +385,7 @@ def run(config: Config) -> Result:
     grip = -float(base.signals["grip"](torch.tensor(base.end, dtype=torch.float64))[0].detach())
     outcomes: dict[str, dict[str, Outcome]] = {group: {} for group in GROUPS}
     result = Result(gains, outcomes, {DISC: rigid(disc.shape, grip, weight)}, {}, {})
-    bar = tqdm(unit="run")
+    bar = tqdm(unit="run", disable=None)
 
     def attempt(case: Case, group: str, key: object) -> Trajectory:
         done, stopped = simulate(case, config.rtol)

@@ -251,7 +251,7 @@ def run(config: Config) -> dict[str, Any]:
         return {"turns": {"ellipse, firm, 20": row(found)}}
     turns: dict[str, Any] = {}
     cases = [(body, grip, turn) for body in BODIES for grip in GRIPS for turn in TURNS]
-    for body, grip, turn in tqdm(cases, desc="turns"):
+    for body, grip, turn in tqdm(cases, desc="turns", disable=None):
         file = case(body, grip)
         found = plan_file(file, goal(file, turn, config.rtol)).plan
         turns[f"{body}, {grip}, {turn:.0f}"] = row(found)

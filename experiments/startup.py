@@ -100,7 +100,7 @@ def medians(rows: Iterable[dict[str, float]]) -> dict[str, float]:
 def main(config: Config) -> None:
     repeats = 1 if config.smoke else config.repeats
     result: dict[str, Any] = {"level": level()}
-    with TemporaryDirectory() as name, tqdm(total=2 * repeats + 2) as bar:
+    with TemporaryDirectory() as name, tqdm(total=2 * repeats + 2, disable=None) as bar:
         folder = Path(name)
         site = unpacked(folder)
         wrong = folder / "wrong.toml"

@@ -191,4 +191,4 @@ def test_what_cannot_be_is_refused():
         PAPER.override({"actuators.y.setpoint": None, "actuators.y.Ki": 1.0})
     with pytest.raises(ValueError, match=r"actuators\.y\.lag"):
         PAPER.override({LAG_Y: -1.0})
-    check_law(Actuator("disc.x", "disc.x", Lagging(PD(1.0, 1.0), 1e-3), setpoint="x_d"))
+    check_law(Lagging(PD(1.0, 1.0), 1e-3))

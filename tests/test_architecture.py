@@ -3,6 +3,7 @@ never in circles."""
 
 import ast
 import re
+from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        display extras diagnostic files parallel tables csvfile quantity codegen
+        caller display extras diagnostic files parallel tables csvfile quantity codegen
         physics cost
         solve testing plan
         plot materials rigs sysid reduced datasets envs experiment cli __main__
@@ -138,7 +139,7 @@ def test_physics_does_not_know_how_it_is_solved():
         own, others = layer(name, ""), {layer(other, "") for other in imports(path)}
         if own in ("physics", "codegen"):
             assert others <= (
-                {"physics", "quantity", "csvfile", "files", "display", "parallel"}
+                {"physics", "quantity", "csvfile", "files", "display", "parallel", "caller"}
                 if own == "physics"
                 else {"codegen"}
             ), name
@@ -196,6 +197,23 @@ def test_commands_leave_the_work_to_the_package():
         assert len(path.read_text().splitlines()) <= COMMAND, path
 
 
+def calls(*folders: Path) -> Iterator[tuple[Path, ast.Call]]:
+    """All calls in the modules of some folders, with their file."""
+    for path in (path for folder in folders for path in folder.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call):
+                yield path, node
+
+
+def test_bars_are_for_terminals_and_warnings_point_to_the_caller():
+    """A log would hold a carriage return for every step of a bar, and a number of frames is wrong
+    wherever pydantic or a decorator is between."""
+    for path, call in calls(ROOT, ROOT.parent / "experiments"):
+        name, given = ast.unparse(call.func), {keyword.arg for keyword in call.keywords}
+        assert name != "tqdm" or "disable" in given, f"{path}:{call.lineno}"
+        assert name != "warnings.warn" or path.name == "caller.py", f"{path}:{call.lineno}"
+
+
 def opens_text(call: ast.Call) -> bool:
     """Whether a call opens, reads or writes a file as text."""
     name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
@@ -211,17 +229,9 @@ def opens_text(call: ast.Call) -> bool:
 
 def test_text_names_its_encoding():
     """Or a file would be read and written otherwise where the terminal knows ASCII only."""
-    found = []
-    for path in (
-        path
-        for folder in (ROOT, *(ROOT.parent / x for x in OUTSIDE))
-        for path in folder.rglob("*.py")
-    ):
-        for call in (
-            node
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-            if isinstance(node, ast.Call)
-        ):
-            if opens_text(call) and "encoding" not in {keyword.arg for keyword in call.keywords}:
-                found.append(f"{path.name}:{call.lineno}")
+    found = [
+        f"{path.name}:{call.lineno}"
+        for path, call in calls(ROOT, *(ROOT.parent / x for x in OUTSIDE))
+        if opens_text(call) and "encoding" not in {keyword.arg for keyword in call.keywords}
+    ]
     assert found == []

@@ -135,10 +135,11 @@ def test_a_run_that_fails_leaves_the_others_alone(start):
     model, y0 = start
     y0[1, model.layout.slices["velocity", "disc"]] = f64(20.0, 0.0, 0.0)
     E = f64(5e5, 5e5, -1.0).requires_grad_()
-    with pytest.warns(SamplesFailed, match="2 of 3 runs failed; run 1: at t = "):
+    with pytest.warns(SamplesFailed, match="2 of 3 runs failed; run 1: at t = ") as caught:
         batch = simulate_batch(
             model, T, parameters={"pad.E": E}, y0=y0, rtol=1e-3, gradient="discrete"
         )
+    assert caught[0].filename == __file__
     assert sorted(batch.failures) == [1, 2]
     lost = batch.failures[1]
     assert isinstance(lost, SimulationFailed)

@@ -225,10 +225,12 @@ def test_trajectories_show_themselves(made):
 
 
 def test_the_bar_of_a_finished_set_shows_no_rate(made, capsys):
-    """Not the simulated seconds of the shards that were there already."""
+    """Not the simulated seconds of the shards that were there already. A log has lines."""
     folder, config = made
     generate(config, str(folder), Serial(), progress=True)
-    last = capsys.readouterr().err.replace("\r", "\n").strip().splitlines()[-1]
+    log = capsys.readouterr().err
+    assert "\r" not in log
+    last = log.splitlines()[-1]
     total = re.escape(f"{config.duration * config.trajectories:.3g}")
     assert re.search(rf"100%.* {total}0?/{total}0? .*(\?|0\.00) ?simulated s/s", last), last
 

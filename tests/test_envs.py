@@ -1,5 +1,6 @@
 """Environments of rig files: gymnasium's contract, states handed on, gradients, refusals."""
 
+import copy
 import importlib
 import sys
 from collections.abc import Callable
@@ -293,6 +294,29 @@ def test_gradient_of_an_episode_by_a_policy(ready):
     assert float(slope @ way) == pytest.approx(differs(episode, weights, way, 1e-6), rel=1e-5)
 
 
+def test_a_copy_in_the_middle_of_an_episode_goes_on_alike_and_apart():
+    """With the gradient by the parameters of its own rig."""
+    env = small(duration=0.2)
+    env.reset(seed=3)
+    env.step(TURN)
+    copied = copy.deepcopy(gymnasium.wrappers.ClipAction(env))
+    ends = [one.step(-TURN) for one in (env, copied)]
+    assert np.array_equal(ends[0][0], ends[1][0])
+    copied.step(TURN)
+    assert (env.moment.steps, copied.unwrapped.moment.steps) == (2, 3)
+    E = [one.unwrapped.dynamics.rig.parameter("materials.rubber.E") for one in (env, copied)]
+    copied.unwrapped.dynamics.step(env.moment, f64(0.2, -0.3, 0.1)).reward.backward()
+    assert E[0].grad is None
+    assert E[1].grad != 0.0
+    several = RigVectorEnv([lambda: small(duration=0.1)] * 2, threads=2)
+    several.reset(seed=3)
+    others = copy.deepcopy(several)
+    actions = np.stack((TURN, -TURN))
+    assert np.array_equal(several.step(actions)[0], others.step(actions)[0])
+    several.close()
+    others.close()
+
+
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_threads_do_not_change_results(mode):
     ends = []
@@ -323,7 +347,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         "`disturbances` names `grip`; signals that no action sets are upper_rate",
     ),
     "no action": ({"actions": {}}, "`actions` is empty; name signals of lower_x"),
-    "range": ({"actions": {"grip": (1.0, 1.0)}}, "must be a pair of finite numbers, low and high"),
+    "range": ({"actions": {"grip": (1.0, 1.0)}}, "a pair of finite numbers, low below high"),
+    "reversed target": (
+        {"goal": TargetPose("disc", {"theta": (0.6, -0.6)}, {"theta": 0.1})},
+        "`goal.target['theta']` must be a pair of finite numbers, low below high, but is (0.6",
+    ),
     "channel": ({"observations": {"x_disk": (0, 1)}}, "names `x_disk`; did you mean `x_disc`"),
     "interval": ({"interval": 0.0}, "`interval` must be positive and finite, but is 0.0"),
     "rate": ({"interval": 1e-6}, "`interval` must be at least 0.0001 s"),

@@ -171,8 +171,9 @@ def test_a_law_with_a_viscosity_of_its_own_is_warned_about():
         return (E - 0.5 * F_N).clamp(min=0.0) / (R + 10.0)
 
     law.friction = viscous
-    with pytest.warns(UserWarning, match="where nothing presses"):
+    with pytest.warns(UserWarning, match="where nothing presses") as caught:
         simulate(built.rig, built.t[:2], y0=built.y0)
+    assert caught[0].filename == __file__
 
 
 SERIES = {"kind": "prony", "E": 0.15e6, "moduli": [0.15e6], "tau": [1.0], "nu": 0.45, "depth": 0.04}

@@ -6,6 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -128,6 +129,18 @@ def test_sources_that_changed_since_the_start_are_refused(folder, monkeypatch):
     with pytest.raises(RuntimeError, match="start it again"):
         objects.load("run")
     assert not folder.exists()
+
+
+def test_a_second_process_waits_for_the_first_and_takes_its_kernels(folder, monkeypatch, capsys):
+    monkeypatch.setattr(objects, "compile_missing", lambda name: pytest.fail("compiled twice"))
+    with ThreadPoolExecutor(1) as pool:
+        with objects.alone():
+            second = pool.submit(objects.build, "run")
+            with pytest.raises(TimeoutError):
+                second.result(0.2)
+            kept()
+        assert second.result(10) == MACHINE_CODE
+    assert f"another process compiles kernels for {folder}" in capsys.readouterr().err
 
 
 def test_folders(monkeypatch):

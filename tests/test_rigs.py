@@ -232,8 +232,10 @@ def test_a_hardness_stands_for_a_modulus(tmp_path, monkeypatch, capsys):
     tree = template("t").model_dump(exclude_unset=True)
     del tree["materials"]["rubber"]["E"]
     tree["materials"]["rubber"]["shore_a"] = 30
-    with pytest.warns(UserWarning, match=r"shore_a = 30 is taken for E = 1\.14 MPa, the estimate"):
+    stated = r"shore_a = 30 is taken for E = 1\.14 MPa, the estimate"
+    with pytest.warns(UserWarning, match=stated) as caught:
         file = RigFile.from_tree(tree)
+    assert caught[0].filename == __file__  # through pydantic
     assert file.materials["rubber"].build(tmp_path).E.item() == from_shore_a(30)
     assert (
         file.override(materials={"rubber": {"E": 1e6}}).assemble().parameter("materials.rubber.E")

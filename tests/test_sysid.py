@@ -178,17 +178,28 @@ def test_a_fit_without_headway_ends_where_it_is_and_says_so(level, stalls):
     assert not stalls or "the fit made no headway: over 6 evaluations" in fit.notices[0]
 
 
-def test_a_fit_far_above_the_noise_is_not_refined(strokes):
-    """Half a millimetre of a wave in a reading of 10 um: finer steps would be to no purpose."""
+def test_a_fit_far_above_the_noise_is_not_refined(strokes, monkeypatch):
+    """Half a millimetre of a wave in a reading of 10 um: finer steps would be to no purpose. The
+    fit makes no headway, so that it has not converged, although one with coloured noise would; chi2
+    of the file is that of the headline."""
+    monkeypatch.setattr("torchsoft.sysid.fit.HEADWAY", 0)
+    monkeypatch.setattr("torchsoft.sysid.fit.LITTLE", 1.0)  # any fit far above the noise
     t, y = strokes.samples["x_C"]
     wavy = replace(strokes, samples=strokes.samples | {"x_C": (t, y + 5e-4 * np.sin(50 * t))})
     answer = identify(Problem([wavy], SENSORS, {E: Unknown(nominal=7e5)}), rtol=1e-3, **TRUSTED)
-    assert answer.chi2_stated > 25
     assert {stage["rtol"] for stage in answer.stages} == {1e-3}
     assert {stage["name"] for stage in answer.stages} <= {
         "strokes: first look", "everything", "with the noise that was found",
     }  # fmt: skip
     assert any("steps were checked and not made finer" in one for one in answer.notices)
+    assert any("the fit made no headway" in one for one in answer.notices)
+    assert answer.stages[-1]["converged"]  # with coloured noise
+    assert not answer.converged
+    content = json.loads(answer.to_json())
+    assert not content["converged"]
+    assert content["chi2"] == pytest.approx(answer.residuals[0].stated ** 2 / 7, rel=0.05)  # of 7
+    assert content["chi2_whitened"] < 1.0 < 25 < content["chi2"]
+    assert f"χ² = {content['chi2']:.3g}" in answer.headline
 
 
 def test_the_adjoint_route_ends_where_gauss_newton_does(strokes):
@@ -415,7 +426,7 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes):
         (lambda: sampled(""), "no samples"),
         (lambda: sampled("x", t, y), "`x` is not a channel"),
         (lambda: sampled("x_C", t, y[1:]), "times and values alike"),
-        (lambda: sampled("x_C", t[::-1], y), "increasing times"),
+        (lambda: sampled("x_C", t[::-1], y), "must increase, but .* sort the samples"),
         (lambda: sampled("x_C", t, np.full_like(y, np.nan)), "finite values"),
     ]
     for made, message in refused:

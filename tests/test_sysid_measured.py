@@ -2,13 +2,14 @@
 command continues."""
 
 import csv
+import math
 import re
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from torchsoft.physics.channels import measurable
 from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.solve.formats import save
-from torchsoft.sysid import Sensor, record
+from torchsoft.sysid import Sensor, Unknown, record
 from torchsoft.sysid.columns import read_table
+from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.initial_state import MovingStart, StartCoordinate
 from torchsoft.sysid.measured import STATED, cost, load, stem, vocabulary
 
@@ -156,9 +158,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have "
                                    r"gaps"),
     "empty set-point": (put(12, Y_D, " "), r"row 12, column `y_d` is empty"),
-    "time twice": (put(12, T, "0.045"), r"row 12, column `t`: the time 0.045 s is there twice"),
+    "time twice": (put(12, T, "0.045"),
+        r"row 12, column `t`: the time 0.045 s is there twice: delete one of the two rows"),
     "time goes back": (put(12, T, "0.01"),
-        r"row 12, column `t`: time goes back, from 0.045 to 0.01 s"),
+        r"row 12, column `t`: time goes back, from 0.045 to 0.01 s: sort the rows by time"),
     "rows missing": (lambda table: table.__delitem__(slice(10, 40)),
         r"row 11, column `t`: 0.155 s are missing before it"),
     "few rows": (lambda table: table.__delitem__(slice(8, None)),
@@ -179,8 +182,12 @@ BAD: dict[str, tuple[Change, str]] = {
     "moving": (
         lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i,
         cells in enumerate(table[1:])],
-        r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = "
-        r"\{kind = \"moving\"\}",
+        r"row 3, column `x_C` moves already, by 0.0003 m: a recording must begin at rest,.* or say "
+        r"start = \{kind = \"moving\"\}",
+    ),
+    "degrees under radians": (
+        lambda table: [scale(THETA, 0.18 / math.pi)(table), put(1, THETA, "theta [rad]")(table)],
+        r"column `theta_C` moves already, by .* rad: is its unit right \(degrees taken for radians",
     ),
     "turning": (
         lambda table: [cells.__setitem__(THETA, f"{15.0 * i}") for i,
@@ -299,6 +306,17 @@ BAD_CONFIG = {
     "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n',
         r"names of their own, but are called data, data"),
 }  # fmt: skip
+
+
+def test_the_table_of_keys_has_every_key_with_its_values():
+    """Numbers as such or by their unit, texts and truth values by those that are allowed."""
+    text = (EXAMPLE / "README.md").read_text(encoding="utf-8")
+    for table in (Unknown, Sensor, Settings):
+        for name, field in table.model_fields.items():
+            assert f"`{name}`" in text or f"`{name} = " in text, name
+            if get_origin(field.annotation) is Literal:
+                assert all(f'"{value}"' in text for value in get_args(field.annotation)), name
+    assert "`fixed` (true or false" in text
 
 
 @pytest.mark.parametrize("name", [*BAD, *BAD_CONFIG])

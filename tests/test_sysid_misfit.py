@@ -1,6 +1,7 @@
 """What a fit leaves: no false alarms where model and noise are right, and for each fault the
 sentence that names it."""
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -210,6 +211,25 @@ def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss():
     assert not alarms(many.judged(robust=True), "level")  # the median is what was stated
     loud = Case(4, scale=1.4)
     assert alarms(loud.judged(robust=True), "level")
+
+
+def test_a_misfit_that_begins_at_a_certain_time_is_named_with_that_time():
+    """In place of outliers. One that is there from the first sample on, or a few outliers at the
+    end, does not begin."""
+    wave, late = 6.0 * np.sin(40 * np.arange(300) * H), np.arange(300) >= 240
+    for robust in (False, True):
+        fault = {("run 0", "theta_C"): wave * late}
+        verdicts = Case(4, fault=fault).judged(robust=robust)
+        (found,) = alarms(verdicts, "onset")
+        time = float(re.search(r"t = (\S+) s", found.words)[1])  # pyright: ignore[reportOptionalSubscript]
+        assert time == pytest.approx(240 * H, abs=2 * H)
+        assert found.size == pytest.approx((1 + 18) ** 0.5, rel=0.15)
+        assert not alarms(verdicts, "outliers")
+        assert residual_notices(verdicts)["onset"].startswith(
+            "the misfit begins in `run 0` at t = "
+        )
+    for other in (wave, 30.0 * (np.arange(300) >= 295)):
+        assert not alarms(Case(4, fault={("run 0", "theta_C"): other}).judged(), "onset")
 
 
 def test_saturated_samples_and_ends_that_cannot_be_tested():

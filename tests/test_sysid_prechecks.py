@@ -144,6 +144,14 @@ MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str, bool]
         "rolling", lambda r: changed(r, theta_C=scaled(57.3)), "unit of theta_C",
         "degrees taken for radians", True
     ),
+    "an angle of zeros": (
+        "rolling", lambda r: changed(r, theta_C=scaled(0.0)), "constant theta_C",
+        "theta_C is constant, 0 rad in all of its ", True
+    ),
+    "a constant force": (
+        "shaking", lambda r: changed(r, effort_x=lambda t, y: 0.0 * y + 2.5), "constant effort_x",
+        "2.5 N in all of its 181 samples, but its noise is stated as 0.1 N", True
+    ),
     "the disc's set-point taken for the bracket's": (
         ABOUT, lambda r: noted(r, {"control.senses": "bracket.x"}), SETPOINT,
         'set-point of the disc, not of the bracket (say measures = "disc.x" of the actuator x)',
@@ -206,6 +214,17 @@ def test_noise_in_another_unit_is_told_by_samples_that_are_too_near_to_each_othe
     (found,) = looked_at(one, runs["rolling"], SENSORS | {"x_C": Sensor(noise=10.0)})
     assert (found.code, found.severity) == ("noise of x_C", "error")
     assert "the noise of x_C is stated as 10 m, but all of its samples are within" in found.message
+
+
+def test_a_constant_channel_of_a_coarse_sensor_is_compared_with_the_run(recordings, runs):
+    """Where steps of the resolution exceed the noise, samples may be constant, unless the run
+    moves by several steps."""
+    one = changed(recordings["rolling"], theta_C=scaled(0.0))
+    fine, coarse = (Sensor(noise=5e-4, resolution=q) for q in (1e-3, 1.0))
+    (found,) = looked_at(one, runs["rolling"], SENSORS | {"theta_C": fine})
+    assert (found.code, found.severity) == ("constant theta_C", "error")
+    assert "a run with the parameters of the start moves it by 0." in found.message
+    assert looked_at(one, runs["rolling"], SENSORS | {"theta_C": coarse}) == []
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

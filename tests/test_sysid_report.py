@@ -85,12 +85,12 @@ def found():
 def test_the_first_line_says_when_the_model_does_not_explain_the_data(found):
     """Whatever colour was found: it is the noise that sensors state that counts."""
     answer, problem = found
-    assert answer.chi2_stated == pytest.approx(answer.chi2, rel=0.05)
+    assert answer.chi2 == pytest.approx(answer.chi2_whitened, rel=0.05)
     assert answer.headline.startswith("4 of 6 parameters identifiable, ")
     residuals = [
         replace(one, stated=29.0 if one.channel == "effort_y" else 1.0) for one in answer.residuals
     ]
-    bad = replace(answer, residuals=residuals, chi2_stated=200.0)
+    bad = replace(answer, residuals=residuals, chi2=200.0)
     first = (
         "The model does not explain the data: residuals of effort_y are 29 times the stated noise"
     )

@@ -260,10 +260,15 @@ def test_laws_that_are_right_pass():
     for law in (
         SmoothSlip(0.5, 0.4, 5e-2), Coulomb(0.4, 0.4), NetworkFriction(),
         SoftContact(1e5, 400.0, 1e5, 400.0, friction=SmoothSlip(0.5, 0.4, 5e-2)),
-        sliding(lambda E, F_N: E - 0.3 * F_N), pushing(PD(1e3, 10.0)), LAW,
+        sliding(lambda E, F_N: E - 0.3 * F_N), pushing(PD(1e3, 10.0)), PD(1e3, 10.0), LAW,
         RIGS["policy"]()[0].actuators,
     ):  # fmt: skip
         check_law(law)
+
+
+class DetachedPD(PD):
+    def forward(self, w: Any, w_dot: Any, feed_forward: Any, q: Any, q_dot: Any) -> Any:
+        return super().forward(w.detach(), w_dot, feed_forward, q, q_dot)
 
 
 WRONG = [
@@ -278,6 +283,7 @@ WRONG = [
     (pushing(lambda w, w_dot, F, q, q_dot: (w - q).detach()), "by x, disc.x are wrong"),
     (pushing(lambda w, w_dot, F, q, q_dot: 0 * w + q.sum()), "several states at once"),
     (pushing(lambda w: w), "must take five tensors"),
+    (DetachedPD(1.0, 1.0), "the law of `actuators.DetachedPD` .*by x_d.* wrong"),
 ]  # fmt: skip
 
 

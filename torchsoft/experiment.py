@@ -79,7 +79,7 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
 
 def repeated(found: Callable[[int], T], count: int, workers: int, label: str) -> list[T]:
     """Results of so many seeds, in their order, with progress."""
-    work = tqdm(parallel_map(found, count, workers), desc=label, total=count)
+    work = tqdm(parallel_map(found, count, workers), desc=label, total=count, disable=None)
     return [one for _, one in sorted(work, key=lambda pair: pair[0])]
 
 

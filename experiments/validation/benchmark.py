@@ -289,7 +289,7 @@ def peers(config: Config) -> dict[str, Any]:
 
     goals = {rtol: w.attempt(OURS, rtol, ours, 9) for rtol in config.rtols}
     hardest, attempts = goals[min(goals)], dict[str, list[Attempt]]()
-    for name, solver in tqdm(solvers.items(), unit="integrator", leave=False):
+    for name, solver in tqdm(solvers.items(), unit="integrator", leave=False, disable=None):
         attempts[name] = []
         for rtol in RTOLS[:: 2 if config.smoke else 1]:
             attempts[name].append(w.attempt(name, rtol, solver, repeats))
@@ -362,7 +362,7 @@ def run(config: Config) -> dict[str, Any]:
         "costs": costs, "batches": batches, "growth": growth,
     }  # fmt: skip
     parts |= {"peers": peers} if config.peers else {}
-    return {name: part(config) for name, part in tqdm(parts.items(), unit="part")}
+    return {name: part(config) for name, part in tqdm(parts.items(), unit="part", disable=None)}
 
 
 def tables(found: dict[str, Any]) -> str:

@@ -81,7 +81,7 @@ def run(config: Config) -> dict[str, dict[str, float]]:
             config, elements_x=(120,), points=(0, 2), places=5, duration=0.8, window=(0.5, 0.8)
         )
     out = {}
-    for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
+    for case in tqdm(list(product(config.elements_x, config.points)), unit="case", disable=None):
         built = build(*case)
         rolled = built.run(grid(config.duration, 5e-3))
         F_x = rolled["effort_x"]

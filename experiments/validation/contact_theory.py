@@ -195,7 +195,7 @@ def sizes(config: Config) -> list[dict[str, float]]:
     """Boxes and discs of every mass and size: what is off."""
     rows = []
     cases = [(m, s) for m in config.masses_kg for s in config.sizes_mm]
-    for mass, size in tqdm(cases, "sizes", leave=False):
+    for mass, size in tqdm(cases, "sizes", leave=False, disable=None):
         scene = Scene(mass, 1e-3 * size)
         rate, final = scene.spin()
         rows.append({
@@ -429,7 +429,7 @@ def carter(nu: float, config: Config) -> list[dict[str, Any]]:
     and what the traction is off Carter's for that creepage, over the limit; half of the sum."""
     case = HalfPlane(nu, config.rolled_elements, fine=(-1.3, config.way + 1.3))
     rows = []
-    for traction in tqdm(config.tractions, f"rolls, nu = {nu:g}", leave=False):
+    for traction in tqdm(config.tractions, f"rolls, nu = {nu:g}", leave=False, disable=None):
         (one, Q, at), (other, P, _) = (rolled(case, x * traction, config.way) for x in (1, -1))
         xi, Q = 0.5 * (one - other), 0.5 * (Q - P)
         near = abs(at.x) < 1.2 * A
@@ -465,7 +465,10 @@ def run(config: Config) -> dict[str, Any]:
     }
     stiff = {"40 elements, springs 400 E*/a": STIFF}
     layers = {f"layer of {h:g} a": replace(usual, thick=h) for h in config.thick}
-    slid = {name: cattaneo(case)[0] for name, case in tqdm(cases.items(), "slid", leave=False)}
+    slid = {
+        name: cattaneo(case)[0]
+        for name, case in tqdm(cases.items(), "slid", leave=False, disable=None)
+    }
     return {
         "slopes": slopes,
         "sizes": sizes(config),

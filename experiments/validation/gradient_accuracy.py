@@ -243,7 +243,7 @@ def table(found: dict[str, dict[str, Any]]) -> str:
 def main(config: Config) -> None:
     if config.smoke:
         config = replace(config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), duration=0.6)
-    every = tqdm(windows(config), unit="window")
+    every = tqdm(windows(config), unit="window", disable=None)
     found = {window.name: judge_window(window, config) for window in every}
     write(config, {"windows": found}, table=table(found))
 

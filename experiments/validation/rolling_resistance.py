@@ -282,7 +282,7 @@ def resistance(material: Material, config: Config) -> dict[str, Any]:
     speeds = np.geomspace(config.slowest, config.fastest, config.speeds) * a / TAU
     rolls = [
         roll(material, config.load_N, 1e-3 * config.element_mm, v, speeds[-1], config.rtol)
-        for v in tqdm(speeds.tolist(), "speeds", leave=False)
+        for v in tqdm(speeds.tolist(), "speeds", leave=False, disable=None)
     ]
     peaks = {}
     for kind in ("force", "theory"):
@@ -353,7 +353,9 @@ def main(config: Config) -> None:
             config, speeds=3, slowest=0.2, fastest=2.0, loads_N=(10.0,), element_mm=1.0
         )
         every = {SOLID: every[SOLID]}
-    curves = {name: resistance(one, config) for name, one in tqdm(every.items(), "rubbers")}
+    curves = {
+        name: resistance(one, config) for name, one in tqdm(every.items(), "rubbers", disable=None)
+    }
     content = {"resistance": curves, "by load": by_load(config)}
     write(config, content, {"rolling_resistance": figure(curves)}, table(content))
 

@@ -138,7 +138,8 @@ def run(config: Config) -> Result:
     default = PAPER["pads.U.elements_x"]
     cases = [(n, 1.0) for n in config.elements_x] + [(default, k) for k in config.stiffenings]
     curves = {
-        case: indent(*case, compressions) for case in tqdm(dict.fromkeys(cases), unit="curve")
+        case: indent(*case, compressions)
+        for case in tqdm(dict.fromkeys(cases), unit="curve", disable=None)
     }
     meshes = {f"{n} x {n // 30}": curves[n, 1.0] for n in config.elements_x}
     return Result(config, meshes, {f"{k:g}": curves[default, k] for k in config.stiffenings})

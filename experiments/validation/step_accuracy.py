@@ -90,7 +90,7 @@ def run(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     ways |= {f"step = {h:g} ms": {"step": 1e-3 * h} for h in config.steps_ms}
     every = motions(config)
     out: dict[str, dict[str, dict[str, Any]]] = {}
-    for title, motion in tqdm(every.items(), unit="motion"):
+    for title, motion in tqdm(every.items(), unit="motion", disable=None):
         exact = motion.run(rtol=config.exact)
         wanted = gradient(motion, rtol=config.exact)
         out[title] = {}

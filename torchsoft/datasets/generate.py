@@ -130,6 +130,17 @@ BAR = "{l_bar}{bar}| {n:.1f}/{total:.1f}{unit} [{elapsed}<{remaining}, {rate_noi
 """What a bar in simulated seconds says."""
 
 
+class Log:
+    """The standard error as the file of a bar: lines in place of carriage returns."""
+
+    def write(self, text: str) -> None:
+        if text := text.strip():
+            print(text, file=sys.stderr, flush=True)
+
+    def flush(self) -> None:
+        pass
+
+
 class Part(NamedTuple):
     """Every `of`-th shard, from number - 1 on. Parts are disjoint."""
 
@@ -259,15 +270,12 @@ def generate(
     running = dict[Future[tuple[int, int]], int]()
     total = sum(len(config.rows(shard)) for shard in mine)
     finished = total - sum(len(config.rows(shard)) for shard in left)
-    options: Any = {
-        "bar_format": BAR,
-        "unit": " simulated s",
-        "disable": not progress,
-        "smoothing": 0.05,
-        "mininterval": 0.1 if sys.stderr.isatty() else 30.0,  # [s], a line each in a log
-    }
-    each = config.duration
-    with tqdm(total=total * each, initial=finished * each, **options) as bar:
+    each, terminal = config.duration, sys.stderr.isatty()
+    with tqdm(
+        total=total * each, initial=finished * each, unit=" simulated s", bar_format=BAR,
+        disable=not progress, file=None if terminal else Log(), smoothing=0.05,
+        mininterval=0.1 if terminal else 30.0,  # [s]
+    ) as bar:  # fmt: skip
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):

@@ -1,7 +1,7 @@
 """A rig under actions at a control rate, in torch: from a state and an action to the next state, an
 observation and a reward, all differentiable."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -100,7 +100,7 @@ class Dynamics:
         solver: Mapping[str, Any], disturbances: Ranges,
     ) -> None:  # fmt: skip
         self.rig, self._built, self.solver = built.rig, built, dict(solver)
-        self._reference = built.rig.reference
+        self._reference: Reference | None = None
         self._stepper: ImplicitStepper | None = None
         self.goal, self.reward = goal, reward
         self.interval, self.samples = positive("interval", interval), whole("samples", samples, 1)
@@ -161,7 +161,9 @@ class Dynamics:
             )
         goal_at = [free[f"{body}.{axis}"] for axis in target]
         self._goal_at = torch.tensor(goal_at, dtype=torch.int64)
-        ends = [x if isinstance(x, tuple) else (x, x) for x in target.values()]
+        drawn = {axis: x for axis, x in target.items() if isinstance(x, Sequence)}
+        ends = target | checked("goal.target", drawn, target, "")
+        ends = [x if axis in drawn else (x, x) for axis, x in ends.items()]
         self.targets = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
         scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in target] if goal else []
         self._scale = torch.tensor(scale, dtype=torch.float64)
@@ -170,19 +172,8 @@ class Dynamics:
         """The moment at the time `begin`, after the rig's own motion, without disturbance. The
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
-        y0, self._reference = started(self.rig, self._built.initial, "discrete")
-        with torch.enable_grad():  # a step may be differentiated, whatever is done here
-            task = prepare(
-                self.rig, [0.0, 1.0], y0=y0, reference=self._reference, gradient="discrete",
-                **self.solver,
-            )  # fmt: skip
-        self._stepper = task.stepper
-        own, t = self._reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
-        set_by = [*self.actions, *self.disturbances]
-        self._set = [self.rig.signals.index(name) for name in set_by]
-        lines = torch.zeros(len(set_by), 2, dtype=torch.float64)
-        self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
-        rows = attached([self._run(t, y0, None).solved])[0]
+        y0, t = self._read_parameters(), torch.tensor([0.0, self.start or LOOK]).double()
+        own, rows = self.reference, attached([self._run(t, y0, None).solved])[0]
         there = -1 if self.start else 0
         with torch.no_grad():
             now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
@@ -190,6 +181,33 @@ class Dynamics:
         reached = (now - self._low) / self._half - 1
         none = torch.zeros(len(self.disturbances), 2, dtype=torch.float64)
         return Moment(rows.y[there], reached, 0, target, none, rows.recorded[there])
+
+    def _read_parameters(self) -> Tensor:
+        """Read the parameters of the rig: its stepper and its reference. Returns its initial
+        state."""
+        y0, self._reference = started(self.rig, self._built.initial, "discrete")
+        with torch.enable_grad():  # a step may be differentiated, whatever is done here
+            task = prepare(
+                self.rig, [0.0, 1.0], y0=y0, reference=self._reference, gradient="discrete",
+                **self.solver,
+            )  # fmt: skip
+        self._stepper, set_by = task.stepper, [*self.actions, *self.disturbances]
+        self._set = [self.rig.signals.index(name) for name in set_by]
+        t, lines = torch.tensor([0.0, LOOK]).double(), torch.zeros(len(set_by), 2).double()
+        self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
+        return y0
+
+    @property
+    def reference(self) -> Reference:
+        """The rig's own motion, with the parameters that were read."""
+        if self._reference is None:
+            self._read_parameters()
+        assert self._reference is not None
+        return self._reference
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what was read: a copy reads the parameters of its own rig."""
+        return self.__dict__ | {"_stepper": None, "_motion": None, "_reference": None}
 
     def step(self, now: Moment, action: Tensor, knots: Tensor | None = None) -> Transition:
         """The transition from a moment to the next control time, with an action (actions,) in [-1,
@@ -242,7 +260,7 @@ class Dynamics:
         parts = [y[self._state], self._sums @ now.recorded[: self._sums.shape[1]]]
         if self._other:
             t = torch.tensor(self.start + now.steps * self.interval, dtype=torch.float64)
-            signals = rig.follow(t, self._reference) if stepper is None else stepper.signals_now(t)
+            signals = rig.follow(t, self.reference) if stepper is None else stepper.signals_now(t)
             seen = Seen(rig, rig.unpack(y, signals), signals)
             for name, own in self._other.items():
                 touch = own is None
@@ -272,14 +290,14 @@ class Dynamics:
             return now.peaks
         steps = now.steps + torch.arange(2)
         t = self.start + self.interval * steps.double()
-        own = torch.stack([self._reference(x, list(self.disturbances))[:, 0] for x in t], -1)
+        own = torch.stack([self.reference(x, list(self.disturbances))[:, 0] for x in t], -1)
         when, peak = now.peaks[:, :1], now.peaks[:, 1:]
         return own + torch.where((when == steps) & (steps > 0), peak, 0.0)
 
     def _following(self, times: Tensor, values: Tensor) -> Reference:
         """The rig's own reference, with lines between two values each (signals, 2) for signals set
         by actions or disturbances."""
-        own = {name: self._reference[name] for name in self.rig.signals}
+        own = {name: self.reference[name] for name in self.rig.signals}
         lines = [Lines(times, row) for row in values]
         return Reference(**own | dict(zip((*self.actions, *self.disturbances), lines)))
 
@@ -289,8 +307,10 @@ class Dynamics:
         """A run with lines between `values` (signals, 2) for signals set by actions or
         disturbances, or by the rig's own motion."""
         if self._stepper is None:
-            raise ValueError("the parameters have not been read; call `begin` first")
-        stepper, given = self._stepper, knots is not None or self._stepper.step is not None
+            self._read_parameters()
+        stepper = self._stepper
+        assert stepper is not None
+        given = knots is not None or stepper.step is not None
         if values is not None and self._motion.known and not (given or torch.is_grad_enabled()):
             times = t.numpy()
             motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
@@ -298,7 +318,7 @@ class Dynamics:
         elif values is not None:
             stepper = stepper.following(self._following(t[[0, -1]], values))
         else:
-            stepper = stepper.following(self._reference)
+            stepper = stepper.following(self.reference)
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)
@@ -322,7 +342,7 @@ def checked(field: str, ranges: Ranges, known: Iterable[str], listed: str) -> Ra
             low, high = 0.0, 0.0
         if not -float("inf") < low < high < float("inf"):
             raise ValueError(
-                f"`{field}[{name!r}]` must be a pair of finite numbers, low and high, but is "
+                f"`{field}[{name!r}]` must be a pair of finite numbers, low below high, but is "
                 f"{given!r}"
             )
     return dict(ranges)

@@ -1,8 +1,9 @@
 """A rig file as an environment of gymnasium; vectors of environments, and their pictures."""
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.display import suggestion
 from torchsoft.envs.dynamics import (
     Dynamics,
@@ -211,7 +213,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                     raise ValueError(f"{message}; see `begin`") from None
                 continue
             if message:
-                warnings.warn(f"{message}; others were drawn", RedrawnStart, stacklevel=3)
+                warn(f"{message}; others were drawn", RedrawnStart)
             return start
         raise ValueError(f"{message}; narrow the ranges of `parameters`")
 
@@ -305,7 +307,14 @@ class RigVectorEnv(SyncVectorEnv):
         threads = cores() if threads is None else whole("threads", threads, 1)
         super().__init__(make, autoreset_mode=autoreset_mode)
         self._threads = min(threads, len(make))
-        self._pool = executor(self._threads)
+
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return executor(self._threads)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the threads: a copy has threads of its own."""
+        return {name: value for name, value in vars(self).items() if name != "_pool"}
 
     def step(self, actions: Any) -> Any:
         """Step all environments, as gymnasium's `SyncVectorEnv` does."""

@@ -1,12 +1,12 @@
 """States from coordinates of bodies: placed, moving, at rest on pads, touching or pressing."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, tensor
 from torchsoft.physics.contact import turned
@@ -90,10 +90,9 @@ def warn_of_moments(rig: Graph, y: Tensor, bodies: Starts) -> None:
         if shape is None or shape.round:
             continue
         if abs(moment) > MOMENT_ARM * shape.size() * pressed:
-            warnings.warn(
+            warn(
                 f"`{name}` is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a "
                 'run from here begins with that; say theta = "rest", or another angle',
-                stacklevel=3,
             )
 
 

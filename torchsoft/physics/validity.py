@@ -4,7 +4,6 @@ take no more than the effort. Every refusal is one sentence that names the fault
 """
 
 import math
-import warnings
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -14,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the only way to tell
 
+from torchsoft.caller import warn
 from torchsoft.physics.arguments import check_transforms
 from torchsoft.physics.contact import slip_of
 from torchsoft.physics.material import Material
@@ -366,10 +366,9 @@ class Backwards:
         self.last = t
         if self.falls >= FALLS:
             self.said = True
-            warnings.warn(
+            warn(
                 "the rig is integrated backwards, where its stiff pads grow: states at decreasing "
                 "times, and gradients of `odeint_adjoint` with an explicit method, may be wrong by "
                 'any factor; use increasing times and method="sdirk2" (after '
                 "`torchsoft.register_method()`), or `torchsoft.simulate`",
-                stacklevel=2,
             )

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
+from torchsoft.caller import warn
 from torchsoft.display import Shown, amount
 from torchsoft.extras import needed
 from torchsoft.reduced.ode import ReducedModel, Rollout, Term, symbol
@@ -321,9 +322,8 @@ def _warn_of_misses(
             "take small taps of a settled grasp, sampled every 0.25 ms, that begin at rest, and "
             f"no coarse samples of a large motion; here a sample is {1e3 * on.step:.3g} ms"
         )
-    warnings.warn(
+    warn(
         f"the reduced model is not to be trusted: rolled out on record {i}, it {miss}; {remedy}",
-        stacklevel=3,
     )
     return True
 
@@ -360,11 +360,10 @@ def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
 
 def _warn_of_mechanics(model: ReducedModel, records: Sequence[Record]) -> None:
     if wrong := contradictions(model, records):
-        warnings.warn(
+        warn(
             f"the reduced model contradicts mechanics: {'; '.join(wrong)}. Its coefficients are "
             "not those of the rig, although it may predict well: kick disc and bracket at the "
             "start of the taps, sample them every 0.25 ms, and keep them to some micrometres",
-            stacklevel=3,
         )
 
 

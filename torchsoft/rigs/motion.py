@@ -141,7 +141,10 @@ class Knots(Motion):
             )
         for before, after in pairwise(self.times):
             if after <= before:
-                raise ValueError(f"times must increase, but {after:g} s follows {before:g} s")
+                raise ValueError(
+                    f"times must increase, but {after:g} s follows {before:g} s; let a jump take a "
+                    "millisecond"
+                )
         return self
 
     def knots(self, context: MotionContext) -> tuple[list[float], list[Any]]:
@@ -384,7 +387,8 @@ def read_column(
         i = back[0]
         raise ValueError(
             f"{path}, row {table.rows[i + 1]}, column `{time}`: {times[i + 1]:g} s follows "
-            f"{times[i]:g} s; times must increase"
+            f"{times[i]:g} s; times must increase: sort the rows, and delete one of two at the "
+            "same time"
         )
     return times.tolist(), values.tolist()
 

@@ -3,7 +3,6 @@ more entry of its union."""
 
 import os
 import sys
-import warnings
 from collections.abc import Mapping, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import signature
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
+from torchsoft.caller import warn
 from torchsoft.display import suggestion
 from torchsoft.materials.presets import PRESETS, from_shore_a
 from torchsoft.physics.ageing import AgeingSlip
@@ -275,10 +275,9 @@ class RubberTable(PartTable):
             hardness = NumberOr("Shore A").check(data["shore_a"])
             assert isinstance(hardness, float)
             E = from_shore_a(hardness)
-        warnings.warn(
+        warn(
             f"shore_a = {hardness:g} is taken for E = {1e-6 * E:.3g} MPa, the estimate of Gent "
             "(1958); where it matters, identify E or fit a test",
-            stacklevel=2,
         )
         return {name: x for name, x in data.items() if name != "shore_a"} | {"E": E}
 

@@ -2,7 +2,6 @@
 in threads."""
 
 import time as clock
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from torchsoft.caller import warn
 from torchsoft.display import Shown, hidden
 from torchsoft.parallel import cores, parallel_map, single_threaded, ungraphed
 from torchsoft.physics.arguments import Numbers, tensor, whole
@@ -213,7 +213,7 @@ def simulate_batch(
         ):
             raise failures[first]  # nothing of a single run
         message = f"{len(failures)} of {count} runs failed; run {first}: {failures[first]}"
-        warnings.warn(message, SamplesFailed, stacklevel=2)
+        warn(message, SamplesFailed)
     states = attached([one.solved for one in done.values()], threads)
     trajectories = [one if isinstance(one, Trajectory) else None for one in results]
     for (i, outcome), rows in zip(done.items(), states):
@@ -241,7 +241,7 @@ def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> No
             if others
             else f"run {first}"
         )
-        warnings.warn(f"{label}: {runs[first]}", stacklevel=3)
+        warn(f"{label}: {runs[first]}")
 
 
 def starts(y0: Any) -> bool:

@@ -1,7 +1,6 @@
 """Derivatives of a whole run: the discrete adjoint, and forward sensitivities."""
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -9,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.parallel import parallel_map, released_turn
 from torchsoft.physics.state import Layout
 from torchsoft.solve.kernel.arrays import Backward, Forward
@@ -50,13 +50,12 @@ def sizes_of(layout: Layout, y: Array) -> Array:
 def warn_of_amplified(most: float) -> None:
     """A warning of a gradient that is `most` times as large as what is differentiated."""
     if most > AMPLIFIED:
-        warnings.warn(
+        warn(
             f"a parameter or a start that changes by 1e-{math.floor(math.log10(most)):02d} of "
             "itself moves the run by its own size: the gradient is exact for the steps that ran "
             "and holds for no change that matters, since the rig amplifies differences, by an "
             "unstable loop that friction or lost contact bounds, or by impacts; differentiate a "
             "shorter run, or a stable rig",
-            stacklevel=3,
         )
 
 

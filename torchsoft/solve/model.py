@@ -6,7 +6,6 @@ by comparing all that it was made of.
 """
 
 import threading
-import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.codegen import Law
 from torchsoft.physics.contact import Friction, SoftContact
 from torchsoft.physics.elements import CONSTANTS, CORNERS
@@ -258,7 +258,7 @@ class Model:
         base = [3 * (len(bodies) if pad.base is None else bodies.index(pad.base)) for pad in pads]
         for name, pad in rig.pads.items():
             if structure_of(pad.material) is None and (wrong := material_fault(name, pad.material)):
-                warnings.warn(wrong, stacklevel=2)
+                warn(wrong)
         columns = np.full((len(pads), len(self._bodies.coordinate)), -1, np.int64)
         for number, name in enumerate(rig.pads):
             touched = (3 * bodies.index(rig.contacts[key].body) for key in rig.contacts_of(name))
@@ -346,7 +346,7 @@ class Model:
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
             laws.append(actuator_law(name, actuator, parameters))
             if structure_of(actuator) is None and (wrong := actuator_fault(name, actuator)):
-                warnings.warn(wrong, stacklevel=2)
+                warn(wrong)
             starts.append(self._add(*parameters.values()))
         for name in rig.weighted:
             laws.append(weight_law())
@@ -393,7 +393,7 @@ class Model:
             if structure_of(shape) is None:
                 faults.append(shape_fault(self.rig.contacts[name].body, shape))
             for wrong in filter(None, faults):
-                warnings.warn(wrong, stacklevel=2)
+                warn(wrong)
         return self._known[key]
 
     def _make_contacts(self) -> tuple[Contacts, Points]:

@@ -2,7 +2,6 @@
 `Trajectory`."""
 
 import time as clock
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import version
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from torchsoft.caller import warn
 from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.channels import Seen, read, units
@@ -110,7 +110,7 @@ def simulate(
     )  # fmt: skip
     trajectory = run(task, TAPE_BYTES, progress).trajectory()
     for doubt in doubts(trajectory, task.stepper.rig).values():
-        warnings.warn(doubt, stacklevel=2)
+        warn(doubt)
     return trajectory
 
 

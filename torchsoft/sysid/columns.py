@@ -300,9 +300,15 @@ def check_table(table: Columns, known: Vocabulary) -> Columns:
     for i in np.flatnonzero(~((apart_by > 0) & (apart_by <= (GAP if setpoints else np.inf))))[:1]:
         t, before = values["t"][i + 1], values["t"][i]
         if t == before:
-            fault = f"the time {t:g} s is there twice"
+            fault = (
+                f"the time {t:g} s is there twice: delete one of the two rows, or, if times were "
+                "rounded, write them with more digits"
+            )
         elif t < before:
-            fault = f"time goes back, from {before:g} to {t:g} s"
+            fault = (
+                f"time goes back, from {before:g} to {t:g} s: sort the rows by time, or, if the "
+                "clock started again there, give what follows as a recording of its own"
+            )
         else:
             fault = (
                 f"{t - before:.3g} s are missing before it; set-points are needed every {GAP} s or "

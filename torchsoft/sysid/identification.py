@@ -150,6 +150,8 @@ def conclude(
     `rtol_asked` is the tolerance of the whole plan, `began` is on the clock [s]."""
     hopeless, linear = is_hopeless(planned), planned.loss == "linear"
     end = at_rest(planned, settings.tightenings if linear and not hopeless else 0)
+    stalled = end.stalled or (hopeless and planned.stalled)  # whatever noise was found after that
+    end = end._replace(stalled=stalled, converged=end.converged and not stalled)
     problem, x, at, rtol, free, colour = end.problem, end.x, end.at, end.rtol, end.free, end.colour
     c, fitted, runner = problem.coordinates, list(end.which), end.runner
     check, own = end.check, undeclared_colour(end)
@@ -157,7 +159,7 @@ def conclude(
     left = parts(problem, at.r, fitted)
     exact = np.concatenate([np.arange(0), *(part.rows for part in left)])  # not saturated
     rows = np.append(exact, np.arange(len(at.r) - len(c.priors), len(at.r)))
-    chi2 = float(at.r[rows] @ at.r[rows]) / max(len(rows) - int(free.sum()), 1)
+    whitened = float(at.r[rows] @ at.r[rows]) / max(len(rows) - int(free.sum()), 1)
     verdicts = judge_residuals(
         left,
         at.r,
@@ -174,14 +176,14 @@ def conclude(
         checked = tested_assumptions(end, doubtful, effort)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if check.bias is None else check.bias
     C_fit = (
-        C_free * max(1.0, chi2)
+        C_free * max(1.0, whitened)
         if linear
         else covariance(end.J, at.r, end.loss, len(c.priors), exact)
     )
     C_fit = C_fit + spread(end.J, C_free, left, colour.refused)
     C[np.ix_(free, free)] = C_fit + checked.widening()
     found = estimates(end, C, shift)
-    predicted, notices = {}, [*findings, *planned.notices]
+    predicted, notices = {}, [*findings, *(planned if hopeless else end).notices]
     if heldout:
         held = problem.with_noise({}).residuals(runner, x, heldout, rtol)
         if held.failed:
@@ -196,7 +198,7 @@ def conclude(
     notices += notices_on(
         found,
         ordering_constraints(problem),
-        end.converged or bool(check.rough) or hopeless,
+        end.converged or bool(check.rough) or hopeless or stalled,
         rtol,
         check.bias is None,
     )
@@ -212,7 +214,7 @@ def conclude(
             f"{check.jacobian_error:.2g} of the noise, and estimates scatter more than their "
             f"intervals say; take rtol = {FINER * rtol:g}"
         )
-    alarms = residual_notices(verdicts, max(1.0, chi2) ** 0.5 if linear else 1.0)
+    alarms = residual_notices(verdicts, max(1.0, whitened) ** 0.5 if linear else 1.0)
     against, plain = assumption_doubts(checked), not systematic(verdicts) and not checked.favoured
     notices += [*against, *assumption_notices(checked), *alarms.values()]
     notices += colour_notices(own, colour)
@@ -222,9 +224,8 @@ def conclude(
         x=[float(v) for v in x],
         correlation=(C_free / np.outer(end.sd, end.sd)).tolist(),
         directions=directions([*end.labels], values, vectors),
-        chi2=chi2,
-        chi2_stated=sum(float(one.raw @ one.raw) for one in left)
-        / max(len(exact) - int(free.sum()), 1),
+        chi2=sum(float(one.raw @ one.raw) for one in left) / max(len(exact) - int(free.sum()), 1),
+        chi2_whitened=whitened,
         converged=end.converged,
         residuals=residual_channels(end),
         heldout=predicted,

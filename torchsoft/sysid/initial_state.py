@@ -6,7 +6,6 @@ with a prior; their values travel with those of the parameters, and the state at
 differentiable in both.
 """
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.display import suggestion
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.pads import Pad
@@ -245,11 +245,10 @@ def warn_of_memory(rig: Rig, lead: float) -> None:
     for name, pad in rig.pads.items():
         longest = float(pad.chain()[1].detach().max())
         if not pad.inertial and lead < FORGOTTEN * longest:
-            warnings.warn(
+            warn(
                 f"the run begins {lead:g} s before the first sample, but the pad `{name}` creeps "
                 f"for {longest:.3g} s: what is not known of its beginning reaches the samples; a "
                 f"`lead` of {FORGOTTEN * longest:.3g} s would do",
-                stacklevel=2,
             )
 
 

@@ -31,6 +31,7 @@ from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing
 from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.prechecks import channel as channel_of
+from torchsoft.sysid.prechecks import confusions
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Sensor, by_channel
@@ -216,24 +217,32 @@ def check_start(
         noise, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
         near = (ASIDE if name in rig.signals else APART).get(unit, np.inf)
         near += noise + bias + unsure.get(name, 0.0)
-        for place in places.get(name, ())[:1]:
-            if min(abs(y[0] - one) for one in places[name]) > near:
-                opposite = abs(y[0] + place) <= near
-                raise ValueError(
-                    f"{table.at(int(rows[0]))}, column `{name}`: it begins at {y[0]:.5g} {unit}, "
-                    f"but the rig file at {place:.5g} {unit}; "
-                    + ("is its sign opposite?" if opposite else f"say so there, {WAY_OUT}")
-                )
+        place = places.get(name, [0.0])[0]
+        others = {one: k for k, one in confusions(unit) if abs(y[0] / k - place) <= near}
+        if name in places and min(abs(y[0] - one) for one in places[name]) > near:
+            opposite = abs(y[0] + place) <= near
+            raise ValueError(
+                f"{table.at(int(rows[0]))}, column `{name}`: it begins at {y[0]:.5g} {unit}, but "
+                f"the rig file at {place:.5g} {unit}; {question([*others])}"
+                + ("is its sign opposite?" if opposite else f"say so there, {WAY_OUT}")
+            )
         early = (t <= first + BEGINNING) | (np.arange(len(t)) < 2)
         fastest = (speed + rush * (t - first + start.lead)) / (smallest if "rad" in unit else 1.0)
-        moving = np.abs(y - y[0]) > fastest * (t - t[0]) + noise
+        size, most = np.abs(y - y[0]), fastest * (t - t[0]) + noise
         if unit.endswith("/s"):
-            moving = np.abs(y) > fastest + noise + bias
-        for i in np.flatnonzero(early & moving)[:1].tolist():
+            size, most = np.abs(y), fastest + noise + bias
+        for i in np.flatnonzero(early & (size > most))[:1].tolist():
+            slow = [one for one, k in others.items() if not (size / k > most)[early].any()]
             raise ValueError(
-                f"{table.at(int(rows[i]))}, column `{name}` moves already: a recording must begin "
-                f"at rest, its bodies where the rig file has them start, {WAY_OUT}"
+                f"{table.at(int(rows[i]))}, column `{name}` moves already, by {size[i]:.3g} "
+                f"{unit}: {question(slow)}a recording must begin at rest, its bodies where the rig "
+                f"file has them start, {WAY_OUT}"
             )
+
+
+def question(units: Sequence[str]) -> str:
+    """The question whether a column is in another unit, empty where there is none."""
+    return f"is its unit right ({' or '.join(units)})? If it is, " if units else ""
 
 
 def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[float, float]:

@@ -427,13 +427,27 @@ def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagn
     """Noise that is stated so large that samples could not be as near to each other as they are."""
     for name, sensor in sensors.items():
         y = recording.samples[name][1] if name in recording.samples else np.zeros(0)
-        if len(y) >= ENOUGH and 0 < np.ptp(y) < WIDTH * sensor.noise:
-            unit = recording.units[name]
+        if len(y) < ENOUGH:
+            continue
+        unit = recording.units[name]
+        if np.ptp(y) == 0 and sensor.resolution < sensor.noise and not sensor.saturated(y).any():
+            yield constant(recording, name, f"its noise is stated as {sensor.noise:.3g} {unit}")
+        elif 0 < np.ptp(y) < WIDTH * sensor.noise:
             text = (
                 f"the noise of {name} is stated as {sensor.noise:.3g} {unit}, but all of its "
                 f"samples are within {np.ptp(y):.3g} {unit}: is it in the right unit?"
             )
             yield found(f"noise of {name}", recording, text, grave=True)
+
+
+def constant(recording: Recording, name: str, contradiction: str) -> Diagnostic:
+    """Diagnostic on a channel whose samples are all equal, with what contradicts that."""
+    y = recording.samples[name][1]
+    text = (
+        f"{name} is constant, {y[0]:.6g} {recording.units[name]} in all of its {len(y)} samples, "
+        f"but {contradiction}: was it recorded? Leave out its sensor, or correct the column"
+    )
+    return found(f"constant {name}", recording, text, grave=True)
 
 
 def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
@@ -473,6 +487,10 @@ def against_run(
         p = one.expected(signals, t)[0]
         measured, run = float(np.std(y)), float(np.std(p))
         if max(measured, run) < MOVES * noise:
+            continue
+        if measured == 0:
+            moves = f"a run with the parameters of the start moves it by {run:.3g} rms"
+            yield constant(recording, name, moves)
             continue
         ratio = measured / max(run, 1e-300)
         if not 1 / LARGER < ratio < LARGER and run > 0:

@@ -106,9 +106,13 @@ class Recording:
                     f"`{channel}` of `{self.name}` needs at least two samples, times and values "
                     "alike"
                 )
-            if not (np.isfinite(t).all() and np.isfinite(y).all() and (np.diff(t) > 0).all()):
+            if not (np.isfinite(t).all() and np.isfinite(y).all()):
+                raise ValueError(f"`{channel}` of `{self.name}` must have finite times and values")
+            for i in np.flatnonzero(np.diff(t) <= 0)[:1]:
                 raise ValueError(
-                    f"`{channel}` of `{self.name}` must have finite values at increasing times"
+                    f"times of `{channel}` of `{self.name}` must increase, but {t[i + 1]:.9g} s "
+                    f"follows {t[i]:.9g} s: sort the samples, and leave out one of two at the same "
+                    "time"
                 )
 
     @cached_property

@@ -8,6 +8,7 @@ Tests are of one channel in one recording where possible:
     white     Ljung and Box: no correlation is left from sample to sample
     motion    F: no correlation with the predicted reading, its rates, or other channels
     channels  Bartlett: no correlation between channels at one time
+    onset     Mann and Whitney: residuals are not larger from a certain time on
     outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
     priors    normal: estimates are where their priors expect them
 
@@ -129,7 +130,12 @@ MOST = 3
 MEDIAN = 0.37
 """Efficiency of the level by the median residual, relative to the mean square."""
 
-Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
+SUDDEN, BEFORE, BEYOND = 3.0, 2.0, 5.0
+"""Least ratio of rms residuals after a time to those before it at which a misfit begins there,
+largest rms residual before it, and the residual that shows it first, which one sample in a million
+exceeds by chance; over the noise."""
+
+Test = Literal["level", "white", "motion", "channels", "onset", "outliers", "priors"]
 
 
 @dataclass(frozen=True)
@@ -183,15 +189,21 @@ def judge_residuals(
         out.append(
             Verdict("level", None, None, two_sided(square, dof), (square / dof) ** 0.5, words)
         )
+    recordings = {
+        one: [part for part in parts if part.recording == one]
+        for one in dict.fromkeys(part.recording for part in parts)
+    }
+    begins = {one: found for one, mine in recordings.items() if (found := onset(mine))}
+    out += begins.values()
     for part in parts:
         if float(np.mean(part.raw**2)) < FAINT**2:
             continue
         out.append(white(part, r))
         out += lines_up(part, [p for p in parts if p.recording == part.recording], r, Q)
-        if not robust:
+        if not robust and part.recording not in begins:  # what follows are no outliers
             out.append(outliers(part, r))
-    for recording in dict.fromkeys(part.recording for part in parts):
-        out += together(recording, [part for part in parts if part.recording == recording], r, Q)
+    for recording, mine in recordings.items():
+        out += together(recording, mine, r, Q)
     out += [
         contradicted(name, r[k], Q[k])
         for name, k in zip(priors, range(len(r) - len(priors), len(r)))
@@ -322,6 +334,57 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
     return out
 
 
+class Change(NamedTuple):
+    """The largest change of one channel's residuals in time: p-value, time [s], and the rms
+    residuals before and after it, over the noise."""
+
+    p: float
+    time: float
+    before: float
+    after: float
+    channel: str
+
+
+def largest_change(part: Part) -> Change:
+    """The change of the variance of the raw residuals with the largest likelihood, with at least
+    `LAGS` samples on either side, tested by ranks, so that single outliers do not count."""
+    m, squares, size = len(part.raw), np.cumsum(part.raw**2), np.abs(part.raw)
+    if m < 2 * LAGS:
+        return Change(1.0, np.nan, np.nan, np.nan, part.channel)
+    k = np.arange(LAGS, m - LAGS + 1)
+    before, after = squares[k - 1] / k, (squares[-1] - squares[k - 1]) / (m - k)
+    least = 1e-300  # of noise-free residuals
+    i = int(np.argmin(k * np.log(before + least) + (m - k) * np.log(after + least)))
+    rank = stats.mannwhitneyu(size[: k[i]], size[k[i] :], alternative="less")
+    p, low, high = len(k) * float(rank.pvalue), float(before[i]) ** 0.5, float(after[i]) ** 0.5
+    return Change(min(1.0, p), float(part.t[k[i]]), low, high, part.channel)
+
+
+def onset(mine: Sequence[Part]) -> Verdict | None:
+    """Test of a misfit that begins at a certain time, of the parts of one recording. It begins with
+    the first residual beyond `BEYOND` in any channel that fits until then."""
+    changes = [
+        one
+        for one in map(largest_change, mine)
+        if one.p < LEVEL and one.before < BEFORE and one.after > SUDDEN * max(one.before, 1.0)
+    ]
+    if not changes:
+        return None
+    clear, recording = min(changes), mine[0].recording
+    first = [(clear.time, clear.channel, clear.after)]
+    for part in mine:
+        for i in np.flatnonzero(np.abs(part.raw) > BEYOND)[:1]:
+            if np.sum(part.raw[:i] ** 2) < BEFORE**2 * i:
+                first.append((float(part.t[i]), part.channel, float(np.abs(part.raw[i]))))
+    time, channel, size = min(first)
+    words = (
+        f"`{recording}` at t = {time:.4g} s, where {channel} is off by {size:.2g} times the noise "
+        f"(residuals of {clear.channel} are {clear.before:.2g} times the noise before t = "
+        f"{clear.time:.4g} s, and {clear.after:.2g} times after)"
+    )
+    return Verdict("onset", recording, None, clear.p, clear.after, words)
+
+
 def outliers(part: Part, r: Array) -> Verdict:
     """Tests of the largest residual (Grubbs), and of heavy tails (Anscombe and Glynn)."""
     rows = r[part.rows]
@@ -377,6 +440,8 @@ def contradicted(name: str, r: float, q: Array) -> Verdict:
 
 
 SENTENCES: dict[str, str] = {
+    "onset": "the misfit begins in {}: look for what happened then (samples lost, a clock that "
+    "jumped, a knock, a motion that the model does not describe), or fit the data before it",
     "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or "
     "the noise larger",
     "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or "

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter
 
+from torchsoft.caller import warn
 from torchsoft.display import Shown, suggestion
 from torchsoft.files import check_file, finite, save_text
 from torchsoft.physics.arguments import whole
@@ -136,7 +137,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
 # The result
 
 
-SCHEMA = "torchsoft-answer-7"
+SCHEMA = "torchsoft-answer-8"
 """Name and version of the file format."""
 
 
@@ -176,10 +177,10 @@ class IdentificationResult(Shown):
     x: list[float]
     correlation: list[list[Number]]
     directions: list[Direction]
-    # sum of squared residuals over degrees of freedom; 1 where model and noise are right
+    # sum of squared residuals over the stated noise, per degree of freedom: 1 where both are right
     chi2: Number
-    # the same over the noise that sensors state, white: colour that was found takes nothing from it
-    chi2_stated: Number
+    # the same of residuals whitened by the colour that was found, with those of the priors
+    chi2_whitened: Number
     converged: bool
     residuals: list[ChannelResiduals]
     heldout: dict[
@@ -254,8 +255,8 @@ class IdentificationResult(Shown):
             f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = "
             f"{self.chi2:.3g}"
         )
-        if not abs(self.chi2_stated - self.chi2) < 0.1 * self.chi2:
-            text += f", {self.chi2_stated:.3g} against the stated noise"
+        if not abs(self.chi2_whitened - self.chi2) < 0.1 * self.chi2:
+            text += f", {self.chi2_whitened:.3g} once whitened"
         if self.verdict == "doubtful":
             several = len(self.doubts) > 1
             held = f"{len(self.doubts)} notes below speak" if several else "a note below speaks"
@@ -269,7 +270,7 @@ class IdentificationResult(Shown):
             if len(self.doubts) == 1:
                 size = "a note below says what it leaves"
         return (
-            f"The model does not explain the data: {size} (χ² = {self.chi2_stated:.3g}), and "
+            f"The model does not explain the data: {size} (χ² = {self.chi2:.3g}), and "
             "intervals may miss the truth"
         )
 
@@ -320,10 +321,9 @@ class IdentificationResult(Shown):
                 f"{name} is {shown(mine.get(name))} and was {shown(one.known[name])}"
                 for name in other
             )
-            warnings.warn(
+            warn(
                 "this rig is not the one of the fit, so its values may mislead: "
                 f"{line(changes, 300)}",
-                stacklevel=2,
             )
         rig = deepcopy(rig)
         set_parameters(rig, one.identified)
@@ -380,7 +380,7 @@ class IdentificationResult(Shown):
             and (c.name in named or not self.unknowns[c.name].fixed)
         }
         if weak:
-            warnings.warn(undetermined(weak), stacklevel=3)
+            warn(undetermined(weak))
         return identifiable
 
     def to_json(self) -> str:

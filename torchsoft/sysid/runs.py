@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.cost import rig_step, steps_per_second
 from torchsoft.files import (
     CHECKPOINT,
@@ -130,9 +131,8 @@ class Journal:
         except Exception:  # a reader meets a forged archive in a hundred ways
             pass
         if not self._warned:
-            warnings.warn(
+            warn(
                 f"the checkpoint {self.folder} holds damaged results, whose runs are made again",
-                stacklevel=2,
             )
             self._warned = True
         return None

@@ -81,9 +81,14 @@ def assumption_doubts(checked: Checked) -> list[str]:
     looks = "; ".join(SHORT[one.test].format(one.words) for one in checked.alarms[:WORST])
     if favoured:
         best = favoured[0]
+        says = "the misfit stands for something that is none of the assumptions tested: with the "
+        says += f"nearest one, {best.name}"
+        if not best.refitted:  # a score test excludes nothing
+            says = (
+                f"the likeliest suspect, which only a new fit can exclude, is {best.name}: with it"
+            )
         return [
-            "the misfit stands for something that is none of the assumptions tested: with the "
-            f"nearest one, {best.name}, the sum of squares {best.falls}{best.found}, but "
+            f"{says}, the sum of squares {best.falls}{best.found}, but "
             f"{looks}{several(checked)}{again * bool(candidates)}"
         ]
     if candidates:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.display import Shown
 from torchsoft.physics.arguments import Numbers, tensor
 from torchsoft.physics.rig import Rig
@@ -224,13 +225,12 @@ def check_gradients(
     conclude(faults)
     idle = idle if {"touch", "stick", "slip"} & {*check.absent} else ()
     for names in filter(None, (idle, check.unchecked)):
-        warnings.warn(_unchecked(check, names), stacklevel=2)
+        warn(_unchecked(check, names))
     for one in check.unsigned:
-        warnings.warn(
+        warn(
             f"the sign of the derivative of `{one.value}` by `{one.by}` depends on the steps: it "
             f"is {one.adjoint:.3g} with an error of {one.step_error:.3g} at rtol = {rtol:g}; take "
-            "a smaller `rtol`",
-            stacklevel=2,
+            "a smaller `rtol`"
         )
     return check
 
@@ -385,10 +385,9 @@ def _checked(
                 )
             )
         except SimulationFailed as failed:
-            warnings.warn(
+            warn(
                 f"the error of the steps is not known, since a run at a tenth of rtol = {rtol:g} "
                 f"failed: {failed}",
-                stacklevel=3,
             )
     ahead = _forward(rig, start, leaves, shake, ways, by_forward, centres)
 

@@ -1,6 +1,7 @@
 """Whether a law of one's own is one: a friction law, or that of an actuator."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from torchsoft.codegen.stops import evaluate
 from torchsoft.physics.contact import SlipLaw, SoftContact, sharp_onset
 from torchsoft.physics.parts import Actuator
 from torchsoft.physics.shapes import Circle
-from torchsoft.physics.validity import NORMALS, check_slip
+from torchsoft.physics.validity import NORMALS, check_slip, slip_rates
 from torchsoft.solve.laws import (
     actuator_fault,
     actuator_law,
@@ -34,23 +35,46 @@ def check_law(
     law: SlipLaw | SoftContact | Actuator | Mapping[str, Actuator], *, R: float = 500.0
 ) -> None:
     """Try a friction law, a function or module of (E, F_N, R), with the dashpot R [N.s/m] or that
-    of the contact that has it; or an actuator, or all of a `controller` or of a rig.
+    of the contact that has it; or an actuator, the law of one, such as a `PD`, a function or module
+    of (w, w', feed-forward, q, q'), or all of a `controller` or of a rig.
 
     A friction law is to be of one point, to dissipate, to leave no effort where nothing presses,
     and to begin to slip without a jump. Every law is to have a derivative that is its value's, and
     to be compiled as it is written. Raises `CheckFailed` with a sentence on every fault.
     """
-    if isinstance(law, Actuator | Mapping | nn.ModuleDict):
-        every: Any = {law.pushes: law} if isinstance(law, Actuator) else law
+    every: Any = law
+    if isinstance(law, Actuator):
+        every = {law.pushes: law}
+    elif isinstance(law, SoftContact):
+        law, R = law.friction, law.R_t.item()
+    elif (loop := _loop(law)) is not None:
+        every = {_name(law): loop}
+    if isinstance(every, Mapping | nn.ModuleDict):
         conclude([fault for name, one in every.items() for fault in _actuator_faults(name, one)])
         return
-    if isinstance(law, SoftContact):
-        law, R = law.friction, law.R_t.item()
     conclude(list(_friction_faults(law, R)))
 
 
+def _loop(law: Any) -> Actuator | None:
+    """The actuator of a law of one; None for a law that takes the arguments of friction, or neither
+    these nor those of a loop."""
+    one = torch.ones((), dtype=torch.float64)
+    with suppress(ValueError):
+        slip_rates("", law, one, one, 1.0)
+        return None
+    with suppress(Exception):  # any error of user code
+        loop = Actuator("body.x", "body.x", law, setpoint="x_d", feed_forward="F_ff")
+        loop(torch.zeros(6, dtype=torch.float64))
+        return loop
+    return None
+
+
+def _name(law: Any) -> str:
+    return getattr(law, "__name__", type(law).__name__)
+
+
 def _friction_faults(slip: Any, R: float) -> Iterator[str]:
-    name = getattr(slip, "__name__", type(slip).__name__)
+    name = _name(slip)
     try:
         wrong = check_slip(name, slip, R)
         contact_laws(SoftContact(1e5, 0.0, 1e5, R, friction=slip), Circle(0.02))

@@ -10,6 +10,8 @@ changes numba for its process, so nothing else imports it.
 import argparse
 import importlib
 import time
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,17 @@ from numba.extending import infer_getattr
 from numba.np.arrayobj import make_array, populate_array
 
 from torchsoft.solve import kernel
-from torchsoft.solve.kernel.objects import ENTRIES, LEVELS, NAME, keep, level, remove_old
+from torchsoft.solve.kernel.objects import (
+    ENTRIES,
+    FOLDERS,
+    LEVELS,
+    NAME,
+    alone,
+    keep,
+    level,
+    read,
+    remove_old,
+)
 from torchsoft.solve.kernel.table import layout
 
 KNOWN = {"sin", "cos", "sqrt", "hypot", "pow"}
@@ -170,16 +182,27 @@ def main() -> None:
     kernel.inlined = lambda function: numba.njit(inline="always", **OPTIONS)(placeless(function))
     if asked.out is None:
         remove_old()
-    for name in asked.entries:
-        start, module = time.perf_counter(), str(entry_module(name))
-        for target in asked.level or [level()]:
-            content = compiled_object(module, target)
-            if asked.out is None:
-                keep(name, target, content)
-            else:
-                (asked.out / NAME).mkdir(exist_ok=True)
-                (asked.out / NAME / f"{name}-{target}.o").write_bytes(content)
-        print(f"{name}: {time.perf_counter() - start:.1f} s")
+    with alone() if asked.out is None else nullcontext():
+        for name in asked.entries:
+            make(name, asked.level or [level()], asked.out)
+
+
+def make(name: str, targets: Sequence[str], out: Path | None) -> None:
+    """Compile an entry for levels of processors, into a folder `out`, or into that of the kernels
+    where it is missing."""
+    if out is None:
+        targets = [one for one in targets if read(FOLDERS[0] / f"{name}-{one}.o") is None]
+    if not targets:
+        return
+    start, module = time.perf_counter(), str(entry_module(name))
+    for target in targets:
+        content = compiled_object(module, target)
+        if out is None:
+            keep(name, target, content)
+        else:
+            (out / NAME).mkdir(exist_ok=True)
+            (out / NAME / f"{name}-{target}.o").write_bytes(content)
+    print(f"{name}: {time.perf_counter() - start:.1f} s")
 
 
 if __name__ == "__main__":

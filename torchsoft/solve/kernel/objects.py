@@ -16,7 +16,8 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
@@ -27,7 +28,7 @@ import llvmlite.binding as llvm
 from platformdirs import user_cache_path
 from tqdm import tqdm
 
-from torchsoft.files import replacing
+from torchsoft.files import held, replacing
 from torchsoft.solve.kernel.arrays import Backward, Forward, Rates, Run
 from torchsoft.solve.kernel.table import address
 
@@ -175,11 +176,36 @@ def found(name: str) -> bytes | None:
     return next((content for content in contents if content is not None), None)
 
 
+@contextmanager
+def alone() -> Iterator[None]:
+    """While no other process compiles kernels for the same folder: waits until it has ended. Nobody
+    waits where no folder can be written or locked."""
+    lock = None
+    for folder in FOLDERS:
+        with suppress(OSError):
+            if (lock := held(folder / "compiling", 0.0)) is None:
+                note(f"another process compiles kernels for {folder}; waiting for it")
+                lock = held(folder / "compiling", -1.0)
+            break
+    try:
+        yield
+    finally:
+        if lock is not None:
+            lock.release()
+
+
 def build(name: str) -> bytes:
-    """Compile an entry for this processor, and beside it the others that are missing and that a
-    user is likely to need, where there are processors for it; each in a process of its own."""
+    """The object of an entry for this processor: compiled, unless another process has just done
+    so."""
     if digest(HERE) != NAME:
         raise RuntimeError(CHANGED)
+    with alone():
+        return found(name) or compile_missing(name)
+
+
+def compile_missing(name: str) -> bytes:
+    """Compile an entry for this processor, and beside it the others that are missing and that a
+    user is likely to need, where there are processors for it; each in a process of its own."""
     likely = [other for other in ENTRIES if other != "rates" and other != name]
     others = [other for other in likely if found(other) is None]
     names = [name, *others[: (os.cpu_count() or 1) - 1]]
