@@ -216,8 +216,8 @@ DRAWN: dict[str, Callable[[Rig, Trajectory], Figure]] = {
     "dashboard": lambda m, r: dashboard(r),
     "page": lambda m, r: dashboard(r, look="page"),
     "column": lambda m, r: dashboard(r, look="column", only=("scene", *list(panels(r))[:2])),
-    "snapshots": lambda m, r: figures.snapshots(r, (0.05, 0.1, 0.15, 0.2)),
-    "snapshots_of_the_end": lambda m, r: figures.snapshots(r),
+    "snapshots": lambda m, r: figures.snapshots(r, (0.02, 0.05, 0.1, 0.12)),
+    "snapshots_by_default": lambda m, r: figures.snapshots(r),
     "multibond_graph": lambda m, r: multibond_graph(m),
 }
 
@@ -277,6 +277,30 @@ def test_ripples_are_explained_in_a_whole_dashboard_only(done, monkeypatch):
     assert dashboard(done[1]).get_supxlabel() == RIPPLE
     assert not dashboard(done[1], only=["scene", "disc.y"]).get_supxlabel()
     assert not dashboard(done[1], look="page").get_supxlabel()
+
+
+@pytest.mark.parametrize(
+    ("curve", "length"),
+    [
+        (lambda t: np.minimum(t / 0.4, 1.0) + 0.01 * np.sin(20 * t), 0.5),  # a grasp, and ripples
+        (lambda t: np.where(t > 0.1, np.minimum(t / 0.2, 1.0), np.nan), 0.2),  # no value at first
+        (np.sin, None),  # as much change everywhere
+        (lambda t: np.minimum(t / 2.0, 1.0), None),  # wide enough to see
+        (lambda t: 0.0 * t, None),
+    ],
+)
+def test_a_start_with_most_of_the_change_gets_a_third_of_the_time_axis(curve, length):
+    t = np.linspace(0.0, 30.0, 3001)
+    axes = Figure().subplots()
+    axes.plot(t, curve(t))
+    axes.axhline(0.0)
+    axes.set_xlim(0.0, 30.0)
+    figures.finish_time_axis(axes)
+    x = [0.0, 0.25, 0.5, 15.25, 30.0] if length == 0.5 else [0.0, 0.1, 0.2, 15.1, 30.0]
+    expected = [0.0, 1 / 6, 1 / 3, 2 / 3, 1.0] if length else np.divide(x, 30.0)
+    place = axes.transAxes.inverted().transform(axes.transData.transform([(one, 0.0) for one in x]))
+    np.testing.assert_allclose(place[:, 0], expected, atol=1e-9)
+    assert (f"first {length} s enlarged" in axes.get_xlabel()) == bool(length)
 
 
 def test_a_loaded_run_has_the_same_mesh(done, tmp_path):

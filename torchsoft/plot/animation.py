@@ -20,8 +20,16 @@ from torchsoft.display import hidden, suggestion
 from torchsoft.files import replacing, save_text
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.setup import von_mises
-from torchsoft.plot.dashboard import RIPPLE, curves, liveliest, motion, ripples, sums
-from torchsoft.plot.figures import ACTUAL, COLOURS, SIZES, STYLE, stress_bar
+from torchsoft.plot.dashboard import (
+    RIPPLE,
+    curves,
+    frame_rows,
+    liveliest,
+    motion,
+    ripples,
+    sums,
+)
+from torchsoft.plot.figures import ACTUAL, COLOURS, SIZES, STYLE, finish_time_axis, stress_bar
 from torchsoft.plot.scene import (
     DISC,
     FRICTION,
@@ -95,7 +103,7 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> 
         whole.grid(False)
         figure.legend(handles=keys(setup, shown), loc="outside lower center", ncols=5)
         motion(strip, run, curve)
-        strip.set_xlabel("time [s]")
+        finish_time_axis(strip)
         (cursor,) = strip.plot([], [], "o", color=INK, ms=6)
         clock = whole.text(
             0.012, 0.97, "", transform=whole.transAxes, va="top", family="monospace", fontsize=12
@@ -205,9 +213,6 @@ CHART_SAMPLES = 1500
 
 LEVELS = 65535
 
-DENSER = 0.3
-"""Share of the frames that are spaced by steps, not by time."""
-
 
 def packed(values: Array) -> dict[str, Any]:
     """Numbers quantised to 16 bits between their extremes, in base 64, with their shape."""
@@ -221,15 +226,6 @@ def packed(values: Array) -> dict[str, Any]:
 
 def encoded(values: NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
-
-
-def frame_rows(run: Trajectory, frames: int) -> list[int]:
-    """Rows of the run for `frames` frames or fewer, each once; denser where the steps were
-    shorter."""
-    t, knots = run.t.numpy(), run.knots.numpy()
-    count = np.interp(t, knots, np.linspace(0.0, 1.0, len(knots)))
-    clock = (1 - DENSER) * (t - t[0]) / (t[-1] - t[0]) + DENSER * count
-    return sorted({int(np.abs(clock - x).argmin()) for x in np.linspace(0.0, clock[-1], frames)})
 
 
 def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
@@ -284,6 +280,16 @@ def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
     return out
 
 
+def opening(run: Trajectory, rows: list[int]) -> int:
+    """The first frame with as many contacts closed as ever at once, and half of the largest force
+    that these carry."""
+    normal = np.array([x[rows, :, 0].detach().sum(-1).numpy() for x in run.force.values()])
+    normal = normal.reshape(-1, len(rows))  # without contacts too
+    closed = (normal > 0).sum(0)
+    total = np.where(closed == closed.max(), normal.sum(0), 0.0)
+    return int((total >= 0.5 * total.max()).argmax())
+
+
 def charts(run: Trajectory) -> list[dict[str, Any]]:
     """The times, then groups of curves over time, each group with one unit. Forces of less than a
     billionth of the largest are drawn as zero."""
@@ -330,6 +336,7 @@ def player(
     (first, *curves_) = charts(run)
     about = {
         "title": title or "torchsoft", "times": times.round(9).tolist(),
+        "opening": opening(run, rows),
         "bodies": {
             name: {
                 "pose": packed(run.state.pose[name][rows].detach().numpy() * [MM, MM, 1.0]),

@@ -25,6 +25,7 @@ from torchsoft.plot.figures import (
     COLOURS,
     DESIRED,
     Look,
+    finish_time_axis,
     forces_on,
     legend_above,
     letter,
@@ -51,6 +52,9 @@ STILL = 1e-3
 
 SAMPLES = 400
 """Most samples at which stresses are computed."""
+
+DENSER = 0.3
+"""Share of the frames that are spaced by steps, not by time."""
 
 RIPPLES = 6
 """Number of changes of the touching points from which the figure explains ripples."""
@@ -178,9 +182,18 @@ def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
     axes.plot(t, scale * run[one.channel].detach().numpy(), color=ACTUAL)
 
 
+def frame_rows(run: Trajectory, frames: int) -> list[int]:
+    """Rows of the run for `frames` frames or fewer, each once; denser where the steps were
+    shorter."""
+    t, knots = run.t.numpy(), run.knots.numpy()
+    count = np.interp(t, knots, np.linspace(0.0, 1.0, len(knots)))
+    clock = (1 - DENSER) * (t - t[0]) / (t[-1] - t[0]) + DENSER * count
+    return sorted({int(np.abs(clock - x).argmin()) for x in np.linspace(0.0, clock[-1], frames)})
+
+
 def stresses(axes: Axes, run: Trajectory) -> None:
     """Draw the largest von Mises stress in every pad."""
-    rows = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).round().astype(int))
+    rows = frame_rows(run, SAMPLES)
     for (name, pad), colour in zip(run.setup.pads.items(), COLOURS * len(run.setup.pads)):
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
         peak = 1e-3 * von_mises(pad.stress(whole)).max(-1)
@@ -371,5 +384,5 @@ def dashboard(
             drawn[name](axes)
             axes.set_title(f"{letter(i + pictured)} {name}")
             if not axes.get_xlabel():
-                axes.set_xlabel("time [s]")
+                finish_time_axis(axes)
     return figure

@@ -5,6 +5,7 @@ Times in s, lengths in mm, forces in N, stresses in kPa.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -15,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from torchsoft.display import suggestion
@@ -60,8 +62,11 @@ DESIRED, ACTUAL, OTHER = "#999999", "#0077bb", "#ee7733"
 COLOURS = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#bbbbbb")
 """Colours of bodies, contacts and actuators, in order."""
 
-SNAPSHOTS = (0.375, 2.5, 5.0, 7.5, 10.0, 17.5, 20.0, 22.5, 25.0)
-"""Times [s] of the paper's Fig. 16."""
+SNAPSHOTS = 6
+"""Default number of pictures in a figure of snapshots."""
+
+SHORT, ENLARGED = 0.03, 1 / 3
+"""Share of a time axis on which a change looks like a vertical line, and its share enlarged."""
 
 Look = Literal["screen", "page", "column"]
 """Style of a figure: for a screen, with a title; or camera-ready without one, for the width of a
@@ -144,6 +149,33 @@ def timeline(axes: Axes, label: str, run: Trajectory) -> NDArray[np.float64]:
     return t
 
 
+def finish_time_axis(axes: Axes) -> None:
+    """Label the time axis of a panel. Where most of the change of its curves happens in a small
+    first part, that part is enlarged to a third of the axis. Changes count by their squares, so
+    that ripples do not hide a fast start."""
+    axes.set_xlabel("time [s]")
+    curves = [line for line in axes.get_lines() if line.get_transform() == axes.transData]
+    t, (start, end) = np.asarray(curves[0].get_xdata())[1:], axes.get_xlim()
+    sums = [np.nancumsum(np.diff(np.asarray(line.get_ydata())) ** 2) for line in curves]
+    change = np.mean([one / (one[-1] or 1.0) for one in sums], 0)
+    passed = (t - start) / (t[-1] - start)
+    k = np.where(passed <= SHORT, change - passed, 0.0).argmax()
+    if passed[k] > SHORT or change[k] < 0.5:
+        return
+    decade = 10.0 ** np.floor(np.log10(t[k] - start))
+    length = decade * min(m for m in (1, 2, 5, 10) if m * decade >= t[k] - start - 1e-9)
+    knee = start + length
+    times, places = (start, knee, end), (0.0, ENLARGED, 1.0)
+    both = partial(np.interp, xp=times, fp=places), partial(np.interp, xp=places, fp=times)
+    axes.set_xscale("function", functions=both)
+    late = MaxNLocator(4, steps=[1, 2, 5, 10]).tick_values(start, end)
+    ticks = [start, start + length / 2, knee, *(x for x in late if knee + length < x <= end)]
+    axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
+    axes.set_xlim(start, end)
+    axes.axvspan(start, knee, color="#f3f3f3", lw=0, zorder=0)
+    axes.set_xlabel(f"time [s], the first {length:g} s enlarged")
+
+
 def legend_above(axes: Axes) -> None:
     """Add a legend at the top of the panel, and extend its y axis to make room."""
     room, count = axes.get_window_extent(), len(axes.get_legend_handles_labels()[1])
@@ -198,12 +230,14 @@ def forces_on(axes: Axes, setup: Setup, instant: Instant, contact: str) -> None:
 
 
 def snapshots(
-    run: Trajectory, times: Sequence[float] = SNAPSHOTS, *, title: str = "", look: Look = "screen"
+    run: Trajectory, times: Sequence[float] = (), *, title: str = "", look: Look = "screen"
 ) -> Figure:
     """Bodies, deformed pads with their stress, contact points by their state, and contact forces at
-    `times` [s]; those after the end of the run are left out."""
-    end, setup = float(run.t[-1]) + 1e-9, run.setup
-    shown = instants(run, [t for t in times if t <= end] or [end])
+    `times` [s], by default at six over the whole run."""
+    setup = run.setup
+    shown = instants(
+        run, times or np.linspace(float(run.t[0]), float(run.t[-1]), SNAPSHOTS).tolist()
+    )
     with looking(look) as size:
         curves, stress = force_scale(setup, shown), largest_stress(shown)
         scene = Scene(Figure().subplots(), setup, curves=curves)
