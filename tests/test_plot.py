@@ -33,7 +33,7 @@ from torchsoft.physics.setup import von_mises
 from torchsoft.plot import figures
 from torchsoft.plot.animation import animate, pace
 from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
-from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
+from torchsoft.plot.diagram import LAYER, dot, graph_of, multibond_graph, positions
 from torchsoft.plot.scene import Scene, instants, straight_up
 
 Done = tuple[Rig, Trajectory]
@@ -342,6 +342,8 @@ def test_diagram_places_every_node_of_the_graph_by_itself(build):
     points = np.array(list(at.values()))
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(len(points))
     assert apart.min() > 0.5
+    for tail, head, signal in graph.edges(data="activated"):  # bonds join neighbouring layers
+        assert signal or abs(at[tail][1] - at[head][1]) < LAYER + 1e-9
     assert dot(rig).startswith("digraph")
 
 
