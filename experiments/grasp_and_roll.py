@@ -32,6 +32,7 @@ from torchsoft.plot.dashboard import dashboard
 from torchsoft.plot.figures import (
     COLOURS,
     DESIRED,
+    finish_time_axis,
     legend_above,
     looking,
     new_figure,
@@ -42,6 +43,12 @@ from torchsoft.plot.figures import (
 PAPER = RigFile.ready("paper")
 PAPER_LIKE = {"contact.K_t": 100.0}
 """The paper-like friction set."""
+
+FIGURE_16 = PAPER.outputs.snapshots
+"""Times [s] of the panels of the paper's Fig. 16."""
+
+FORCES_AT = {0.125: 14, 5.0: 15}
+"""Times [s] of the paper's figures of forces along the contacts, and their numbers."""
 
 SETTLE = 0.5
 """Time [s] after the grasp at which the bracket is judged to be at rest."""
@@ -103,7 +110,7 @@ def grasping_force(file: RigFile, rtol: float) -> float:
 
 def manipulate(config: Config, friction: str, changes: Mapping[str, Any]) -> Run:
     """Find the grasping force and run the manipulation with one friction set."""
-    file = PAPER.override(changes)
+    file = PAPER.override(changes, outputs={"snapshots": sorted({*FIGURE_16, *FORCES_AT})})
     if config.smoke:
         file = file.override(COARSE, outputs={"duration": 0.6, "snapshots": [0.125, 0.375]})
     print(f"{friction} friction: finding the grasping force", flush=True)
@@ -207,33 +214,32 @@ def table(numbers: Mapping[str, Any]) -> str:
 
 
 CURVES = (  # title, channel, its set-point, label, scale
-    ("speed (paper: Figs. 10b, 13b)", "v_x_C", "x_d", "$v_x$ [mm/s]", 1e3),
-    ("force on the bracket (Fig. 11)", "effort_x", "", "$F_x$ [N]", 1.0),
+    ("place of the disc (paper: Figs. 10a, 13a)", "x_C", "x_d", "$x_C$ [mm]", 1e3),
+    ("speed of the disc (Figs. 10b, 13b)", "v_x_C", "x_d_dot", "$v_x$ [mm/s]", 1e3),
+    ("vertical force on the bracket (Fig. 11a)", "effort_y", "", "$F_y$ [N]", 1.0),
+    ("horizontal force on the bracket (Fig. 11b)", "effort_x", "", "$F_x$ [N]", 1.0),
     ("moment on the bracket (Fig. 12)", "M_U", "", "$M_{Br}$ [N m]", 1.0),
     ("angular momentum (Fig. 17)", "angular_momentum_C", "", r"$I_C\,\omega$ [kg mm$^2$/s]", 1e6),
 )
 
 
 def over_time(runs: Sequence[Run]) -> Figure:
-    """The paper's curves of both friction sets, and the speed that is asked for."""
+    """The paper's curves of both friction sets, and the set-points of the disc."""
     with looking("screen") as size:
-        figure = new_figure("Grasp and roll over time", size.width, 6.0)
+        figure = new_figure("Grasp and roll over time", size.width, 9.0)
         for axes, (title, channel, setpoint, label, scale) in zip(
-            figure.subplots(2, 2, sharex=True).flat, CURVES
+            figure.subplots(3, 2).flat, CURVES
         ):
             first = runs[0].trajectory
             t = timeline(axes, label, first)
             if setpoint:
-                axes.plot(
-                    t, scale * first[f"{setpoint}_dot"], color=DESIRED, lw=3, label="asked for"
-                )
+                axes.plot(t, scale * first[setpoint], color=DESIRED, lw=3, label="set-point")
             for run, colour in zip(runs, COLOURS):
                 values = scale * run.trajectory[channel].detach().numpy()
                 axes.plot(t, values, color=colour, lw=1.0, label=f"{run.friction} friction")
             axes.set_title(title)
             legend_above(axes)
-        for axes in figure.axes[-2:]:
-            axes.set_xlabel("time [s]")
+            finish_time_axis(axes)
     return figure
 
 
@@ -243,11 +249,13 @@ def figures(run: Run) -> dict[str, Figure]:
     out = {
         "dashboard": dashboard(trajectory, title=f"Grasp and roll, {run.friction} friction"),
         "snapshots": snapshots(
-            trajectory, title=f"Grasp and roll, {run.friction} friction (paper: Fig. 16)"
+            trajectory,
+            [t for t in FIGURE_16 if t <= trajectory.t[-1]],
+            title=f"Grasp and roll, {run.friction} friction (paper: Fig. 16)",
         ),
         "multibond": diagram.multibond_graph(run.rig),
     }
-    for time, number in ((0.125, 14), (5.0, 15)):
+    for time, number in FORCES_AT.items():
         if time <= trajectory.t[-1]:
             out[f"force_distribution_{time:g}s"] = dashboard(
                 trajectory, only=("scene", "contact U", "contact L"), time=time,

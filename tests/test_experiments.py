@@ -47,9 +47,12 @@ def test_grasp_and_roll_smoke(tmp_path):
     assert numbers["x_C_mm"]["10"] is None
     assert numbers["energy_residual_rel"] < 2e-4
     assert numbers["config"]["smoke"] is True
+    assert module.FIGURE_16 == (0.375, 2.5, 5.0, 7.5, 10.0, 17.5, 20.0, 22.5, 25.0)
+    assert {"effort_x", "effort_y"} <= {channel for _, channel, *_ in module.CURVES}
     names = {path.name for path in tmp_path.iterdir()}
     assert {
         "trajectory.nc",
+        "force_distribution_0.125s.png",
         "multibond.dot",
         "animation.gif",
         "snapshots.png",

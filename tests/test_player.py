@@ -72,6 +72,22 @@ def test_the_file_holds_everything(run, tmp_path):
         player(run, tmp_path / "run.html", frames=1)
 
 
+def first_shown(run, path):
+    player(run, path, frames=30)
+    data = json.loads(re.search(r"const data = (\{.*\});\n", path.read_text(encoding="utf-8"))[1])
+    return run.at(data["times"][data["opening"]])
+
+
+def test_it_opens_when_all_contacts_are_closed(run, tmp_path):
+    row = first_shown(run, tmp_path / "run.html")
+    lower, upper = (run.force[name][..., 0].sum(-1) for name in "LU")
+    assert min(lower[row], upper[row]) > 10.0
+    assert 0 < row < run.at(0.375)
+    never = run.force | {"U": torch.zeros_like(run.force["U"])}
+    row = first_shown(replace(run, force=never), tmp_path / "run.html")
+    assert lower[row] > 0.5 * lower.max() > lower[row - 2]
+
+
 NODE = shutil.which("node")
 LOADED = re.compile(r"<script>\n(.*?)const whole = extent\(\);", re.S)
 CURVES = """const curves = Object.fromEntries(Object.entries(data.contacts).map(
@@ -137,6 +153,12 @@ def test_the_page_opens_without_errors_and_without_a_network(page):
         for one in asked if one["method"] == "Network.requestWillBeSent"
     ]  # fmt: skip
     assert all(url.startswith(("file:", "data:")) for url in urls), urls
+
+
+def test_the_page_shows_the_first_frame_and_its_time(page):
+    shown = page.run("return [frame, +$('slider').value, time, data.times[data.opening]]")
+    assert shown[0] == shown[1] == page.run("return data.opening") > 0
+    assert shown[2] == shown[3]
 
 
 def test_charts_follow_the_slider(page, run):

@@ -31,9 +31,9 @@ from torchsoft import (
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.setup import von_mises
 from torchsoft.plot import figures
-from torchsoft.plot.animation import animate, pace
+from torchsoft.plot.animation import animate, frame_times, pace
 from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
-from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
+from torchsoft.plot.diagram import LAYER, dot, graph_of, multibond_graph, positions
 from torchsoft.plot.scene import Scene, instants, straight_up
 
 Done = tuple[Rig, Trajectory]
@@ -216,8 +216,8 @@ DRAWN: dict[str, Callable[[Rig, Trajectory], Figure]] = {
     "dashboard": lambda m, r: dashboard(r),
     "page": lambda m, r: dashboard(r, look="page"),
     "column": lambda m, r: dashboard(r, look="column", only=("scene", *list(panels(r))[:2])),
-    "snapshots": lambda m, r: figures.snapshots(r, (0.05, 0.1, 0.15, 0.2)),
-    "snapshots_of_the_end": lambda m, r: figures.snapshots(r),
+    "snapshots": lambda m, r: figures.snapshots(r, (0.02, 0.05, 0.1, 0.12)),
+    "snapshots_by_default": lambda m, r: figures.snapshots(r),
     "multibond_graph": lambda m, r: multibond_graph(m),
 }
 
@@ -279,6 +279,30 @@ def test_ripples_are_explained_in_a_whole_dashboard_only(done, monkeypatch):
     assert not dashboard(done[1], look="page").get_supxlabel()
 
 
+@pytest.mark.parametrize(
+    ("curve", "length"),
+    [
+        (lambda t: np.minimum(t / 0.4, 1.0) + 0.01 * np.sin(20 * t), 0.5),  # a grasp, and ripples
+        (lambda t: np.where(t > 0.1, np.minimum(t / 0.2, 1.0), np.nan), 0.2),  # no value at first
+        (np.sin, None),  # as much change everywhere
+        (lambda t: np.minimum(t / 2.0, 1.0), None),  # wide enough to see
+        (lambda t: 0.0 * t, None),
+    ],
+)
+def test_a_start_with_most_of_the_change_gets_a_third_of_the_time_axis(curve, length):
+    t = np.linspace(0.0, 30.0, 3001)
+    axes = Figure().subplots()
+    axes.plot(t, curve(t))
+    axes.axhline(0.0)
+    axes.set_xlim(0.0, 30.0)
+    figures.finish_time_axis(axes)
+    x = [0.0, 0.25, 0.5, 15.25, 30.0] if length == 0.5 else [0.0, 0.1, 0.2, 15.1, 30.0]
+    expected = [0.0, 1 / 6, 1 / 3, 2 / 3, 1.0] if length else np.divide(x, 30.0)
+    place = axes.transAxes.inverted().transform(axes.transData.transform([(one, 0.0) for one in x]))
+    np.testing.assert_allclose(place[:, 0], expected, atol=1e-9)
+    assert (f"first {length} s enlarged" in axes.get_xlabel()) == bool(length)
+
+
 def test_a_loaded_run_has_the_same_mesh(done, tmp_path):
     done[1].save(tmp_path / "run.nc")
     drawn = []
@@ -300,6 +324,16 @@ def test_a_video_says_how_fast_it_is(speed, text):
     assert pace(speed) == text
 
 
+@pytest.mark.parametrize(
+    "only", [["scene"], ["friction"], ["stress", "scene"], ["disc.y", "friction", "disc.y"]]
+)
+def test_a_dashboard_of_some_panels_draws_each_once(done, only):
+    figure = dashboard(done[1], only=only, time=0.1)
+    titles = [title for axes in figure.axes if (title := axes.get_title(loc="left")[3:])]
+    expected = ["t = 0.1 s" if name == "scene" else name for name in {*only}]
+    assert sorted(titles) == sorted(expected)
+
+
 def test_save_writes_the_whole_file_or_none(done, tmp_path):
     figures.save(dashboard(done[1], only=["effort_y"]), tmp_path / "moment.png", dpi=50)
     assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
@@ -318,6 +352,8 @@ def test_diagram_places_every_node_of_the_graph_by_itself(build):
     points = np.array(list(at.values()))
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(len(points))
     assert apart.min() > 0.5
+    for tail, head, signal in graph.edges(data="activated"):  # bonds join neighbouring layers
+        assert signal or abs(at[tail][1] - at[head][1]) < LAYER + 1e-9
     assert dot(rig).startswith("digraph")
 
 
@@ -332,6 +368,12 @@ def test_animation_moves(done, tmp_path):
             gif.seek(i)
             pictures.append(np.asarray(gif.convert("RGB"), dtype=float))
     assert np.abs(pictures[0] - pictures[1]).max() > 50
+
+
+def test_a_slow_start_takes_an_eighth_of_the_pictures(done):
+    np.testing.assert_allclose(frame_times(done[1], 5, 0.0), [0.0, 0.05, 0.1, 0.15, 0.2])
+    times = frame_times(done[1], 17, 0.06)
+    np.testing.assert_allclose(times[[0, 1, 2, 9, 16]], [0.0, 0.03, 0.06, 0.13, 0.2])
 
 
 def test_animation_in_an_unknown_format_is_refused(done, tmp_path):

@@ -165,6 +165,12 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= LONGEST
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/start.md"])
+def test_the_two_commands_come_first(page):
+    lines = blocks(ROOT / page, "sh")[0].splitlines()
+    assert [line.partition("#")[0].split() for line in lines] == [["make", "run"], ["make", "test"]]
+
+
 def test_messages_are_said():
     """Every message that the documentation explains is a part of one in the sources."""
     sources = "".join(

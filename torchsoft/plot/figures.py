@@ -5,30 +5,25 @@ Times in s, lengths in mm, forces in N, stresses in kPa.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from matplotlib import rc_context, rcParams
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from torchsoft.display import suggestion
 from torchsoft.files import replacing
-from torchsoft.physics.setup import Setup
 from torchsoft.plot.scene import (
-    FRICTION,
-    INK,
-    NORMAL,
-    STATES,
     STRESS,
-    Instant,
     Scene,
-    around_contact,
     force_scale,
     instants,
     keys,
@@ -60,8 +55,14 @@ DESIRED, ACTUAL, OTHER = "#999999", "#0077bb", "#ee7733"
 COLOURS = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#bbbbbb")
 """Colours of bodies, contacts and actuators, in order."""
 
-SNAPSHOTS = (0.375, 2.5, 5.0, 7.5, 10.0, 17.5, 20.0, 22.5, 25.0)
-"""Times [s] of the paper's Fig. 16."""
+SNAPSHOTS = 6
+"""Default number of pictures in a figure of snapshots."""
+
+SHORT, ENLARGED = 0.03, 1 / 3
+"""Share of a time axis on which a change looks like a vertical line, and its share enlarged."""
+
+ROUND = partial(MaxNLocator, steps=[1, 2, 5, 10], min_n_ticks=1)
+"""Chooses at most as many intervals, with round ends."""
 
 Look = Literal["screen", "page", "column"]
 """Style of a figure: for a screen, with a title; or camera-ready without one, for the width of a
@@ -144,6 +145,31 @@ def timeline(axes: Axes, label: str, run: Trajectory) -> NDArray[np.float64]:
     return t
 
 
+def finish_time_axis(axes: Axes) -> None:
+    """Label the time axis of a panel. Where most of the change of its curves happens in a small
+    first part, that part is enlarged to a third of the axis. Changes count by their squares, so
+    that ripples do not hide a fast start."""
+    axes.set_xlabel("time [s]")
+    curves = [line for line in axes.get_lines() if line.get_transform() == axes.transData]
+    t, (start, end) = np.asarray(curves[0].get_xdata())[1:], axes.get_xlim()
+    sums = [np.nancumsum(np.diff(np.asarray(line.get_ydata())) ** 2) for line in curves]
+    change = np.mean([one / (one[-1] or 1.0) for one in sums], 0)
+    passed = (t - start) / (t[-1] - start)
+    k = (change - passed).argmax()
+    if passed[k] > SHORT or change[k] < 0.5:
+        return
+    length = ROUND(1).tick_values(0.0, float(t[k]) - start)[-1]
+    knee = start + length
+    times, places = (start, knee, end), (0.0, ENLARGED, 1.0)
+    both = partial(np.interp, xp=times, fp=places), partial(np.interp, xp=places, fp=times)
+    axes.set_xscale("function", functions=both)
+    late = [x for x in ROUND(4).tick_values(start, end) if knee + length < x <= end]
+    ticks = [start, start + length / 2, knee, *late]
+    axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
+    axes.axvspan(start, knee, color="#f3f3f3", lw=0, zorder=0)
+    axes.set_xlabel(f"time [s], the first {length:g} s enlarged")
+
+
 def legend_above(axes: Axes) -> None:
     """Add a legend at the top of the panel, and extend its y axis to make room."""
     room, count = axes.get_window_extent(), len(axes.get_legend_handles_labels()[1])
@@ -173,37 +199,15 @@ def stress_bar(figure: Figure, axes: Any, largest: float, size: Size) -> None:
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 
-def forces_on(axes: Axes, setup: Setup, instant: Instant, contact: str) -> None:
-    """Draw normal force and friction at one contact's points [N] over their place along the surface
-    [mm]; friction with its cone where the law has one, and points by their state."""
-    x, force = around_contact(instant, contact)
-    state = instant.state[contact][instant.near(contact)]
-    mu = setup.contacts[contact].friction.get("mu_s")
-    if mu is not None:
-        cone = mu * force[:, 0]
-        axes.fill_between(x, -cone, cone, color=FRICTION, alpha=0.14, lw=0)
-        axes.plot(x, cone, ":", color=FRICTION, lw=0.8)
-        axes.plot(x, -cone, ":", color=FRICTION, lw=0.8, label=f"cone, mu_s = {mu:g}")
-    axes.axhline(0, color=INK, lw=0.6)
-    axes.plot(x, force[:, 0], color=NORMAL, label="normal force")
-    axes.plot(x, force[:, 1], color=FRICTION, label="friction")
-    for kind, (_, marker, colour) in STATES.items():
-        for column in (0, 1):
-            rows = state == kind
-            axes.plot(
-                x[rows], force[rows, column], marker, color=colour, ls="none", mew=0,
-                ms=0.35 * rcParams["font.size"],
-            )  # fmt: skip
-    axes.set_ylabel("force [N]")
-
-
 def snapshots(
-    run: Trajectory, times: Sequence[float] = SNAPSHOTS, *, title: str = "", look: Look = "screen"
+    run: Trajectory, times: Sequence[float] = (), *, title: str = "", look: Look = "screen"
 ) -> Figure:
     """Bodies, deformed pads with their stress, contact points by their state, and contact forces at
-    `times` [s]; those after the end of the run are left out."""
-    end, setup = float(run.t[-1]) + 1e-9, run.setup
-    shown = instants(run, [t for t in times if t <= end] or [end])
+    `times` [s], by default at six over the whole run."""
+    setup = run.setup
+    shown = instants(
+        run, times or np.linspace(float(run.t[0]), float(run.t[-1]), SNAPSHOTS).tolist()
+    )
     with looking(look) as size:
         curves, stress = force_scale(setup, shown), largest_stress(shown)
         scene = Scene(Figure().subplots(), setup, curves=curves)
@@ -224,7 +228,7 @@ def snapshots(
             axes.set(
                 xlim=(left, right), ylim=(low, high), title=f"{letter(i)} t = {instant.time:g} s"
             )
-            if curves[0] != 1.0 or curves[1] != 1.0:
+            if curves != (1.0, 1.0):
                 scene.scale_bar(axes)
             axes.grid(False)
         for axes in grid.flat[len(shown) :]:

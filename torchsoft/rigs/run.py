@@ -26,9 +26,6 @@ from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.tables import plain
 
-SNAPSHOTS = 6
-"""Default number of pictures in snapshots.png."""
-
 FLOPS = 1e10
 """Floating-point operations a second [1/s] of block products on one core of a usual machine."""
 
@@ -200,14 +197,10 @@ def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]
     from torchsoft.plot.animation import animate, player
     from torchsoft.plot.dashboard import dashboard, liveliest
 
-    end, written = float(run.t[-1]), []
-    times = [t for t in file.outputs.snapshots if t <= end] or [
-        i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)
-    ]
-    title = plain(file.title)
+    title, written = plain(file.title), []
     made = {
         "dashboard": lambda: dashboard(run, title=title),
-        "snapshots": lambda: figures.snapshots(run, times, title=title),
+        "snapshots": lambda: figures.snapshots(run, file.outputs.snapshots, title=title),
     }
     if file.outputs.figures:
         for name, figure in tqdm(made.items(), "figures", unit="figure", disable=hidden(progress)):
