@@ -277,7 +277,9 @@ class Model:
 
     def _make_backs(self) -> Backs:
         pads = list(self.rig.pads.values())
-        backs = [(pad.placed(corners), bonded) for pad in pads for corners, bonded in (pad.mesh.back,)]
+        backs = [
+            (pad.placed(corners), bonded) for pad in pads for corners, bonded in (pad.mesh.back,)
+        ]
         every = [np.concatenate((x, pad.point_positions)) for pad, (x, _) in zip(pads, backs)]
         return filled(
             Backs, start=np.cumsum([0, *(len(x) for x, _ in backs)]),

@@ -201,7 +201,11 @@ class Mesh:
         loop = next(one for one in loops(self.elements) if self.face[0] in one)
         loop = np.roll(loop, -int(np.flatnonzero(loop == self.face[0])[0]))
         behind = loop[: int(np.flatnonzero(loop == self.face[-1])[0]) + 1][::-1]
-        x, face, around = self.nodes[behind], self.nodes[self.face], self.nodes[np.append(loop, loop[0])]
+        x, face, around = (
+            self.nodes[behind],
+            self.nodes[self.face],
+            self.nodes[np.append(loop, loop[0])],
+        )
         way = np.diff(x, axis=0)
         inwards = np.stack((way[:, 1], -way[:, 0]), -1)
         under = self.bonded[behind[:-1]] & self.bonded[behind[1:]]
