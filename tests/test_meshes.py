@@ -134,6 +134,10 @@ def test_face_and_base_are_where_they_should_be(mesh):
     assert mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2 == pytest.approx(
         area, rel=1e-13
     )
+    corners, under = mesh.back
+    np.testing.assert_array_equal(corners[[0, -1]], face[[-1, 0]])
+    base, way = mesh.base, np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    assert 0.7 <= way[under].sum() / (base[1, 0] - base[0, 0]) <= 1.1
     low, high = mesh.space
     assert np.all(low <= mesh.nodes.min(0)) and np.all(mesh.nodes.max(0) <= high)  # noqa: PT018
 

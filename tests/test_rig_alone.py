@@ -54,6 +54,23 @@ def pressed(force: float) -> RigFile:
     return on_one_pad({"x": 0.0, "y": "rest"}, actuators={"y": Y}, motion=motion)
 
 
+def inclined() -> RigFile:
+    """A block on a pad of a table that is inclined until it slides off, at 21.8 degrees."""
+    box = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 5e-3, "radius": 4e-3}
+    pad = {
+        "material": "rubber", "base": "table", "length": 120e-3, "height": 6e-3, "elements_x": 60,
+        "elements_y": 2, "origin": (-60e-3, 0.0),
+    }  # fmt: skip
+    block = {"mass": 0.3, "shape": box, "start": {"x": 0.0, "y": "rest"}}
+    friction = {"kind": "coulomb", "mu_s": 0.4, "mu_k": 0.4}
+    springs = dict.fromkeys(("K_n", "R_n", "K_t", "R_t"), "auto")
+    return on_one_pad(
+        {}, bodies={"disc": block, "table": {"x": 0.0, "y": 0.0, "theta": "driven"}},
+        pads={"ground": pad}, laws={"dry": {**springs, "friction": friction}},
+        motion={"table.theta": ramp(0.2, 4.2, 0.0, 0.5)}, outputs={"duration": 5.0},
+    )  # fmt: skip
+
+
 CASES: dict[str, tuple[RigFile, str, str]] = {
     "pressed": (pressed(600.0), "pads.ground", "leaves linear elasticity: at t = 0.3 s"),  # 48 %
     "pressed a little": (pressed(50.0), "", ""),  # 11 %
@@ -77,6 +94,7 @@ CASES: dict[str, tuple[RigFile, str, str]] = {
     "out of reach": (
         on_one_pad({"x": 0.0, "y": 0.525}), "bodies.disc", "outside the space over the pad",
     ),  # lost at t = 0
+    "inclined": (inclined(), "", ""),  # slides off
 }  # fmt: skip
 
 

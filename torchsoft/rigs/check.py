@@ -188,6 +188,8 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
     """Findings on loops that are unstable or not tied to their measured coordinate, and on steps
     that are too long. Coordinates out of reach of every loop may be unstable: a disc on the top of
     a node rolls off it. Where nothing is free pads only relax, and no mode swings or grows."""
+    if not e.loops and e.file.solver.step is None:
+        return  # nothing below would be reported
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = {key: float(rig.penetration(key, moment.state).max()) for key in rig.contacts}

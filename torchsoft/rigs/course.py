@@ -2,9 +2,10 @@
 gripped between two pads.
 
 There are two estimates. The geometric one holds at any time: loops reach their set-points, a body
-between two pressing pads is midway between them, and moves with them if both are on bodies. The
-static one, at a few moments, balances the forces of loops and feed-forward efforts with those of
-pads, without friction. All other coordinates keep their place.
+between two pressing pads is midway between them, and moves with them if both are on bodies; one
+that lies on a pad of a body moves with that body. The static one, at a few moments, balances the
+forces of loops and feed-forward efforts with those of pads, without friction. All other coordinates
+keep their place.
 """
 
 from functools import cached_property
@@ -96,10 +97,16 @@ class Estimate:
         return pose
 
     def _carry(self, name: str, was: Scene, now: Scene) -> None:
-        """Move a body with the two bodies whose pads grip it, by their mean motion."""
-        for pair in was.facing(name):
-            bases = [base for key in pair if (base := was.pad(key).base) is not None]
-            if len(bases) < 2 or min(was.pressed(key) for key in pair) <= 0:
+        """Move a body with the two bodies whose pads grip it, by their mean motion, or with the
+        one on whose pad it lies."""
+        pairs = was.facing(name)
+        lying = [] if pairs or not self.file.bodies[name].weighted else [
+            (key,) for key, contact in self.rig.contacts.items()
+            if contact.body == name and was.surface(key).normal[1] > ALONG
+        ]  # fmt: skip
+        for group in [*pairs, *lying]:
+            bases = [base for key in group if (base := was.pad(key).base) is not None]
+            if len(bases) < len(group) or min(was.pressed(key) for key in group) <= 0:
                 continue
             old, new = (np.mean([scene.pose[base] for base in bases], 0) for scene in (was, now))
             turn = new[2] - old[2]

@@ -541,7 +541,8 @@ class ContactTable(Group):
     law: str = Field(description="name of one of the laws")
     may_leave: bool = Field(
         default=False,
-        description="true: the run goes on where the body leaves the space over the pad",
+        description="true: the run goes on where the body leaves the space over the pad or touches "
+        "its ends, which a wider body does",
     )
 
     def build(self, laws: dict[str, SoftContact]) -> Contact:

@@ -41,6 +41,7 @@ from torchsoft.solve.kernel.arrays import (
     CONDENSED,
     LANES,
     NODAL,
+    Backs,
     Bodies,
     Condensed,
     Contacts,
@@ -168,8 +169,9 @@ class Model:
             count += value.numel()
         self._bodies = self._make_bodies()
         self._pads = self._make_pads()
-        parts = self._bodies, self._make_sources(), self._pads, self._make_condensed()
-        self._parts = *parts, self._make_nodal(), *self._make_contacts()
+        parts = self._bodies, self._make_sources(), self._pads, self._make_backs()
+        self._condensed = self._make_condensed()
+        self._parts = *parts, self._condensed, self._make_nodal(), *self._make_contacts()
         self.bytes = sum(np.asarray(one).nbytes for part in self._parts for one in part)
         self.index = torch.tensor(self._index, dtype=torch.int64)
         self.nodal = {
@@ -178,7 +180,7 @@ class Model:
         points = [2 * count for count in rig.point_counts.values()]
         self.felt = [*points, 3 * len(rig.pads), 3 * len(rig.bodies) + 3]
         self._chains = [
-            (at, n) for at, n in zip(self._parts[3].chain_at, self._parts[3].branches) if n
+            (at, n) for at, n in zip(self._condensed.chain_at, self._condensed.branches) if n
         ]
         sizes = [one.shape.size() for one in rig.bodies.values() if one.shape is not None]
         self.smallest = min(sizes, default=np.inf)
@@ -192,7 +194,7 @@ class Model:
 
     def displaced(self, p: Array, y: Array) -> dict[str, float]:
         """Largest displacements of the loaded nodes of condensed pads [m] in states y (T, size)."""
-        own, out = self._parts[3], dict[str, float]()
+        own, out = self._condensed, dict[str, float]()
         for name, here in self.condensed.items():
             i = [*self.rig.pads].index(name)
             at, n = own.chain_at[i], own.branches[i]
@@ -272,6 +274,19 @@ class Model:
             point_start=ends[np.searchsorted(owners, np.arange(len(pads) + 1))],
             y_start=[slices["pads", name].start for name in rig.pads], column=columns,
             columns=(columns >= 0).sum(1),
+        )  # fmt: skip
+
+    def _make_backs(self) -> Backs:
+        pads = list(self.rig.pads.values())
+        backs = [
+            (pad.placed(corners), bonded) for pad in pads for corners, bonded in (pad.mesh.back,)
+        ]
+        every = [np.concatenate((x, pad.point_positions)) for pad, (x, _) in zip(pads, backs)]
+        return filled(
+            Backs, start=np.cumsum([0, *(len(x) for x, _ in backs)]),
+            box=[np.stack((x.min(0), x.max(0)), 1).ravel() for x in every],
+            X=np.concatenate([np.zeros((0, 2)), *(x for x, _ in backs)]),
+            bonded=np.concatenate([np.zeros(0), *(np.append(own, False) for _, own in backs)]),
         )  # fmt: skip
 
     def _make_condensed(self) -> Condensed:
@@ -423,7 +438,7 @@ class Model:
             free_pullback=[one.free.pullback for one in laws],
             stored=[one.stored.value for one in laws], p_start=[*starts, len(self._index)],
             point_start=np.cumsum([0, *counts]), size=[shape.size() for shape in shapes],
-            limits=limits, relative=motion_law().value,
+            inner=[shape.deepest() for shape in shapes], limits=limits, relative=motion_law().value,
             relative_linearise=motion_law().linearise,
         )  # fmt: skip
         pads = [rig.pads[contact.pad] for contact in contacts]

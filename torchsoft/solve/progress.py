@@ -94,9 +94,9 @@ class RunState:
 
     @property
     def stands(self) -> tuple[Array, ...]:
-        """Where the run stands: state and Newton's guesses."""
+        """Where the run stands: state, Newton's guesses, and the places of the bodies."""
         work = self.room.work
-        return self.y, work.V, work.u_dot, work.rate
+        return self.y, work.V, work.u_dot, work.rate, work.inner_before
 
     def keep(
         self, plan: Plan, rows: slice, before: tuple[Array, ...], tapes: tuple[Any, Any] | None

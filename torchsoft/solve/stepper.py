@@ -1,6 +1,5 @@
 """The implicit stepper: the compiled kernels fed from a rig, chunk by chunk."""
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.caller import warn
 from torchsoft.parallel import released_turn
 from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import CLOSEST, Reference
@@ -17,11 +17,13 @@ from torchsoft.physics.structure import Structure
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.kernel.arrays import (
     CONVERGED,
+    CRUSHED,
     INSTANT,
     LOST,
     NEWTON_FAILED,
     NOT_FINITE,
     OFF_THE_PAD,
+    PASSED_THROUGH,
     REFUSED,
     TAPE_FULL,
     Limits,
@@ -176,7 +178,7 @@ class ImplicitStepper:
         if self.reference.plain(self.rig.signals) is None and (
             wrong := reference_fault(self.reference, self.rig.signals, t)
         ):
-            warnings.warn(wrong, stacklevel=2)
+            warn(wrong)
 
     def integrate(
         self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None,
@@ -228,10 +230,10 @@ class ImplicitStepper:
                     since, h = 0.0, INSTANT
                 elif given:
                     since, h = float(plan.starts[steps]), float(plan.h[steps])
-                else:
+                elif status < OFF_THE_PAD:
                     names = self.compiled.model.errors.names
                     worst = names[which] if which >= 0 else "the state"
-                raise self._failure(now, status, since, h, worst)
+                raise self._failure(status, since, h, which, worst)
             if not given and out.rows < len(t):
                 todo.append((self._blank(now, out.rows), 0))
             elif given and steps < len(plan.h):
@@ -332,25 +334,29 @@ class ImplicitStepper:
         assert tapes is not None
         return tapes
 
-    def _lost(self, now: RunState) -> str:
-        """A sentence on the first body that is no longer on its pad where the last stage ended;
-        empty if none is."""
-        s, work = now.room.system, now.room.work
-        for c, contact in enumerate(self.rig.contacts.values()):
-            pad, body = s.contact_pad[c], contact.body
-            at, n = s.pad_point_start[pad], work.actives[pad]
-            ends = s.contact_point_start[c], s.contact_point_start[c + 1] - 1
-            if np.isin(work.active[at : at + n], ends).any():
-                return f"`{body}` was lost: its contact reached the end of the pad `{contact.pad}`"
-            x, y, limit = *work.relative[c, :2], s.contact_limits[c]
-            if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
-                return f"`{body}` was lost: it left the space over the pad `{contact.pad}`"
-        return ""
+    def _lost(self, number: int) -> dict[int, str]:
+        """What is reported of a body that left the domain of a contact, by the kernels' status."""
+        name, contact = list(self.rig.contacts.items())[number]
+        pad = self.rig.pads[contact.pad]
+        height, apart = f"{1e3 * pad.mesh.height:.3g} mm", 1e3 * float(pad.point_lengths.max())
+        lost, of = f"`{contact.body}` was lost:", f"the pad `{contact.pad}`"
+        leave = f"say may_leave = true of the contact `{name}` if the body may be there"
+        return {
+            OFF_THE_PAD: f"{lost} its contact reached the end of {of}, which is "
+            f"{1e3 * pad.mesh.length:.3g} mm long; take a longer pad, or {leave}",
+            LOST: f"{lost} it left the space over {of}; keep it nearer, or {leave}",
+            CRUSHED: f"{lost} it compressed {of} by its whole height of {height} and reached the "
+            "base; press less, or take a thicker or stiffer pad",
+            PASSED_THROUGH: f"{lost} it passed through {of}, whose contact points are up to "
+            f"{apart:.3g} mm apart; take a finer pad or more points, stiffer springs K_n, shorter "
+            "steps, or a slower body",
+        }
 
     def _failure(
-        self, now: RunState, status: int, since: float, h: float, worst: str = ""
+        self, status: int, since: float, h: float, which: int, worst: str = ""
     ) -> SimulationFailed:
-        """The failure at a time `since` the origin [s], of what the last stage left."""
+        """The failure at a time `since` the origin [s]; `which` is the contact of a body that left
+        its domain."""
         time = self.origin + since
         if h == INSTANT:
             most, tried, instead = START_ITERATIONS, "at the start", "another start"
@@ -364,9 +370,9 @@ class ImplicitStepper:
             NEWTON_FAILED: f"Newton's iteration did not converge within {most} iterations {tried}; "
             f"try {instead}, or a larger v_s of the friction law: where friction falls with slip "
             "faster than the pads damp, massless pads have no unique velocity",
-            **dict.fromkeys((OFF_THE_PAD, LOST), self._lost(now)),
             REFUSED: f"the tolerances would need steps below {self._shortest:.3g} s for {worst}; "
             "loosen rtol or atol, or look for a jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
         }
+        reasons |= self._lost(which) if status >= OFF_THE_PAD else {}
         return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)

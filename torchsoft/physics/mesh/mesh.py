@@ -191,7 +191,32 @@ class Mesh:
     @cached_property
     def outline(self) -> Index:
         """Numbers of the nodes around the pad, anticlockwise."""
-        return around(self.elements)
+        return max(loops(self.elements), key=len)
+
+    @cached_property
+    def back(self) -> tuple[Array, NDArray[np.bool_]]:
+        """The boundary behind the face: its corners (corners, 2) [m] from the face's right end
+        round to the left one, and which of its sides (corners - 1,) are bonded and lie under the
+        face, where a body would have to be in the pad's rigid base."""
+        loop = next(one for one in loops(self.elements) if self.face[0] in one)
+        loop = np.roll(loop, -int(np.flatnonzero(loop == self.face[0])[0]))
+        behind = loop[: int(np.flatnonzero(loop == self.face[-1])[0]) + 1][::-1]
+        x, face, around = (
+            self.nodes[behind],
+            self.nodes[self.face],
+            self.nodes[np.append(loop, loop[0])],
+        )
+        way = np.diff(x, axis=0)
+        inwards = np.stack((way[:, 1], -way[:, 0]), -1)
+        under = self.bonded[behind[:-1]] & self.bonded[behind[1:]]
+        for i in np.flatnonzero(under):
+            hits = [first_hit(x[i] + 0.5 * way[i], inwards[i], line) for line in (face, around)]
+            under[i] = hits[0] < (1 + STRAIGHT) * hits[1]
+        straight = np.abs(way[1:, 0] * way[:-1, 1] - way[1:, 1] * way[:-1, 0]) <= (
+            STRAIGHT * np.linalg.norm(way[1:], axis=1) * np.linalg.norm(way[:-1], axis=1)
+        )
+        corner = np.concatenate(([True], ~straight | (under[1:] != under[:-1]), [True]))
+        return x[corner], under[corner[:-1]]
 
     @cached_property
     def sides(self) -> Index:
@@ -241,19 +266,37 @@ def boundary(elements: Index) -> Index:
     return sides[first[count == 1]]
 
 
-def around(elements: Index) -> Index:
-    """Numbers of the nodes around the elements, anticlockwise; the longest way round where there
-    are several."""
+def loops(elements: Index) -> list[Index]:
+    """Numbers of the nodes around the elements, anticlockwise, and around each hole, clockwise."""
     after = {int(a): int(b) for a, b in boundary(elements)}
-    loops: list[list[int]] = []
+    found: list[Index] = []
     while after:
         start, node = after.popitem()
         loop = [start]
         while node != start:
             loop.append(node)
             node = after.pop(node)
-        loops.append(loop)
-    return np.array(max(loops, key=len))
+        found.append(np.array(loop))
+    return found
+
+
+STRAIGHT = 1e-9
+"""Sine of the angle between two sides of an outline up to which they are one."""
+
+AHEAD = 1e-6
+"""Distance, over the length of the direction, at which `first_hit` starts to look."""
+
+
+def first_hit(start: Array, direction: Array, line: Array) -> float:
+    """Distance, in lengths of the direction (2,), at which a ray from a point (2,) first meets a
+    line through points (points, 2); infinite where it does not."""
+    way, to = np.diff(line, axis=0), line[:-1] - start
+    cross = direction[0] * way[:, 1] - direction[1] * way[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (to[:, 0] * way[:, 1] - to[:, 1] * way[:, 0]) / cross
+        part = (to[:, 0] * direction[1] - to[:, 1] * direction[0]) / cross
+    hit = (along > AHEAD) & (part >= -STRAIGHT) & (part <= 1 + STRAIGHT)
+    return float(along[hit].min(initial=np.inf))
 
 
 def in_band(nodes: Array, elements: Index) -> Index:

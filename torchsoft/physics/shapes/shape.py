@@ -31,6 +31,14 @@ NOTED = 1e-9
 is written."""
 
 
+DEEPEST = 33, 9, 9
+"""Points along each side of the grids, one inside the other, that find the place farthest inside a
+body."""
+
+CENTRAL = 1e-3
+"""Depth given up for each distance from the middle of a body by its place farthest inside."""
+
+
 class Shape(nn.Module):
     """Interface of a rigid body's shape; lengths are numbers in m, about the centre of mass. A
     `round` one looks the same however it is turned, and its turning is left out of the law."""
@@ -68,6 +76,21 @@ class Shape(nn.Module):
         return float(reach) / math.cos(
             torch.pi / 360
         )  # a boundary point is half a degree from one of the directions
+
+    @torch.no_grad()
+    def deepest(self) -> tuple[float, float, float]:
+        """The place (x, y) [m] farthest inside the body, nearly, and its depth [m]; the most
+        central where there are several."""
+        outline = self.outline()
+        low, high = outline.amin(0), outline.amax(0)
+        best, across = 0.5 * (low + high), 0.5 * (high - low)
+        central = best.clone()
+        for points in DEEPEST:
+            part = torch.linspace(-1.0, 1.0, points, dtype=torch.float64)
+            x = best + across * torch.cartesian_prod(part, part)
+            off = self(x)[0].nan_to_num(nan=torch.inf) + CENTRAL * (x - central).norm(dim=-1)
+            best, across = x[off.argmin()], 2 * across / (points - 1)
+        return float(best[0]), float(best[1]), -float(self(best[None])[0])
 
     def curvature(self, x: Tensor) -> Tensor:
         """Curvature [1/m] (...) of the boundary at its points nearest to x (..., 2) [m], positive

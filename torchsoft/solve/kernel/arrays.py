@@ -26,8 +26,9 @@ from torchsoft.solve.kernel.table import (
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 MIX = (1.0 - GAMMA) / GAMMA
 
-CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE, REFUSED = range(7)
-"""Why a run ended."""
+CONVERGED, NEWTON_FAILED, TAPE_FULL, NOT_FINITE, REFUSED = range(5)
+OFF_THE_PAD, LOST, CRUSHED, PASSED_THROUGH = range(5, 9)
+"""Why a run ended; the last four: a body left the domain of a contact."""
 
 INSTANT = 1e-13
 """Length a h [s] of the stage that gives the forces at one moment: nothing moves in it."""
@@ -104,6 +105,17 @@ class Pads(NamedTuple):
     columns: Index
 
 
+class Backs(NamedTuple):
+    """The boundary behind the face of every pad, in the base's frame: per pad the first of its
+    corners (pads + 1,) and a box (x from, x to, y from, y to) around the undeformed pad; per corner
+    its place, and whether the side to the next one is bonded and lies under the face."""
+
+    start: Index
+    box: Matrix
+    X: Matrix
+    bonded: Index
+
+
 class Condensed(NamedTuple):
     """Per pad: chain_at of its branches' fractions and then times in p, branches, C_start in C,
     reach: the largest entry of C. C holds the compliances (2 nodes, 2 nodes) for E depth = 1 one
@@ -149,9 +161,9 @@ class Nodal(NamedTuple):
 class Contacts(NamedTuple):
     """Per contact: pad, free numbers of the coordinates of the body and of the pad's base (., 6) or
     -1, and those coordinates; states of each of its points, law addresses, p_start of its
-    parameters, point_start, size of the body, limits (x from, x to, y from, y to) of the body's
-    centre in the base's frame. relative,
-    relative_linearise: addresses of the law of relative motion."""
+    parameters, point_start, size of the body, its innermost point (x, y in the body's frame) with
+    the depth there, limits (x from, x to, y from, y to) of the body's centre in the base's frame.
+    relative, relative_linearise: addresses of the law of relative motion."""
 
     pad: Index
     number: IndexMatrix
@@ -167,6 +179,7 @@ class Contacts(NamedTuple):
     p_start: Index
     point_start: Index
     size: Array
+    inner: Matrix
     limits: Matrix
     relative: int
     relative_linearise: int
@@ -188,6 +201,7 @@ PARTS = {
     "body": Bodies,
     "source": Sources,
     "pad": Pads,
+    "back": Backs,
     "condensed": Condensed,
     "nodal": Nodal,
     "contact": Contacts,
@@ -255,6 +269,8 @@ SCRATCH: dict[str, dict[str, str]] = {
         # of every contact its bodies' motion and the wrench on its pad, their relative motion and
         # loads with derivatives, and those of the motion by velocities of the stage
         "contacts 15": "pair",
+        # places of the bodies' innermost points in the bases' frames, now and where a step began
+        "contacts 2": "inner inner_before",
         "contacts 12": "relative",
         "contacts 12 15": "by_pair",
         "contacts 6 6": "by_stage",

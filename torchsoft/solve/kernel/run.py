@@ -20,10 +20,11 @@ from torchsoft.solve.kernel.arrays import (
     PASSED,
     REFUSED,
 )
+from torchsoft.solve.kernel.domain import departed, innermost
 from torchsoft.solve.kernel.invoke import call_value
 from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.sources import effort
-from torchsoft.solve.kernel.step import departed, solve_near, take_back, take_step, write_rows
+from torchsoft.solve.kernel.step import solve_near, take_back, take_step, write_rows
 from torchsoft.solve.kernel.table import Array
 
 ERROR = 2.0 * abs(3.0 * GAMMA**2 - 2.0 * GAMMA**3 - 1.0 / 6.0)
@@ -153,7 +154,7 @@ def run(call: Any) -> None:
 
     counts receives steps and outputs done, status, linear solves, steps that were refused for their
     error and that Newton did not solve, and the part of the state whose error was largest in the
-    last one.
+    last one, or the contact whose domain a body left.
     """
     rig, work, taken, y, out, given, begin = (
         call.rig,
@@ -192,7 +193,8 @@ def run(call: Any) -> None:
                 if not error <= 1.0:
                     status = REFUSED
             if status == CONVERGED:
-                status = departed(rig, work)
+                status, lost = departed(rig, work, y, GAMMA * now)
+                which = lost if status != CONVERGED else which
             if status == CONVERGED:
                 while last < out.step.size and (
                     out.step[last] == steps if given else t_out[last] <= end
@@ -212,9 +214,13 @@ def run(call: Any) -> None:
             break
         if begin:
             put(work.k, call.k)
+            for c in range(rig.contact_pad.size):
+                innermost(rig, work, c)
+            put(work.inner, work.inner_before)
             afresh(work)
             begin, row, solves = False, last, 0
         elif status == CONVERGED:
+            put(work.inner, work.inner_before)
             if not given:
                 call.starts[steps], h[steps] = t, now
                 put(taken.K[1], call.k)

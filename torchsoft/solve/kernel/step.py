@@ -1,5 +1,4 @@
-"""One implicit step: SDIRK2, its running energy integrals, its dense output, and causes of an early
-end.
+"""One implicit step: SDIRK2, its running energy integrals and its dense output.
 
 SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable, stiffly accurate,
 of second order, both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both. The
@@ -15,11 +14,9 @@ from torchsoft.solve.kernel.arrays import (
     CONVERGED,
     GAMMA,
     INSTANT,
-    LOST,
     MIX,
     NEWTON_FAILED,
     NOT_FINITE,
-    OFF_THE_PAD,
     TAPE_FULL,
     TINY,
     WRENCH,
@@ -52,23 +49,6 @@ def write_tape(rig: Any, work: Any, tape: Any, row: int, y: Array, way: float) -
             state[0], state[1] = ux + way * state[2], uy + way * state[3]
             slot += 1
     return True
-
-
-@compiled
-def departed(rig: Any, work: Any) -> int:
-    """Whether a contact has reached the end of a pad, or a body has left the space over one."""
-    for c in range(rig.contact_pad.size):
-        at = rig.pad_point_start[rig.contact_pad[c]]
-        for i in range(work.actives[rig.contact_pad[c]]):
-            if (
-                work.active[at + i] == rig.contact_point_start[c]
-                or work.active[at + i] == rig.contact_point_start[c + 1] - 1
-            ):
-                return OFF_THE_PAD
-        x, y, limit = work.relative[c, 0], work.relative[c, 1], rig.contact_limits[c]
-        if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
-            return LOST
-    return CONVERGED
 
 
 @compiled
