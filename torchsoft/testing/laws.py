@@ -50,7 +50,8 @@ def check_law(
     elif (loop := _loop(law)) is not None:
         every = {_name(law): loop}
     if isinstance(every, Mapping | nn.ModuleDict):
-        conclude([fault for name, one in every.items() for fault in _actuator_faults(name, one)])
+        loops: Any = every.items()
+        conclude([fault for name, one in loops for fault in _actuator_faults(name, one)])
         return
     conclude(list(_friction_faults(law, R)))
 
