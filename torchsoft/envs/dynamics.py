@@ -162,8 +162,8 @@ class Dynamics:
         goal_at = [free[f"{body}.{axis}"] for axis in target]
         self._goal_at = torch.tensor(goal_at, dtype=torch.int64)
         drawn = {axis: x for axis, x in target.items() if isinstance(x, Sequence)}
-        ends = {**target, **checked("goal.target", drawn, target, "")}
-        ends = [x if axis in drawn else (x, x) for axis, x in ends.items()]
+        drawn = checked("goal.target", drawn, target, "")
+        ends = [drawn.get(axis, (x, x)) for axis, x in target.items()]
         self.targets = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
         scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in target] if goal else []
         self._scale = torch.tensor(scale, dtype=torch.float64)

@@ -84,9 +84,8 @@ def assumption_doubts(checked: Checked) -> list[str]:
         says = "the misfit stands for something that is none of the assumptions tested: with the "
         says += f"nearest one, {best.name}"
         if not best.refitted:  # a score test excludes nothing
-            says = (
-                f"the likeliest suspect, which only a new fit can exclude, is {best.name}: with it"
-            )
+            says = "the likeliest suspect, which only a new fit can exclude, is "
+            says += f"{best.name}: with it"
         return [
             f"{says}, the sum of squares {best.falls}{best.found}, but "
             f"{looks}{several(checked)}{again * bool(candidates)}"
