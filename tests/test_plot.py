@@ -31,7 +31,7 @@ from torchsoft import (
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.setup import von_mises
 from torchsoft.plot import figures
-from torchsoft.plot.animation import animate, pace
+from torchsoft.plot.animation import animate, frame_times, pace
 from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
 from torchsoft.plot.diagram import LAYER, dot, graph_of, multibond_graph, positions
 from torchsoft.plot.scene import Scene, instants, straight_up
@@ -324,6 +324,16 @@ def test_a_video_says_how_fast_it_is(speed, text):
     assert pace(speed) == text
 
 
+@pytest.mark.parametrize(
+    "only", [["scene"], ["friction"], ["stress", "scene"], ["disc.y", "friction", "disc.y"]]
+)
+def test_a_dashboard_of_some_panels_draws_each_once(done, only):
+    figure = dashboard(done[1], only=only, time=0.1)
+    titles = [title for axes in figure.axes if (title := axes.get_title(loc="left")[3:])]
+    expected = ["t = 0.1 s" if name == "scene" else name for name in {*only}]
+    assert sorted(titles) == sorted(expected)
+
+
 def test_save_writes_the_whole_file_or_none(done, tmp_path):
     figures.save(dashboard(done[1], only=["effort_y"]), tmp_path / "moment.png", dpi=50)
     assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
@@ -358,6 +368,12 @@ def test_animation_moves(done, tmp_path):
             gif.seek(i)
             pictures.append(np.asarray(gif.convert("RGB"), dtype=float))
     assert np.abs(pictures[0] - pictures[1]).max() > 50
+
+
+def test_a_slow_start_takes_an_eighth_of_the_pictures(done):
+    np.testing.assert_allclose(frame_times(done[1], 5, 0.0), [0.0, 0.05, 0.1, 0.15, 0.2])
+    times = frame_times(done[1], 17, 0.06)
+    np.testing.assert_allclose(times[[0, 1, 2, 9, 16]], [0.0, 0.03, 0.06, 0.13, 0.2])
 
 
 def test_animation_in_an_unknown_format_is_refused(done, tmp_path):

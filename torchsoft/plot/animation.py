@@ -1,9 +1,9 @@
 """Videos and interactive players: bodies, deformed pads and contact forces over a whole run."""
 
 import base64
-import importlib.util
 import json
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,13 @@ from PIL import Image
 from tqdm import tqdm
 
 from torchsoft.display import hidden, suggestion
+from torchsoft.extras import needed
 from torchsoft.files import replacing, save_text
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.setup import von_mises
 from torchsoft.plot.dashboard import (
     RIPPLE,
+    Curve,
     curves,
     frame_rows,
     liveliest,
@@ -62,15 +64,8 @@ Picture = NDArray[np.uint8]
 def frame_times(run: Trajectory, frames: int, slow: float) -> Array:
     """Times [s] of the frames; one in eight goes to the first `slow` [s], unless that is zero."""
     start, end = float(run.t[0]), float(run.t[-1])
-    if not 0 < slow < end - start:
-        return np.linspace(start, end, frames)
-    first = max(2, frames // 8)
-    return np.concatenate(
-        (
-            np.linspace(start, start + slow, first),
-            np.linspace(start + slow, end, frames - first + 1)[1:],
-        )
-    )
+    first = slow if 0 < slow < end - start else (end - start) / 8
+    return np.interp(np.linspace(0, 8, frames), (0, 1, 8), (start, start + first, end))
 
 
 def pace(speed: float) -> str:
@@ -81,18 +76,16 @@ def pace(speed: float) -> str:
     return f"\n{times:g} times {'as fast' if speed > 1 else 'slower'}"
 
 
-def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
-    """RGB pictures (height, width, 3) at `times` [s]: the scene, and below it the coordinate
-    `follow` over time. The axes are drawn once; each picture redraws moving parts only."""
+def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) -> Iterator[Picture]:
+    """RGB pictures (height, width, 3) at `times` [s]: the scene, and below it a coordinate over
+    time. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
-    curve = next(curve for curve in curves(run) if curve.name == follow)
     scale = force_scale(setup, shown)
     x_limits, y_limits = Scene(Figure().subplots(), setup, curves=scale).limits(shown)
     tall = (y_limits[1] - y_limits[0]) / (x_limits[1] - x_limits[0])
     with rc_context(STYLE):
-        figure = Figure(
-            figsize=(8.0, min(max(5.8, 7.0 * tall + 2.2), 8.6)), dpi=dpi, layout="constrained"
-        )
+        height = 2 * round(0.5 * dpi * min(max(5.8, 7.0 * tall + 2.2), 8.6)) / dpi  # H.264: even
+        figure = Figure(figsize=(8.0, height), dpi=dpi, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         whole, strip = figure.subplots(2, 1, height_ratios=(figure.get_figheight() - 1.26, 1.26))
         stress = largest_stress(shown)
@@ -139,11 +132,9 @@ def animate(
     """
     if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"`path` must end in .gif or .mp4, but is {path}")
-    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ModuleNotFoundError(
-            f"{path} needs imageio-ffmpeg: pip install 'torchsoft[video]', or write a .gif"
-        )
-    times, known = frame_times(run, frames, slow), [curve.name for curve in curves(run)]
+    if path.suffix == ".mp4":
+        needed("imageio_ffmpeg", "video")
+    times, known = frame_times(run, frames, slow), {curve.name: curve for curve in curves(run)}
     followed = follow or liveliest(run)
     if followed not in known:
         raise ValueError(
@@ -151,7 +142,7 @@ def animate(
             f"{suggestion(followed, known, 'there are')}"
         )
     bar = tqdm(
-        render(run, times, dpi, title, followed),
+        render(run, times, dpi, title, known[followed]),
         "animation",
         len(times),
         unit="frame",
@@ -164,40 +155,30 @@ def animate(
 def write_gif(pictures: Iterable[Picture], path: Path) -> None:
     """Write a GIF with the palette of one picture, so that still areas stay identical and the file
     is small."""
-    images = [Image.fromarray(picture) for picture in pictures]
+    images = list(map(Image.fromarray, pictures))
     middle = images[len(images) // 2].copy()
     for i, colour in enumerate(
         (NORMAL, FRICTION, PAD, LAYER, DISC, STEEL, ACTUAL)
     ):  # few pixels have some of them
         middle.paste(colour, (0, 12 * i, middle.width, 12 * (i + 1)))
     palette = middle.quantize(96)
-    reduced = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    first, *rest = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     pause = round(1000 / FRAMES_PER_SECOND)
-    reduced[0].save(path, "GIF", save_all=True, append_images=reduced[1:], duration=pause, loop=0)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=pause, loop=0)
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path) -> None:
     """Write H.264 through the ffmpeg of imageio-ffmpeg."""
-    import imageio_ffmpeg  # pyright: ignore[reportMissingImports] -- an optional dependency
-
-    writer = None
-    for picture in pictures:
-        even = np.ascontiguousarray(
-            picture[: len(picture) // 2 * 2, : picture.shape[1] // 2 * 2]
-        )  # H.264 asks for it
-        if writer is None:
-            size = (even.shape[1], even.shape[0])
-            writer = imageio_ffmpeg.write_frames(
-                str(path),
-                size,
-                fps=FRAMES_PER_SECOND,
-                macro_block_size=2,
-                output_params=["-f", "mp4"],
-            )
-            writer.send(None)
-        writer.send(even)
-    if writer is not None:
-        writer.close()
+    pictures = iter(pictures)
+    first = next(pictures)
+    writer = needed("imageio_ffmpeg", "video").write_frames(
+        str(path), first.shape[1::-1], fps=FRAMES_PER_SECOND, macro_block_size=2,
+        output_params=["-f", "mp4"],
+    )  # fmt: skip
+    writer.send(None)
+    for picture in chain([first], pictures):
+        writer.send(picture)
+    writer.close()
 
 
 # The interactive player: a run as one self-contained HTML file for any browser.
@@ -283,17 +264,17 @@ def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
 def opening(run: Trajectory, rows: list[int]) -> int:
     """The first frame with as many contacts closed as ever at once, and half of the largest force
     that these carry."""
-    normal = np.array([x[rows, :, 0].detach().sum(-1).numpy() for x in run.force.values()])
-    normal = normal.reshape(-1, len(rows))  # without contacts too
+    normal = [x[rows, :, 0].detach().sum(-1).numpy() for x in run.force.values()]
+    normal = np.array([np.zeros(len(rows)), *normal])
     closed = (normal > 0).sum(0)
-    total = np.where(closed == closed.max(), normal.sum(0), 0.0)
+    total = normal.sum(0) * (closed == closed.max())
     return int((total >= 0.5 * total.max()).argmax())
 
 
 def charts(run: Trajectory) -> list[dict[str, Any]]:
     """The times, then groups of curves over time, each group with one unit. Forces of less than a
     billionth of the largest are drawn as zero."""
-    rows = np.unique(np.linspace(0, len(run.t) - 1, CHART_SAMPLES).round().astype(int))
+    rows = frame_rows(run, CHART_SAMPLES)
     t = run.t.numpy()[rows].round(9).tolist()
     out: list[dict[str, Any]] = []
 
@@ -332,11 +313,12 @@ def player(
         raise ValueError(f"`frames` must be 2 or more, but is {frames}")
     rows = frame_rows(run, frames)
     times = run.t.numpy()[rows]
-    shown = instants(run, [times[0], times[len(times) // 2], times[-1]])
+    first_shown = opening(run, rows)
+    shown = instants(run, times[[first_shown, len(times) // 2, -1]].tolist())
     (first, *curves_) = charts(run)
     about = {
         "title": title or "torchsoft", "times": times.round(9).tolist(),
-        "opening": opening(run, rows),
+        "opening": first_shown,
         "bodies": {
             name: {
                 "pose": packed(run.state.pose[name][rows].detach().numpy() * [MM, MM, 1.0]),

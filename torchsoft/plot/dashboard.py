@@ -5,12 +5,13 @@ Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, stresses
 mJ.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -26,7 +27,6 @@ from torchsoft.plot.figures import (
     DESIRED,
     Look,
     finish_time_axis,
-    forces_on,
     legend_above,
     letter,
     looking,
@@ -35,8 +35,11 @@ from torchsoft.plot.figures import (
     timeline,
 )
 from torchsoft.plot.scene import (
+    FRICTION,
     INK,
     MM,
+    NORMAL,
+    STATES,
     Instant,
     Scene,
     along_surface,
@@ -188,7 +191,8 @@ def frame_rows(run: Trajectory, frames: int) -> list[int]:
     t, knots = run.t.numpy(), run.knots.numpy()
     count = np.interp(t, knots, np.linspace(0.0, 1.0, len(knots)))
     clock = (1 - DENSER) * (t - t[0]) / (t[-1] - t[0]) + DENSER * count
-    return sorted({int(np.abs(clock - x).argmin()) for x in np.linspace(0.0, clock[-1], frames)})
+    rows = np.interp(np.linspace(0.0, clock[-1], frames), clock, np.arange(len(t)))
+    return np.unique(rows.round().astype(int)).tolist()
 
 
 def stresses(axes: Axes, run: Trajectory) -> None:
@@ -237,17 +241,33 @@ def energies(axes: Axes, run: Trajectory) -> None:
 
 
 def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
-    """Draw the forces along one contact at an instant, with the friction cone."""
-    forces_on(axes, run.setup, instant, contact)
-    if not len(instant.near(contact)):
+    """Draw normal force and friction [N] at the points of one contact over their place along the
+    surface [mm]; friction with its cone where the law has one, and points by their state."""
+    near, setup = instant.near(contact), run.setup
+    x, state = instant.along[contact][near], instant.state[contact][near]
+    normal, friction = instant.force[contact][near].T
+    mu = setup.contacts[contact].friction.get("mu_s")
+    if mu is not None:
+        axes.fill_between(x, -mu * normal, mu * normal, color=FRICTION, alpha=0.14, lw=0)
+        axes.plot(x, mu * normal, ":", color=FRICTION, lw=0.8)
+        axes.plot(x, -mu * normal, ":", color=FRICTION, lw=0.8, label=f"cone, mu_s = {mu:g}")
+    axes.axhline(0, color=INK, lw=0.6)
+    axes.plot(x, normal, color=NORMAL, label="normal force")
+    axes.plot(x, friction, color=FRICTION, label="friction")
+    for kind, (_, marker, colour) in STATES.items():
+        at = state == kind
+        style = {"color": colour, "mew": 0, "ms": 0.35 * rcParams["font.size"]}
+        axes.plot(x[at], normal[at], marker, x[at], friction[at], marker, **style)
+    axes.set_ylabel("force [N]")
+    if not len(near):
         axes.set(xticks=[], yticks=[], ylim=(-1, 1), xlabel="no point touches")
         return
-    name = run.setup.contacts[contact].pad
-    level = along_surface(run.setup.pads[name], instant.base[name])[0] > 0.999
+    name = setup.contacts[contact].pad
+    pad = setup.pads[name]
+    level = along_surface(pad, instant.base[name])[0] > 0.999
     axes.set_xlabel("x [mm]" if level else "along the surface [mm]")
     legend_above(axes)
-    pad = run.setup.pads[name]
-    area = pad.depth * pad.lengths[instant.near(contact)]
+    area = pad.depth * pad.lengths[near]
     if np.ptp(area) < 1e-6 * area[0]:  # else a force is not the same pressure everywhere
         scale = 1e-3 / float(area[0])
         both = partial(np.multiply, scale), partial(np.multiply, 1 / scale)
@@ -259,7 +279,7 @@ def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
     """Functions that draw the panels over time, by title."""
     moving = [one for one in curves(run) if np.ptp(one.values) > STILL] or list(curves(run))[:1]
     out: dict[str, Callable[[Axes], None]] = {
-        curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving
+        curve.name: partial(motion, run=run, curve=curve) for curve in moving
     }
     if run.force:
         every = sums(run)
@@ -268,10 +288,10 @@ def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
             out[kind] = partial(contact_sums, run=run, kind=kind, unit=unit, series=series)
         out["points in contact"] = lambda axes: points(axes, run, touching, slipping)
     for one in run.setup.actuators.values():
-        out[one.channel] = lambda axes, one=one: effort(axes, run, one)
+        out[one.channel] = partial(effort, run=run, one=one)
     if run.setup.pads:
-        out["stress"] = lambda axes: stresses(axes, run)
-    return out | {"energy": lambda axes: energies(axes, run)}
+        out["stress"] = partial(stresses, run=run)
+    return out | {"energy": partial(energies, run=run)}
 
 
 FLATTEST = 0.8
@@ -286,13 +306,12 @@ def ripples(run: Trajectory) -> bool:
     return on_nodes and any(int((one != 0).sum()) >= RIPPLES for one in counts)
 
 
-def chosen(only: Sequence[str], known: Iterable[str]) -> list[str]:
-    """The panels in `only`, or all. Raises `ValueError` for an unknown one."""
-    names = list(known)
+def chosen(only: Sequence[str], names: list[str]) -> list[str]:
+    """The panels in `only`, or all of `names`. Raises `ValueError` for an unknown one."""
     for name in only:
         if name not in names:
             raise ValueError(f"there is no panel `{name}`; {suggestion(name, names, 'there are')}")
-    return list(only) or names
+    return list(dict.fromkeys(only)) or names
 
 
 def named(run: Trajectory) -> list[str]:
@@ -319,14 +338,13 @@ def dashboard(
         time = float(run.t[int(total.argmax())])
     (instant,) = instants(run, [time])
     contacts = {
-        f"contact {key}": lambda axes, key=key: cones(axes, run, instant, key)
+        f"contact {key}": partial(cones, run=run, instant=instant, contact=key)
         for key in list(run.setup.contacts)[::-1]
     }
     drawn = contacts | panels(run)
-    few = [*list(contacts)[:2], *(name for name in drawn if name == "friction")]
     if look == "column" and not only:
-        only = ("scene", *few)
-    selected = chosen(only, named(run))
+        only = ("scene", *list(contacts)[:2], *(["friction"] if run.force else []))
+    selected = chosen(only, ["scene", *drawn])
     pictured = "scene" in selected
     selected = [name for name in selected if name != "scene"]
     with looking(look) as size:
@@ -341,25 +359,21 @@ def dashboard(
             share = 0.86 if columns > 1 else 0.73
             tall = min((high - low) / (right - left), 1.1) * share * width * span + 0.5
             beside = min(len(contacts), len(selected), round(tall / each)) if columns > 1 else 0
-        top = max(1, beside) if pictured else 0
-        rows = -(-(len(selected) - beside) // columns)
+        at_right, below = selected[:beside] or ["."], selected[beside:]
+        top = [["scene"] * span + [name][: columns - span] for name in at_right] * pictured
+        below += below[-1:] * (-len(below) % columns)  # the last takes what is left
+        rows = [below[i : i + columns] for i in range(0, len(below), columns)]
         heading = (title or "Run") if size.titled else ""
-        room = (size.height - tall - 0.06 * size.font) / max(rows, 1)
+        room = (size.height - tall - 0.06 * size.font) / max(len(rows), 1)
         each = room if FLATTEST * each <= room < each else each
-        figure = new_figure(heading, width * columns, tall + rows * each + 0.06 * size.font)
-        heights = [*[tall / max(top, 1)] * top, *[each] * rows]
-        # Rows under the scene are as if it had no colour bar, but a column has one left edge.
-        split = top if columns > 1 else 0
-        parts = [part for part in (heights[:split], heights[split:]) if part]
-        outer = figure.add_gridspec(len(parts), height_ratios=[sum(part) for part in parts])
-        lines = [
-            (grid, i)
-            for k, part in enumerate(parts)
-            for grid in [outer[k].subgridspec(len(part), columns, height_ratios=part)]
-            for i in range(len(part))
-        ]
+        figure = new_figure(heading, width * columns, tall + len(rows) * each + 0.06 * size.font)
+        mosaic: Any = top + rows
+        ratios = [tall] * len(top) + [each] * len(rows)
+        if columns > 1 and top and rows:  # the colour bar of the scene moves its own rows only
+            mosaic, ratios = [[top], [rows]], [tall, each * len(rows)]
+        axes = figure.subplot_mosaic(mosaic, height_ratios=ratios)
         if pictured:
-            whole = figure.add_subplot(lines[0][0][:top, :span])
+            whole = axes["scene"]
             scene = Scene(whole, run.setup, curves=curves_, stress=stress, size=0.1 * size.font)
             scene.show(instant)
             whole.set(
@@ -376,13 +390,8 @@ def dashboard(
         if size.titled and not only and ripples(run):
             figure.supxlabel(RIPPLE, fontsize="small", color="#666666")
         for i, name in enumerate(selected):
-            k = i - beside
-            grid, row = lines[i if k < 0 else top + k // columns]
-            first = columns - 1 if k < 0 else k % columns
-            end = None if i == len(selected) - 1 else first + 1  # the last takes what is left
-            axes = figure.add_subplot(grid[row, first:end])
-            drawn[name](axes)
-            axes.set_title(f"{letter(i + pictured)} {name}")
-            if not axes.get_xlabel():
-                finish_time_axis(axes)
+            drawn[name](axes[name])
+            axes[name].set_title(f"{letter(i + pictured)} {name}")
+            if not axes[name].get_xlabel():
+                finish_time_axis(axes[name])
     return figure

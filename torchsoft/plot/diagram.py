@@ -34,20 +34,21 @@ KINDS = {
 SPACING, LAYER = 6.4, 3.4
 """Distances between hubs, along and across layers."""
 
+DASHES = "-", (0, (4, 3))
+"""Line styles of bonds of power and of signals."""
+
 STEP, RADIUS = 13.0, 3.0
 """Step [deg] and radius of the fan of a hub's elements."""
 
 
 def graph_of(rig: Rig) -> nx.DiGraph:
-    """The topology of the rig's ports. It does not depend on the state; here bodies are far
+    """The topology of the rig's ports. It does not depend on the state; here bodies are a kilometre
     apart."""
     with torch.no_grad():
         signals = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
         state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), signals)
-        sizes = [body.shape.size() for body in rig.bodies.values() if body.shape is not None]
-        far = 10 * sum((*sizes, *(pad.mesh.length + pad.mesh.height for pad in rig.pads.values())))
         pose = {
-            name: torch.tensor([0.0, (k + 1) * far, 0.0]).double()
+            name: torch.tensor([0.0, 1e3 * (k + 1), 0.0]).double()
             for k, name in enumerate(rig.bodies)
         }
         return topology(rig.evaluate(0.0, state._replace(pose=pose), signals).ports, rig.junctions)
@@ -132,7 +133,7 @@ def bond(axes: Axes, path: Array, sizes: tuple[Array, Array], activated: bool) -
         way = path[inner] - path[end]
         path[end] = path[end] + way * np.min(size / np.maximum(np.abs(way), 1e-9))
     style = {"color": INK, "lw": 1.2, "solid_capstyle": "butt"}
-    axes.plot(*path.T, **style, ls=(0, (4, 3)) if activated else "-")
+    axes.plot(*path.T, **style, ls=DASHES[activated])
     along = (path[-1] - path[-2]) / np.linalg.norm(path[-1] - path[-2])
     across = np.array([-along[1], along[0]])
     for side in (1, -1) if activated else (1,):
@@ -177,9 +178,9 @@ def multibond_graph(rig: Rig) -> Figure:
         Line2D([], [], ls="", marker="s", color=colour, label=meaning)
         for meaning, colour in KINDS.values()
     ]
-    keys += [Line2D([], [], color=INK, lw=1.2, label="bond, half arrow towards positive power")]
-    keys += [
-        Line2D([], [], color=INK, lw=1.2, ls=(0, (4, 3)), label="activated bond: information only")
-    ]
+    for activated, meaning in enumerate(
+        ("bond, half arrow towards positive power", "activated bond: information only")
+    ):
+        keys.append(Line2D([], [], color=INK, lw=1.2, ls=DASHES[activated], label=meaning))
     figure.legend(handles=keys, loc="outside lower left", ncols=3)
     return figure

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from matplotlib import rc_context, rcParams
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -21,16 +21,9 @@ from numpy.typing import NDArray
 
 from torchsoft.display import suggestion
 from torchsoft.files import replacing
-from torchsoft.physics.setup import Setup
 from torchsoft.plot.scene import (
-    FRICTION,
-    INK,
-    NORMAL,
-    STATES,
     STRESS,
-    Instant,
     Scene,
-    around_contact,
     force_scale,
     instants,
     keys,
@@ -67,6 +60,9 @@ SNAPSHOTS = 6
 
 SHORT, ENLARGED = 0.03, 1 / 3
 """Share of a time axis on which a change looks like a vertical line, and its share enlarged."""
+
+ROUND = partial(MaxNLocator, steps=[1, 2, 5, 10], min_n_ticks=1)
+"""Chooses at most as many intervals, with round ends."""
 
 Look = Literal["screen", "page", "column"]
 """Style of a figure: for a screen, with a title; or camera-ready without one, for the width of a
@@ -158,20 +154,18 @@ def finish_time_axis(axes: Axes) -> None:
     t, (start, end) = np.asarray(curves[0].get_xdata())[1:], axes.get_xlim()
     sums = [np.nancumsum(np.diff(np.asarray(line.get_ydata())) ** 2) for line in curves]
     change = np.mean([one / (one[-1] or 1.0) for one in sums], 0)
-    passed = (t - start) / (t[-1] - start)
-    k = np.where(passed <= SHORT, change - passed, 0.0).argmax()
+    passed = (t - start) / (end - start)
+    k = (change - passed).argmax()
     if passed[k] > SHORT or change[k] < 0.5:
         return
-    decade = 10.0 ** np.floor(np.log10(t[k] - start))
-    length = decade * min(m for m in (1, 2, 5, 10) if m * decade >= t[k] - start - 1e-9)
+    length = ROUND(1).tick_values(0.0, float(t[k]) - start)[-1]
     knee = start + length
     times, places = (start, knee, end), (0.0, ENLARGED, 1.0)
     both = partial(np.interp, xp=times, fp=places), partial(np.interp, xp=places, fp=times)
     axes.set_xscale("function", functions=both)
-    late = MaxNLocator(4, steps=[1, 2, 5, 10]).tick_values(start, end)
+    late = ROUND(4).tick_values(start, end)
     ticks = [start, start + length / 2, knee, *(x for x in late if knee + length < x <= end)]
     axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
-    axes.set_xlim(start, end)
     axes.axvspan(start, knee, color="#f3f3f3", lw=0, zorder=0)
     axes.set_xlabel(f"time [s], the first {length:g} s enlarged")
 
@@ -205,30 +199,6 @@ def stress_bar(figure: Figure, axes: Any, largest: float, size: Size) -> None:
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 
-def forces_on(axes: Axes, setup: Setup, instant: Instant, contact: str) -> None:
-    """Draw normal force and friction at one contact's points [N] over their place along the surface
-    [mm]; friction with its cone where the law has one, and points by their state."""
-    x, force = around_contact(instant, contact)
-    state = instant.state[contact][instant.near(contact)]
-    mu = setup.contacts[contact].friction.get("mu_s")
-    if mu is not None:
-        cone = mu * force[:, 0]
-        axes.fill_between(x, -cone, cone, color=FRICTION, alpha=0.14, lw=0)
-        axes.plot(x, cone, ":", color=FRICTION, lw=0.8)
-        axes.plot(x, -cone, ":", color=FRICTION, lw=0.8, label=f"cone, mu_s = {mu:g}")
-    axes.axhline(0, color=INK, lw=0.6)
-    axes.plot(x, force[:, 0], color=NORMAL, label="normal force")
-    axes.plot(x, force[:, 1], color=FRICTION, label="friction")
-    for kind, (_, marker, colour) in STATES.items():
-        for column in (0, 1):
-            rows = state == kind
-            axes.plot(
-                x[rows], force[rows, column], marker, color=colour, ls="none", mew=0,
-                ms=0.35 * rcParams["font.size"],
-            )  # fmt: skip
-    axes.set_ylabel("force [N]")
-
-
 def snapshots(
     run: Trajectory, times: Sequence[float] = (), *, title: str = "", look: Look = "screen"
 ) -> Figure:
@@ -258,7 +228,7 @@ def snapshots(
             axes.set(
                 xlim=(left, right), ylim=(low, high), title=f"{letter(i)} t = {instant.time:g} s"
             )
-            if curves[0] != 1.0 or curves[1] != 1.0:
+            if curves != (1.0, 1.0):
                 scene.scale_bar(axes)
             axes.grid(False)
         for axes in grid.flat[len(shown) :]:

@@ -144,13 +144,6 @@ def own_places(pad: PadSetup, base: Array, own: Array) -> Array:
     return in_world(MM * pad.placed(own / MM), base)
 
 
-def around_contact(instant: Instant, contact: str) -> tuple[Array, Array]:
-    """Positions along the pad's surface [mm] and forces [N] of the points under a normal force, and
-    of one neighbour on each side."""
-    rows = instant.near(contact)
-    return instant.along[contact][rows], instant.force[contact][rows]
-
-
 def unit(setup: Setup) -> float:
     """Length unit of margins and curves [mm]: one for the paper's pads of 120 mm."""
     return MM * max((pad.mesh.length for pad in setup.pads.values()), default=0.12) / 120
