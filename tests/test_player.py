@@ -17,7 +17,7 @@ from PIL import Image
 
 from torchsoft import simulate
 from torchsoft.plot.animation import charts, frame_rows, packed, player
-from torchsoft.plot.scene import Scene, instants
+from torchsoft.plot.scene import Scene, curve_height, instants
 from torchsoft.rigs import RigFile
 
 ROOT = Path(__file__).parents[1]
@@ -75,7 +75,10 @@ def test_the_file_holds_everything(run, tmp_path):
 def first_shown(run, path):
     player(run, path, frames=30)
     data = json.loads(re.search(r"const data = (\{.*\});\n", path.read_text(encoding="utf-8"))[1])
-    return run.at(data["times"][data["opening"]])
+    row = run.at(data["times"][data["opening"]])
+    largest = max(float(x[row].abs().max()) for x in run.force.values())
+    assert data["scale"] * largest <= curve_height(run.setup) * (1 + 1e-9)  # it fits the picture
+    return row
 
 
 def test_it_opens_when_all_contacts_are_closed(run, tmp_path):
@@ -86,6 +89,10 @@ def test_it_opens_when_all_contacts_are_closed(run, tmp_path):
     never = run.force | {"U": torch.zeros_like(run.force["U"])}
     row = first_shown(replace(run, force=never), tmp_path / "run.html")
     assert lower[row] > 0.5 * lower.max() > lower[row - 2]
+    impact = torch.ones(51, 1, 1)
+    impact[24:27] = 100.0
+    struck = replace(run, force={name: impact * x for name, x in run.force.items()})
+    assert 24 <= first_shown(struck, tmp_path / "run.html") <= 26
 
 
 NODE = shutil.which("node")

@@ -313,11 +313,12 @@ def player(
         raise ValueError(f"`frames` must be 2 or more, but is {frames}")
     rows = frame_rows(run, frames)
     times = run.t.numpy()[rows]
-    shown = instants(run, [times[0], times[len(times) // 2], times[-1]])
+    first_shown = opening(run, rows)
+    shown = instants(run, times[[first_shown, len(times) // 2, -1]].tolist())
     (first, *curves_) = charts(run)
     about = {
         "title": title or "torchsoft", "times": times.round(9).tolist(),
-        "opening": opening(run, rows),
+        "opening": first_shown,
         "bodies": {
             name: {
                 "pose": packed(run.state.pose[name][rows].detach().numpy() * [MM, MM, 1.0]),

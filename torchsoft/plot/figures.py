@@ -154,7 +154,7 @@ def finish_time_axis(axes: Axes) -> None:
     t, (start, end) = np.asarray(curves[0].get_xdata())[1:], axes.get_xlim()
     sums = [np.nancumsum(np.diff(np.asarray(line.get_ydata())) ** 2) for line in curves]
     change = np.mean([one / (one[-1] or 1.0) for one in sums], 0)
-    passed = (t - start) / (t[-1] - start)
+    passed = (t - start) / (end - start)
     k = (change - passed).argmax()
     if passed[k] > SHORT or change[k] < 0.5:
         return
@@ -163,8 +163,8 @@ def finish_time_axis(axes: Axes) -> None:
     times, places = (start, knee, end), (0.0, ENLARGED, 1.0)
     both = partial(np.interp, xp=times, fp=places), partial(np.interp, xp=places, fp=times)
     axes.set_xscale("function", functions=both)
-    late = [x for x in ROUND(4).tick_values(start, end) if knee + length < x <= end]
-    ticks = [start, start + length / 2, knee, *late]
+    late = ROUND(4).tick_values(start, end)
+    ticks = [start, start + length / 2, knee, *(x for x in late if knee + length < x <= end)]
     axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
     axes.axvspan(start, knee, color="#f3f3f3", lw=0, zorder=0)
     axes.set_xlabel(f"time [s], the first {length:g} s enlarged")
