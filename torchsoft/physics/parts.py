@@ -113,7 +113,7 @@ class Contact(nn.Module):
 
     A run ends when the body leaves the space over the pad or touches an end of it, unless it
     `may_leave`: it may then be wider than the pad. The sides of a pad are not in contact. A run
-    also ends when the body compresses the pad by its whole height, or gets behind its surface.
+    also ends when the body compresses the pad down to its base, or gets behind its surface.
     """
 
     def __init__(self, pad: str, body: str, law: SoftContact, *, may_leave: bool = False) -> None:

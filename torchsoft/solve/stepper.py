@@ -345,8 +345,8 @@ class ImplicitStepper:
             OFF_THE_PAD: f"{lost} its contact reached the end of {of}, which is "
             f"{1e3 * pad.mesh.length:.3g} mm long; take a longer pad, or {leave}",
             LOST: f"{lost} it left the space over {of}; keep it nearer, or {leave}",
-            CRUSHED: f"{lost} it compressed {of} by its whole height of {height} and reached the "
-            "base; press less, or take a thicker or stiffer pad",
+            CRUSHED: f"{lost} it compressed {of}, {height} high, down to its bonded base; press "
+            "less, or take a thicker or stiffer pad",
             PASSED_THROUGH: f"{lost} it passed through {of}, whose contact points are up to "
             f"{apart:.3g} mm apart; take a finer pad or more points, stiffer springs K_n, shorter "
             "steps, or a slower body",
