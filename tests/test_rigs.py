@@ -483,7 +483,7 @@ def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(tmp_path
     assert RigFile.from_toml(path).model_dump() == template("mine").model_dump()
     rows = [row for row in text.splitlines() if re.match(r"(# )?\w+ = ?\S*$|.*  # ", row)]
     assert [row for row in rows if "  # " not in row and " # " not in row[2:]] == []
-    for word in ("[kg]", "[m]", "[Pa]", "[N.s/m]", "[s]", "# points = 0", "# step ="):
+    for word in ("[kg]", "[m]", "[Pa]", "[N.s/m]", "[s]", "# inertial = ", "# step ="):
         assert word in text
     assert main(["init", str(path)]) == 2
     assert f"{path} is there already" in capsys.readouterr().err
