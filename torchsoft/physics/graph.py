@@ -34,6 +34,7 @@ from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import (
     Layout,
     State,
+    ages,
     begin_states,
     body_blocks,
     own_blocks,
@@ -266,9 +267,13 @@ class Graph(nn.Module):
 
     def pack(self, state: State, t: float = 0.0) -> Tensor:
         """The flat vector (..., size) of a state; states of friction and of actuators that it lacks
-        are those that they begin with, at t [s]."""
+        are those that they begin with, at t [s], ages only at points that touch."""
         friction = {name: self.friction_of(name, state) for name in self.contacts}
         own = {name: both[0] for name, both in friction.items() if both}
+        for name, z in own.items():
+            if name not in state.friction and ages(self.contacts[name].law.friction):
+                touches = (self.penetration(name, state) > 0)[..., None, :]
+                own[name] = torch.where(touches, z, 0.0)
         control = dict(state.control)
         if missing := [k for k, one in self.actuators.items() if one.states and k not in control]:
             signals = self.follow(t).expand(*state.pose[next(iter(self.bodies))].shape[:-1], -1, -1)
