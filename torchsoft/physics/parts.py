@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor, nn
 
-from torchsoft.physics.arguments import positive
+from torchsoft.physics.arguments import number, positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import (
@@ -72,6 +72,11 @@ class Body(nn.Module):
         self.own_inertia = None if inertia is None else parameter(inertia)
         turns = self.freedom["theta"] == "free" and inertia is None and shape is not None
         self.inertia_ratio = parameter(inertia_ratio) if turns else None
+        if number("inertia_ratio", inertia_ratio) != 1.0 and (shape is None or inertia is not None):
+            raise ValueError(
+                f"`inertia_ratio` must be 1 beside `inertia`, or without a shape, but is "
+                f"{inertia_ratio!r}; leave it out"
+            )
         if self.freedom["theta"] == "free" and shape is None and inertia is None:
             raise ValueError(
                 "a body that may turn needs an `inertia`, or a `shape` to compute it from"
