@@ -86,7 +86,8 @@ class Pad(nn.Module):
         super().__init__()
         self.points = whole("points", points, 0)
         self.E_ratio, self.tau_ratio = (
-            None if ratio is None else parameter(ratio) for ratio in (E_ratio, tau_ratio)
+            None if ratio is None else parameter(ratio, name)
+            for name, ratio in (("E_ratio", E_ratio), ("tau_ratio", tau_ratio))
         )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
         kept = np.arange(len(mesh.free)) if self.nodal else mesh.surface
