@@ -9,7 +9,9 @@ from conftest import f64
 from torchsoft import BuiltRig, RigFile
 from torchsoft.rigs.excite import CATALOGUE, GRIP, OFF_NODE, SINCE, Excitation, excite
 
-RIGS = "paper", "light_grasp", "ellipse", "rounded_box"
+RIGS = "paper", "light_grasp", *(
+    pytest.param(name, marks=pytest.mark.slow) for name in ("ellipse", "rounded_box")
+)
 COARSE = {"elements_x": 40, "elements_y": 1}
 ROLL = {"kind": "profile", "times": [0.5, 0.8], "values": [0.0, 4e-3], "offset": "start"}
 
@@ -26,10 +28,9 @@ def followed(built: BuiltRig, *times: float) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-@pytest.mark.parametrize("rig", ["paper", pytest.param("ellipse", marks=pytest.mark.slow)])
-def test_every_entry_of_the_catalogue_builds(rig, name):
+def test_every_entry_of_the_catalogue_builds(name):
     one = CATALOGUE[name]
-    built = excite(coarse(rig), name).build()
+    built = excite(coarse("paper"), name).build()
     assert float(built.t[-1]) == one.duration
     values = followed(built, *built.t.tolist())
     heights = values["y_d"]
@@ -70,16 +71,12 @@ def test_a_rig_that_grasps_is_excited(rig):
     assert changed.materials == file.materials
 
 
-@pytest.mark.parametrize("rig", ["paper", "light_grasp"])
-def test_an_excitation_runs(rig):
-    (law,) = (file := coarse(rig)).laws
-    file = file.override({f"laws.{law}.friction.v_s": 0.05})
+def test_an_excitation_runs():
+    file = coarse("paper").override({"contact.v_s": 0.05})
     run = excite(file, Excitation(ROLL, duration=0.8)).build().run(rtol=1e-3)
-    x, body = (
-        run[name] for name in (("x_Br", "x_C") if rig == "paper" else ("x_bracket", "x_disc"))
-    )
+    x, body = run["x_Br"], run["x_C"]
     assert (body[run.t <= SINCE] - body[0]).abs().max() < 1e-4  # gripped, it does not roll off
-    assert float(x[-1]) == pytest.approx(64.3e-3, abs=4e-4)  # the loop gives way to friction
+    assert float(x[-1]) == pytest.approx(64.3e-3, abs=4e-4)  # the loop deflects under friction
     assert all(float(F[-1, :, 0].sum()) > 10.0 for F in run.force.values())
 
 
@@ -105,7 +102,7 @@ def test_shaking_is_along_and_across():
     assert max(abs(a - b) for a, b in zip(x, scaled)) > 1e-3
 
 
-# refusals
+# rejections
 # ----------------------------------------------------------------------
 
 
@@ -117,7 +114,7 @@ def test_shaking_is_along_and_across():
         ("paper", {"body": "disc"}, "along it: none does"),
     ],
 )
-def test_a_rig_without_one_body_that_grasps_is_refused(rig, how, words):
+def test_a_rig_without_one_body_that_grasps_is_rejected(rig, how, words):
     with pytest.raises(ValueError, match=r"needs a body with a pad that two loops move") as error:
         excite(RigFile.ready(rig), "strokes", **how)
     assert words in str(error.value)
@@ -141,7 +138,7 @@ def test_times_of_an_excitation_may_be_chosen():
     assert float(changed.build().t[-1]) == 0.4
 
 
-def test_an_unknown_excitation_is_refused():
+def test_an_unknown_excitation_is_rejected():
     with pytest.raises(ValueError, match="there is no excitation `stroke`; did you mean `strokes`"):
         excite(RigFile.ready("paper"), "stroke")
 
@@ -157,10 +154,8 @@ def test_an_unknown_excitation_is_refused():
          "motion.x_d.stroke_time = 1e-05 s makes 850000 strokes"),
         ({"kind": "profile", "times": [0.1, 0.1], "values": [0.0, 1e-3]}, 2.0,
          "times must increase, but 0.1 s"),
-        ({"kind": "waltz"}, 2.0, "motion.x_d"),
     ],
 )  # fmt: skip
-def test_an_impossible_excitation_is_refused_by_its_field(roll: Any, duration, message):
-    with pytest.raises(ValueError, match=r".") as error:
+def test_an_impossible_excitation_is_rejected_by_its_field(roll: Any, duration, message):
+    with pytest.raises(ValueError, match=message):
         excite(coarse("paper"), Excitation(roll, duration=duration)).build()
-    assert message in str(error.value)

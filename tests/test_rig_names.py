@@ -1,4 +1,5 @@
-"""Numbers of a rig file have their names in that file, whatever asks for them."""
+"""Names of a rig's numbers: those of its file, short ones, sources, units, and changes by names and
+by tables; names that are taken; and what a built rig does."""
 
 import json
 import pickle
@@ -9,16 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, nested
+from conftest import COARSE, PAPER, coarse, f64, grasped, nested, still, times, turning
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_controllers import file as controlled
 from torch import nn
 
-from torchsoft import Body, Profile, Reference, Rig
-from torchsoft.rigs import RigFile
-from torchsoft.rigs.build import ready
+from torchsoft import Body, BuiltRig, Circle, Ellipse, Profile, Reference, Rig, RigFile, hold
+from torchsoft.rigs.build import READY, ready
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
-RIGS = ready()
+COULOMB = {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}
 PHYSICAL = ("gravity", "bodies", "materials", "laws", "actuators", "controllers")
 MASS = ("density", "depth", "half_width", "half_height", "radius")
 """Numbers that the mass of a uniform body is computed from."""
@@ -27,12 +29,15 @@ SERIES = {
 }  # fmt: skip
 
 
-def opened(name: str) -> RigFile:
-    if name == "controllers":
-        return controlled()
-    if name == "series":
-        return controlled().override(materials={"rubber": SERIES})
-    return RigFile.ready(name)
+def rejection(values: dict[str, Any] | None = None, **groups: Any) -> str:
+    """The message with which these changes of the paper's file are rejected."""
+    with pytest.raises(ValueError, match=r"^[^\n]+$") as error:
+        PAPER.override(values, **groups).assemble()
+    return str(error.value)
+
+
+# names of parameters
+# ----------------------------------------------------------------------
 
 
 def numbers(tree: Any, name: str = "") -> Iterator[tuple[str, float]]:
@@ -52,17 +57,22 @@ def values(rig: Rig) -> dict[str, float]:
     return {own.get(name, name): value.item() for name, value in rig.named_parameters()}
 
 
-@pytest.mark.parametrize("rig", [*RIGS, "controllers", "series"])
+OPENED = {
+    **{name: RigFile.ready(name) for name in ("paper", "rounded_box", "two_fingers")},
+    "series": controlled().override(materials={"rubber": SERIES}),
+}
+
+
+@pytest.mark.parametrize("rig", OPENED)
 def test_every_number_that_a_rig_is_made_with_has_its_name(rig):
     """Each number of the file is changed in turn: what changes in the rig is called the same."""
-    file = opened(rig)
+    file = OPENED[rig]
     before, seen = values(file.assemble()), set[str]()
     for name, value in numbers(file.model_dump(exclude_unset=True)):
         group, part, *_ = (*name.split("."), "")
         if group not in PHYSICAL:
             continue
-        other = file.override(**nested(name, 1.01 * value or 1e-3))
-        after = values(other.assemble())
+        after = values(file.override(**nested(name, 1.01 * value or 1e-3)).assemble())
         own = (key for key in before if not key.endswith(".R_pad"))  # follows the pad
         changed = {key for key in own if after[key] != before[key]}
         if ".start." in name:
@@ -73,79 +83,285 @@ def test_every_number_that_a_rig_is_made_with_has_its_name(rig):
             assert changed == {name}
             assert after[name] == pytest.approx(1.01 * value or 1e-3, rel=1e-12)
             seen.add(name)
-    assert len(seen) > 10
+    assert seen
 
 
-def test_gains_have_units_and_bounds():
-    rig = controlled(pushes=["bracket.x", "bracket.y"]).assemble()
-    for name, unit in (("gain_1_1", "N/m"), ("gain_2_3", "N.s/m")):
-        found = rig.quantity(f"controllers.jaw.{name}")
+def test_short_names_are_for_typing_only():
+    """Parameters and channels have both; results have the full ones."""
+    one = PAPER.override({"pad.E": 8e5, "pad.elements_x": 60})
+    assert [pad.elements_x for pad in one.pads.values()] == [60, 60]
+    lengths = {"pads.L.elements_x": 60, "pads.U.elements_x": 60}
+    assert one == PAPER.override({"materials.rubber.E": 8e5} | lengths)
+    assert PAPER.full("pad.elements_x") == tuple(lengths)
+    built = brief({"names.push": "effort_x"} if "push" in PAPER.names else {})
+    rig, run = built.rig, built.run(times(0.02, 3), step=5e-3)
+    for short, full in rig.short.items():
+        if full in run:
+            assert run[short] is run[full]
+        else:
+            assert rig.parameter(short) is rig.parameter(full)
+    assert not rig.short.keys() & {*run.channels, *rig.description()["parameters"], *one.table()}
+    assert "pad.elements_x" not in rig.short  # no parameter, and no channel
+    sharp = still({"laws.steel_on_rubber.friction": COULOMB})
+    with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
+        sharp.parameter("contact.v_s")
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ({"pad.E": "materials.steel.E"}, "names.pad.E: `materials.steel.E` is not .* has rubber"),
+        ({"mesh": ["pads.L.elements_x", "pads.M.elements_x"]}, "names.mesh: `pads.M.elements_x`"),
+        ({"angle": "theta_D"}, "names.angle: .* no channel `theta_D`; did you mean"),
+        ({"x_C": "theta_C"}, "names.x_C: it is the name of something else already"),
+        ({"gravity": "materials.rubber.E"}, "names.gravity: it is the name of something else"),
+        ({"none": []}, "names.none"),
+        ({"one": 1.0}, "names.one"),
+    ],
+)
+def test_a_short_name_of_nothing_or_of_two_things_is_rejected(names, words):
+    assert re.search(words, rejection(names=names))
+
+
+def test_names_go_with_the_entries_that_a_change_takes_away():
+    changed = PAPER.override({"laws.steel_on_rubber.friction": COULOMB})
+    assert PAPER.names.keys() - changed.names.keys() == {"contact.v_s"}
+    with pytest.raises(ValueError, match=r"`contact.v_s` is not in the rig file"):
+        changed.override({"contact.v_s": 1e-3})
+    assert PAPER.override({"pad.inertial": True}).names == PAPER.names  # there by default
+
+
+@pytest.mark.parametrize("name", ["pad.Young", "pad", "pad.E.x", "", "materials.rubber.Young"])
+def test_an_unknown_name_is_rejected(name):
+    assert f"`{name}` is not in the rig file: " in rejection({name: 1.0})
+    with pytest.raises(ValueError, match=rf"`{re.escape(name)}` is not in the rig file"):
+        PAPER.unit_of(name)
+
+
+# sources and units
+# ----------------------------------------------------------------------
+
+
+def test_a_number_that_is_changed_loses_its_source():
+    for change in ({"materials.rubber.E": 8e5}, {"pad.E": 8e5}):
+        changed = PAPER.override(change)
+        assert PAPER.sources.keys() - changed.sources.keys() == {"materials.rubber.E"}
+        assert changed.table()["materials.rubber.E"]["source"] == "assumed"
+    assert PAPER.override(materials={"rubber": {"E": 8e5}}).sources == changed.sources
+    assert PAPER.override({"pad.E": 0.75e6}).sources == PAPER.sources  # the same number
+    kept = PAPER.override({"motion.x_d.values_2": 41e-3})
+    assert PAPER.sources.keys() - kept.sources.keys() == {"motion.x_d.values"}
+
+
+def test_a_source_of_a_number_that_has_its_default_stays():
+    tables = PAPER.model_dump(exclude_unset=True)
+    del tables["actuators"]["x"]["Kd"]
+    name = "actuators.x.Kd"
+    file = RigFile.from_tree(tables).override(outputs={"duration": 0.5, "snapshots": []})
+    assert name in file.sources
+    assert file.sources.keys() - file.override({name: 3.0}).sources.keys() == {name}
+
+
+@pytest.mark.parametrize(
+    ("sources", "words"),
+    [
+        ({"materials.rubber.E": "measured"}, "sources.materials.rubber.E: .* begin with .publi"),
+        ({"materials.rubber.G": "assumed"}, "sources.`materials.rubber.G` is not in the rig file"),
+    ],
+)
+def test_a_source_of_nothing_or_of_another_kind_is_rejected(sources, words):
+    assert re.search(words, rejection(sources=sources))
+
+
+def test_the_table_has_value_unit_source_and_meaning_of_every_number():
+    table = PAPER.table()
+    assert {row["source"].partition(":")[0] for row in table.values()} == {"published", "assumed"}
+    assert table["bodies.disc.shape.radius"] == {
+        "value": 19.37e-3, "unit": "m", "source": "published: radius of the disc",
+        "meaning": "radius",
+    }  # fmt: skip
+    assert all(row["unit"] and row["meaning"] for row in table.values())
+
+
+WIDE = {"measures": ["bracket.x", "bracket.y", "disc.theta"], "pushes": ["bracket.x", "bracket.y"],
+        "setpoints": ["x_d", "y_d"], "gain": [[1.0] * 6, [2.0] * 6]}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "unit"),
+    [
+        *((PAPER, name, unit) for name, unit in {
+            "pad.E": "Pa", "contact.mu_s": "1", "gravity": "m/s2", "actuators.x.Kp": "N/m",
+            "control.R_99": "N.s/m", "motion.F_ff.values": "N", "motion.x_d.values_2": "m",
+            "motion.x_d.times": "s", "pad.elements_x": "1", "bodies.bracket.theta": "rad",
+        }.items()),
+        *((RigFile.ready("two_fingers"), name, unit) for name, unit in {
+            "actuators.left_turn.Kp": "N.m/rad", "actuators.left_turn.Kd": "N.m.s/rad",
+            "motion.lean.values": "rad",
+        }.items()),
+        (RigFile.ready("orientation"), "actuators.turn_lower.Kp", "N/rad"),
+        *((controlled(**WIDE), f"controllers.jaw.{name}", unit) for name, unit in {
+            "gain_1_1": "N/m", "gain_1_3": "N/rad", "gain_2_4": "N.s/m", "gain_2_6": "N.s/rad",
+        }.items()),
+    ],
+)  # fmt: skip
+def test_an_entry_has_a_unit(file, name, unit):
+    assert file.unit_of(name) == unit
+    if name.startswith("controllers"):
+        found = file.assemble().quantity(name)
         assert (found.unit, found.low) == (unit, -1e12)
 
 
-def test_gains_are_unknowns():
-    rig, y0, t = controlled().build()
-    at = t.numpy()
-    one = Recording("one", rig, {"x_disc": (at, 0 * at)}, Known(y0))
-    sensors, gain = {"x_disc": Sensor(noise=1e-5)}, "controllers.jaw.gain_1_3"
-    problem = Problem([one], sensors, {gain: Unknown(), "materials.rubber.E": Unknown()})
-    assert problem.values(problem.coordinates.start, 0)[gain] == pytest.approx(400.0)
-    with pytest.raises(ValueError, match=r"gain_1_2 = 0 is not on a logarithmic scale"):
-        Problem([one], sensors, {"controllers.jaw.gain_1_2": Unknown()})
-    with pytest.raises(ValueError, match=r"known: .*controllers\.jaw\.gain_1_1") as refused:
-        Problem([one], sensors, {"controllers.jaw.gain_1": Unknown()})
-    assert len(str(refused.value)) < 300
+# changes
+# ----------------------------------------------------------------------
+
+CHANGES = st.fixed_dictionaries(
+    {},
+    optional={
+        "pad.E": st.floats(1e4, 1e9), "pad.nu": st.floats(-0.9, 0.4999),
+        "pad.elements_x": st.integers(4, 1000), "pad.inertial": st.booleans(),
+        "contact.K_n": st.floats(1e-3, 1e9), "contact.v_s": st.floats(0.1, 10.0),
+        "control.senses": st.sampled_from(["disc.x", "bracket.x"]),
+        "motion.x_d.values": st.lists(st.floats(0.04, 0.08), min_size=4, max_size=4),
+        "gravity": st.floats(0.0, 30.0),
+    },
+)  # fmt: skip
 
 
-def test_weights_of_a_network_are_tensors_by_name(tmp_path):
+@settings(max_examples=20, derandomize=True)
+@given(changes=CHANGES)
+def test_changes_arrive_once_and_undo(changes):
+    changed, before = PAPER.override(changes), PAPER.table()
+    full = {name: value for key, value in changes.items() for name in PAPER.full(key)}
+    after = changed.table()
+    for name in before:
+        value = full.get(name, before[name]["value"])
+        assert after[name]["value"] == (tuple(value) if isinstance(value, list) else value)
+    assert changed.override(changes) == changed == changed.override(full)
+    back = {name: row["value"] for name, row in before.items() if name in full}
+    undone = changed.override(back).table()
+    assert all(undone[name]["value"] == row["value"] for name, row in before.items())
+
+
+def test_names_replace_what_is_there_and_tables_merge():
+    one = PAPER.override({"pad.E": 8e5}, outputs={"duration": 0.1, "snapshots": []})
+    assert (one["pad.E"], one.outputs.duration) == (8e5, 0.1)
+    assert one.outputs.interval == PAPER.outputs.interval
+    merged = PAPER.override(motion={"y_d": {"values_2": 48e-3}})
+    assert merged.motion["y_d"].values == ("start", 48e-3)
+    assert PAPER.override({"motion.y_d.values_2": 48e-3}) == merged
+    assert PAPER.override({"motion.y_d.values.1": 48e-3}) == merged  # as in files of before
+    with pytest.raises(ValueError, match=r"it has motion\.y_d\.values_1 to _2"):
+        PAPER.override({"motion.y_d.values_7": 48e-3})
+    hold = PAPER.override({"motion.y_d": {"kind": "hold", "value": 50e-3}})
+    assert hold.motion["y_d"].model_dump() == {"kind": "hold", "value": 50e-3}
+    assert PAPER.override(motion={"y_d": {"kind": "hold", "value": 50e-3}}) == hold
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"pad.E": -1.0}, "materials.rubber.E: should be from 1 to"),
+        ({"control.senses": "disc.z"}, "actuators.x.measures"),
+        ({"laws.steel_on_rubber.friction.kind": "stribeck"}, "laws.steel_on_rubber.friction"),
+        ({"contact.mu_k": 0.9}, "laws.steel_on_rubber.friction: .*0.9.*0.8"),
+    ],
+)
+def test_impossible_values_are_rejected_by_their_full_names(changes, words):
+    assert re.search(words, rejection(changes))
+
+
+@pytest.mark.parametrize("key", ["gain_3_1", "gain_1_5", "gain_0_1", "gains_1_1"])
+def test_an_entry_that_is_not_there_is_rejected(key):
+    with pytest.raises(ValueError, match=rf"{key}: there is no such entry|`{key}`.* mean `gain`"):
+        controlled().override(controllers={"jaw": {key: 1.0}})
+
+
+# files
+# ----------------------------------------------------------------------
+
+
+def test_a_file_comes_before_a_ready_rig_of_its_name(tmp_path):
+    assert RigFile.from_toml(READY / "paper.toml") == PAPER
+    with pytest.raises(ValueError, match=r"there is no ready rig `papers`; did you mean `paper`"):
+        RigFile.ready("papers")
+    assert RigFile.path("paper", tmp_path) == READY / "paper.toml"
+    (tmp_path / "paper").write_text("")
+    assert RigFile.path("paper", tmp_path) == tmp_path / "paper"
+    with pytest.raises(ValueError, match=r"mine\.tom: No such file .*; the ready rigs are drop, "):
+        RigFile.path("mine.tom", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("[bodies.disc]\nmas = 1.0", "bodies.disc: `mas` is not known here"),
+        ("[materials.rubber]\nE = soft", "line 2"),
+        ('[channels]\ntheta = "theta_C"', "say [names], the short name first"),
+    ],
+)
+def test_a_file_that_is_wrong_is_rejected_with_its_name(text, named, tmp_path):
+    path = tmp_path / "soft.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"soft\.toml: .*{re.escape(named)}|soft.*{named}"):
+        RigFile.from_toml(path)
+
+
+@pytest.mark.parametrize("name", ready())
+def test_rig_files_are_pickled(name):
+    file = RigFile.ready(name)
+    again = pickle.loads(pickle.dumps(file))
+    assert again == file
+    assert again.folder == file.folder
+    assert again.model_fields_set == file.model_fields_set
+
+
+# unknowns
+# ----------------------------------------------------------------------
+
+
+def test_gains_are_unknowns_and_weights_are_tensors_by_name(tmp_path):
     net = nn.Sequential(nn.Linear(8, 3), nn.Tanh(), nn.Linear(3, 2)).double()
     weights = {name: value.detach().numpy() for name, value in net.state_dict().items()}
     np.savez(tmp_path / "law.npz", **weights)
     file = controlled(network="law.npz")
     file._folder = tmp_path
-    rig, y0, t = file.build()
-    assert rig.parameter("controllers.jaw.network.0.weight").shape == (3, 8)
-    one = Recording("one", rig, {"x_disc": (t.numpy(), 0 * t.numpy())}, Known(y0))
-    name = "controllers.jaw.network.0.weight"
-    with pytest.raises(ValueError, match=r"network\.0\.weight` .* has 24 numbers"):
-        Problem([one], {"x_disc": Sensor(noise=1e-5)}, {name: Unknown()})
+    weight = "controllers.jaw.network.0.weight"
+    for one, name, words in (
+        (controlled(), "controllers.jaw.gain_1_2", r"gain_1_2 = 0 is not on a logarithmic scale"),
+        (controlled(), "controllers.jaw.gain_1", r"known: .*controllers\.jaw\.gain_1_1"),
+        (file, weight, r"network\.0\.weight` .* has 24 numbers"),
+    ):
+        rig, y0, t = one.build()
+        recording = Recording("one", rig, {"x_disc": (t.numpy(), 0 * t.numpy())}, Known(y0))
+        sensors, gain = {"x_disc": Sensor(noise=1e-5)}, "controllers.jaw.gain_1_3"
+        problem = Problem([recording], sensors, {gain: Unknown()})
+        assert problem.values(problem.coordinates.start, 0)[gain] == pytest.approx(400.0)
+        with pytest.raises(ValueError, match=words):
+            Problem([recording], sensors, {name: Unknown()})
+    assert rig.parameter(weight).shape == (3, 8)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"gain_3_1": 1.0}, "gain_3_1: there is no such entry"),
-        ({"gain_1_5": 1.0}, "gain_1_5: there is no such entry"),
-        ({"gain_0_1": 1.0}, "gain_0_1: there is no such entry"),
-        ({"gains_1_1": 1.0}, "`gains_1_1` is not known here; did you mean `gain`"),
-    ],
-)
-def test_an_entry_that_is_not_there_is_refused(settings, words):
-    with pytest.raises(ValueError, match=words):
-        controlled().override(controllers={"jaw": settings})
+# names that are taken
+# ----------------------------------------------------------------------
+
+MOTION = "left_close"
 
 
-TREE = RigFile.path("two_fingers")
-
-
-def renamed(old: str, new: str) -> RigFile:
-    """A ready rig with another name in every place."""
-    tree = json.dumps(RigFile.from_toml(TREE).model_dump(exclude_unset=True))
-    assert f'"{old}"' in tree
-    return RigFile.from_tree(json.loads(tree.replace(f'"{old}"', json.dumps(new))))
-
-
-MOTION = next(iter(RigFile.from_toml(TREE).motion))
+def renamed(new: str) -> RigFile:
+    """A ready rig with another name of a motion in every place."""
+    tree = json.dumps(RigFile.ready("two_fingers").model_dump(exclude_unset=True))
+    assert f'"{MOTION}"' in tree
+    return RigFile.from_tree(json.loads(tree.replace(f'"{MOTION}"', json.dumps(new))))
 
 
 @pytest.mark.parametrize("name", ["a/b", ".", "", "forward", "training", "a.b.c", "1", "a\nb"])
 def test_motions_have_names_by_the_rule_of_the_others(name):
     words = "taken by torch" if name in ("forward", "training") else "letters, digits and"
     with pytest.raises(ValueError, match=f"motion\\..*: the name .*{words}"):
-        renamed(MOTION, name)
+        renamed(name)
     with pytest.raises(ValueError, match=f"motion\\..*: the name .*{words}"):
         Reference(**{name: Profile([0.0], [0.0])})
-    assert "self" in renamed(MOTION, "self").assemble().signals
     assert Reference(self=Profile([0.0], [1.0]))(torch.zeros(1).double(), ["self"])[0, 0, 0] == 1
 
 
@@ -154,33 +370,28 @@ def test_motions_have_names_by_the_rule_of_the_others(name):
     [
         ("x_{body}", "{body}.x"),
         ("v_x_{body}", "the rate of {body}.x"),
-        ("angular_momentum_{body}", "the angular momentum of the body `{body}`"),
         ("M_{pad}", "the moment on the pad `{pad}`"),
         ("effort_{actuator}", "the effort of the actuator `{actuator}`"),
         ("time", "an array `time` of files"),
-        ("pose", "an array `pose` of files"),
         ("stretch_{contact}", "`stretch_{contact}` of the contact"),
-        ("{contact}.centre", "`{contact}.centre` of the contact"),
         ("energy_strain_{pad}", "`energy_strain_{pad}` of the pad"),
         ("energy_{body}", "`energy_{body}` of the body"),
         ("supplied_control_{actuator}", "`supplied_control_{actuator}` of the actuator"),
     ],
 )
-def test_two_channels_of_one_name_are_refused_with_both_owners(name, owner):
-    """A motion that was called `x_disc` was read in place of the disc's x."""
-    rig = renamed(MOTION, MOTION).assemble()
-    parts = {k: next(iter(getattr(rig, f"{k}s"))) for k in ("pad", "actuator", "contact")}
-    parts["body"] = next(iter(rig.bodies))
+def test_two_channels_of_one_name_are_rejected_with_both_owners(name, owner):
+    file = RigFile.ready("two_fingers")
+    parts = {k: next(iter(getattr(file, f"{k}s"))) for k in ("pad", "actuator", "contact")}
+    parts["body"] = next(iter(file.bodies))
     name, owner = name.format(**parts), owner.format(**parts)
-    with pytest.raises(ValueError, match=re.escape(f"the channel `{name}`")) as refused:
-        renamed(MOTION, name).assemble()
-    assert owner in str(refused.value)
-    assert f"the motion `{name}`" in str(refused.value)
+    with pytest.raises(ValueError, match=re.escape(f"the channel `{name}`")) as rejected:
+        renamed(name).assemble()
+    assert owner in str(rejected.value)
+    assert f"the motion `{name}`" in str(rejected.value)
 
 
 @pytest.mark.parametrize("name", ["ground", "disc_spin", "pad_L", "a/b", "keys"])
 def test_bodies_cannot_have_names_of_other_junctions(name):
-    """One called "ground" did not settle in one rig and ran in others."""
     model = coarse()
     parts = {"pads": dict(model.pads), "contacts": dict(model.contacts)}
     bodies = dict(model.bodies) | {name: Body(0.1, theta=0.0)}
@@ -188,32 +399,98 @@ def test_bodies_cannot_have_names_of_other_junctions(name):
         Rig(bodies=bodies, **parts)
 
 
-def places(tree: Any) -> Iterator[tuple[Any, Any]]:
-    """Every number in tables and lists, as its container and key."""
-    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
-        if isinstance(value, dict | list):
-            yield from places(value)
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            yield tree, key
+# built rigs
+# ----------------------------------------------------------------------
 
 
-def test_integers_of_400_digits_in_a_file_are_refused():
-    """In bounds of all kinds: some of them ended in an OverflowError."""
-    tree = json.loads(RigFile.from_toml(TREE).model_dump_json(exclude_none=True))
-    count = 0
-    for table, key in places(tree):
-        before, table[key] = table[key], 10**400
-        with pytest.raises(ValueError, match="should be") as refused:
-            RigFile.from_tree(tree)
-        assert len(str(refused.value)) < 300
-        table[key], count = before, count + 1
-    assert count > 50
+def brief(changes: dict[str, Any] | None = None, **groups: Any) -> BuiltRig:
+    short = {"duration": 0.03, "snapshots": ()}
+    file = PAPER.override(COARSE | (changes or {}), outputs=short)
+    return file.override(**groups).build()
 
 
-@pytest.mark.parametrize("name", RIGS)
-def test_rig_files_are_pickled(name):
-    file = opened(name)
-    again = pickle.loads(pickle.dumps(file))
-    assert again == file
-    assert again.folder == file.folder
-    assert again.model_fields_set == file.model_fields_set
+def test_a_built_rig_runs_as_its_file_says():
+    one = brief(outputs={"interval": 0.015}, solver={"step": 5e-3})
+    rig, y0, t = one
+    assert (rig, y0, t) == (one.rig, one.y0, one.t)
+    assert t.tolist() == pytest.approx([0.0, 0.015, 0.03])
+    run = one.run()
+    assert torch.equal(run.t, t)
+    assert torch.equal(run.y[0], y0)
+    assert torch.equal(one.run(times(0.01, 2)).t, times(0.01, 2))
+    assert [one.run(**how).stats.steps for how in ({}, {"step": 2.5e-3})] == [6, 12]
+    assert one.run(rtol=1e-4).stats.steps != 6  # a choice of steps replaces the file's
+    y0 = rig.state(disc={"x": 61e-3, "y": "rest"}, bracket={"x": 61e-3, "y": "touch"})
+    assert one.run(times(0.01, 2), y0=y0)["x_C"][0] == 61e-3
+
+
+def test_the_start_follows_the_parameters():
+    """Differentiable, and that of the file as long as nothing was changed."""
+    one = brief()
+    assert (one.start() - one.y0).abs().max() < 1e-12
+    radius = one.rig.parameter("disc.radius")
+    height = one.rig.layout.slices["pose", "disc"].start + 1
+    (slope,) = torch.autograd.grad(one.start()[height], radius)
+    with torch.no_grad():
+        radius.copy_(radius + 1e-6)
+        moved = one.start()
+        made = brief({"disc.radius": radius.item()})
+    assert (moved - made.y0).abs().max() < 1e-12
+    assert slope.item() == pytest.approx((moved - one.y0)[height].item() / 1e-6, rel=1e-4)
+    assert 0.9 < slope.item() < 1.1
+
+
+@torch.no_grad()
+def test_the_papers_controllers():
+    """Eq. 31-34: the horizontal loop measures the disc, the vertical one the bracket, and both push
+    the bracket."""
+    model = coarse()
+    state = model.unpack(grasped(model, (0.02, -0.01)))
+    aside = state.pose["bracket"] + f64(1e-3, 2e-3, 0.0)
+    state = state._replace(pose=state.pose | {"bracket": aside})
+    t = f64(0.0)[0]
+    F_x, F_y = (float(model.actuator_effort(name, state, model.follow(t))) for name in "xy")
+    x_d, y_d, F_ff = (float(model.reference[name](t)[0]) for name in ("x_d", "y_d", "F_ff"))
+    x, y = float(state.pose["disc"][0]), float(aside[1])
+    assert F_x == pytest.approx(1.2e5 * (x_d - x) - 441.7149 * 0.02, rel=1e-13)
+    assert F_y == pytest.approx(1.2e5 * (y_d - y) + F_ff, rel=1e-13)
+
+
+def test_bodies_know_their_inertia():
+    for body, inertia in (
+        (disc := Body(2.0, Circle(0.1)), 0.5 * 2.0 * 0.01),
+        (Body(2.0, Ellipse(0.3, 0.1)), 0.25 * 2.0 * (0.09 + 0.01)),
+        (Body(2.0, Circle(0.1), inertia=0.7), 0.7),
+    ):
+        assert body.inertia.item() == pytest.approx(inertia, rel=1e-15)
+    (slope,) = torch.autograd.grad(disc.inertia, disc.shape.radius)
+    assert float(slope) == pytest.approx(2.0 * 0.1, rel=1e-15)
+
+
+def test_sizes_of_the_papers_rig():
+    """61 surface nodes a pad: forces and stretches, five free coordinates and their rates."""
+    layout = coarse().layout
+    assert layout.size == 2 * (2 * 61 + 61) + 2 * 5
+    assert layout.blocks["pads", "L"].shape == (1, 61, 2)
+    assert layout.free == {"disc": [0, 1, 2], "bracket": [0, 1]}
+    inertial = coarse(pad__inertial=True).layout.blocks
+    shapes = [inertial[field, "U"].shape for field in ("pads", "rates")]
+    assert shapes == [(122, 2)] * 2  # two elements high, the base held
+    assert turning().layout.size == layout.size + 2
+
+
+def test_coordinates_that_are_not_free_are_filled_in():
+    """A driven coordinate comes from its signal at t, a fixed one from its number; neither is in
+    the vector."""
+    rig = Rig(
+        bodies={"a": Body(1.0, Circle(0.01), x="driven", y=0.25), "b": Body(1.0, theta=0.1)},
+        pads={}, contacts={}, reference=hold(**{"a.x": 0.7}),
+    )  # fmt: skip
+    assert rig.layout.size == 2 * (1 + 2)
+    state = rig.unpack(f64(0.5, 3.0, 4.0, 0.05, 0.3, 0.4))
+    assert (state.pose["a"].tolist(), state.pose["b"].tolist()) == ([0.7, 0.25, 0.5], [3, 4, 0.1])
+    assert state.velocity["a"].tolist() == [0.0, 0.0, 0.05]
+    assert state.velocity["b"].tolist() == [0.3, 0.4, 0.0]
+    moved = rig.unpack(torch.zeros(6, dtype=torch.float64), f64(0.9, -2.0).reshape(1, 2))
+    assert moved.pose["a"].tolist() == [0.9, 0.25, 0.0]
+    assert moved.velocity["a"].tolist() == [-2.0, 0.0, 0.0]

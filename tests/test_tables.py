@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field, model_validator
 
-from torchsoft.tables import LISTED, InvalidTable, Table, from_toml, read_toml, shown
+from torchsoft.tables import LISTED, InvalidTable, Table, from_toml, shown
 
 
 class Roll(Table):
@@ -36,15 +36,9 @@ class Run(Table):
         return self
 
 
-REFUSED: dict[str, tuple[Any, str]] = {
-    "boolean": ({"step": True}, "step should be a valid number, not True"),
-    "text": ({"step": "1_0"}, "step should be a valid number, not '1_0'"),
-    "text for a whole number": ({"count": "3"}, "count should be a valid integer, not '3'"),
+REJECTED: dict[str, tuple[Any, str]] = {
     "part of a whole number": ({"count": 3.0}, "count should be a valid integer, not 3.0"),
     "number for a truth": ({"checked": 1}, "checked should be a valid boolean, not 1"),
-    "not finite": ({"step": float("nan")}, "step should be a finite number, not nan"),
-    "too many digits": ({"step": 10**400}, "step should be a valid number, not 1000"),
-    "bounds": ({"step": -1}, "step should be greater than 0, not -1"),
     "unknown": ({"steps": 1.0}, "`steps` is not known here; did you mean `step`?"),
     "missing": ({"motions": [{"kind": "roll"}, {}]}, "motions.1.kind is missing"),
     "another kind": (
@@ -66,9 +60,9 @@ REFUSED: dict[str, tuple[Any, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_refusal_is_one_sentence_that_names_the_field(name, tmp_path):
-    tree, message = REFUSED[name]
+@pytest.mark.parametrize("name", REJECTED)
+def test_a_rejection_is_one_sentence_that_names_the_field(name, tmp_path):
+    tree, message = REJECTED[name]
     for make in (lambda: Run(**tree), lambda: Run.model_validate(tree)):
         with pytest.raises(InvalidTable) as error:
             make()
@@ -86,11 +80,6 @@ def test_what_is_right_is_taken_as_it_is():
 def test_a_table_stays_as_it_was_made():
     with pytest.raises(InvalidTable, match=r"^step cannot be set: a table stays as it was made"):
         Run().step = 2.0
-
-
-def test_json_is_refused_alike():
-    with pytest.raises(InvalidTable, match=r"^step should be greater than 0, not -1"):
-        Run.model_validate_json('{"step": -1}')
 
 
 def test_values_are_shown_short():
@@ -123,8 +112,3 @@ def test_a_file_that_cannot_be_read_is_named(content, message, tmp_path):
         from_toml(path, Run.model_validate)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_file_that_is_not_there_is_the_systems_error(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_toml(tmp_path / "none.toml")

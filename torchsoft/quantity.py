@@ -14,6 +14,16 @@ from types import MappingProxyType
 from typing import Annotated, Any, get_args, get_origin
 
 
+def short(x: float) -> str:
+    """A number for messages: six digits, and all of them where they are needed to tell it from its
+    bound."""
+    if isinstance(x, int):
+        text = str(x)
+        return text if len(text) < 20 else f"{text[:17]}..."
+    six = f"{x:g}"
+    return six if float(six) == x or x != x else repr(float(x))
+
+
 @dataclass(frozen=True)
 class Quantity:
     """Closed interval [`low`, `high`] in `unit`, and the meaning of the number; an annotation of a
@@ -33,7 +43,7 @@ class Quantity:
     def check(self, x: float) -> float:
         """Raises `ValueError` for a number outside the interval."""
         if not self.low <= x <= self.high:
-            raise ValueError(f"should be {self.range}, not {x:g}")
+            raise ValueError(f"should be {self.range}, not {short(x)}")
         return x
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
@@ -76,6 +86,18 @@ def quantities(part: type) -> Mapping[str, Quantity]:
         declared = {name: quantity(argument.annotation) for name, argument in arguments.items()}
         found |= {name: one for name, one in declared.items() if one is not None}
     return MappingProxyType(found)
+
+
+def check_declared(part: object, *names: str) -> None:
+    """Raises `ValueError` for arguments of a part, kept under their names, outside what its
+    constructor declares."""
+    for name in names:
+        given = getattr(part, name)
+        for value in given if isinstance(given, tuple) else [given]:
+            try:
+                quantities(type(part))[name].check(value)
+            except ValueError as error:
+                raise ValueError(f"`{name}` {error}") from None
 
 
 def quantity_of(part: object, name: str) -> Quantity | None:

@@ -116,8 +116,14 @@ def is_huge(value: Any) -> bool:
 def findings(error: ValidationError, data: Any = None, within: str = "") -> str:
     """pydantic's findings in one sentence, each with its field (`within` another), its value and
     the values allowed."""
-    found = list(
-        dict.fromkeys(finding(one, data, within) for one in error.errors(include_url=False))
+    errors = error.errors(include_url=False)
+    outer = {one["loc"][:n] for one in errors for n in range(len(one["loc"]))}
+    found = list(  # a list that only its wrong entries leave too short has no finding of its own
+        dict.fromkeys(
+            finding(one, data, within)
+            for one in errors
+            if one["type"] != "too_short" or one["loc"] not in outer
+        )
     )
     more = len(found) - SHOWN
     return "; ".join(found[:SHOWN]) + (f"; and {more} more" if more > 0 else "")

@@ -15,7 +15,7 @@ from pydantic import (
 )
 from scipy.special import ndtr, ndtri
 
-from torchsoft.tables import LISTED, Table
+from torchsoft.tables import LISTED, Table, is_huge
 
 WIDTH = 4.0
 """Default distance of both bounds of a normal distribution from its mean, in standard
@@ -86,7 +86,8 @@ class Normal(Related):
     def _is_cut(cls, data: Any) -> Any:
         given = data if isinstance(data, Mapping) else {}
         mean, sd = (given.get(key) for key in ("mean", "sd"))
-        if not isinstance(mean, int | float) or not isinstance(sd, int | float):
+        numbers = isinstance(mean, int | float) and isinstance(sd, int | float)
+        if not numbers or is_huge(mean) or is_huge(sd):
             return data
         return {"low": mean - WIDTH * sd, "high": mean + WIDTH * sd} | dict(data)
 

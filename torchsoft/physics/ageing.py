@@ -53,8 +53,11 @@ class AgeingSlip(SmoothSlip):
         age_0: Annotated[float, Quantity("s", 0.0, 1e12, "age of contacts at the start")] = 1.0,
     ) -> None:  # fmt: skip
         super().__init__(mu_s, mu_k, v_s)
-        self.ageing = parameter(ageing)
-        self.D_c, self.t_0, self.age_0 = (parameter(x, trained=False) for x in (D_c, t_0, age_0))
+        self.ageing = parameter(ageing, "ageing")
+        self.D_c, self.t_0, self.age_0 = (
+            parameter(x, name, trained=False)
+            for name, x in (("D_c", D_c), ("t_0", t_0), ("age_0", age_0))
+        )
 
     def at_rest(self) -> Tensor:
         """Static friction [1] at the start of a run."""

@@ -75,6 +75,10 @@ def places(name: str, value: Any) -> Tensor:
     """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for other values."""
     try:
         given = np.array(value.detach() if isinstance(value, Tensor) else value)
+        if not isinstance(value, Tensor | np.ndarray) and any(
+            isinstance(x, bool) for row in value for x in row
+        ):
+            given = np.zeros(0)  # numpy takes one among numbers for 1
     except (TypeError, ValueError):  # rows of different lengths
         given = np.zeros(0)
     if (

@@ -181,7 +181,7 @@ class Friction(LawPart):
 
     def __init__(self, mu_s: StaticFriction, mu_k: KineticFriction) -> None:
         super().__init__()
-        self.mu_s, self.mu_k = parameter(mu_s), parameter(mu_k)
+        self.mu_s, self.mu_k = parameter(mu_s, "mu_s"), parameter(mu_k, "mu_k")
 
     def well_posed(self) -> str:
         """The conflict between the parameters; empty where there is none."""
@@ -221,8 +221,8 @@ class SmoothSlip(Friction):
         | None = None,
     ) -> None:  # fmt: skip
         super().__init__(mu_s, mu_k)
-        self.v_s = parameter(v_s)
-        self.R_pad = None if R_pad is None else parameter(R_pad, trained=False)
+        self.v_s = parameter(v_s, "v_s")
+        self.R_pad = None if R_pad is None else parameter(R_pad, "R_pad", trained=False)
 
     def at_rest(self) -> Tensor:
         """Static friction [1] at the start of a run."""
@@ -349,11 +349,16 @@ class SoftContact(LawPart):
     ) -> None:
         super().__init__()
         self.K_n, self.R_n, self.K_t, self.R_t = (
-            parameter(value) for value in (K_n, R_n, K_t, R_t)
+            parameter(value, name)
+            for name, value in (("K_n", K_n), ("R_n", R_n), ("K_t", K_t), ("R_t", R_t))
         )
         self.power, self.adhesion, self.friction_ratio = (
-            None if value is None else parameter(value)
-            for value in (power, adhesion, friction_ratio)
+            None if value is None else parameter(value, name)
+            for name, value in (
+                ("power", power),
+                ("adhesion", adhesion),
+                ("friction_ratio", friction_ratio),
+            )
         )
         if not callable(friction):
             raise ValueError(

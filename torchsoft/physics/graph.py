@@ -105,7 +105,7 @@ class Graph(nn.Module):
         for name, parts in zip(("bodies", "pads", "contacts", "actuators"), lists):
             check_names(name, parts)
             self.add_module(name, nn.ModuleDict(parts))
-        self.gravity = parameter(gravity)
+        self.gravity = parameter(gravity, "gravity")
         self.reference = reference or Reference()
         self.taxels = dict(taxels or {})
         self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}

@@ -260,7 +260,7 @@ class MooneyRivlin(_ByShear):
         depth: Depth, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
         super().__init__(None, nu, rho, tau, depth, moduli, times)
-        self.C10, self.C01 = parameter(C10), parameter(C01)
+        self.C10, self.C01 = parameter(C10, "C10"), parameter(C01, "C01")
 
     @property
     def shear(self) -> Tensor:
@@ -280,7 +280,9 @@ class Yeoh(_ByShear):
         C20: Coefficient = 0.0, C30: Coefficient = 0.0, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
         super().__init__(None, nu, rho, tau, depth, moduli, times)
-        self.C10, self.C20, self.C30 = (parameter(x) for x in (C10, C20, C30))
+        self.C10, self.C20, self.C30 = (
+            parameter(x, name) for name, x in (("C10", C10), ("C20", C20), ("C30", C30))
+        )
 
     @property
     def shear(self) -> Tensor:

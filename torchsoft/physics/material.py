@@ -48,7 +48,7 @@ class Branch(nn.Module):
         time: Retardation,
     ) -> None:
         super().__init__()
-        self.fraction, self.time = parameter(fraction), parameter(time)
+        self.fraction, self.time = parameter(fraction, "fraction"), parameter(time, "time")
 
 
 class Material(nn.Module):
@@ -64,8 +64,10 @@ class Material(nn.Module):
         """E is None where a material makes it of other numbers."""
         super().__init__()
         if E is not None or not isinstance(getattr(type(self), "E", None), property):
-            self.E = parameter(E)  # pyright: ignore[reportArgumentType]
-        self.nu, self.rho, self.depth = (parameter(value) for value in (nu, rho, depth))
+            self.E = parameter(E, "E")  # pyright: ignore[reportArgumentType]
+        self.nu, self.rho, self.depth = (
+            parameter(value, name) for name, value in (("nu", nu), ("rho", rho), ("depth", depth))
+        )
         self.add_module("added", nn.ModuleList())
 
     def chain(self) -> tuple[Tensor, Tensor]:
@@ -109,7 +111,7 @@ class OneTime(Material):
         self, E: Modulus | None, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth
     ) -> None:
         super().__init__(E, nu, rho, depth)
-        self.tau = parameter(tau)
+        self.tau = parameter(tau, "tau")
 
     def chain(self) -> tuple[Tensor, Tensor]:
         return torch.ones_like(self.tau)[None], self.tau[None]
@@ -143,7 +145,8 @@ class StandardLinearSolid(Material):
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
         self.E_instant, self.tau, self.tau_instant = (
-            parameter(x) for x in (E_instant, tau, tau_instant)
+            parameter(x, name)
+            for name, x in (("E_instant", E_instant), ("tau", tau), ("tau_instant", tau_instant))
         )
 
     def well_posed(self) -> str:
@@ -172,7 +175,7 @@ class Series(Material):
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
         self.terms = numbered(self, "a series", self.lists, strengths, tau)
-        self.tau_instant = parameter(tau_instant)
+        self.tau_instant = parameter(tau_instant, "tau_instant")
 
     def series(self) -> tuple[Tensor, Tensor]:
         """Strengths and times [s] of the terms, (terms,) each."""

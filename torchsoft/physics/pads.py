@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from torchsoft.display import suggestion
-from torchsoft.physics.arguments import tensor, whole
+from torchsoft.physics.arguments import number, tensor, whole
 from torchsoft.physics.elements import (
     element_constants,
     element_energy,
@@ -35,7 +35,7 @@ from torchsoft.physics.mesh import (
 )
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import StateBlock
-from torchsoft.quantity import Length, Quantity, Ratio, quantities
+from torchsoft.quantity import Length, Quantity, Ratio, check_declared, quantities
 
 SAMPLES = 64
 """States whose elements are evaluated side by side."""
@@ -86,7 +86,8 @@ class Pad(nn.Module):
         super().__init__()
         self.points = whole("points", points, 0)
         self.E_ratio, self.tau_ratio = (
-            None if ratio is None else parameter(ratio) for ratio in (E_ratio, tau_ratio)
+            None if ratio is None else parameter(ratio, name)
+            for name, ratio in (("E_ratio", E_ratio), ("tau_ratio", tau_ratio))
         )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
         kept = np.arange(len(mesh.free)) if self.nodal else mesh.surface
@@ -511,18 +512,18 @@ class Taxels:
     ] = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "centres", tuple(map(float, self.centres)))
+        for name, given in (
+            ("centres", self.centres),
+            ("width", [self.width]),
+            ("spread", [self.spread]),
+        ):
+            found = tuple(number(name, one) for one in given)
+            object.__setattr__(self, name, found if name == "centres" else found[0])
         if (self.count is None) == (self.centres == ()):
             raise ValueError("taxels need a `count` or their `centres`, and not both")
         if self.count is not None:
             whole("count", self.count, 1)
-        for name, known in quantities(type(self)).items():
-            given = getattr(self, name)
-            for value in given if name == "centres" else [given]:
-                try:
-                    known.check(float(value))
-                except ValueError as error:
-                    raise ValueError(f"`{name}` {error}") from None
+        check_declared(self, *quantities(type(self)))
 
     @cached_property
     def places(self) -> Array:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor, nn
 
-from torchsoft.physics.arguments import positive
+from torchsoft.physics.arguments import number, positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import (
@@ -64,14 +64,19 @@ class Body(nn.Module):
         fixed = {k: v for k, v in zip(COORDINATES, (x, y, theta)) if not isinstance(v, str)}
         self.fixed = nn.ParameterDict(
             {
-                name: parameter(x if isinstance(x, int) else float(x), trained=False)
+                name: parameter(x if isinstance(x, int) else float(x), name, trained=False)
                 for name, x in fixed.items()
             }
         )
-        self.mass, self.shape, self.weighted = parameter(mass), shape, weighted
-        self.own_inertia = None if inertia is None else parameter(inertia)
+        self.mass, self.shape, self.weighted = parameter(mass, "mass"), shape, weighted
+        self.own_inertia = None if inertia is None else parameter(inertia, "inertia")
         turns = self.freedom["theta"] == "free" and inertia is None and shape is not None
-        self.inertia_ratio = parameter(inertia_ratio) if turns else None
+        self.inertia_ratio = parameter(inertia_ratio, "inertia_ratio") if turns else None
+        if number("inertia_ratio", inertia_ratio) != 1.0 and (shape is None or inertia is not None):
+            raise ValueError(
+                f"`inertia_ratio` must be 1 beside `inertia`, or without a shape, but is "
+                f"{inertia_ratio!r}; leave it out"
+            )
         if self.freedom["theta"] == "free" and shape is None and inertia is None:
             raise ValueError(
                 "a body that may turn needs an `inertia`, or a `shape` to compute it from"
@@ -142,7 +147,7 @@ class PD(nn.Module):
 
     def __init__(self, Kp: ProportionalGain, Kd: DerivativeGain) -> None:
         super().__init__()
-        self.Kp, self.Kd = parameter(Kp), parameter(Kd)
+        self.Kp, self.Kd = parameter(Kp, "Kp"), parameter(Kd, "Kd")
 
     def forward(
         self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
@@ -175,7 +180,7 @@ class Integral(nn.Module):
                 "`law` of integral action must have no states of its own; put the lag around it: "
                 "Lagging(Integral(law, Ki), lag)"
             )
-        self.law, self.Ki, self.sign = law, parameter(Ki), -1.0 if reversed else 1.0
+        self.law, self.Ki, self.sign = law, parameter(Ki, "Ki"), -1.0 if reversed else 1.0
 
     def forward(
         self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor,
@@ -196,7 +201,7 @@ class Lagging(nn.Module):
 
     def __init__(self, law: nn.Module, lag: Lag) -> None:
         super().__init__()
-        self.law, self.lag = law, parameter(lag)
+        self.law, self.lag = law, parameter(lag, "lag")
 
     @property
     def states(self) -> dict[str, OwnState]:
@@ -247,8 +252,8 @@ class Guide(nn.Module):
         ] = 1e-3,
     ) -> None:
         super().__init__()
-        self.friction, self.damping = parameter(friction), parameter(damping)
-        self.v_0 = parameter(v_0, trained=False)
+        self.friction, self.damping = parameter(friction, "friction"), parameter(damping, "damping")
+        self.v_0 = parameter(v_0, "v_0", trained=False)
 
     def forward(
         self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
@@ -329,7 +334,7 @@ class Actuator(nn.Module):
             feed_forward,
             elements,
         )
-        self.limit = None if limit is None else parameter(limit)
+        self.limit = None if limit is None else parameter(limit, "limit")
 
     @property
     def follows(self) -> tuple[tuple[str, str], ...]:
@@ -467,7 +472,7 @@ class StateFeedback(nn.Module):
         self.rows, self.columns = len(gain), len(gain[0])
         for i, row in enumerate(gain, 1):
             for j, one in enumerate(row, 1):
-                self.register_parameter(f"gain_{i}_{j}", parameter(one))
+                self.register_parameter(name := f"gain_{i}_{j}", parameter(one, name))
 
     def matrix(self) -> Tensor:
         """The matrix K (k, 2 m)."""

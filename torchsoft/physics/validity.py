@@ -18,7 +18,7 @@ from torchsoft.physics.arguments import check_transforms
 from torchsoft.physics.contact import slip_of
 from torchsoft.physics.material import Material
 from torchsoft.physics.shapes import Shape
-from torchsoft.quantity import quantities, quantity_of
+from torchsoft.quantity import quantities, quantity_of, short
 
 P = TypeVar("P")
 
@@ -118,7 +118,7 @@ def check_numbers(part: nn.Module, names: Mapping[str, str] = MappingProxyType({
     for owner, module in part.named_modules():
         path = f"{owner}." if owner else ""
         for name, value in module.named_parameters(recurse=False):
-            called = names.get(f"{path}{name}", f"{path}{name}")
+            called = names.get(f"{path}{name}", f"{path}{name.removeprefix('own_')}")
             check_array(called, value)
             if value.is_inference():
                 raise ValueError(
@@ -136,7 +136,7 @@ def check_numbers(part: nn.Module, names: Mapping[str, str] = MappingProxyType({
     for owner, module in part.named_modules():
         path = f"{owner}." if owner else ""
         for name in dict.fromkeys((*module._parameters, *quantities(type(module)))):
-            called = names.get(f"{path}{name}", f"{path}{name}")
+            called = names.get(f"{path}{name}", f"{path}{name.removeprefix('own_')}")
             declared, value = quantity_of(module, name), getattr(module, name, None)
             if declared is None or not isinstance(value, Tensor | float):
                 continue
@@ -148,7 +148,7 @@ def check_numbers(part: nn.Module, names: Mapping[str, str] = MappingProxyType({
             wrong = numbers[~((declared.low <= numbers) & (numbers <= declared.high))]
             if wrong.size:
                 raise ValueError(
-                    f"parameter `{called}` must be {declared.range}, but is {wrong[0]:g}"
+                    f"parameter `{called}` must be {declared.range}, but is {short(wrong[0])}"
                 )
 
 

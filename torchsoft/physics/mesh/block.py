@@ -3,7 +3,7 @@ matrices banded, and half-round fingertips."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import inf, isnan
+from math import inf, isfinite, isnan
 from typing import Annotated
 
 import numpy as np
@@ -19,7 +19,7 @@ from torchsoft.physics.mesh.mesh import (
     in_band,
     quads,
 )
-from torchsoft.quantity import Length, Quantity
+from torchsoft.quantity import Length, Quantity, check_declared
 
 SLENDER = 1e4
 """Largest ratio of the sides of an element; the stiffness is lost in rounding near 1e7."""
@@ -46,6 +46,7 @@ class PadMesh(Mesh):
             positive(name, getattr(self, name))
         for name in ("elements_x", "elements_y"):
             whole(name, getattr(self, name), 1)
+        check_declared(self, "length", "height", "elements_x", "elements_y")
         wide, tall = self.length / self.elements_x, self.height / self.elements_y
         if not 1 / SLENDER <= wide / tall <= SLENDER:
             raise ValueError(
@@ -154,6 +155,8 @@ class CurvedPadMesh(PadMesh):
                 f"`radius` must be at least half of the length, {0.5 * self.length:g} m, but is "
                 f"{self.radius!r}"
             )
+        if isfinite(self.radius):
+            check_declared(self, "radius")
         if not self.profile(np.array([0.0]))[0] > 0:
             raise ValueError(
                 f"`radius` {self.radius:g} m makes the arc deeper than the `height` of "
@@ -204,7 +207,9 @@ class FingertipMesh(FreeMesh):
 
     def __post_init__(self) -> None:
         positive("radius", self.radius)
-        if whole("elements_around", self.elements_around, 4) % 4:
+        whole("elements_around", self.elements_around, 4)
+        check_declared(self, "radius", "elements_around")
+        if self.elements_around % 4:
             raise ValueError(
                 f"`elements_around` must be a multiple of 4, but is {self.elements_around}"
             )

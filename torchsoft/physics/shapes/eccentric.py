@@ -25,7 +25,10 @@ class Eccentric(Shape):
     def __init__(self, contour: Shape, centre_x: CentreX = 0.0, centre_y: CentreY = 0.0) -> None:
         super().__init__()
         self.contour = contour
-        self.centre_x, self.centre_y = parameter(centre_x), parameter(centre_y)
+        self.centre_x, self.centre_y = (
+            parameter(centre_x, "centre_x"),
+            parameter(centre_y, "centre_y"),
+        )
 
     @property
     def centre(self) -> Tensor:

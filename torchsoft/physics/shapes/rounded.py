@@ -118,7 +118,12 @@ class RoundedBox(Rounded):
     ) -> None:
         super().__init__()
         self.half_width, self.half_height, self.radius = (
-            parameter(value) for value in (half_width, half_height, radius)
+            parameter(value, name)
+            for name, value in (
+                ("half_width", half_width),
+                ("half_height", half_height),
+                ("radius", radius),
+            )
         )
 
     def well_posed(self) -> str:
@@ -177,7 +182,10 @@ class RoundedPolygon(Rounded):
         given = places("vertices", vertices)
         if not 3 <= len(given) <= self.MOST:
             raise ValueError(f"`vertices` must be 3 to {self.MOST} places, but are {len(given)}")
-        self.vertices, self.radius = nn.Parameter(given), parameter(positive("radius", radius))
+        self.vertices, self.radius = (
+            nn.Parameter(given),
+            parameter(positive("radius", radius)),
+        )
         if wrong := self.well_posed():
             raise ValueError(f"`vertices` cannot be used as a polygon: {wrong}")
         self.note_centre()
@@ -262,7 +270,7 @@ class Circle(Shape):
 
     def __init__(self, radius: Annotated[Length, "radius"]) -> None:
         super().__init__()
-        self.radius = parameter(radius)
+        self.radius = parameter(radius, "radius")
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         d = torch.linalg.vector_norm(x, dim=-1)
@@ -298,7 +306,7 @@ class Superellipse(Shape):
 
     def __init__(self, a: HalfAxisX, b: HalfAxisY, n: Exponent) -> None:
         super().__init__()
-        self.a, self.b, self.n = parameter(a), parameter(b), parameter(n)
+        self.a, self.b, self.n = parameter(a, "a"), parameter(b, "b"), parameter(n, "n")
 
     def well_posed(self) -> str:
         """Conflict between the parameters; empty where there is none."""

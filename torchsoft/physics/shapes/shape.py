@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from torchsoft.physics.arguments import number
 
 
-def parameter(value: float, trained: bool = True) -> nn.Parameter:
+def parameter(value: float, name: str = "a parameter", *, trained: bool = True) -> nn.Parameter:
     """A scalar parameter in float64, independent of torch's default. Raises `ValueError` unless the
     value is a number."""
     return nn.Parameter(
-        torch.tensor(number("a parameter", value), dtype=torch.float64), requires_grad=trained
+        torch.tensor(number(name, value), dtype=torch.float64), requires_grad=trained
     )
 
 

@@ -1,0 +1,351 @@
+"""What `check` reports of a rig before it is run: impossible files, rigs that make no sense, and
+estimates of what pads and bodies will do, as runs of the same rigs end."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import nested
+from test_rig_parts import RUBBER, changed, coarse_tree
+
+from torchsoft import RigFile
+from torchsoft.rigs.check import check
+from torchsoft.rigs.course import Estimate
+
+# one pad and one body; compressions of runs are in comments
+# ----------------------------------------------------------------------
+
+FIRM = {"kind": "kelvin_voigt", "E": 0.75e6, "nu": 0.45, "tau": 10e-3, "depth": 44e-3}
+GEL = FIRM | {"E": 0.15e6, "tau": 3e-3}
+TALL = {"kind": "rounded_box", "half_width": 10e-3, "half_height": 20e-3, "radius": 3e-3}
+BALL = {"kind": "circle", "radius": 5e-3}
+AUTO = dict.fromkeys(("K_n", "R_n", "K_t", "R_t"), "auto")
+SPRINGS = {"K_n": 1.2e5, "R_n": 400.0, "K_t": 1.2e5, "R_t": 400.0}
+DRY = {**SPRINGS, "friction": {"kind": "smooth", "mu_s": 0.8, "mu_k": 0.7, "v_s": 0.05}}
+
+
+def ramp(since: float, until: float, *values: Any) -> dict[str, Any]:
+    return {"kind": "profile", "times": (since, until), "values": values}
+
+
+def on_one_pad(
+    start: dict[str, Any], material: dict[str, Any] = FIRM, height: float = 5e-3, *,
+    press: float = 0.0, far: float = 0.0, disc: dict[str, Any] | None = None, **others: Any,
+) -> RigFile:  # fmt: skip
+    """A body of 0.4 kg on or over a pad of 160 mm on the ground, pressed by a force [N] and dragged
+    along by so much [m]."""
+    body = {"mass": 0.4, "shape": {"kind": "circle", "radius": 20e-3}, "start": start}
+    pad = {
+        "material": "rubber", "length": 160e-3, "height": height, "elements_x": 80,
+        "elements_y": 2, "origin": (-80e-3, 0.0),
+    }  # fmt: skip
+    loops, motion = {}, {}
+    if press:
+        loops["y"] = {"pushes": "disc.y", "feed_forward": "press"}
+        motion["press"] = ramp(0.0, 0.3, 0.0, -press)
+    if far:
+        loops["x"] = {"pushes": "disc.x", "setpoint": "x_d", "Kp": 1e5, "Kd": 400.0}
+        motion["x_d"] = ramp(0.3, 0.5, "start", far)
+    return RigFile.model_validate(
+        {
+            "bodies": {"disc": body | (disc or {})}, "materials": {"rubber": material},
+            "pads": {"ground": pad}, "laws": {"dry": DRY}, "actuators": loops, "motion": motion,
+            "contacts": {"ground": {"pad": "ground", "body": "disc", "law": "dry"}},
+            "outputs": {"duration": 0.6}, **others,
+        }
+    )  # fmt: skip
+
+
+def inclined() -> RigFile:
+    """A block on a pad of a table that is inclined until it slides off, at 21.8 degrees."""
+    box = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 5e-3, "radius": 4e-3}
+    pad = {
+        "material": "rubber", "base": "table", "length": 120e-3, "height": 6e-3, "elements_x": 60,
+        "elements_y": 2, "origin": (-60e-3, 0.0),
+    }  # fmt: skip
+    block = {"mass": 0.3, "shape": box, "start": REST}
+    friction = {"kind": "coulomb", "mu_s": 0.4, "mu_k": 0.4}
+    return on_one_pad(
+        {}, bodies={"disc": block, "table": {"x": 0.0, "y": 0.0, "theta": "driven"}},
+        pads={"ground": pad}, laws={"dry": {**AUTO, "friction": friction}},
+        motion={"table.theta": ramp(0.2, 4.2, 0.0, 0.5)}, outputs={"duration": 5.0},
+    )  # fmt: skip
+
+
+REST, HIGH = {"x": 0.0, "y": "rest"}, {"x": 0.0, "y": 60e-3}
+FLAT = {"theta": 0.0}
+
+ALONE: dict[str, tuple[RigFile, str]] = {
+    "pressed": (on_one_pad(REST, press=600.0),
+                r"warning: pads.ground: .*leaves linear elasticity: at t = 0\.3 s"),  # 48 %
+    "pressed a little": (on_one_pad(REST, press=50.0), ""),  # 11 %
+    "fallen": (on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 1.0}),
+               r"warning: pads.ground: .*`disc` comes onto `ground` with 0\.7"),  # 31 %
+    "fallen lightly": (on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 0.1}), ""),  # 10 %
+    "thrown": (on_one_pad(HIGH | {"v_y": -3.0}, FIRM | {"tau": 1e-3}),
+               r"warning: bodies.disc: .* with 3\.1.* m/s, and a trial fails"),
+    "thrown away": (on_one_pad(HIGH | {"v_x": 3.0}, GEL, 12e-3), ""),
+    "dragged": (on_one_pad(REST, press=100.0, far=20e-3, disc=FLAT),
+                "warning: pads.ground: .*is dragged over it by 20 mm"),  # 61 %
+    "dragged lightly": (on_one_pad(REST, press=10.0, far=20e-3, disc=FLAT), ""),  # 10 %
+    "rolled": (on_one_pad(REST, press=50.0, far=20e-3), ""),  # 11 %
+    "tipped": (on_one_pad(REST, press=60.0, far=20e-3, disc={"shape": TALL}),
+               "warning: bodies.disc: .*friction tips it onto an edge"),  # 45 %
+    "out of reach": (on_one_pad({"x": 0.0, "y": 0.525}),
+                     "error: bodies.disc: .*outside the space over the pad"),  # lost at t = 0
+    "inclined": (inclined(), ""),  # slides off
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_one_pad_is_judged_as_its_run_ends(name):
+    file, expected = ALONE[name]
+    found = [str(one) for one in check(file) if one.severity != "note"]
+    assert len(found) == bool(expected)
+    assert all(re.search(expected, one) for one in found), found
+
+
+# the template, changed
+# ----------------------------------------------------------------------
+
+STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": BALL}
+SQUARE = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 20e-3, "radius": 3e-3}
+BOX = {"shape": SQUARE, "start": {"theta": "rest"}}
+CSV = {"motion.x_d": {"kind": "csv", "file": "x.csv", "column": "x_d"}}
+STEPS = "".join(f"{0.01 * i},{round(0.03 * i, 1)}\n" for i in range(250))
+
+
+def csv(text: str) -> dict[str, Any]:
+    return CSV | {"x.csv": text}
+
+
+def moved(disc: dict[str, Any], far: float, press: float, mu: float = 0.7) -> dict[str, Any]:
+    """The template's pads moved along the disc."""
+    return {
+        "bodies.disc": disc, "motion.x_d.values": ("start", far), "laws.dry.friction.mu_s": mu,
+        "laws.dry.friction.mu_k": mu, "motion.press.values": (0.0, press),
+    }  # fmt: skip
+
+
+REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
+    # what no file may say
+    "freedom": ({"bodies.bracket.theta": "locked"},
+        r'bodies\.bracket\.theta: should be "free", "driven" or a number'),
+    "kind": ({"bodies.disc.shape.kind": "heart"},
+        r"bodies\.disc\.shape\.kind should be one of .*'circle'.*, not 'heart'"),
+    "no mass": ({"bodies.bracket.mass": None}, r"bodies\.bracket: mass is missing, but x and y"),
+    "no start": ({"bodies.bracket.start": {"y": None}}, r"bracket: start\.y is missing: y is free"),
+    "start of what is fixed": ({"bodies.bracket.start.theta": 0.1},
+        r"bodies\.bracket: start\.theta has no meaning"),
+    "no such base": ({"pads.upper.base": "braket"}, r"pads\.upper\.base: .* `braket` .* is disc"),
+    "pad on its own body": ({"pads.lower.base": "disc"},
+        r"contacts\.lower: the pad `lower` is bonded to the body `disc`"),
+    "nothing to touch with": ({"contacts.lower.body": "bracket"},
+        r"contacts\.lower\.body: `bracket` has no shape"),
+    "loop without a motion": ({"actuators.x.setpoint": None},
+        r"actuators\.x: setpoint is missing: the gains Kp, Kd and Ki need"),
+    "no such motion": ({"actuators.x.setpoint": "w"}, r"motion\.w is missing: .* of bracket\.x"),
+    "motion of nothing": ({"motion.wave": {"kind": "hold"}}, r"motion\.wave: nothing follows it"),
+    "law of nothing": ({"laws.wet": DRY}, r"laws\.wet: no contact follows it; name it as the law"),
+    "two units": ({"actuators.y.feed_forward": "x_d"},
+        r"motion\.(x_d would be in two units|press: nothing)"),
+    "two steps": ({"solver": {"step": 1e-3, "rtol": 1e-4}}, r"solver: step and rtol .*each say"),
+    "two masses": ({"bodies.disc": {"density": 7800.0, "depth": 1e-2}},
+        r"mass and density each say how heavy it is; give one"),
+    "no density": ({"bodies.disc": {"depth": 1e-2}}, r"density is missing: depth is given"),
+    "two moduli": ({"materials.rubber.shore_a": 30}, r"E and shore_a each say how stiff it is"),
+    "slender": ({"bodies.disc.shape": {"kind": "ellipse", "a": 40e-3, "b": 10e-3}},
+        r"bodies\.disc\.shape: the axes a and b differ by more than a factor of 3"),
+    "inertial": ({"materials.rubber": {"kind": "prony", **RUBBER, "moduli": [1e5], "tau": [0.1]},
+        "pads.lower.inertial": True}, r"lower\.inertial: an inertial pad has one retardation time"),
+    "taken name": ({"bodies.keys": {"x": 0.0, "y": 0.0, "theta": 0.0}},
+        r"bodies\.keys: the name is taken by torch"),
+    # what cannot be built
+    "memory": ({"pads.lower": {"kind": "fingertip", "material": "rubber", "radius": 1e-2,
+        "elements_around": 4000}}, r"elements_around = 4000 take about"),
+    "no mesh": ({"x.csv": "x", "pads.lower": {"kind": "mesh", "material": "rubber", "unit": "mm",
+        "file": "x.csv"}}, r"error: pads\.lower\.file:"),
+    "program": ({"actuators.x.network": "law.pt"},
+        r"error: actuators\.x\.network: .*law\.pt is not an \.npz file: weights are data"),
+    "no file": (CSV, r"error: motion\.x_d\.file: .*x\.csv: No such"),
+    "start of an effort": ({"motion.press.values": ("start", -30.0)},
+        r'error: motion\.press\.values: "start" stands for where the one free'),
+    "no time for waves": ({"motion.x_d": {"kind": "sines", "since": 1.9,
+        "components": [{"amplitude": 1e-3, "frequency": 5.0}]}},
+        r"error: motion\.x_d\.since = 1\.9 s leaves 0\.1 s until 2 s, but waves take 0\.3 s"),
+    "no pad below": ({"bodies.disc.start.x": 0.1}, r'bodies\.disc\.start\.y: "rest", but no pad'),
+    "between points": ({"bodies.disc.shape.radius": 1e-5},
+        r"error: bodies\.disc\.start\.y: 0\.02 mm wide, it falls between points of `lower`"),
+    "too stiff": ({"laws.dry.K_n": 1e9},
+        r"error: laws\.dry\.K_n: no rest .* 1e\+09 N/m, .* take 4e\+05 N/m or less"),
+    "too heavy": ({"bodies.disc.mass": 400.0},
+        r"error: bodies\.disc\.start\.y: .*no rest under its weight of 3\.92e\+03 N is found"),
+    # what will not go well
+    "overlap": ({"bodies.stone": STONE},
+        r"error: bodies\.disc: it and bodies\.stone overlap by .* mm at t = 0 s"),
+    "no room": ({"motion.y_d.values": ("start", 40e-3)},
+        r"error: contacts\.upper: `disc` does not fit: at t = 0\.4 s"),
+    "not carried": ({"bodies.ball": {"mass": 0.1, "shape": BALL, "start": {"x": 0.0, "y": 0.1}}},
+        r"error: bodies\.ball: nothing carries it: it has no contact with any pad"),
+    "beside the pad": ({"bodies.disc.start": {"x": 0.1, "y": 0.03}},
+        r"error: bodies\.disc: nothing carries it: no pad that it has a contact with lies under"),
+    "never touches": ({"motion.y_d.values": ("start", 50.05e-3), "motion.press.values": (0.0, 0.0)},
+        r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
+    "lets go": ({"motion.y_d": {"kind": "profile", "times": (0.0, 0.4, 1.0),
+        "values": ("start", 49e-3, 72e-3)}},
+        r"note: contacts\.upper: .*let go.*at t = .* s they are 2\d\.\d mm apart"),
+    "a meganewton": ({"motion.press.values": (0.0, -1e6)},
+        r"error: motion\.press: at t = 2 s it pushes `bracket` with 1e\+06 N, but"),
+    "through the disc": ({"motion.y_d.values": ("start", -0.05)},
+        r"error: pads\.lower: it and pads\.upper overlap by .* mm at t = 0\.2 s"),
+    "unstable": ({"materials.rubber.tau": 1e-4, "bodies.bracket.start.y": 49.5e-3,
+        "actuators.x": {"measures": "disc.x", "Kp": 1e6, "Kd": 10.0},
+        "motion.y_d": {"kind": "hold"}}, r"the rig is unstable at t = "),
+    "jump, corners, steps, slip, outputs": ({
+        "bodies.disc": {"shape": SQUARE | {"radius": 5e-4}, "start": {"theta": "rest"}},
+        "motion.x_d": {"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 50.0,
+        "values": (10e-3,)}, "solver": {"step": 0.05}, "laws.dry.friction.v_s": 1e-4},
+        r"warning: motion\.x_d: it begins at 0\.01 m, but .* `actuators\.x` pushes with 1e\+03",
+        r"warning: bodies\.disc\.shape: its sharpest corner has a radius of 0\.5 mm",
+        r"warning: solver\.step: steps of 0\.05 s are too coarse: motion\.y_d goes",
+        r"warning: laws\.dry\.friction: slip is not single-valued",
+        r"warning: outputs\.interval: outputs every 0\.01 s .* up to 50 Hz; take 0\.005 s"),
+    "cannot roll": (moved(BOX, 20e-3, -30.0), "warning: bodies.disc: .*cannot roll"),  # 95 %
+    "cannot roll, pressed": (moved({"theta": 0.0}, 20e-3, -200.0),
+        "warning: pads.lower: .*cannot roll", "warning: pads.upper: .*cannot roll"),  # 53 %
+    # recorded motions
+    "early end": (csv("t [s],x_d [mm]\n0,0\n1,1\n"), r"x\.csv ends at 1 s, .* lasts until 2 s"),
+    "no column": (csv("t [s],x [mm]\n0,0\n1,1\n"),
+        r"no column `x_d \[m\]`, in this unit .*; it has `t`, `x`; .* in `column`"),
+    "no time": (csv("Time (s),x_d (m)\n0,0\n1,1\n"),
+        r"no column `t \[s\]`, .*; it has `x_d`, `Time`; say which one in `time`"),
+    "a force": (csv("t [s],x_d [N]\n0,0\n1,1\n"), r"column `x_d` cannot be in 'N'; .* m, cm"),
+    "a gap": (csv("t [s],x_d [mm]\n0,0\n1,\n"), r"row 3, column `x_d` is empty"),
+    "backwards": (csv("t [s],x_d [mm]\n1,0\n0,1\n"), r"row 3, .* 0 s follows 1 s; times must incr"),
+    "one row": (csv("t [s],x_d [mm]\n0,0\n"), r"has 1 rows of numbers"),
+    "a clock": (csv("t [s],x_d [mm]\n1.7e9,0\n1.7000001e9,1\n"),
+        r"begins at 1\.7e\+09 s, and the run ends at 2 s: .* say from_first = true"),
+    "an encoder, strain": (
+        csv(f"t [s],x_d [mm]\n{STEPS}") | {"motion.y_d.values": ("start", 45.8e-3)},
+        r"warning: motion\.x_d\.file: .*in steps of 0\.0001 m, as of an encoder: .*0\.01 m/s",
+        r"warning: pads\.\w+: the strain leaves linear elasticity: at"),
+    "milliseconds": (csv("t [s],x_d [m]\n0,0\n1000,1e-3\n2000,0\n"),
+        r"warning: motion\.x_d\.file: .*lasts 2000 s.*millisec"),
+    "millimetres": (csv("t [s],x_d [m]\n0,0\n1,12\n2,0\n"),
+        r"warning: motion\.x_d: .*goes 12 m, .* is it in millimetres"),
+}  # fmt: skip
+"""Changes of the template by dotted names, or the content of a file, and what is reported."""
+
+
+def reported(changes: dict[str, Any], folder: Path) -> list[str]:
+    """Findings on the template, changed, or the error with which it is rejected."""
+    tree = coarse_tree()
+    for name, value in changes.items():
+        if name == "x.csv":
+            (folder / name).write_text(value, encoding="utf-8")
+        else:
+            tree = changed(tree, nested(name, value))
+    try:
+        return [str(one) for one in check(RigFile.from_tree(tree, folder))]
+    except ValueError as error:
+        return [f"error: {error}"]
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory):
+    found = reported({}, tmp_path_factory.mktemp("quiet"))
+    assert all(one.startswith("note: ") for one in found)
+    return "\n".join(found)
+
+
+SLOW = "too heavy", "cannot roll"
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW)) for x in REPORTED]
+)
+def test_what_is_wrong_is_reported_with_its_field(name, quiet, tmp_path):
+    changes, *expected = REPORTED[name]
+    found = reported(changes, tmp_path)
+    for one in expected:
+        assert any(re.search(one, finding) for finding in found), found
+        assert not re.search(one, quiet)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        moved({"theta": 0.0}, 20e-3, -30.0),  # 20 %
+        *(pytest.param(one, marks=pytest.mark.slow) for one in (
+            moved(BOX, 2e-3, -30.0),  # 13 %
+            moved(BOX, 20e-3, -30.0, mu=0.2),  # it slides: 11 %
+            moved({}, 20e-3, -300.0),  # it rolls: 22 %
+        )),
+    ],
+)
+def test_pads_that_are_moved_gently_are_not_warned_about(changes, tmp_path):
+    assert not [one for one in reported(changes, tmp_path) if one.startswith(("warn", "err"))]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "expected"),
+    [
+        ({"0.weight": np.zeros((1, 3)), "0.bias": np.zeros(1)}, r"0\.weight has .* \(1, 3\)"),
+        ({"a": np.zeros(3)}, r"it has a, but a network has 0\.weight, 0\.bias"),
+        ({"0.weight": np.full((1, 4), np.nan), "0.bias": np.zeros(1)}, "must be finite numbers"),
+        ({"0.weight": np.zeros((600, 4)), "0.bias": np.zeros(600)}, "more than 2000 numbers"),
+        ({"0.weight": np.array([object()]), "0.bias": np.zeros(1)}, "no.* file of numbers: Object"),
+    ],
+)
+def test_weights_that_are_no_network_are_reported(tmp_path, arrays, expected):
+    np.savez(tmp_path / "law.npz", allow_pickle=True, **arrays)
+    (found,) = reported({"actuators.x.network": "law.npz"}, tmp_path)
+    assert re.search(rf"^error: actuators\.x\.network: .*{expected}", found), found
+
+
+def test_a_loop_that_is_about_to_close_is_not_judged():
+    """The bracket does not hold the disc yet, so that the loop over both is unstable there."""
+    file = RigFile.ready("paper")
+    file = file.override({"pad.elements_x": 60, "pad.elements_y": 2})
+    ready = file.build()
+    top = float(ready.rig.unpack(ready.y0).pose["bracket"][1])
+    found = check(file.override({"bodies.bracket.start.y": top + 5e-5}))
+    assert [str(one) for one in found if one.severity != "note"] == []
+
+
+@pytest.mark.parametrize(("step", "is_coarse"), [(1.5e-3, False), (3e-3, True)])
+def test_steps_are_held_against_the_modes(step, is_coarse):
+    """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
+    less = {"pad.tau": 2e-3, "pad.elements_x": 60, "pad.elements_y": 2}
+    file = RigFile.ready("paper").override(less, solver={"step": step})
+    file = file.override(outputs={"duration": 1.0, "snapshots": []})
+    swings = [one for one in check(file) if "a mode of the rig swings with" in one.message]
+    assert bool(swings) == is_coarse
+
+
+def test_a_body_that_falls_freely_asks_for_finer_steps():
+    """It comes down with sqrt(2 g h), though it starts at rest."""
+    (found,) = (
+        one for one in check(RigFile.ready("drop").override(solver={"step": 0.05}))
+        if "a body comes flying" in one.message
+    )  # fmt: skip
+    assert found.severity == "warning"
+
+
+def test_what_two_pads_grip_is_taken_along():
+    """Fingertips go around a box that they hold, and the box with them, as in the run."""
+    file = RigFile.ready("fingertips")
+    estimate = Estimate(file, file.build())
+    for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
+        assert estimate(time)["box"] == pytest.approx([0.0, 45e-3, angle], abs=2e-4)
+    assert estimate(0.5)["box"][1] < 22e-3  # not lifted yet
+
+
+def test_the_estimate_by_statics_is_where_the_run_ends(tmp_path):
+    file = RigFile.from_tree(coarse_tree()).override(outputs={"duration": 0.45})
+    built = file.build()
+    expected, run = Estimate(file, built).balanced(0.45), built.run()
+    for name in ("disc", "bracket"):
+        assert float(run[f"y_{name}"][-1]) == pytest.approx(expected[name][1], abs=3e-5)
