@@ -48,26 +48,14 @@ class Units(NamedTuple):
 SI = Units()
 
 
-def moved_by(
-    turn: float, mirror: float, shift: tuple[float, float], x: float, y: float
-) -> tuple[float, float]:
-    """A place mirrored in x, turned and then shifted."""
-    c, s = math.cos(turn), math.sin(turn)
-    x *= mirror
-    return c * x - s * y + shift[0], s * x + c * y + shift[1]
-
-
 def motion(
-    turn: float = 0.0,
-    mirror: float = 1.0,
-    shift: tuple[float, float] = (0.0, 0.0),
-    reordered: bool = False,
-    weighted: bool = True,
-    units: Units = SI,
-    atol: float | None = None,
-) -> np.ndarray:
-    """Two ellipses thrown onto two pads, taken back into the first frame and units: (times, 6)."""
+    turn: float = 0.0, mirror: float = 1.0, shift: complex = 0.0, reordered: bool = False,
+    weighted: bool = True, units: Units = SI, atol: float | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Two ellipses thrown onto two pads, taken back into the first frame and units: (times, 6);
+    places are complex numbers."""
     L, M, T = units
+    turned = lambda x, y: (mirror * x + 1j * y) * np.exp(1j * turn)
     law = SoftContact(
         5e4 * M / T**2, 20.0 * M / T, 5e4 * M / T**2, 20.0 * M / T,
         friction=SmoothSlip(0.6, 0.6), node_spacing=1e-3 * L,
@@ -76,29 +64,26 @@ def motion(
     pads, bodies, contacts, start = {}, {}, {}, {}
     for name, left, tilt in (("one", 0.0, 0.4), ("two", 0.2, -0.7)):
         end = left if mirror > 0 else left + LENGTH  # the left one, mirrored
-        origin = moved_by(turn, mirror, (shift[0] * L, shift[1] * L), L * end, 0.0)
+        origin = L * (shift + turned(end, 0.0))
         mesh = PadMesh(LENGTH * L, HEIGHT * L, 30, 3)
-        pads[name] = Pad(mesh, material, origin=origin, angle=turn, points=2)
+        at = (float(origin.real), float(origin.imag))
+        pads[name] = Pad(mesh, material, origin=at, angle=turn, points=2)
         bodies[name] = Body(0.1 * M, Ellipse(15e-3 * L, 9e-3 * L), weighted=weighted)
         contacts[name] = Contact(name, name, law)
-        place = moved_by(
-            turn, mirror, (shift[0] * L, shift[1] * L), L * (left + 0.5 * LENGTH), L * 25e-3
-        )
-        v = moved_by(turn, mirror, (0.0, 0.0), 0.15 * L / T, -0.4 * L / T)
+        place, v = L * (shift + turned(left + 0.5 * LENGTH, 25e-3)), L / T * turned(0.15, -0.4)
         start[name] = {
-            "x": place[0], "y": place[1], "theta": mirror * tilt + turn,
-            "v_x": v[0], "v_y": v[1], "omega": 5.0 * mirror / T,
+            "x": place.real, "y": place.imag, "theta": mirror * tilt + turn,
+            "v_x": v.real, "v_y": v.imag, "omega": 5.0 * mirror / T,
         }  # fmt: skip
     if reordered:
         pads, bodies, contacts = (dict(reversed(one.items())) for one in (pads, bodies, contacts))
     rig = Rig(bodies=bodies, pads=pads, contacts=contacts, gravity=weighted * 9.81 * L / T**2)
     run = simulate(rig, T * times(0.12, 25), y0=rig.state(start), rtol=RTOL, atol=atol)
     out = []
-    c, s = math.cos(turn), math.sin(turn)
     for name in ("one", "two"):
         x, y, theta = (run[f"{axis}_{name}"].numpy() for axis in ("x", "y", "theta"))
-        x, y = x / L - shift[0], y / L - shift[1]
-        out += [mirror * (c * x + s * y), -s * x + c * y, mirror * (theta - turn)]
+        z = ((x + 1j * y) / L - shift) * np.exp(-1j * turn)
+        out += [mirror * z.real, z.imag, mirror * (theta - turn)]
     return np.stack(out, -1)
 
 
@@ -115,7 +100,7 @@ def first() -> np.ndarray:
 @pytest.mark.parametrize(
     "change",
     [
-        {"shift": (1.0, -3.0)}, {"mirror": -1.0}, {"reordered": True},
+        {"shift": 1.0 - 3.0j}, {"mirror": -1.0}, {"reordered": True},
         # lengths times L, masses times L^3, times by sqrt(L): under gravity nothing else is left
         {"units": Units(10.0, 1e3, math.sqrt(10.0))},
     ],

@@ -1,13 +1,11 @@
-"""What every mesh and its pads guarantee, against scikit-fem, meshed where the pad stands, and closed
-forms; meshes from files."""
+"""What every mesh and its pads guarantee, against scikit-fem, meshed where the pad stands, and
+closed forms; meshes from files."""
 
 import pickle
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-import meshio
 import numpy as np
 import pytest
 import torch
@@ -242,8 +240,11 @@ def test_a_fingertip_is_half_a_disc():
     assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(np.full(2, 2.0), abs=0.02)
 
 
-def test_taxels_lie_about_their_middle():
-    assert Taxels(4, 2e-3).centres == pytest.approx(np.array([-3e-3, -1e-3, 1e-3, 3e-3]))
+def test_taxels_share_every_force_between_them():
+    """Side by side about the middle; a force at an end of them belongs to one by half."""
+    pad = Pad(PadMesh(20e-3, 4e-3, 20, 2), rubber())
+    shares = Taxels("pad", 5e-3, count=4).weights(pad).sum(0)
+    assert shares.tolist() == [0.5, *[1.0] * 19, 0.5]
 
 
 # compliance of fine meshes
@@ -316,29 +317,6 @@ def test_work_converges_with_the_square_of_the_spacing(make, pressure, nu, bound
 
 
 # files
-
-
-def written(path: Path, mesh: Mesh, z: float | Array = 0.25) -> Path:
-    """The mesh in a file of gmsh 2.2 [mm], with groups of lines."""
-    line = np.stack((mesh.face[:-1], mesh.face[1:]), -1)
-    around = np.stack((mesh.outline, np.roll(mesh.outline, -1)), -1)
-    held = around[mesh.bonded[around].all(1)]
-    points = np.concatenate((1e3 * mesh.nodes, np.broadcast_to(z, len(mesh.nodes))[:, None]), 1)
-    cells = [("line", line), ("line", held), ("quad", mesh.elements)]
-    tags = [np.full(len(block), k + 1) for k, (_, block) in enumerate(cells)]
-    data: Any = {"gmsh:physical": tags, "gmsh:geometrical": tags}
-    names = {"skin": np.array([1, 1]), "bone": np.array([2, 1]), "rubber": np.array([3, 2])}
-    file = meshio.Mesh(points, cells, cell_data=data, field_data=names)
-    meshio.write(path, file, file_format="gmsh22")
-    return path
-
-
-def test_a_mesh_is_read_from_a_file_with_its_groups(tmp_path):
-    mesh = FingertipMesh(RADIUS, 8)
-    file = written(tmp_path / "tip.msh", mesh)
-    read = QuadMesh.read(file, unit="mm", face="skin", bonded=["bone"])
-    C, expected = (Pad(m, rubber()).compliance().detach() for m in (read, mesh))
-    assert torch.allclose(C, expected, rtol=1e-8, atol=1e-10 * float(expected.abs().max()))
 
 
 GMSH = """$MeshFormat
@@ -426,39 +404,33 @@ def test_edges_are_named_by_groups_curves_and_sets_of_nodes(tmp_path, name, text
     assert mesh.nodes[mesh.bonded][:, 1].tolist() == [0.0, 0.0, 0.0]
 
 
+TRIANGLES = """*NODE
+1, 0.0, 0.0
+2, 1.0, 0.0
+3, 0.0, 1.0
+*ELEMENT, TYPE=CPE3
+1, 1, 2, 3
+"""
+
+
 @pytest.mark.parametrize(
-    ("options", "match"),
+    ("name", "text", "options", "match"),
     [
-        ({"unit": "inch"}, "`unit` must be one of m, cm, mm, but is 'inch'"),
-        ({}, "no edge `face`; there are skin, bone, curve 1, curve 2"),
-        ({"face": "skin", "bonded": ["rubber"]}, "there is no edge `rubber`"),
-        ({"face": "skin", "bonded": []}, "`bonded_sides` must be sides of quadrilaterals"),
-        ({"face": "skin", "bonded": ["skin"]}, "fewer than two points of the face are free"),
+        ("a.msh", GMSH, {"unit": "inch"}, "`unit` must be one of m, cm, mm, but is 'inch'"),
+        ("a.msh", GMSH, {"face": "skin"}, "no edge `skin`; there are base, "),
+        ("a.msh", GMSH, {"bonded": []}, "`bonded_sides` must be sides of quadrilaterals"),
+        ("a.msh", GMSH, {"bonded": ["face"]}, "fewer than two points of the face are free"),
+        ("a.msh", GMSH.replace("10 5 0\n", "10 5 1\n"), {}, "points in a plane of constant z"),
+        ("a.inp", TRIANGLES, {}, "quadrilaterals with four points, but has triangle"),
+        ("a.inp", DECK.format(kind="CAX4"), {}, "a.inp is not a mesh that can be read: .*CAX4"),
+        ("a.mesh2", "no mesh", {}, "a.mesh2 is not a mesh that can be read"),
+        ("a.msh", GMSH[:300], {}, "a.msh is not a mesh that can be read"),
     ],
-)
-def test_edges_that_a_file_does_not_have_are_rejected(tmp_path, options, match):
-    file = written(tmp_path / "tip.msh", FingertipMesh(RADIUS, 8))
+)  # fmt: skip
+def test_files_that_are_no_pads_are_rejected(tmp_path, name, text, options, match):
+    (tmp_path / name).write_text(text, encoding="ascii")
     with pytest.raises(ValueError, match=match):
-        QuadMesh.read(file, **{"unit": "mm"} | options)
-
-
-def test_files_that_are_no_meshes_are_rejected(tmp_path):
-    file, mesh = tmp_path / "tip.msh", FingertipMesh(RADIUS, 8)
-    with pytest.raises(FileNotFoundError):
-        QuadMesh.read(file, unit="mm")
-    written(file, mesh, z=np.linspace(0, 1, len(mesh.nodes)))
-    with pytest.raises(ValueError, match="points in a plane of constant z"):
-        QuadMesh.read(file, unit="mm", face="skin", bonded=["bone"])
-    meshio.write(file, meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]), file_format="gmsh22")
-    with pytest.raises(ValueError, match="quadrilaterals with four points, but has triangle"):
-        QuadMesh.read(file, unit="mm")
-    for name, text in (
-        ("tip.msh", "no mesh"), ("tip.mesh2", "no mesh"), ("tip.msh", GMSH[:300]),
-        ("block.inp", DECK.format(kind="CAX4")),
-    ):  # fmt: skip
-        (tmp_path / name).write_text(text, encoding="ascii")
-        with pytest.raises(ValueError, match=f"{name} is not a mesh that can be read"):
-            QuadMesh.read(tmp_path / name, unit="mm")
+        QuadMesh.read(tmp_path / name, **{"unit": "mm"} | options)
 
 
 def test_elements_too_slender_to_be_computed_with_are_rejected():
