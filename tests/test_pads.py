@@ -1,161 +1,439 @@
-"""Pads: masses, where they stand, condensation against the full stiffness, contact points, and
-gradients.
+"""What every mesh and its pads guarantee, against scikit-fem, meshed where the pad stands, and
+closed forms; meshes from files."""
 
-The oracle is scikit-fem, assembled in the world frame: the upper pad's mesh really hangs from its
-base there.
-"""
+import pickle
+from collections.abc import Callable
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import RUBBER
-from fem_oracle import CM_HEIGHT, matching, world_stiffness
-from torch import Tensor
+from fem_oracle import dilatation, mass, shear
+from skfem import (
+    Basis,
+    ElementQuad1,
+    ElementQuad2,
+    ElementVector,
+    FacetBasis,
+    LinearForm,
+    MeshQuad,
+    condense,
+    solve,
+)
 
-from torchsoft import KelvinVoigt, Pad, PadMesh
-from torchsoft.physics.balance import Balance
+from torchsoft import CurvedPadMesh, FingertipMesh, KelvinVoigt, Pad, PadMesh, QuadMesh, Taxels
+from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 
-ROUNDING = 1e-13
-"""Relative to the largest entry: two assemblies of the same integrals, in another order of
-summation."""
+ROUNDING, SOLVED = 1e-12, 1e-10
+"""Parts of the largest entry: two assemblies of the same integrals; two solutions of one system."""
 
-SOLVED = 1e-10
-"""Relative: two linear solves of the same stiffness, whose condition number is below 1e5."""
-
-LENGTH = 0.02
-"""Of a small pad [m]."""
-
-Place = tuple[str, bool]
-
-
-@pytest.fixture(params=["lower", "upper", "enclosed"])
-def place(request):
-    """Which pad ("L" or "U"), and whether the bracket holds the upper one's sides."""
-    return ("L" if request.param == "lower" else "U"), request.param == "enclosed"
+RADIUS = 8e-3
 
 
-def pad_at(place: Place, *, inertial: bool, points: int = 0) -> Pad:
-    upper, enclosed = place[0] == "U", place[1]
-    mesh = PadMesh(LENGTH, 4e-3, 12, 3, bonded_sides=enclosed)
-    at = {"base": "bracket", "origin": (-LENGTH / 2, -CM_HEIGHT), "mirrored": True} if upper else {}
-    rubber = KelvinVoigt(**RUBBER | {"nu": 0.47}, tau=0.01)
-    return Pad(mesh, rubber, inertial=inertial, points=points, **at)
+def trapezium() -> QuadMesh:
+    """A skew, ragged mesh whose points are numbered at random, and some of whose quadrilaterals are
+    clockwise."""
+    rng = np.random.default_rng(4)
+    s, t = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 4), indexing="ij")
+    inner = (s * (1 - s) > 0) & (t * (1 - t) > 0)
+    s, t = (x + w * inner * rng.standard_normal(s.shape) for x, w in ((s, 0.02), (t, 0.05)))
+    points = np.stack((30e-3 * s + 4e-3 * t * (1 - 2 * s), 6e-3 * t + 1e-3 * s), -1).reshape(-1, 2)
+    number = np.arange(len(points)).reshape(s.shape)
+    corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    quads = np.stack(corners, -1).reshape(-1, 4)
+    quads[::3] = quads[::3, ::-1]
+    face, base = (np.stack((row[:-1], row[1:]), -1) for row in (number[:, -1], number[:, 0]))
+    mixed = rng.permutation(len(points) + 1)  # the last belongs to no quadrilateral
+    shuffled = np.empty((len(points) + 1, 2))
+    shuffled[mixed] = np.concatenate((points, [[9.0, 9.0]]))
+    return QuadMesh.of(shuffled, mixed[quads], mixed[face[::-1]], mixed[base])
 
 
-# masses
-# ----------------------------------------------------------------------
+# A new mesh is one line.
+MESHES: dict[str, Callable[[], Mesh]] = {
+    "block": lambda: PadMesh(20e-3, 4.59e-3, 11, 4),
+    "enclosed": lambda: PadMesh(20e-3, 4e-3, 12, 3, bonded_sides=True),
+    "crowned": lambda: CurvedPadMesh(30e-3, 6e-3, 15, 3, radius=40e-3),
+    "hollow": lambda: CurvedPadMesh(
+        30e-3, 4e-3, 15, 3, radius=-50e-3, bonded_edges=("base", "right")
+    ),
+    "fingertip": lambda: FingertipMesh(RADIUS, 12),
+    "trapezium": trapezium,
+}
 
 
-def test_lumped_masses_are_those_of_the_free_share_of_the_pad(place):
-    pad = pad_at(place, inertial=True)
-    p, masses = pad.mesh, pad.masses().detach()
-    width = p.length * (
-        1 - 1 / p.elements_x if place[1] else 1
-    )  # held nodes take their half elements along
-    area = width * p.height * (1 - 1 / (2 * p.elements_y))
-    assert float(masses.min()) > 0
-    assert float(masses.sum()) == pytest.approx(1100.0 * 0.044 * area, rel=1e-13)
-    a, b = p.length / p.elements_x, p.height / p.elements_y
-    assert float(masses.max()) == pytest.approx(
-        1100.0 * 0.044 * a * b, rel=1e-13
-    )  # an inner node: one element
+@pytest.fixture(params=MESHES)
+def mesh(request):
+    return MESHES[request.param]()
 
 
-# the pads in the world
-# ----------------------------------------------------------------------
+def rubber(nu: float = 0.45) -> KelvinVoigt:
+    return KelvinVoigt(0.75e6, nu, 1100.0, 10e-3, 44e-3)
 
 
-def test_pads_stand_where_the_base_is(place):
-    massless = pad_at(place, inertial=False)
-    inertial = pad_at(place, inertial=True)
-    p, positions = massless.mesh, massless.positions.numpy()
-    assert np.array_equal(positions, inertial.positions[inertial.surface].numpy())
-    face = p.height if place[0] == "L" else -CM_HEIGHT - p.height
-    assert np.allclose(positions[:, 1], face, rtol=0, atol=1e-17)
-    assert np.all(np.diff(positions[:, 0]) > 0)
-    assert len(positions) == p.elements_x + (-1 if place[1] else 1)
+def bases(nodes: Array, elements: Any, element: Any) -> tuple[Basis, Basis, Basis]:
+    """With the quadratures of a pad's elements: lambda's in the centre, mu's and the mass's."""
+    grid = MeshQuad(np.ascontiguousarray(nodes.T), elements.T)
+    centre = Basis(grid, element, quadrature=(np.full((2, 1), 0.5), np.ones(1)))
+    return centre, Basis(grid, element, intorder=2), Basis(grid, element, intorder=5)
 
 
-def test_condensed_compliance_is_the_surface_block_of_the_full_inverse(place):
-    massless = pad_at(place, inertial=False)
-    inertial = pad_at(place, inertial=True)
-    nodes, K = world_stiffness(massless)
-    full = np.linalg.inv(K)
-    surface = matching(massless.positions, nodes)
-    everywhere = matching(inertial.positions, nodes)
-    scale = np.abs(full).max()
-    with torch.no_grad():
-        condensed = massless.compliance().numpy()
-        forces = torch.randn(
-            massless.nodes, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-        )
-    extended = displaced(inertial, forces).detach().flatten().numpy()
-    slopes = [
-        torch.autograd.grad((w * u).sum(), pad.material.nu)[0]
-        for w in [torch.arange(2.0 * massless.nodes).reshape(-1, 2)]
-        for pad, u in (
-            (massless, (massless.compliance() @ forces.flatten()).reshape(-1, 2)),
-            (inertial, displaced(inertial, forces)[inertial.surface]),
-        )
-    ]
-    assert slopes[0].item() == pytest.approx(slopes[1].item(), rel=1e-9)
-    assert np.abs(condensed - full[surface][:, surface]).max() < SOLVED * scale
-    assert np.abs(
-        extended - full[everywhere][:, surface] @ forces.flatten().numpy()
-    ).max() < SOLVED * scale * len(forces)
+def theirs(nodes: Array, elements: Any) -> list[Array]:
+    """scikit-fem's K_lambda, K_mu and M, dofs (x, y) node by node."""
+    where = bases(nodes, elements, ElementVector(ElementQuad1()))
+    order = where[0].nodal_dofs.T.ravel()
+    forms = zip((dilatation, shear, mass), where)
+    return [form.assemble(basis).toarray()[order][:, order] for form, basis in forms]
 
 
-def test_elastic_force_of_the_inertial_pad_is_the_assembled_stiffness(place):
-    pad = pad_at(place, inertial=True)
-    nodes, K = world_stiffness(pad)
-    dofs = matching(pad.positions, nodes)
+def test_assembly_equals_scikit_fem(mesh):
+    for mine, want in zip(mesh.matrices, theirs(mesh.nodes, mesh.elements)):
+        got = mesh.assemble(mine, all_nodes=True).toarray()
+        assert np.abs(got - want).max() < ROUNDING * np.abs(want).max()
+
+
+def test_a_linear_displacement_has_forces_at_the_boundary_only(mesh):
+    """The patch test: each is the stress on half of both its sides; rigid motions have none."""
+    gradient = np.array([[0.3, -0.7], [1.1, 0.4]])
+    strain = (gradient + gradient.T) / 2
+    lame_lambda, lame_mu = lame_moduli(1.0, 0.4)
+    stress = lame_lambda * np.trace(strain) * np.eye(2) + 2 * lame_mu * strain
+    K = mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True)
+    force = (K @ (mesh.nodes @ gradient.T + [3e-3, -1e-3]).ravel()).reshape(-1, 2)
+    expected, around = np.zeros_like(force), mesh.outline
+    sides = mesh.nodes[np.roll(around, -1)] - mesh.nodes[around]
+    traction = np.stack((sides[:, 1], -sides[:, 0]), -1) @ stress
+    np.add.at(expected, around, 0.5 * (traction + np.roll(traction, 1, 0)))
+    scale = np.abs(K.toarray()).max() * np.abs(mesh.nodes).max()
+    assert np.abs(force - expected).max() < ROUNDING * scale
+
+
+PLACES: dict[str, dict[str, Any]] = {
+    "on the ground": {},
+    "under a bracket": {"base": "bracket", "origin": (-0.01, -2.18e-3), "mirrored": True},
+    "turned": {"base": "jaw", "origin": (2e-3, -1e-3), "angle": 0.7},
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_pad_is_the_mesh_where_it_stands(mesh, place):
+    """Places, masses, forces of the inertial pad, compliance of the condensed one and its slope in
+    nu, against elements meshed there."""
+    where = PLACES[place]
+    c, s = np.cos(where.get("angle", 0.0)), np.sin(where.get("angle", 0.0))
+    axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if "mirrored" in where else 1.0])
+    nodes = mesh.nodes @ axes.T + where.get("origin", (0.0, 0.0))
+    K_lambda, K_mu, M = theirs(nodes, mesh.elements)
+    free = np.flatnonzero(~mesh.bonded)
+    dofs = (2 * free[:, None] + np.arange(2)).ravel()
+    material = rubber(0.47)
+    massless, inertial = (Pad(mesh, material, inertial=how, **where) for how in (False, True))
+    order = [int(np.abs(nodes[free] - x).sum(1).argmin()) for x in inertial.positions.numpy()]
+    assert np.abs(nodes[free][order] - inertial.positions.numpy()).max() < 1e-15
+    assert torch.equal(massless.positions, inertial.positions[inertial.surface])
+    masses = 1100.0 * 44e-3 * M.sum(1)[2 * free[order]]
+    assert inertial.masses().detach().numpy() == pytest.approx(masses, rel=1e-12)
+
+    def stiffness(nu: float) -> Array:
+        lame_lambda, lame_mu = lame_moduli(0.75e6, nu)
+        return 44e-3 * (lame_lambda * K_lambda + lame_mu * K_mu)[dofs][:, dofs]
+
+    mine = (2 * np.array(order)[:, None] + np.arange(2)).ravel()
     u = 1e-4 * torch.randn(
-        2, 3, pad.nodes, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+        2, inertial.nodes, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64
     )
-    f = elastic_force(pad, u)
-    want = u.flatten(-2).numpy() @ K[dofs][:, dofs]
-    assert np.abs(f.flatten(-2).numpy() - want).max() < ROUNDING * np.abs(K).max() * float(
-        u.abs().max()
-    )
-
-
-def displaced(pad: Pad, forces: Tensor) -> Tensor:
-    """Displacements (nodes, 2) [m] of a nodal pad under forces on its surface nodes."""
-    balance = Balance(pad, pad.element_forces, lambda u: forces + 0 * u)
-    u, factors, left = balance.found(torch.zeros(pad.nodes, 2).double(), 1e-15, 3)
-    assert left < 1e-15
-    return balance.corrected(u, factors)
-
-
-def elastic_force(pad: Pad, u: Tensor) -> Tensor:
     with torch.no_grad():
-        return pad.internal_force(u, torch.zeros_like(u))
-
-
-# contact points
-# ----------------------------------------------------------------------
+        force = inertial.internal_force(u, 0 * u).flatten(-2).numpy()
+    K = stiffness(0.47)
+    want = u.flatten(-2).numpy() @ K[mine][:, mine]
+    assert np.abs(force - want).max() < ROUNDING * np.abs(K).max() * float(u.abs().max())
+    on = mine.reshape(-1, 2)[inertial.surface.numpy()].ravel()
+    low, here, high = (np.linalg.inv(stiffness(nu))[on][:, on] for nu in (0.4699, 0.47, 0.4701))
+    C = massless.compliance()
+    assert np.abs(C.detach().numpy() - here).max() < SOLVED * np.abs(here).max()
+    weight = torch.randn(C.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    (slope,) = torch.autograd.grad((weight * C).sum(), material.nu)
+    expected = (weight.numpy() * (high - low)).sum() / 2e-4
+    assert float(slope) == pytest.approx(expected, rel=1e-4)
+    again = pickle.loads(pickle.dumps(massless))
+    assert torch.equal(again.compliance(), C)
+    assert torch.equal(again.positions, massless.positions)
 
 
 @pytest.mark.parametrize("points", [0, 1, 3])
-def test_contact_points_stand_for_the_whole_surface(place, points):
-    """Lengths add up, shape functions to one; Gauss points integrate a cubic along the surface
-    exactly from two on."""
-    pad = pad_at(place, inertial=False, points=points)
-    p = pad.mesh
-    count = p.elements_x + (-2 if place[1] else 0)
-    assert len(pad.spread) == (pad.nodes if points == 0 else points * count)
-    held = (
-        2 * p.length / p.elements_x
-        if place[1] and points
-        else p.length / p.elements_x
-        if place[1]
-        else 0.0
-    )
-    assert float(pad.point_lengths.sum()) == pytest.approx(p.length - held, rel=1e-13)
-    assert torch.allclose(
-        pad.spread.sum(1), torch.ones(len(pad.spread), dtype=torch.float64), rtol=0, atol=1e-15
-    )
-    x = pad.point_positions[:, 0].numpy() - pad.positions[:, 0].numpy().mean()
+def test_contact_points_stand_for_the_whole_face(mesh, points):
+    """Lengths add up to the sides between free nodes, shape functions to one; three Gauss points
+    integrate s^4 along the face exactly."""
+    pad = Pad(mesh, rubber(), points=points)
+    face = mesh.nodes[mesh.face]
+    way = np.concatenate(([0.0], np.linalg.norm(np.diff(face, axis=0), axis=1).cumsum()))
+    every = way - 0.5 * way[-1]
+    s = every[~mesh.bonded[mesh.face]]
+    beside = 0.5 * (every[-1] - every[0] - s[-1] + s[0])  # half of the sides to a held node
+    lengths = pad.point_lengths
+    assert lengths.sum() == pytest.approx(s[-1] - s[0] + beside * (points == 0), rel=1e-12)
+    assert pad.spread.sum(1).numpy() == pytest.approx(np.ones(len(lengths)), abs=1e-15)
+    assert len(lengths) == (len(s) if points == 0 else points * (len(s) - 1))
     if points == 3:
-        end = (p.length - held) / 2
-        assert float((pad.point_lengths * x**4).sum()) == pytest.approx(2 * end**5 / 5, rel=1e-12)
+        integral = (lengths * pad.point_coordinates**4).sum()
+        assert integral == pytest.approx((s[-1] ** 5 - s[0] ** 5) / 5, rel=1e-12)
+
+
+def test_face_outline_and_base_are_those_of_the_nodes(mesh):
+    face = mesh.nodes[mesh.face]
+    assert np.all(np.diff(face[:, 0]) > 0)  # from left to right
+    assert np.all(np.isin(mesh.face, mesh.outline))
+    x, y = mesh.nodes[mesh.outline].T
+    area = 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum()
+    M = mesh.assemble(mesh.matrices[2], all_nodes=True)
+    assert M.sum() / 2 == pytest.approx(area, rel=1e-13)
+    corners, under = mesh.back
+    np.testing.assert_array_equal(corners[[0, -1]], face[[-1, 0]])
+    base, way = mesh.base, np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    assert 0.7 <= way[under].sum() / (base[1, 0] - base[0, 0]) <= 1.1
+    low, high = mesh.space
+    assert np.all(low <= mesh.nodes.min(0))
+    assert np.all(mesh.nodes.max(0) <= high)
+    fine = mesh.refined(3)
+    assert len(fine.face) - 1 == 3 * (len(mesh.face) - 1)
+    assert fine.nodes[fine.face][::3] == pytest.approx(face, abs=1e-15)
+
+
+def test_equal_descriptions_are_one_mesh():
+    for make in MESHES.values():
+        assert make() == make()
+        assert hash(make()) == hash(make())
+
+
+@pytest.mark.parametrize("radius", [40e-3, -40e-3, np.inf])
+def test_a_curved_block_has_an_arc_for_a_face(radius):
+    """Of its height in the middle; without curvature it is the block."""
+    edges = ("base", "left", "right")
+    mesh = CurvedPadMesh(30e-3, 6e-3, 10, 2, radius=radius, bonded_edges=edges)
+    face, (x, y) = mesh.nodes[mesh.face], mesh.nodes.T
+    assert face[5] == pytest.approx([15e-3, 6e-3], abs=1e-15)
+    assert np.array_equal(mesh.bonded, (y == 0) | (x == 0) | (x == 30e-3))
+    if np.isfinite(radius):
+        off = np.linalg.norm(face - [15e-3, 6e-3 - radius], axis=1)
+        assert off == pytest.approx(np.full(11, 40e-3), rel=1e-13)
+    else:
+        plain = PadMesh(30e-3, 6e-3, 10, 2, bonded_sides=True)
+        pads = [Pad(one, rubber()).compliance().detach() for one in (plain, mesh)]
+        assert torch.allclose(*pads, rtol=1e-10)
+
+
+def test_a_fingertip_is_half_a_disc():
+    areas = []
+    for around in (8, 16, 32):
+        mesh = FingertipMesh(RADIUS, around)
+        face = mesh.nodes[mesh.face]
+        off = np.linalg.norm(face - [RADIUS, 0.0], axis=1)
+        assert off == pytest.approx(np.full(around + 1, RADIUS), rel=1e-14)
+        assert np.ptp(np.linalg.norm(np.diff(face, axis=0), axis=1)) < 1e-15
+        assert np.array_equal(mesh.bonded, mesh.nodes[:, 1] == 0)
+        ways = np.diff(mesh.nodes[mesh.elements[:, [0, 1, 2, 3, 0]]], axis=1)
+        sides = np.linalg.norm(ways, axis=-1)
+        assert (sides.max(1) / sides.min(1)).max() < 2.5
+        areas.append(mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2)
+    errors = 1 - np.array(areas) / (0.5 * np.pi * RADIUS**2)
+    assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(np.full(2, 2.0), abs=0.02)
+
+
+def test_taxels_share_every_force_between_them():
+    """Side by side about the middle; a force at an end of them belongs to one by half."""
+    pad = Pad(PadMesh(20e-3, 4e-3, 20, 2), rubber())
+    shares = Taxels("pad", 5e-3, count=4).weights(pad).sum(0)
+    assert shares.tolist() == [0.5, *[1.0] * 19, 0.5]
+
+
+# compliance of fine meshes
+
+LENGTH, HEIGHT = 0.04, 4.59e-3
+
+
+def bump(middle: float, width: float) -> Callable[[Array], Array]:
+    """A smooth pressure [Pa]."""
+    return lambda x: np.exp(-(((x - middle) / width) ** 2))
+
+
+ON_LAYER, ON_TIP = bump(LENGTH / 2, 3e-3), bump(1.1 * RADIUS, 0.3 * RADIUS)
+"""About as wide as the contact of a grasp and far from the layer's ends; beside the middle of a
+fingertip."""
+
+
+@cache
+def work(mesh: Mesh, nu: float, pressure: Callable[[Array], Array], order: int) -> float:
+    """Work of a pressure downwards on the face with E = 1 and unit depth: scikit-fem, with full
+    integration of bilinear (order 1) or biquadratic (order 2) elements."""
+    grid = MeshQuad(mesh.nodes.T, mesh.elements.T)
+    element = ElementVector(ElementQuad1() if order == 1 else ElementQuad2())
+    sides = np.sort(np.stack((mesh.face[:-1], mesh.face[1:])), 0)
+    face = [k for k, side in enumerate(grid.facets.T) if (side == sides.T).all(1).any()]
+    basis = Basis(grid, element)
+    facets = FacetBasis(grid, element, facets=np.array(face), intorder=10)
+    lame_lambda, lame_mu = lame_moduli(1.0, nu)
+    K = lame_lambda * dilatation.assemble(basis) + lame_mu * shear.assemble(basis)
+    f = LinearForm(lambda v, w: -pressure(w.x[0]) * v[1]).assemble(facets)
+    held = basis.get_dofs(lambda x: x[1] < 1e-12)
+    return float(f @ solve(*condense(K, f, D=held)))
+
+
+def pad_work(mesh: Mesh, nu: float, pressure: Callable[[Array], Array]) -> float:
+    """The same by the massless pad, the pressure lumped to its nodes as contact forces are."""
+    pad = Pad(mesh, KelvinVoigt(1.0, nu, 1.0, 1.0, depth=1.0))
+    f = np.zeros((pad.nodes, 2))
+    f[:, 1] = -pressure(pad.positions[:, 0].numpy()) * pad.mesh.tributary
+    return float(f.ravel() @ pad.compliance().detach().numpy() @ f.ravel())
+
+
+def layer(fineness: int) -> PadMesh:
+    return PadMesh(LENGTH, HEIGHT, 10 * fineness, fineness)
+
+
+def tip(fineness: int) -> FingertipMesh:
+    return FingertipMesh(RADIUS, 4 * fineness)
+
+
+def test_a_nearly_incompressible_layer_does_not_lock():
+    """Full integration misses 93 % of the work on 1 mm elements at nu = 0.4999."""
+    reference = work(layer(12), 0.4999, ON_LAYER, 2)
+    assert abs(pad_work(layer(4), 0.4999, ON_LAYER) / reference - 1) < 0.02
+    assert work(layer(4), 0.4999, ON_LAYER, 1) / reference - 1 < -0.9
+
+
+@pytest.mark.parametrize(
+    ("make", "pressure", "nu", "bound"),
+    [(layer, ON_LAYER, 0.3, 1e-3), (layer, ON_LAYER, 0.49, 1e-3), (tip, ON_TIP, 0.49, 6e-3)],
+    ids=["layer", "stiff layer", "fingertip"],
+)
+def test_work_converges_with_the_square_of_the_spacing(make, pressure, nu, bound):
+    reference = work(make(24 if make is tip else 18), nu, pressure, 2)
+    errors = np.array([abs(pad_work(make(k), nu, pressure) / reference - 1) for k in (4, 8, 16)])
+    order = np.log2(errors[:-1] / errors[1:])
+    low, high = (1.7, np.inf) if make is tip else (1.9, 2.2)
+    assert np.all((low < order) & (order < high))
+    assert errors[-1] < bound
+
+
+# files
+
+
+GMSH = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+3
+1 5 "base"
+1 7 "face"
+2 1 "rubber"
+$EndPhysicalNames
+$Entities
+0 2 1 0
+1 0 0 0 20 0 0 1 5 0
+2 0 5 0 20 5 0 1 7 0
+1 0 0 0 20 5 0 1 1 0
+$EndEntities
+$Nodes
+1 6 1 6
+2 1 0 6
+1
+2
+3
+4
+5
+6
+0 0 0
+10 0 0
+20 0 0
+0 5 0
+10 5 0
+20 5 0
+$EndNodes
+$Elements
+3 6 1 6
+1 1 1 2
+1 1 2
+2 2 3
+1 2 1 2
+3 5 6
+4 4 5
+2 1 3 2
+5 1 2 5 4
+6 2 3 6 5
+$EndElements
+"""
+
+UNNAMED = GMSH[: GMSH.index("$PhysicalNames")] + GMSH[GMSH.index("$Entities") :].replace(
+    "0 1 5 0\n", "0 0 1 1\n"
+).replace("0 1 7 0\n", "0 0 1 1\n").replace("0 1 1 0\n", "0 0 2 1 2\n").replace(
+    "0 2 1 0\n", "1 2 1 0\n1 0 0 0 0\n"
+)  # fmt: skip
+"""As gmsh saves it by default, without physical groups: curves have bounding points."""
+
+DECK = """*NODE, NSET=ALL
+1, 0.0, 0.0
+2, 10.0, 0.0
+3, 20.0, 0.0
+4, 0.0, 5.0
+5, 10.0, 5.0
+6, 20.0, 5.0
+*ELEMENT, TYPE={kind}, ELSET=RUBBER
+1, 1, 2, 5, 4
+2, 2, 3, 6, 5
+*NSET, NSET=FACE
+4, 5, 6
+*NSET, NSET=BASE
+1, 2, 3
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "edges"),
+    [
+        ("block.msh", GMSH, ("face", "base")),
+        ("block.msh", UNNAMED, ("curve 2", "curve 1")),
+        *((f"{kind}.inp", DECK.format(kind=kind), ("FACE", "BASE"))
+          for kind in ("CPE4", "CPE4H", "CPE4RH", "CPS4")),
+    ],
+)  # fmt: skip
+def test_edges_are_named_by_groups_curves_and_sets_of_nodes(tmp_path, name, text, edges):
+    (tmp_path / name).write_text(text, encoding="ascii")
+    mesh = QuadMesh.read(tmp_path / name, unit="cm", face=edges[0], bonded=[edges[1]])
+    assert mesh.nodes[mesh.face] == pytest.approx(np.array([[0.0, 0.05], [0.1, 0.05], [0.2, 0.05]]))
+    assert mesh.nodes[mesh.bonded][:, 1].tolist() == [0.0, 0.0, 0.0]
+
+
+TRIANGLES = """*NODE
+1, 0.0, 0.0
+2, 1.0, 0.0
+3, 0.0, 1.0
+*ELEMENT, TYPE=CPE3
+1, 1, 2, 3
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "options", "match"),
+    [
+        ("a.msh", GMSH, {"unit": "inch"}, "`unit` must be one of m, cm, mm, but is 'inch'"),
+        ("a.msh", GMSH, {"face": "skin"}, "no edge `skin`; there are base, "),
+        ("a.msh", GMSH, {"bonded": []}, "`bonded_sides` must be sides of quadrilaterals"),
+        ("a.msh", GMSH, {"bonded": ["face"]}, "fewer than two points of the face are free"),
+        ("a.msh", GMSH.replace("10 5 0\n", "10 5 1\n"), {}, "points in a plane of constant z"),
+        ("a.inp", TRIANGLES, {}, "quadrilaterals with four points, but has triangle"),
+        ("a.inp", DECK.format(kind="CAX4"), {}, "a.inp is not a mesh that can be read: .*CAX4"),
+        ("a.mesh2", "no mesh", {}, "a.mesh2 is not a mesh that can be read"),
+        ("a.msh", GMSH[:300], {}, "a.msh is not a mesh that can be read"),
+    ],
+)  # fmt: skip
+def test_files_that_are_no_pads_are_rejected(tmp_path, name, text, options, match):
+    (tmp_path / name).write_text(text, encoding="ascii")
+    with pytest.raises(ValueError, match=match):
+        QuadMesh.read(tmp_path / name, **{"unit": "mm"} | options)
+
+
+def test_elements_too_slender_to_be_computed_with_are_rejected():
+    with pytest.raises(ValueError, match=r"elements of 5e-08 m by 10 m are too slender"):
+        PadMesh(1e-6, 10.0, 20, 1)
+    PadMesh(1.0, 1e-3, 20, 1)

@@ -1,17 +1,15 @@
-"""The paper's manipulation and light shaking as the engine computed them when its friction law
-last changed (`made_by`), and their gradients."""
+"""The paper's manipulation, its gradients and its statics as the engine computed them when its
+friction law last changed (`made_by`)."""
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from conftest import PAPER, grasp, holding_force, paper, press, rest, still, times
+from conftest import grasp, holding_force, paper, press, rest, still, times
 from torch import Tensor
 
-from torchsoft import Profile, Reference, Rig, Trajectory, simulate
-from torchsoft.physics.motion import Wave, Waves, wave
+from torchsoft import Rig, Trajectory, simulate
 from torchsoft.solve.diagnostics import NEUTRAL, modes
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
@@ -85,55 +83,6 @@ def test_gradients_of_the_manipulation_are_the_references(manipulation):
         assert gradient.item() == pytest.approx(
             reference["by"][name], rel=RELATIVE if name in sure else bound
         ), name
-
-
-def light_shaking(y_Br: float, force: float) -> Reference:
-    """A grasp 0.3 mm deep from the bracket's height [m], with its force [N] fed forward, and sums
-    of five sines of 6 mm and 0.2 mm along it and across, in a band of 4 to 20 Hz."""
-    rng, n, (low, high) = np.random.default_rng(0), 5, np.log((4.0, 20.0))
-
-    def sines(amplitude: float) -> Wave:
-        frequency = np.exp(low + (np.arange(n) + rng.random(n)) / n * (high - low))
-        phase = rng.uniform(0, 2 * np.pi, n)
-        return wave(np.full(n, amplitude / n), frequency, np.zeros(n), phase)
-
-    along, across = sines(6e-3), sines(2e-4)
-    times, since, until = [0.0, 0.375], 0.5, 2.0
-    return Reference(
-        x_d=Waves(([0.0], [60.3e-3]), since, until, along),
-        y_d=Waves((times, [y_Br, 49.8e-3]), since, until, across),
-        F_ff=Profile(times, [0.0, -force]),
-    )
-
-
-def test_light_shaking_is_the_reference():
-    """Nodes touch, leave and slip all along; the angle's derivatives by one pass forward, with
-    those of the start."""
-    reference = REFERENCE["light_shaking"]
-    y_Br = reference["y_Br_start"]
-    changes = {"contact.v_s": 0.05, "control.senses": "bracket.x", "bodies.disc.start.x": 60.3e-3}
-    model = PAPER.override(changes).assemble()
-    model.reference = light_shaking(y_Br, reference["grasp_force"])
-    y0 = model.state(disc={"x": 60.3e-3, "y": "rest"}, bracket={"x": 60.3e-3, "y": y_Br}).detach()
-    names = list(reference["theta_C_end_by"])
-    columns = []
-    for name in names:
-        keep = held_displacements(model, y0)
-        ones = torch.zeros(model.layout.size, dtype=torch.float64, requires_grad=True)
-        (pulled,) = torch.autograd.grad(
-            (keep * ones).sum(), model.parameter(name), create_graph=True, allow_unused=True
-        )
-        columns.append(
-            torch.zeros_like(y0) if pulled is None else torch.autograd.grad(pulled, ones)[0]
-        )
-    how = {"step": 5e-4, "gradient": "forward", "wrt": names, "rigid": True}
-    run = simulate(model, times(2, 401), y0=y0, dy0=torch.stack(columns, -1), **how)
-    found = series(run)
-    for name, value in reference["end"].items():
-        extent = float(found[name].max() - found[name].min())
-        assert float(found[name][-1]) == pytest.approx(value, abs=OF_RANGE * extent), name
-    for name, gradient in zip(names, run.sensitivities[-1, 2].tolist()):
-        assert gradient == pytest.approx(reference["theta_C_end_by"][name], rel=RELATIVE), name
 
 
 CASES = {"default": {}, "E = 60e3": {"pad.E": 60e3}}

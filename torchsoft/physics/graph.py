@@ -498,6 +498,8 @@ class Graph(nn.Module):
         if pad.nodal:
             return self._field_rates(name, state, 0, law if own else None)
         free, P = free_rates(pad, state.pads[name], 0.0)
+        if not own:
+            return free
         with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
             first = law(torch.zeros_like(pad.spread @ free))
         F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
