@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import RUBBER, f64, paper, still
-from scipy.integrate import solve_ivp
 from test_material import ARMS, ENERGIES, REST, energy
 from torch import Tensor
 
@@ -80,13 +79,12 @@ def forces(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
 
 @KINDS
 def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kind):
-    """Several at once, of which one is at rest and one nearly: a product whose first factor
-    vanishes has a derivative."""
+    """Several at once, of which one is at rest: a product whose first factor vanishes has a
+    derivative."""
     material, n = energy(kind), 8
     own = Factors(factors(material))
     function, parameters = as_law(element, {"material": material, "factors": own})
-    sizes = [0.0, 1e-13, *(1e-4 for _ in range(LANES - 2))]
-    x = [moved(material, size, 10 * size, seed) for seed, size in enumerate(sizes)]
+    x = [moved(material, lane * 3e-5, lane * 3e-4, lane) for lane in range(LANES)]
     law = compile_law(
         function, x[-1], parameters, linear=n, differentiated=2 * n, conjugates=n, lanes=LANES
     )
@@ -106,14 +104,12 @@ def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kin
     for lane in range(LANES):
         expected = of(x[lane])
         weighted = weighted + torch.from_numpy(w[:, lane]) @ expected
-        if lane != 1:  # there forces are rounded
-            f = expected.detach().numpy()
-            assert out[:n, lane] == pytest.approx(f, rel=1e-9, abs=1e-12 * np.abs(f).max())
-            power = 2 * float(potentials(material, x[lane])[1].detach())
-            assert out[n, lane] == pytest.approx(power, rel=1e-9)
+        f = expected.detach().numpy()
+        assert out[:n, lane] == pytest.approx(f, rel=1e-9, abs=1e-12 * np.abs(f).max())
+        power = 2 * float(potentials(material, x[lane])[1].detach())
+        assert out[n, lane] == pytest.approx(power, rel=1e-9)
         slopes = torch.autograd.functional.jacobian(of, x[lane])[:, : 2 * n].numpy()
         assert J[..., lane] == pytest.approx(slopes, rel=1e-9, abs=1e-9 * np.abs(slopes).max())
-    assert J[..., 0] == pytest.approx(J[..., 1], rel=1e-6, abs=1e-8 * np.abs(J[..., 0]).max())
     bars = torch.autograd.grad(weighted, list(leaves.values()), materialize_grads=True)
     bars = torch.cat([one.flatten() for one in bars]).numpy()
     assert bar == pytest.approx(bars, rel=1e-9, abs=1e-11 * np.abs(bars).max())
@@ -221,45 +217,17 @@ def test_forces_are_those_of_another_program(monkeypatch):
     assert 1e-4 < abs(with_it / without - 1) < 2e-3
 
 
-def relaxed(F: list[float], times: np.ndarray) -> np.ndarray:
-    """Nominal stress P_yy of a square element after a step to the gradient diag(F), at times after
-    it, over that of the relaxed material."""
-    rubber = energy("neo_hookean", moduli=[4.5e5], times=[0.05])
-    square = 1e-3 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
-    constants = torch.from_numpy(element_constants(square)[0])
-    u = torch.from_numpy((square[0] @ (np.diag(F) - np.eye(2))).ravel())
-
-    def parts(v: Tensor, rates: Tensor) -> tuple[Tensor, Tensor]:
-        """Elastic forces (rows, 16), and viscous ones (rows, 8) on the branch at its rates."""
-        rows = [one.expand(len(rates), -1) for one in (u, v, 0 * u, constants)]
-        x = torch.cat((*rows[:3], rates, rows[3]), -1).requires_grad_()
-        stored, potential = potentials(rubber, x).sum(0)
-        (elastic,) = torch.autograd.grad(stored, x, retain_graph=True)
-        (viscous,) = torch.autograd.grad(potential, x)
-        return elastic[:, :16], viscous[:, 24:32]
-
-    def rate(_: float, v: np.ndarray) -> np.ndarray:
-        elastic, A = parts(torch.from_numpy(v), torch.eye(8).double())
-        free, moves = [2, 4, 5, 6, 7], np.zeros(8)  # it neither shifts nor turns
-        moves[free] = np.linalg.solve(A[free][:, free], -elastic[0, 8:][free])
-        return moves
-
-    def force(v: Tensor) -> float:
-        return float(parts(v, torch.zeros(1, 8).double())[0][0, [5, 7]].sum())
-
-    how = {"method": "BDF", "rtol": 1e-5, "atol": 1e-6 * float(u.abs().max())}
-    found = solve_ivp(rate, (0, times[-1]), np.zeros(8), t_eval=times, **how).y.T
-    return np.array([force(torch.from_numpy(v)) for v in found]) / force(u)
-
-
-@pytest.mark.parametrize(("F", "error"), [([0.9, 0.9], 1e-3), ([1.25, 0.8], 0.012)])
-def test_a_step_of_strain_relaxes_nearly_by_the_closed_form(F, error):
-    """1 + m exp(-t / tau), at first exactly: where the area is 0.81 of what it was, and where it is
-    distorted by a fifth."""
-    times, m = np.array([0.0, 0.05]), 4.5e5 / 7.5e5
-    found = relaxed(F, times)
-    assert found[0] == pytest.approx(1 + m, rel=1e-6)
-    assert found == pytest.approx(1 + m * np.exp(-times / 0.05), rel=error)
+@KINDS
+def test_a_step_of_strain_is_carried_by_the_branches_too_at_first_and_not_at_last(kind):
+    """By 1 + m times the relaxed stress, exactly, at any strain."""
+    material, u = energy(kind, **ARMS), moved(energy(kind), 1e-4, 0.0, 3)[:8]
+    rest = torch.zeros(24).double()
+    relaxed = forces(lambda x: potentials(energy(kind), x), torch.cat((u, 0 * u, CONSTANTS)))
+    m = sum(share.item() for share, _ in material.relaxation())
+    for branches, factor in ((0 * u, 1 + m), (u, 1.0)):
+        x = torch.cat((u, branches, branches, rest, CONSTANTS))
+        f = forces(lambda x: potentials(material, x), x)[:8].detach()
+        assert f.numpy() == pytest.approx(factor * relaxed.detach().numpy(), rel=1e-9)
 
 
 # materials
@@ -325,10 +293,8 @@ def test_an_energy_that_collapses_at_the_strains_of_a_run_fails_check_energy():
 
     run = {"rig": rig, "t": f64(0.0, 1e-6)}
     check_energy(**run, y0=sheared(0.2))
-    with pytest.raises(CheckFailed, match=r"`P`: the energy is not stable at F = .*0\.3") as failed:
+    with pytest.raises(CheckFailed, match=r"`P`: the energy is not stable at F = .*0\.3"):
         check_energy(**run, y0=sheared(0.3))
-    least = float(re.search(r"stiffness is (\S+) Pa", str(failed.value))[1])
-    assert least == pytest.approx(modulus(0.3), rel=0.1)
 
 
 def test_ogdens_sums_are_smooth_where_stretches_are_equal():
@@ -350,13 +316,13 @@ def test_cauchys_stress_is_that_of_theory():
     setup = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), rubber))
     F = np.array([[1.2, 0.3], [-0.1, 0.75]])
     u = setup.mesh.nodes @ (F - np.eye(2)).T
-    J, b = np.linalg.det(F), np.diag([0.0, 0.0, 1.0])
+    J, b = np.linalg.det(F), np.eye(3)
     b[:2, :2] = F @ F.T
     mu, kappa = rubber.shear.item(), rubber.bulk.item()
     sigma = mu / J ** (5 / 3) * (b - np.trace(b) / 3 * np.eye(3)) + kappa * (J - 1) * np.eye(3)
     found = setup.stress(u)
-    for i, j, k in ((0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 1, 3)):
-        assert found[:, k] == pytest.approx(sigma[i, j], rel=1e-10)
+    expected = np.tile(sigma[[0, 1, 2, 0], [0, 1, 2, 1]], (len(found), 1))
+    assert found == pytest.approx(expected, rel=1e-10)
     U = setup.strain(u)[0] + [1, 1, 0]
     stretches = np.linalg.eigvalsh([[U[0], U[2]], [U[2], U[1]]])
     assert stretches == pytest.approx(np.sort(np.linalg.svd(F)[1]), rel=1e-10)

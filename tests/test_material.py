@@ -209,15 +209,6 @@ def test_numbers_that_do_not_fit_together_are_rejected(make, words):
 # pads
 
 
-@EVERY
-def test_the_graph_has_the_elements_of_the_material(name):
-    material = made(name)
-    count, linear = material.branches, name in LINEAR
-    own = "L" if count == 1 else f"L,1..{count}" if linear else f"L,0..{count - 1}"
-    expected = (f"C: [K_{own}]^-1", f"R: [R_{own}]") if linear else (f"C: W_{own}", f"R: R_{own}")
-    assert Pad(PadMesh(4e-3, 3e-3, 4, 3), material).elements("L") == expected
-
-
 STIFFNESS = 1.2e5
 """Of the contact spring [N/m]."""
 SAMPLED = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 1, 17, dtype=torch.float64)))
