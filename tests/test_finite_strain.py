@@ -1,29 +1,31 @@
-"""Pads at finite strain: elements against theory and another program, energies in every form, rest,
-runs and files."""
+"""Energies at finite strain, elastic and with relaxing branches: elements against theory, the
+linear chain and another program; what is rejected; equilibria, runs and files."""
 
 import ctypes
 import re
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import PAPER, RUBBER, f64, paper
+from conftest import RUBBER, f64, paper, still
+from test_material import ARMS, ENERGIES, REST, energy
 from torch import Tensor
 
 from torchsoft import (
     Body,
     Circle,
+    Contact,
     Hyperelastic,
     KelvinVoigt,
-    MooneyRivlin,
     NeoHookean,
-    Ogden,
     Pad,
     PadMesh,
     Rig,
+    SmoothSlip,
+    SoftContact,
     Trajectory,
     Yeoh,
     simulate,
@@ -31,137 +33,143 @@ from torchsoft import (
 from torchsoft.codegen import compile_law
 from torchsoft.physics import elements
 from torchsoft.physics.elements import element_constants, element_potentials
-from torchsoft.physics.hyperelastic import again, described, invariants, plane
+from torchsoft.physics.hyperelastic import invariants, plane
 from torchsoft.physics.setup import PadSetup
-from torchsoft.physics.statics import net_loads, settled, unstretched
 from torchsoft.solve.kernel.arrays import LANES
 from torchsoft.solve.laws import Factors, as_law, element
 from torchsoft.testing import CheckFailed, check_energy
 
-REST = {"nu": 0.45, "rho": 1100.0, "tau": 0.01, "depth": 0.044}
-MATERIALS = {
-    "neo_hookean": lambda: NeoHookean(**RUBBER, tau=0.01),
-    "mooney_rivlin": lambda: MooneyRivlin(C10=9e4, C01=4e4, **REST),
-    "yeoh": lambda: Yeoh(C10=1.3e5, C20=-1e4, C30=3e3, **REST),
-    "ogden": lambda: Ogden(mu=[2.8e5, -2e4], alpha=[1.8, -3.0], **REST),
-}
 SKEWED = np.array([[[0.0, 0.0], [1.0, 0.02], [1.05, 1.0], [0.03, 0.9]]]) * 1e-3
 CONSTANTS = torch.from_numpy(element_constants(SKEWED)[0])
+KINDS = pytest.mark.parametrize("kind", ENERGIES)
+EVERY = pytest.mark.parametrize(
+    "material",
+    [energy(kind, **arms) for kind in ENERGIES for arms in ({}, ARMS)],
+    ids=[f"{kind}, {how}" for kind in ENERGIES for how in ("elastic", "relaxing")],
+)
 
 
-@pytest.fixture(scope="module", params=MATERIALS)
-def material(request):
-    return MATERIALS[request.param]()
+def factors(material: Hyperelastic) -> Tensor:
+    return Pad(PadMesh(4e-3, 3e-3, 4, 3), material).factors().detach()
 
 
-def factors(material, tau: float = 0.01) -> Tensor:
-    lame = material.bulk - 2 / 3 * material.shear, material.shear
-    return torch.stack((material.depth, f64(tau)[0], *lame)).detach()
-
-
-def random(size: float, seed: int = 0, n: int = 8) -> Tensor:
+def moved(material: Hyperelastic, size: float, rate: float, seed: int) -> Tensor:
+    """Random displacements and rates of an element in every field."""
     generator = torch.Generator().manual_seed(seed)
-    return size * torch.randn(n, generator=generator, dtype=torch.float64)
+    some = torch.randn(2, 8 * material.branches, generator=generator, dtype=torch.float64)
+    return torch.cat((size * some[0], rate * some[1], CONSTANTS))
 
 
-@cache
-def law_of(material, lanes: int = 1):
-    own = Factors(factors(material))
-    function, parameters = as_law(element, {"material": material, "factors": own})
-    x = torch.cat((random(1e-4), random(1e-4, 1), CONSTANTS))
-    law = compile_law(
-        function, x, parameters, linear=8, differentiated=16, conjugates=8, lanes=lanes
-    )
-    p = np.concatenate([value.detach().numpy().ravel() for value in parameters.values()])
-    return law, p
+def potentials(material: Hyperelastic, x: Tensor) -> Tensor:
+    return element_potentials(material, factors(material), x)
 
 
-def linearised(law, x: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outputs and derivatives of a compiled law at inputs x (inputs,) or (inputs, lanes)."""
-    out, J = np.zeros((9, *x.shape[1:])), np.zeros((8, 16, *x.shape[1:]))
-    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(law.linearise)
-    call(*(np.ascontiguousarray(one).ctypes.data for one in (x, p)), out.ctypes.data, J.ctypes.data)
-    return out, J
+def forces(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Forces on the corners in every field, of the potentials of a state x."""
+    n = (len(x) - len(CONSTANTS)) // 2
+    x = x if x.requires_grad else x.clone().requires_grad_()
+    energy, potential = function(x)
+    (elastic,) = torch.autograd.grad(energy, x, create_graph=True)
+    (viscous,) = torch.autograd.grad(potential, x, create_graph=True)
+    return elastic[:n] + viscous[n : 2 * n]
 
 
 # elements
-# ----------------------------------------------------------------------
 
 
-def test_the_compiled_element_is_the_derivative_of_its_energies(material):
-    law, p = law_of(material)
-    x = torch.cat((random(1e-4), random(1e-3, 1), CONSTANTS))
-    out, J = linearised(law, x.numpy(), p)
-    at = x.clone().requires_grad_()
-    energy, potential = element_potentials(material, factors(material), at)
-    elastic = torch.autograd.grad(energy, at, retain_graph=True)[0][:8]
-    viscous = torch.autograd.grad(potential, at)[0][8:16]
-    assert out[:8] == pytest.approx((elastic + viscous).numpy(), rel=1e-12, abs=1e-12)
-    assert out[8] == pytest.approx(2 * float(potential.detach()), rel=1e-12)
-    for i in range(16):
-        size = 1e-9 if i < 8 else 1e-7
-        d = np.zeros(len(x))
-        d[i] = size
-        ahead, behind = (linearised(law, x.numpy() + s * d, p)[0][:8] for s in (1, -1))
-        slope = (ahead - behind) / (2 * size)
-        assert J[:, i] == pytest.approx(slope, rel=1e-6, abs=1e-7 * np.abs(J[:, i]).max())
-
-
-def test_its_derivative_at_rest_is_that_of_the_smallest_motion(material):
-    """A product whose first factor vanishes has a derivative: at no strain and no rate."""
-    law, p = law_of(material)
-    none, some = (torch.cat((random(s), random(s, 1), CONSTANTS)).numpy() for s in (0.0, 1e-13))
-    at_rest, moving = (linearised(law, x, p)[1] for x in (none, some))
-    assert at_rest == pytest.approx(moving, rel=1e-6, abs=1e-8 * np.abs(moving).max())
-    assert np.linalg.eigvalsh(at_rest[:, 8:]).min() > -1e-12 * np.abs(at_rest[:, 8:]).max()
-
-
-def test_several_elements_at_once_are_each_of_them(material):
-    (one, p), (several, _) = law_of(material), law_of(material, LANES)
-    x = [torch.cat((random(1e-4, k), random(1e-3, -k), CONSTANTS)).numpy() for k in range(LANES)]
-    out, J = linearised(several, np.stack(x, -1), p)
+@KINDS
+def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kind):
+    """Several at once, of which one is at rest: a product whose first factor vanishes has a
+    derivative."""
+    material, n = energy(kind), 8
+    own = Factors(factors(material))
+    function, parameters = as_law(element, {"material": material, "factors": own})
+    x = [moved(material, lane * 3e-5, lane * 3e-4, lane) for lane in range(LANES)]
+    law = compile_law(
+        function, x[-1], parameters, linear=n, differentiated=2 * n, conjugates=n, lanes=LANES
+    )
+    p = np.concatenate([value.detach().numpy().ravel() for value in parameters.values()])
+    w = np.random.default_rng(0).normal(size=(n, LANES))
+    out, J, bar = np.zeros((n + 1, LANES)), np.zeros((n, 2 * n, LANES)), np.zeros(len(p))
+    given = torch.stack(x, -1).numpy()
+    for address, arrays in (
+        (law.linearise, (given, p, out, J)),
+        (law.pullback, (given, p, w, bar)),
+    ):
+        call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(address)
+        call(*(one.ctypes.data for one in arrays))
+    leaves = {name: p.detach().clone().requires_grad_() for name, p in parameters.items()}
+    of = lambda x: forces(lambda x: function(x, leaves), x)
+    weighted = torch.zeros(())
     for lane in range(LANES):
-        alone = linearised(one, x[lane], p)
-        assert np.array_equal(out[..., lane], alone[0])
-        assert np.array_equal(J[..., lane], alone[1])
-    w, sums = np.random.default_rng(0).normal(size=(8, LANES)), []
-    for law, pairs in ((several, [(np.stack(x, -1), w)]), (one, list(zip(x, w.T)))):
-        bar = np.zeros(len(p))
-        call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(law.pullback)
-        for own, weights in pairs:
-            given = [np.ascontiguousarray(a) for a in (own, p, weights)]
-            call(*(a.ctypes.data for a in given), bar.ctypes.data)
-        sums.append(bar)
-    assert sums[0] == pytest.approx(sums[1], rel=1e-11, abs=1e-13 * np.abs(sums[1]).max())
+        expected = of(x[lane])
+        weighted = weighted + torch.from_numpy(w[:, lane]) @ expected
+        f = expected.detach().numpy()
+        assert out[:n, lane] == pytest.approx(f, rel=1e-9, abs=1e-12 * np.abs(f).max())
+        power = 2 * float(potentials(material, x[lane])[1].detach())
+        assert out[n, lane] == pytest.approx(power, rel=1e-9)
+        slopes = torch.autograd.functional.jacobian(of, x[lane])[:, : 2 * n].numpy()
+        assert J[..., lane] == pytest.approx(slopes, rel=1e-9, abs=1e-9 * np.abs(slopes).max())
+    bars = torch.autograd.grad(weighted, list(leaves.values()), materialize_grads=True)
+    bars = torch.cat([one.flatten() for one in bars]).numpy()
+    assert bar == pytest.approx(bars, rel=1e-9, abs=1e-11 * np.abs(bars).max())
 
 
-def test_small_strains_are_those_of_the_linear_element(material):
-    linear = KelvinVoigt(E=material.E.item(), **REST)
-    x = torch.cat((random(1e-10), random(1e-10, 1), CONSTANTS)).requires_grad_()
-    rows = []
-    for one in (material, linear):
-        energy, potential = element_potentials(one, factors(material), x)
-        rows.append(torch.autograd.grad(energy + potential, x)[0][:16])
-    assert rows[0].numpy() == pytest.approx(rows[1].numpy(), rel=1e-6, abs=1e-6 * rows[1].max())
+@EVERY
+def test_small_strains_are_those_of_the_linear_chain(material):
+    """K (u + tau u' + sum of m (u - v)) on the nodes, m K (v - u + t v') on those of a branch."""
+    linear = KelvinVoigt(E=material.E.item(), **REST, tau=0.01)
+
+    def K(u: Tensor) -> Tensor:
+        x = torch.cat((u, torch.zeros(8).double(), CONSTANTS))
+        return forces(lambda x: element_potentials(linear, factors(linear), x), x).detach()
+
+    x = moved(material, 1e-10, 1e-10, 0)
+    (u, *v), (u_dot, *v_dot) = x[: -len(CONSTANTS)].reshape(2, -1, 8)
+    on_nodes, on_branches = K(u) + 0.01 * K(u_dot), []
+    for (m, t), one, rate in zip(material.relaxation(), v, v_dot):
+        on_nodes = on_nodes + m.item() * K(u - one)
+        on_branches.append(m.item() * K(one - u + t.item() * rate))
+    expected = torch.cat((on_nodes, *on_branches)).numpy()
+    found = forces(lambda x: potentials(material, x), x).detach().numpy()
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max())
 
 
-def test_a_turn_costs_no_energy_and_its_rate_no_power(material):
-    corners, angle, spin = torch.from_numpy(SKEWED[0]), 1.1, 3.0
-    c, s = np.cos(angle), np.sin(angle)
-    R = torch.tensor([[c, -s], [s, c]])
-    W = spin * torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
-    u = random(5e-5).reshape(4, 2)
-    turned = (corners + u) @ R.mT - corners
-    x = torch.cat((turned.flatten(), ((corners + turned) @ W.mT).flatten(), CONSTANTS))
-    plain = torch.cat((u.flatten(), torch.zeros(8).double(), CONSTANTS))
-    energy, power = element_potentials(material, factors(material), x).detach()
-    strained, _ = element_potentials(material, factors(material), plain).detach()
-    assert float(energy) == pytest.approx(float(strained), rel=1e-12)
-    assert float(power) < 1e-20 * float(strained)
+@EVERY
+def test_turning_any_network_costs_nothing(material):
+    corners, ways = torch.from_numpy(SKEWED[0]), []
+    x = moved(material, 5e-5, 0.0, 1)
+    fields = x[: -len(CONSTANTS)].reshape(2, -1, 8)[0]
+    for u, angle, spin in zip(fields, (1.1, -0.7, 2.0), (3.0, 2.0, -5.0)):
+        c, s = np.cos(angle), np.sin(angle)
+        at = (corners + u.reshape(4, 2)) @ torch.tensor([[c, -s], [s, c]]).mT
+        W = spin * torch.tensor([[0.0, -1.0], [1.0, 0.0]]).double()
+        ways.append(((at - corners).flatten(), (at @ W.mT).flatten()))
+    turned = torch.cat([torch.cat(part) for part in zip(*ways)] + [CONSTANTS])
+    plain, found = (potentials(material, one).detach() for one in (x, turned))
+    assert float(found[0]) == pytest.approx(float(plain[0]), rel=1e-12)
+    assert float(found[1]) < 1e-20 * float(plain[0])
 
 
-def test_uniform_strain_passes_the_patch_test(material):
+@EVERY
+def test_dissipation_is_never_negative_and_is_the_work_that_is_lost(material):
+    """At large random strains; and the forces' power less the change of energy is twice the
+    potential."""
+    states = torch.stack([moved(material, 1.2e-4, 1e-2, seed) for seed in range(200)])
+    assert float(potentials(material, states)[:, 1].detach().min()) > 0
+    x, h = moved(material, 1e-4, 1e-2, 7), 1e-6
+    n = 8 * material.branches
+    ends = [torch.cat((x[:n] + s * h * x[n : 2 * n], x[n:])) for s in (0.5, -0.5)]
+    ahead, behind = (float(potentials(material, end)[0].detach()) for end in ends)
+    power = float(forces(lambda x: potentials(material, x), x).detach() @ x[n : 2 * n])
+    lost = 2 * float(potentials(material, x)[1].detach())
+    assert power - (ahead - behind) / h == pytest.approx(lost, rel=1e-6)
+
+
+@KINDS
+def test_uniform_strain_passes_the_patch_test(kind):
     """Nodes inside of a skewed mesh are balanced, and the energy is that of the area."""
+    material = energy(kind)
     generator = np.random.default_rng(0)
     mesh = PadMesh(4e-3, 3e-3, 4, 3)
     nodes = mesh.nodes.copy()
@@ -171,15 +179,13 @@ def test_uniform_strain_passes_the_patch_test(material):
     u = torch.from_numpy((nodes @ (F - np.eye(2)).T)[mesh.elements].reshape(-1, 8))
     constants = torch.from_numpy(element_constants(nodes[mesh.elements]))
     x = torch.cat((u, torch.zeros_like(u), constants), -1).requires_grad_()
-    energy = element_potentials(material, factors(material), x)[..., 0].sum()
-    (f,) = torch.autograd.grad(energy, x)
+    stored = potentials(material, x)[..., 0].sum()
+    (f,) = torch.autograd.grad(stored, x)
     total = np.zeros_like(nodes)
     np.add.at(total, mesh.elements.ravel(), f[:, :8].reshape(-1, 2).numpy())
-    whole = torch.eye(3).double()
-    whole[:2, :2] = torch.from_numpy(F)
-    W = float(material.energy(whole).detach())
+    W = float(material.energy(plane(torch.from_numpy(F))).detach())
     assert np.abs(total[inner]).max() < 1e-13 * np.abs(total).max()
-    assert float(energy.detach()) == pytest.approx(W * 0.044 * 12e-6, rel=1e-12)
+    assert float(stored.detach()) == pytest.approx(W * 0.044 * 12e-6, rel=1e-12)
 
 
 def test_forces_are_those_of_another_program(monkeypatch):
@@ -198,9 +204,9 @@ def test_forces_are_those_of_another_program(monkeypatch):
         monkeypatch.setattr(elements, "WITHIN", within)
         at = torch.from_numpy(u[quads].reshape(-1, 8))
         x = torch.cat((at, torch.zeros_like(at), constants), -1).requires_grad_()
-        energy = element_potentials(rubber, factors(rubber), x)[..., 0].sum()
+        stored = potentials(rubber, x)[..., 0].sum()
         forces[within] = np.zeros_like(nodes)
-        own = torch.autograd.grad(energy, x)[0][:, :8].reshape(-1, 2).numpy()
+        own = torch.autograd.grad(stored, x)[0][:, :8].reshape(-1, 2).numpy()
         np.add.at(forces[within], quads.ravel(), own)
     free = (data["f_x"] == 0) & (data["f_y"] == 0)
     scale = np.abs(f).max()
@@ -211,15 +217,20 @@ def test_forces_are_those_of_another_program(monkeypatch):
     assert 1e-4 < abs(with_it / without - 1) < 2e-3
 
 
+@KINDS
+def test_a_step_of_strain_is_carried_by_the_branches_too_at_first_and_not_at_last(kind):
+    """By 1 + m times the relaxed stress, exactly, at any strain."""
+    material, u = energy(kind, **ARMS), moved(energy(kind), 1e-4, 0.0, 3)[:8]
+    rest = torch.zeros(24).double()
+    relaxed = forces(lambda x: potentials(energy(kind), x), torch.cat((u, 0 * u, CONSTANTS)))
+    m = sum(share.item() for share, _ in material.relaxation())
+    for branches, factor in ((0 * u, 1 + m), (u, 1.0)):
+        x = torch.cat((u, branches, branches, rest, CONSTANTS))
+        f = forces(lambda x: potentials(material, x), x)[:8].detach()
+        assert f.numpy() == pytest.approx(factor * relaxed.detach().numpy(), rel=1e-9)
+
+
 # materials
-# ----------------------------------------------------------------------
-
-
-def test_moduli_of_small_strains_are_those_of_the_energy(material):
-    assert material.well_posed() == ""
-    again_made = again(described(material))
-    F = torch.eye(3).double() + 0.2 * torch.tensor([[1.0, 2, 0], [0.5, -1, 0], [0, 0, 0]])
-    assert float(again_made.energy(F).detach()) == float(material.energy(F).detach())
 
 
 class Bent(Hyperelastic):
@@ -257,17 +268,15 @@ def test_an_energy_that_is_no_isotropic_objective_stable_one_is_rejected(fault):
     assert re.search(fault, Bent(FAULTS[fault]).well_posed())
 
 
-def test_energies_that_are_right_pass_and_a_negative_modulus_is_rejected():
-    for term in (lambda F: 0 * F[..., 0, 0], lambda F: 1e5 * (green(F, 1, 1) - 1) ** 4):
-        assert Bent(term).well_posed() == ""
-    soft = MooneyRivlin(C10=1e4, C01=-2e4, **REST)
-    assert "make it positive" in soft.well_posed()
+@pytest.mark.parametrize("c", [0.0, 1e5])
+def test_an_energy_that_is_right_passes(c):
+    assert Bent(lambda F: c * (green(F, 1, 1) - 1) ** 4).well_posed() == ""
 
 
 def test_an_energy_that_collapses_at_the_strains_of_a_run_fails_check_energy():
     """In simple shear s the modulus of Yeoh's energy is 2 C10 + 12 C20 s^2: negative from 0.236 on
     with C20 = -3 C10."""
-    rubber = Yeoh(C10=1.3e5, C20=-3.9e5, **REST)
+    rubber = Yeoh(C10=1.3e5, C20=-3.9e5, **REST, tau=0.01)
     modulus = lambda s: 2 * 1.3e5 - 12 * 3.9e5 * s**2
     F = plane(f64(1.0, 0.3, 0.0, 1.0).reshape(1, 2, 2))
     assert float(rubber.stress_and_moduli(F)[1][0, 1, 1]) == pytest.approx(modulus(0.3), rel=1e-9)
@@ -284,81 +293,99 @@ def test_an_energy_that_collapses_at_the_strains_of_a_run_fails_check_energy():
 
     run = {"rig": rig, "t": f64(0.0, 1e-6)}
     check_energy(**run, y0=sheared(0.2))
-    with pytest.raises(CheckFailed, match=r"`P`: the energy is not stable at F = .*0\.3") as failed:
+    with pytest.raises(CheckFailed, match=r"`P`: the energy is not stable at F = .*0\.3"):
         check_energy(**run, y0=sheared(0.3))
-    least = float(re.search(r"stiffness is (\S+) Pa", str(failed.value))[1])
-    assert least == pytest.approx(modulus(0.3), rel=0.1)
 
 
 def test_ogdens_sums_are_smooth_where_stretches_are_equal():
-    rubber = MATERIALS["ogden"]()
-
-    def energy(a: float, b: float, turn: float) -> float:
-        c, s = np.cos(turn), np.sin(turn)
-        R = torch.tensor([[c, -s], [s, c]])
-        F = torch.eye(3).double()
-        F[:2, :2] = torch.diag(f64(a, b)) @ R
-        return float(rubber.distortion(F).detach())
-
-    def direct(a: float, b: float) -> float:
-        J = a * b
-        return sum(
-            2 * mu.item() / k.item() ** 2
-            * (sum((x * J ** (-1 / 3)) ** k.item() for x in (a, b, 1.0)) - 3)
-            for mu, k in rubber.series()
-        )  # fmt: skip
-
+    rubber, R = (
+        energy("ogden"),
+        torch.tensor([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]),
+    )
     for a, b in ((1.3, 1.3), (1.3, 1.3001), (1.1, 1.35), (0.5, 2.2), (0.8, 0.95)):
-        assert energy(a, b, 0.7) == pytest.approx(direct(a, b), rel=1e-10)
+        F = plane(torch.diag(f64(a, b)) @ R)
+        expected = sum(
+            2 * mu / k**2 * (sum((x * (a * b) ** (-1 / 3)) ** k for x in (a, b, 1.0)) - 3)
+            for mu, k in zip(ENERGIES["ogden"]["mu"], ENERGIES["ogden"]["alpha"])
+        )
+        assert float(rubber.distortion(F).detach()) == pytest.approx(expected, rel=1e-10)
 
 
-# rest, runs, files
-# ----------------------------------------------------------------------
+def test_cauchys_stress_is_that_of_theory():
+    rubber = energy("neo_hookean")
+    setup = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), rubber))
+    F = np.array([[1.2, 0.3], [-0.1, 0.75]])
+    u = setup.mesh.nodes @ (F - np.eye(2)).T
+    J, b = np.linalg.det(F), np.eye(3)
+    b[:2, :2] = F @ F.T
+    mu, kappa = rubber.shear.item(), rubber.bulk.item()
+    sigma = mu / J ** (5 / 3) * (b - np.trace(b) / 3 * np.eye(3)) + kappa * (J - 1) * np.eye(3)
+    found = setup.stress(u)
+    expected = np.tile(sigma[[0, 1, 2, 0], [0, 1, 2, 1]], (len(found), 1))
+    assert found == pytest.approx(expected, rel=1e-10)
+    U = setup.strain(u)[0] + [1, 1, 0]
+    stretches = np.linalg.eigvalsh([[U[0], U[2]], [U[2], U[1]]])
+    assert stretches == pytest.approx(np.sort(np.linalg.svd(F)[1]), rel=1e-10)
+    custom = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), Bent(lambda F: F[..., 0, 0])))
+    with pytest.raises(ValueError, match="one of your own"):
+        custom.stress(u)
 
 
-def pressed(nu: float, depth: float, material=NeoHookean, **mesh: int) -> float:
-    """Force [N] on the paper's disc, held so deep [m] in a lower pad, without friction or rates."""
-    sizes = {"length": 0.06, "height": 4.59e-3, "elements_x": 60, "elements_y": 4} | mesh
-    built = paper({"laws.steel_on_rubber.K_n": 4e6})
-    rig = built.rig
-    own = RUBBER | {"nu": nu}
-    rig.pads["L"] = Pad(PadMesh(**sizes), material(**own, tau=0.01), origin=(30e-3, 0.0))
-    pose = {
-        "disc": f64(60e-3, 4.59e-3 + 19.37e-3 - depth, 0.0), "bracket": f64(60e-3, 1.0, 0.0)
-    }  # fmt: skip
-    still = {name: torch.zeros(3).double() for name in pose}
+# pads
+
+
+def test_the_ratio_of_times_counts_for_branches_and_inertia_allows_none():
+    rubber, mesh = energy("neo_hookean", **ARMS), PadMesh(4e-3, 3e-3, 4, 3)
+    times = Pad(mesh, rubber, tau_ratio=2.0).factors()[[1, 5, 7]].tolist()
+    assert times == pytest.approx([0.02, *(2 * t for t in ARMS["times"])])
+    with pytest.raises(NotImplementedError, match="`P` needs a material of one retardation time"):
+        Pad(mesh, rubber, inertial=True).check_chain("P")
+
+
+def pressed(nu: float, depth: float, kind: str = "neo_hookean", finer: int = 1) -> float:
+    """Force [N] of the lower pad on the paper's disc, held so deep [m] in it."""
+    rubber = {"kind": kind, "E": 7.5e5, "nu": nu, "tau": 0.01, "depth": 0.044}
+    mesh = {"elements_x": 30 * finer, "elements_y": 2 * finer, "length": 0.06}
+    changes = {f"pads.L.{name}": value for name, value in mesh.items()}
+    changes |= {"materials.rubber": rubber, "laws.steel_on_rubber.K_n": 4e6}
+    changes |= {"pads.L.origin": [0.03, 0.0]}
+    rig = still(changes)
     with torch.no_grad():
-        y = settled(rig, pose, still, unstretched(rig, ()))
-        signals = torch.zeros(len(rig.signals), 2).double()
-        load = net_loads(rig, rig.unpack(y, signals), signals, ())["disc"][1]
-    return float(load) + 0.4065 * 9.81
+        y = rig.state(
+            disc={"x": 60e-3, "y": 4.59e-3 + 19.37e-3 - depth}, bracket={"x": 60e-3, "y": 1.0}
+        )
+        return float(rig.evaluate(0.0, rig.unpack(y)).interfaces["L"].law.force[:, 0].sum())
 
 
-def test_a_layer_that_is_pressed_by_a_sixth_is_stiffer_than_linear():
-    for nu, low, high in ((0.45, 1.15, 1.30), (0.49, 1.25, 1.45)):
-        finite, linear = pressed(nu, 0.75e-3), pressed(nu, 0.75e-3, KelvinVoigt)
-        assert low < finite / linear < high
-        little = [pressed(nu, 1e-6, kind) for kind in (NeoHookean, KelvinVoigt)]
-        assert little[0] == pytest.approx(little[1], rel=2e-3)
+@pytest.mark.parametrize(("nu", "low", "high"), [(0.45, 1.15, 1.30), (0.49, 1.25, 1.45)])
+def test_a_layer_that_is_pressed_by_a_sixth_is_stiffer_than_linear(nu, low, high):
+    finite, linear = (pressed(nu, 0.75e-3, kind) for kind in ("neo_hookean", "kelvin_voigt"))
+    assert low < finite / linear < high
+    finite, linear = (pressed(nu, 1e-6, kind) for kind in ("neo_hookean", "kelvin_voigt"))
+    assert finite == pytest.approx(linear, rel=2e-3)
 
 
 def test_nearly_incompressible_pads_do_not_lock():
-    coarse = pressed(0.499, 0.4e-3)
-    fine = pressed(0.499, 0.4e-3, elements_x=120, elements_y=8)
-    assert coarse == pytest.approx(fine, rel=0.04)
+    assert 0.94 < pressed(0.499, 0.4e-3) / pressed(0.499, 0.4e-3, finer=2) < 1.0
 
 
-NEO = {"kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044}
+ELASTIC = {"kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044}
+RELAXING = ELASTIC | {"moduli": [4.5e5], "times": [0.05]}
 COARSE = {
-    "materials.rubber": NEO, "pads.L.elements_x": 60, "pads.U.elements_x": 60,
-    "pads.L.elements_y": 2, "pads.U.elements_y": 2,
+    "pads.L.elements_x": 60, "pads.U.elements_x": 60, "pads.L.elements_y": 2,
+    "pads.U.elements_y": 2,
     "outputs": {"duration": 0.2, "interval": 5e-3, "snapshots": [0.0], "figures": False},
 }  # fmt: skip
 
 
+@pytest.fixture(scope="module", params=[ELASTIC, RELAXING], ids=["elastic", "relaxing"])
+def rubber(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def grasp():
-    return paper(COARSE)
+def grasp(rubber):
+    return paper(COARSE | {"materials.rubber": rubber})
 
 
 @pytest.fixture(scope="module")
@@ -366,64 +393,67 @@ def run(grasp):
     return grasp.run(rtol=1e-5)
 
 
-def test_the_ledger_closes_by_tolerance(grasp, run):
+def test_the_ledger_closes_at_the_tolerance(grasp, run):
     loose = grasp.run(rtol=1e-3)
-    assert run.energy_residual_rel < 1e-5
+    assert run.energy_residual_rel < 2e-5
     assert run.energy_residual_rel < 0.2 * loose.energy_residual_rel
     assert float(run.dissipated["pad_L"].diff().min()) >= 0
     assert float(run.energy["strain_L"][-1].detach()) > 1e-3
 
 
-def test_it_starts_at_rest_and_stays(grasp):
-    rig, y0 = grasp.rig, grasp.y0
-    t = torch.linspace(0, 0.02, 3, dtype=torch.float64)
-    held = paper(COARSE | {"motion.y_d": {"kind": "hold", "value": 49.99e-3}})
-    kept = simulate(held.rig, t, y0=held.y0, rtol=1e-6)
+def test_branches_rest_at_the_start_and_follow(run):
+    u, *branches = run.state.pads["L"].detach().split(2, -1)
+    assert torch.equal(run.displacement["L"].detach(), u)
+    for v in branches:
+        assert torch.equal(u[0], v[0])
+        assert float((u - v).abs().max()) > 1e-5
+
+
+def test_a_run_that_starts_in_equilibrium_stays_there(rubber):
+    held = {"materials.rubber": rubber, "motion.y_d": {"kind": "hold", "value": 49.99e-3}}
+    built = paper(COARSE | held)
+    kept = simulate(built.rig, f64(0.0, 0.01, 0.02), y0=built.y0, rtol=1e-6)
     assert float((kept["y_C"] - kept["y_C"][0]).abs().max()) < 2e-7
-    assert rig.layout.size == len(y0)
 
 
-def test_a_run_is_kept_in_files_and_shown(run, tmp_path):
+def test_a_run_is_kept_in_files_and_shown(rubber, run, tmp_path):
     run.save(tmp_path / "run.nc")
     loaded = Trajectory.load(tmp_path / "run.nc")
     assert torch.equal(loaded.y, run.y)
     pad = loaded.setup.pads["L"]
-    assert pad.energy == {"rho": 1100.0, **NEO}
-    whole = pad.displacement(run.displacement["L"][-1].numpy())
-    assert pad.stress(whole).min() < -5e4
-    assert 0.05 < pad.largest_strain(run.displacement["L"][-1].numpy()) < 0.5
-    assert set(loaded.contact_state["L"][-1].unique().tolist()) <= {0, 1, 2}
+    assert pad.energy == {"rho": 1100.0, **rubber}
+    u = run.displacement["L"][-1].numpy()
+    assert pad.stress(pad.displacement(u)).min() < -5e4
+    assert 0.05 < pad.largest_strain(u) < 0.5
     assert loaded.to_vtk(tmp_path / "run.pvd", [0.2])
 
 
-def test_cauchys_stress_is_that_of_theory():
-    rubber = MATERIALS["neo_hookean"]()
-    setup = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), rubber))
-    F = np.array([[1.2, 0.3], [-0.1, 0.75]])
-    u = setup.mesh.nodes @ (F - np.eye(2)).T
-    J, b = np.linalg.det(F), np.diag([0.0, 0.0, 1.0])
-    b[:2, :2] = F @ F.T
-    mu, kappa = rubber.shear.item(), rubber.bulk.item()
-    sigma = mu / J ** (5 / 3) * (b - np.trace(b) / 3 * np.eye(3)) + kappa * (J - 1) * np.eye(3)
-    found = setup.stress(u)
-    for i, j, k in ((0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 1, 3)):
-        assert found[:, k] == pytest.approx(sigma[i, j], rel=1e-10)
-    U = setup.strain(u)[0] + [1, 1, 0]
-    stretches = np.linalg.eigvalsh([[U[0], U[2]], [U[2], U[1]]])
-    assert stretches == pytest.approx(np.sort(np.linalg.svd(F)[1]), rel=1e-10)
-    own = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), Bent(lambda F: F[..., 0, 0])))
-    with pytest.raises(ValueError, match="one of your own"):
-        own.stress(u)
+def let_go(material: Any, force: Tensor, times: Tensor) -> Tensor:
+    """Displacements (times, surface, 2) of a pad that was in equilibrium under forces on its
+    surface and is let go, on given steps."""
+    pad = Pad(PadMesh(12e-3, 4.59e-3, 12, 3), material)
+    away = Body(0.4, Circle(5e-3), x=0.0, y=1.0, theta=0.0, weighted=False)
+    law = SoftContact(1.2e5, 441.7, 1.1e5, 430.0, friction=SmoothSlip(0.5, 0.4, 5e-2))
+    contact = Contact("floor", "disc", law, may_leave=True)
+    rig = Rig(bodies={"disc": away}, pads={"floor": pad}, contacts={"touch": contact})
+    part = force.expand(pad.branches, -1, -1)
+    if pad.nodal:
+        linear, mesh = pad.condensed(), pad.mesh
+        u = (linear.compliance() @ force.flatten()).unflatten(0, (-1, 2)).detach().numpy()
+        whole = PadSetup.of(linear).displacement(u)[mesh.free]
+        part = torch.from_numpy(np.tile(whole, pad.fields))
+    still = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
+    y0 = rig.pack(still._replace(pads={"floor": part}))
+    run = simulate(rig, times, y0=y0, step=5e-3, tolerance=1e-10)
+    return pad.at_points(run.displacement["floor"]).detach()
 
 
-def test_its_numbers_are_unknowns_like_any(grasp):
-    rig = grasp.rig
-    assert rig.quantity("materials.rubber.E").unit == "Pa"
-    ogden = {"kind": "ogden", "mu": [2.5e5], "alpha": [2.0]} | {
-        name: NEO[name] for name in ("nu", "tau", "depth")
-    }
-    other = paper(COARSE | {"materials.rubber": ogden})
-    assert float(other.rig.parameter("materials.rubber.mu_1").detach()) == 2.5e5
-    file = PAPER.override(COARSE | {"materials.rubber": ogden})
-    changed = file.override({"materials.rubber.alpha_1": 3.0}).build()
-    assert float(changed.rig.parameter("materials.rubber.alpha_1").detach()) == 3.0
+def test_a_little_motion_is_that_of_the_linear_chain():
+    """A pad that creeps back, on the same steps as a linear one with the same chain."""
+    rubber = energy("neo_hookean", moduli=[4.5e5], times=[0.05])
+    force = 1e-5 * torch.randn(13, 2, generator=torch.Generator().manual_seed(0)).double()
+    times = torch.linspace(0, 0.1, 5, dtype=torch.float64)
+    finite, linear = (let_go(one, force, times) for one in (rubber, rubber.linear()))
+    scale = float(linear[0].abs().max())
+    assert float((finite - linear).abs().max()) < 1e-6 * scale
+    assert 0.05 < float(linear[-1].abs().max()) / scale < 0.9
