@@ -71,7 +71,7 @@ def test_decreasing_times_are_rejected_or_warned_of(verb):
     y0 = grasped(model, (0.01, 0.0))
     with pytest.raises(ValueError, match=r"`t` must increase strictly.*\[0.5, 0.48\]"):
         verb(model, y0, f64(0.5, 0.48, 0.46), method=METHOD)
-    how = {"method": "rk4", "options": {"step_size": 1e-5}}
+    model, how = coarse(), {"method": "rk4", "options": {"step_size": 1e-5}}
     with torch.no_grad(), pytest.warns(UserWarning, match="backwards.*use increasing times"):
         verb(model, y0, f64(2e-5, 0.0), **how)
     end = verb(model, y0, f64(0.0, 2e-5), **how)[-1].sum()  # forwards nothing is said
