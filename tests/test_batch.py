@@ -57,7 +57,7 @@ def test_every_run_is_the_one_it_would_be_alone(start, threads):
     how = {"parameters": given, "rtol": 1e-4, "threads": threads}
     batch = simulate_batch(model, T, y0=starts, gradient="discrete", **how)
     ahead = simulate_batch(model, T, y0=y0, gradient="forward", wrt=WRT, rigid=True, **how)
-    assert float(model.parameter("contact.K_n")) == 1.2e5
+    assert model.parameter("contact.K_n").item() == 1.2e5
     assert batch.y.shape == (3, 5, model.layout.size)
     assert batch["theta"].shape == batch.mask.shape == (3, 5)
     assert batch.mask.all()

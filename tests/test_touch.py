@@ -166,7 +166,7 @@ def test_taxels_are_sensors_of_a_fit_and_columns_of_its_recordings():
     recorded = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
     recorded |= {"L.centre": Sensor(noise=1e-4), "bracket_moment": Sensor(noise=1e-3)}
     data = record("press", built, {"pad.E": 0.8e6}, recorded, noise=0.0)
-    assert data.channels == (*list(recorded)[:4], "L.centre", "M_U")
+    assert data.channels[-6:] == (*list(recorded)[:4], "L.centre", "M_U")
     assert data.units["skin.normal.18"] == "N"
     sensors = {"skin.normal": Sensor(noise=0.02), "L.centre": Sensor(noise=1e-4)}
     sensors |= {"skin.normal.19": Sensor(noise=0.01, gain=0.1)}

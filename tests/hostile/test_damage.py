@@ -1,14 +1,10 @@
 """Damage to every kind of file that is read back: it is never executed, and noticed, or the values
 are those that were written."""
 
-import io
-import warnings
 from collections.abc import Callable
-from contextlib import redirect_stderr
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
-from unittest import mock
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -26,7 +22,7 @@ from hostile.damage import (
     damage,
     forged,
 )
-from hostile.processes import ended, fork, kernel, restore
+from hostile.processes import ended, fork, restore, tree
 from hostile.specimens import dataset, make, problem, run
 from hostile.trial import LIMIT, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
@@ -35,12 +31,10 @@ from torchsoft.datasets.files import StoreError
 from torchsoft.files import sealed
 from torchsoft.rigs import RigFile
 from torchsoft.solve.formats import load
-from torchsoft.solve.kernel import objects
 from torchsoft.sysid import IdentificationResult, Problem, identify
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.measured import vocabulary
 from torchsoft.sysid.result import load_answer
-from torchsoft.sysid.runs import Journal, encoded
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::zarr.errors.ZarrUserWarning")]
 
@@ -67,78 +61,22 @@ def misread(read: Callable[[], bool], name: str = "") -> str:
         return "" if fine else f"not one sentence with the file's name: {refusal}"
 
 
-# kernels
-# ----------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    def wrong(path: Path, kind: str) -> str:
-        for _ in range(2):
-            objects._said.clear()
-            with (
-                mock.patch.object(objects, "FOLDERS", [path.parent]),
-                redirect_stderr(io.StringIO()) as said,
-            ):
-                right, found = kernel()
-            right = right and said.getvalue().count("\n") <= 1
-        healed = found or kind == "a folder"
-        return "" if right and healed else f"{right}, {healed}: {said.getvalue()}"
-
-    sound = tmp_path_factory.mktemp("compiled") / "kernels"
-    with mock.patch.object(objects, "FOLDERS", [sound]):
-        kernel()
-    kinds = PLANTED | FOREIGN | {"a pipe": SPECIAL["a pipe"]}
-    return Specimen(sound, wrong, lambda path, content: bytes(32) + content, kinds)
-
-
 # identifications
 # ----------------------------------------------------------------------
 
 
 class Identified(NamedTuple):
-    """An identification, the folder that its runs are kept in, and the fingerprint of their
-    recordings, the runs and their results by file name."""
+    """An identification, its answer, and the folder that its runs are kept in."""
 
     problem: Problem
     answer: IdentificationResult
     folder: Path
-    runs: dict[str, tuple[str, Any, Any]]
-
-    def recalled(self, path: Path) -> Any:
-        """The result of a run as the journal in a folder has it."""
-        journal = Journal(path.parent, [])
-        journal._own, run, _ = self.runs[path.name]
-        return journal.recall(run)
 
 
 @pytest.fixture(scope="module")
 def identified(tmp_path_factory):
-    recorded, runs, inner = problem(), {}, Journal.keep
-
-    def noticed(self: Journal, run: Any, result: Any) -> None:
-        runs[self._place(run)[1].name] = self._own, run, result
-        inner(self, run, result)
-
-    folder = tmp_path_factory.mktemp("checkpoint") / "runs"
-    with mock.patch.object(Journal, "keep", noticed):
-        answer = identify(recorded, rtol=RTOL, checkpoint=folder)
-    assert len(runs) >= 5
-    return Identified(recorded, answer, folder, runs)
-
-
-@pytest.fixture(scope="module")
-def checkpoint(identified):
-    def wrong(path: Path, kind: str) -> str:
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            got = identified.recalled(path)
-        quiet = not path.is_file() or kind in GONE  # there is no file
-        told = len(said) == 1 and "\n" not in str(said[0].message)
-        return "" if got is None and (told or quiet) else f"{got!r:.200}, {[*map(str, said)]}"
-
-    seal = lambda path, content: forged(bytes.fromhex(path.stem), content)
-    return Specimen(identified.folder, wrong, seal, PLANTED | FOREIGN | SPECIAL)
+    recorded, folder = problem(), tmp_path_factory.mktemp("checkpoint") / "runs"
+    return Identified(recorded, identify(recorded, rtol=RTOL, checkpoint=folder), folder)
 
 
 @pytest.fixture(scope="module")
@@ -150,31 +88,28 @@ def answer(identified, tmp_path_factory):
     return Specimen(sound, wrong, damages=PLANTED | SPECIAL)
 
 
-def bits(answer: IdentificationResult) -> Any:
-    """All that the data decide."""
-    found = answer.x, answer.estimates, answer.covariance, answer.chi2, answer.residuals
-    return *found, answer.notices
-
-
 @pytest.mark.filterwarnings("ignore:the checkpoint")
-def test_the_answer_keeps_its_bits(identified, checkpoint, tally, tmp_path):
+def test_the_answer_keeps_its_bits(identified, tally, tmp_path):
     """Whatever happened to however many files, and afterwards every file is whole again."""
     line, folder = tally("identifications resumed from damaged checkpoints"), tmp_path / "runs"
-    damages = BYTES | GONE | checkpoint.damages
-    kinds = sorted(damages.keys() - {"a folder"})
-    names, trap = sorted(identified.runs), Trap(tmp_path / "executed")
+    kinds, trap = BYTES | GONE | PLANTED | FOREIGN | SPECIAL, Trap(tmp_path / "executed")
+    kinds.pop("a folder")
+    sound = tree(identified.folder)
+    names = sorted(name for name in sound if name.endswith(".run"))
+    data = lambda answer: (answer.x, answer.estimates, answer.covariance, answer.residuals)
     for number in range(count(24)):
         rng = random("resumed", number)
         restore(folder, identified.folder)
         for name in rng.permutation(names)[: 1 + number % len(names)].tolist():
             path, other = folder / name, identified.folder / str(rng.choice(names))
-            seal = partial(checkpoint.seal, path)
-            damage(damages[str(rng.choice(kinds))], Victim(path, rng, other, trap, seal))
+            seal = partial(forged, bytes.fromhex(path.stem))
+            copy = tmp_path / "other.run"
+            copy.write_bytes(other.read_bytes())
+            damage(kinds[str(rng.choice([*kinds]))], Victim(path, rng, copy, trap, seal))
         again = identify(identified.problem, rtol=RTOL, checkpoint=folder)
-        whole = [encoded(identified.recalled(folder / name)) for name in names]
-        held = whole == [encoded(result) for _, (*_, result) in sorted(identified.runs.items())]
-        held = held and bits(again) == bits(identified.answer) and not trap.path.exists()
-        line.held(held, f"{number}: {bits(again)}")
+        held = repr(data(again)) == repr(data(identified.answer)) and not trap.path.exists()
+        whole = {*tree(folder)} >= {*names} and all((folder / name).is_file() for name in names)
+        line.held(held and whole, f"{number}: {data(again)}")
 
 
 # datasets and trajectories
@@ -244,8 +179,6 @@ def trajectory(tmp_path_factory):
 # ----------------------------------------------------------------------
 
 FILES: dict[str, tuple[str, str, int]] = {
-    "compiled kernels": ("compiled", "*.o", 280),
-    "runs of a checkpoint": ("checkpoint", "*.run", 420),
     "answers": ("answer", "*.json", 200),
     "trajectory files": ("trajectory", "*.nc", 1400),
     "metadata of a dataset": ("generated", "**/*.json", 280),

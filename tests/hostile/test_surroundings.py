@@ -4,17 +4,16 @@ Kernels of a few lines stand for the real ones wherever no physics matters, sinc
 minute to compile.
 """
 
+import json
 import os
 import re
 import shutil
 import subprocess
-import tomllib
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from hostile.damage import document
 from hostile.processes import ROOT, USER, start
 from hostile.specimens import IDENTIFICATION, ROLL, ROLLING, cells, csv_text
 from hostile.trial import Tally, count
@@ -124,59 +123,27 @@ with ThreadPoolExecutor(8) as pool:
 # ----------------------------------------------------------------------
 
 LOCALES: tuple[dict[str, str], ...] = (
-    {},
-    {"LC_ALL": "C"},
-    {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-)
+    {}, {"LC_ALL": "C"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+)  # fmt: skip
 """The last knows ASCII only."""
 
-IDENTIFY, GENERATE = ("torchsoft", "identify"), ("torchsoft", "dataset", "make")
-COMMANDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
-    (IDENTIFY, "data.csv rig.toml --rtol 1e-300", "rtol"),
-    (IDENTIFY, "data.csv many.toml", "--yes"),
-    (IDENTIFY, "data.csv µ.toml", "µ"),
-    (IDENTIFY, "data.csv bad.toml", "not a TOML file"),
-    (GENERATE, "million.toml --out o", "--yes"),
-    (GENERATE, "huge.toml --out o", "elements_x"),
-    (GENERATE, "set.toml --out data.csv/o --workers 0", "data.csv"),
-    (GENERATE, "set.toml --out o --workers -1", "--workers"),
-)
-"""Commands that end with status 2, and a word of the last line."""
 
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Recordings, configurations, and some that are wrong."""
-    rig = tomllib.loads(IDENTIFICATION)
-    data = tomllib.loads(sorted((ROOT / "data_gen" / "configs").glob("*.toml"))[2].read_text())
-    data["rig"] = "paper"
-    table = cells()
-    trees = {
-        "rig.toml": rig,
-        "many.toml": rig | {"fit": {"starts": 1_000_000}},
-        "µ.toml": rig | {"µ": 1},
-        "set.toml": data,
-        "million.toml": data | {"trajectories": 1_000_000},
-        "huge.toml": data | {"fixed": {"pads.L.elements_x": 40_000}},
-    }
-    files = {name: document(tree).encode() for name, tree in trees.items()} | {
-        "data.csv": csv_text(table).encode(),
-        "bad.toml": b"title = '\xff'\n",
-    }
-    for name, content in files.items():
-        (tmp_path / name).write_bytes(content)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def test_commands_as_processes(folder, tally):
-    """Nothing is begun, the status is 2, and the last line says why in any locale."""
-    line, before = tally("commands as processes"), sorted(os.listdir(folder))
-    for i in range(count(16)):
-        module, arguments, word = COMMANDS[i % len(COMMANDS)]
-        where = LOCALES[(i + i // len(COMMANDS)) % len(LOCALES)]
-        words = map(re.escape, (word, word.encode("ascii", "backslashreplace").decode(), "\\udc"))
-        told = f"(.*\n)?[^\n]*({'|'.join(words)})[^\n]*\n"
-        command = "-m", *module, *arguments.split()
-        expect(line, *command, status=2, out="", err=told, cwd=folder, **where)
-    assert sorted(os.listdir(folder)) == before, "something was begun"
+@pytest.mark.parametrize("locale", LOCALES)
+def test_commands_say_why_in_any_locale(tmp_path, locale, tally):
+    """Nothing is started, the status is 2, and the last line says why; names are kept in files."""
+    line, identify = tally(f"commands under {locale}"), ("-m", "torchsoft", "identify")
+    data, config = tmp_path / "größe µ.csv", tmp_path / "αβ.toml"
+    data.write_text(csv_text(cells()), encoding="utf-8")
+    command = *identify, str(data), str(config), "--out", str(tmp_path / "ö"), "--no-progress"
+    for wrong, word in (
+        (b"title = '\xff'\n", "not a TOML file"), (b"a = " + b"[" * 20_000, "nested too deeply"),
+        ((IDENTIFICATION + "[unknowns.'pad.µ']\n").encode(), "pad"),
+        ((IDENTIFICATION + "starts = 1000000\n").encode(), "--yes"),
+    ):  # fmt: skip
+        config.write_bytes(wrong)
+        told = f"(.*\n)?[^\n]*{word}[^\n]*\n"
+        expect(line, *command, status=2, out=".*", err=told, **locale)
+    config.write_text("# Reibung µ, Größe θ\n" + IDENTIFICATION, encoding="utf-8")
+    expect(line, *command, err=".*", **locale)
+    written = json.loads((tmp_path / "ö" / "answer.json").read_text(encoding="utf-8"))
+    line.held("größe µ" in str(written), "the name is lost")
