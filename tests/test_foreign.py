@@ -238,35 +238,6 @@ def test_a_weight_off_the_centre_rocks():
 
 
 @pytest.mark.slow
-def test_adhesion_draws_and_friction_depends_on_what_presses():
-    p, depth = OWN._replace(adhesion=0.02), 5e-5
-    drawn = p.adhesion * depth / (depth + TAKEN_IN)
-    for v in (0.0, 1.0):
-        at = (0.0, 0.0, v / (p.radius - depth), 0.0, -(p.radius - depth), 0.0, False, 0.6, 0.4)
-        own, other = node(OWN, STEP, *at), node(p, STEP, *at)
-        assert other[:2] == (own[0], pytest.approx(own[1] + drawn))
-    p = REST._replace(adhesion=0.02)
-    X, C, share = pads(p)
-    y, _ = lying(p, C[0], X, share)
-    assert y < lying(REST, C[0], X, share)[0] - 1e-8
-    assert hanging(p, 0.02).channels["y_C"] == pytest.approx(y, abs=1e-9)
-
-
-def test_pads_of_another_height_and_length():
-    """Without lateral contraction a pad under a uniform load is a spring of its height; surfaces
-    stay."""
-    p = OWN._replace(nu=0.0, thicker=1.1, thicker_U=0.9, upper=1.25, longer=1.05)
-    (X, C, share), (own, _, _) = pads(p), pads(OWN)
-    force = np.zeros((len(share), 2))
-    force[:, 1] = share * p.spacing * p.depth  # 1 Pa
-    for k, height in enumerate((1.1 * p.height, 0.99 * p.height / 1.25)):
-        u = (C[k] @ force.ravel()).reshape(-1, 2)
-        np.testing.assert_allclose(u[:, 1], height / p.E, rtol=1e-9)
-        assert np.ptp(X[k, :, 0]) == pytest.approx(p.longer * p.length)
-    assert (X[:, :, 1] == own[:, :, 1]).all()
-
-
-@pytest.mark.slow
 def test_a_tilted_pad_is_a_turned_gravity():
     """To first order the disc rolls down a pad as it does along a level one in a gravity turned
     the other way, by half of a fall along the slope over 1.5 masses, less by the mesh."""
@@ -276,18 +247,6 @@ def test_a_tilted_pad_is_a_turned_gravity():
     )
     assert down == pytest.approx(along, rel=0.05)
     assert 0.8 < along / (0.5 * 9.81e-3 / 1.5 * 0.1**2) < 1.0
-
-
-@pytest.mark.slow
-def test_compliance_that_sets_in_at_once():
-    """All of it: pads with a retardation time of a microsecond. A part of it lies between."""
-    at_once, fast, part, slow = (
-        hanging(REST._replace(adhesion=0.05, softening=0.5, **one), 0.02).channels
-        for one in ({"fast": 1.0}, {"tau": 1e-6}, {"fast": 0.5}, {})
-    )
-    for c in CHANNELS:
-        np.testing.assert_allclose(at_once[c], fast[c], rtol=0, atol=1e-10)
-    assert at_once["y_C"][-1] < part["y_C"][-1] < slow["y_C"][-1]
 
 
 @pytest.mark.slow

@@ -1,9 +1,7 @@
 """Object files of the kernels: named after what they are made from, checked before they are used,
 made again where they are missing; and the tables that kernels take."""
 
-import copy
 import os
-import pickle
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -191,17 +189,6 @@ def outer(**changed: Any) -> Any:
         "inner": Inner(0.5),
     }  # fmt: skip
     return Outer(**own | changed)
-
-
-@pytest.mark.parametrize("again", [copy.copy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_the_words_of_a_table_and_of_its_copy(again):
-    made = outer()
-    values, numbers = (x.__array_interface__["data"][0] for x in (made.values, made.numbers))
-    assert list(made.packed) == [3, values, 4, numbers, 2, 5, table.address(made.inner)]
-    assert made.inner.packed.tobytes() == np.float64(0.5).tobytes()
-    other = again(made)
-    assert table.address(other) != table.address(made)
-    assert other.packed[1] == other.values.__array_interface__["data"][0]
 
 
 @pytest.mark.parametrize(

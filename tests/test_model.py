@@ -106,11 +106,3 @@ def test_a_step_in_the_room_of_another_is_that_of_a_graph():
         assert torch.equal(done.knots, graph.knots)
         assert same(done.outcome.trajectory(), graph.outcome.trajectory())
         now = done.moment
-
-
-def test_constants_of_elements_follow_the_buffers_of_their_pad():
-    pad, turned = (coarse(pad__inertial=True, pad__elements_x=24).pads["L"] for _ in "12")
-    before = pad.constants
-    turned.axes.neg_()
-    assert (turned.constants[:, :8] == -before[:, :8]).all()
-    assert (pad.constants == before).all()

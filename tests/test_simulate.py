@@ -25,9 +25,7 @@ from torchsoft import (
     Ellipse,
     Profile,
     Rig,
-    Shape,
     SimulationFailed,
-    SmoothSlip,
     hold,
     simulate,
 )
@@ -42,35 +40,6 @@ T = times(0.02, 11)
 def rolled(model: Rig, **options: object):
     """A short run from the grasp, the disc moving."""
     return simulate(model, T, y0=grasped(model, (0.05, 0.0)), step=2e-3, **options)
-
-
-class Polygonal(Shape):
-    """A custom shape in plain torch: a circle by its support, radius and all."""
-
-    def __init__(self, radius: float) -> None:
-        super().__init__()
-        self.r = nn.Parameter(torch.tensor(radius, dtype=torch.float64))
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        d = (x * x).sum(-1).sqrt()
-        return d - self.r, x / d[..., None]
-
-    def gyration(self) -> Tensor:
-        return self.r**2 / 2
-
-    def support(self, direction: Tensor) -> Tensor:
-        return self.r * (direction * direction).sum(-1).sqrt()
-
-
-def test_a_custom_shape_and_friction_law_run_like_those_of_the_package():
-    mine = SmoothSlip(0.8, 0.7, 0.05).requires_grad_(False)  # captured, so a constant of the law
-    own = still(COARSE, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3))
-    rigs = coarse(), own
-    radii = rigs[0].bodies["disc"].shape.radius, own.bodies["disc"].shape.r
-    runs = [rolled(rig, gradient="discrete") for rig in rigs]
-    assert float((runs[0].y - runs[1].y).detach().abs().max()) < 1e-9
-    a, b = (torch.autograd.grad(run["theta"][-1], r)[0] for run, r in zip(runs, radii))
-    assert float(a) == pytest.approx(float(b), rel=1e-6)
 
 
 def test_what_is_saved_is_what_ran():

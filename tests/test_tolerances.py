@@ -145,17 +145,6 @@ def test_what_a_signal_raises_is_raised():
         simulate(model, times(0.1, 6), y0=y0, reference=towards(model, signal), rtol=1e-4)
 
 
-def test_inertial_pads_take_steps_by_tolerance():
-    grasp = {"motion.y_d.times": [0.0, 0.1], "motion.F_ff.times": [0.0, 0.1]}
-    model, y0, _ = paper(COARSE | GRASP | grasp | {"pad.inertial": True, "pad.elements_x": 30})
-    t = times(0.15, 7)
-    loose, tight = (simulate(model, t, y0=y0, rtol=rtol) for rtol in (1e-3, 1e-5))
-    assert float((loose["y_C"] - tight["y_C"]).abs().max()) < 1e-6
-    assert len(np.unique(loose.knots.diff().numpy().round(12))) > 0.5 * len(loose.knots)
-    again = simulate(model, t, y0=y0, knots=loose.knots)
-    assert float((again.y - loose.y).abs().max()) < 1e-9
-
-
 def test_torchdiffeqs_tolerances_are_the_steppers():
     model, t = coarse(), times(0.02, 4)
     y0, grads = grasped(model, (0.03, 0.0)), []

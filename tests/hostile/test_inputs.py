@@ -1,7 +1,6 @@
 """Mutated configurations, identification files and tables of measurements: accepted and then
 finite, or refused in a sentence that names the field, or file, row and column."""
 
-import re
 import tomllib
 from collections.abc import Callable
 from functools import partial
@@ -11,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from hostile.damage import TEXTS, Mutant, Victim, damage, document, mutant, written
+from hostile.damage import Mutant, document, written
 from hostile.processes import ROOT
-from hostile.specimens import Table, cells, csv_text
+from hostile.specimens import cells, csv_text
 from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft import RigFile, simulate
 from torchsoft.cost import Costly, agree
@@ -295,38 +294,4 @@ def test_a_mutated_identification(way, number, folder, tally):
     assert attack(line, Mutant(), load, run_once)
     for i in range(count(number)):
         changed = written(path, trees[i % 10 == 5], way, i, rng)
-        attack(line, changed, load, run_once if i % 10 == 0 else None)
-
-
-# tables of measurements
-# ----------------------------------------------------------------------
-
-NUMBER = re.compile(r"\s*|[-+]?[\d.]+(e[-+]?\d+)?", re.ASCII)
-"""What a cell may hold: a number, or none."""
-
-
-def mutated(table: Table, rng: np.random.Generator) -> tuple[str, Mutant]:
-    """A table with a column scaled, a cell or a row changed, as text."""
-    head, *body = table
-    if rng.random() < 0.2:
-        column, factor = int(rng.integers(len(head))), float(10.0 ** rng.uniform(-6, 6))
-        for row in (body := [[*row] for row in body]):
-            row[column] = repr(float(row[column] or 0) * factor)
-        place = (head[column].partition(" ")[0],)
-        return csv_text([head, *body]), Mutant(place=place, new=f"times {factor}")
-    changed = mutant([[float(x or 0) for x in row] for row in body], rng)
-    place = (head[changed.place[1]].partition(" ")[0],) if changed.place else ()
-    wrong = changed.new if not NUMBER.fullmatch(str(changed.new)) else None
-    return csv_text([head, *changed.tree]), Mutant(None, place, 1.0, wrong and str(wrong))
-
-
-def test_a_mutated_table_of_measurements(folder, tally):
-    line, rng, table = tally("tables of measurements"), random("cells"), cells()
-    path = folder / "data.csv"
-    load = partial(measured.load, [path], folder / "rig.toml")
-    for i in range(count(3000)):
-        text, changed = mutated(table, rng) if i % 4 < 3 else (csv_text(table), Mutant(new=i))
-        path.write_text(text, encoding="utf-8")
-        if i % 4 == 3:
-            damage(TEXTS[i // 4 % len(TEXTS)], Victim(path, rng))
         attack(line, changed, load, run_once if i % 10 == 0 else None)
