@@ -30,6 +30,14 @@ def test_second_order_on_a_smooth_motion(fidelity):
     assert min(np.log2(errors[:2]) - np.log2(errors[1:])) >= 1.8, errors
 
 
+@pytest.mark.parametrize("step", [3e-3, 4.9e-3, 5e-3])
+def test_steps_are_never_longer_than_asked_for(step):
+    model = coarse(pad__elements_x=24)
+    h = simulate(model, times(0.02, 5), y0=grasped(model), step=step).knots.diff()
+    assert h.max() <= step * (1 + 1e-9)
+    assert h.min() > 0.5 * step
+
+
 # how runs end
 # ----------------------------------------------------------------------
 
@@ -224,6 +232,8 @@ def test_a_step_that_newton_does_not_solve_is_halved_and_differentiated(monkeypa
     failed = run.stats.failed_steps
     assert failed > 0
     assert 5 < run.stats.steps < 5 + 64 * failed
+    again = simulate(model, t, y0=y0, knots=run.knots, tolerance=1e-10)
+    assert float((again.y - run.y).detach().abs().max()) < 1e-8
     (slope,) = torch.autograd.grad(run["theta"][-1], E)
     ahead = go(gradient="forward", wrt=["pad.E"], rigid=True)
     assert ahead.stats.failed_steps == failed
