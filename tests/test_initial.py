@@ -71,13 +71,13 @@ def test_derivatives_include_the_start_the_set_points_and_the_feed_forward():
     ahead = built.run(gradient="forward", wrt=names, knots=run.knots)
     leaves = [*map(built.rig.parameter, names)]
     ends = [
-        [anew({name: float(value) * (1 + h)}, knots=run.knots) for h in (1e-4, -1e-4)]
+        [anew({name: value.item() * (1 + h)}, knots=run.knots) for h in (1e-4, -1e-4)]
         for name, value in zip(names, leaves)
     ]
     for channel in ("y_disc", "effort_y"):
         slopes = torch.autograd.grad(run[channel][-1], leaves, retain_graph=True)
         for value, (high, low), slope in zip(leaves, ends, slopes):
-            difference = float(high[channel][-1] - low[channel][-1]) / (2e-4 * float(value))
+            difference = float(high[channel][-1] - low[channel][-1]) / (2e-4 * value.item())
             assert float(slope) == pytest.approx(difference, 1e-4)
     at = built.rig.layout.slices["pose", "disc"].start + 1
     slopes = torch.autograd.grad(run["y_disc"][-1], leaves)
