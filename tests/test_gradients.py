@@ -1,70 +1,94 @@
-"""Gradients of runs: finite differences in every regime of contact; reproducible to the bit."""
+"""Gradients of runs: finite differences and forward sensitivities in every regime of contact;
+reproducible to the bit."""
+
+from typing import Any
 
 import pytest
 import torch
-from conftest import GRASPED, coarse, f64, grasped, times
-from rig_tester import assert_gradients_exact
+from conftest import GRASPED, coarse, f64, grasped, shaken, times
 from torch import Tensor
 
 import torchsoft.solve.gradients
-from torchsoft import Rig, simulate
+from torchsoft import Body, Profile, Reference, Rig, simulate
 from torchsoft.solve.gradients import GradientFailed
-
-Window = tuple[Rig, Tensor, float]
-"""A model, its initial state (size,), and how long it runs [s]."""
+from torchsoft.testing import check_gradients
 
 
 def window(
-    duration: float, velocity: tuple[float, float] = (0.0, 0.0), height: float = GRASPED,
-    x: float = 60e-3, **changes: object,
-) -> Window:  # fmt: skip
+    velocity: tuple[float, float], place: dict[str, float], x_d: float = 0.0, **changes: object
+) -> tuple[Rig, Tensor]:
     model = coarse(**changes)
-    return model, grasped(model, velocity, height=height, x=x), duration
+    y0 = grasped(model, velocity, **place)
+    with torch.no_grad():
+        model.reference["x_d"].values += x_d
+    return model, y0
+
+
+def driven() -> tuple[Rig, Tensor]:
+    """A bracket that follows its set-points exactly."""
+    model = coarse(pad__elements_x=30)
+    state = model.unpack(grasped(model, (0.05, 0.0)))
+    bracket = Body(x="driven", y="driven", theta=0.0, weighted=False)
+    signals = {
+        "bracket.x": Profile([0.0, 4e-3], [0.06, 0.0602]),
+        "bracket.y": Profile([0.0, 4e-3], [GRASPED, GRASPED - 1e-4]),
+    }
+    rig = Rig(
+        bodies={"disc": model.bodies["disc"], "bracket": bracket}, pads=dict(model.pads),
+        contacts=dict(model.contacts), reference=Reference(**signals),
+    )  # fmt: skip
+    return rig, rig.pack(state)
 
 
 SLIPPERY = {"contact__mu_s": 0.3, "contact__mu_k": 0.2}
-
-
-def jerk() -> Window:
-    """A light grasp, the horizontal loop about the bracket, and the bracket far from where that
-    loop wants it."""
-    made = window(6e-3, height=49.7e-3, control__senses="bracket.x", **SLIPPERY)
-    with torch.no_grad():
-        made[0].reference["x_d"].values += 2e-3
-    return made
-
-
-WINDOWS = {
-    "stick": lambda: window(4e-3, (1e-2, 5e-3)),
-    "slip": lambda: window(2e-3, (0.08, 0.0), **SLIPPERY),
-    "make-break": lambda: window(2e-3, (0.3, -0.02), x=0.0609),
-    "jerk": jerk,
-}
+WINDOWS: dict[str, tuple[float, Any]] = {
+    "stick": (4e-3, lambda: window((1e-2, 5e-3), {})),
+    "slip": (2e-3, lambda: window((0.08, 0.0), {}, **SLIPPERY)),
+    "make-break": (2e-3, lambda: window((0.3, -0.02), {"x": 0.0609})),
+    "jerk": (6e-3, lambda: window(
+        (0.0, 0.0), {"height": 49.7e-3}, 2e-3, control__senses="bracket.x", **SLIPPERY)),
+    "driven": (4e-3, driven),
+}  # fmt: skip
+"""Durations [s] and rigs with a start; the jerk is of a light grasp, with the bracket far from its
+set-point."""
 
 
 @pytest.mark.parametrize("name", WINDOWS)
+@pytest.mark.filterwarnings("ignore:the derivatives by .* were not checked")  # without effect
 def test_gradients_are_the_differences_in_every_regime(name):
-    """And the windows are what they are called."""
-    model, y0, duration = WINDOWS[name]()
-    run = assert_gradients_exact((model, y0), times(duration, 5), rtol=1e-6)
+    """Along a direction of the start, of every parameter and of every value of the reference; and
+    the windows are what they are called."""
+    duration, make = WINDOWS[name]
+    model, y0 = make()
+    dy0 = shaken(model, model.unpack(y0), 0) - y0
+    checked = check_gradients(
+        model, times(duration, 5), y0, rtol=1e-6, bound=2e-6, dy0=dy0, each=False,
+        step_error=False,
+    )  # fmt: skip
+    run = checked.run
+    assert sum(one.difference is not None for one in checked.derivatives) == 2
+    assert run.energy_residual_rel < 2e-3
     with torch.no_grad():
-        faces = model.evaluate(run.t, model.unpack(run.y, t=run.t)).interfaces.values()
-    on = torch.cat([face.frame.g > 0 for face in faces], -1)
-    slips = on & torch.cat([face.law.slip != 0 for face in faces], -1)
+        graph = model.evaluate(run.t, model.unpack(run.y, t=run.t))
+        faces = graph.interfaces
+        for side, pad in model.pads.items():  # the torch equations against the kernels
+            assert float((run.force[side] - faces[side].law.force).abs().max()) < 1e-8
+            (x, y), (fx, fy) = pad.positions.T, graph.ports[f"pad_{side}"].effort.movedim(-1, 0)
+            assert torch.allclose(run[f"M_{side}"], (x * fy - y * fx).sum(-1), rtol=0, atol=1e-9)
+    on = torch.cat([face.frame.g > 0 for face in faces.values()], -1)
+    slips = on & torch.cat([face.law.slip != 0 for face in faces.values()], -1)
     touching, leaving = int((on[1:] & ~on[:-1]).sum()), int((on[:-1] & ~on[1:]).sum())
-    if name != "jerk":
+    if name in ("stick", "slip", "make-break"):
         assert (touching > 0 and leaving > 0) if name == "make-break" else touching + leaving == 0
-    assert bool(slips.any()) == (name != "stick")
+    assert bool(slips.any()) == (name not in ("stick", "driven"))
 
 
-def test_same_gradient_twice_and_from_checkpoints_to_the_bit(
-    monkeypatch,
-):
-    """Also when every tape is made again from where its segment began, over several segments."""
+def test_a_gradient_is_the_same_from_checkpoints_to_the_bit(monkeypatch):
+    """When every tape is made again from where its segment starts, over several segments."""
     model = coarse()
     wanted = [grasped(model, (2e-3, 1e-3)).requires_grad_(), *model.parameters()]
     wanted = [p for p in wanted if p.requires_grad]
-    t = torch.cat((times(0.4, 201), f64(0.401, 0.402)))  # another step size at the end
+    t = torch.cat((times(0.1, 51), f64(0.101, 0.102)))  # another step size at the end
 
     def gradients() -> tuple[Tensor, ...]:
         run = simulate(model, t, y0=wanted[0], step=4e-4, gradient="discrete")
@@ -79,10 +103,10 @@ def test_same_gradient_twice_and_from_checkpoints_to_the_bit(
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
-def test_a_cotangent_that_is_not_finite_is_refused(bad):
-    model, y0, duration = WINDOWS["stick"]()
-    solution = simulate(model, times(duration, 5), y0=y0, step=1e-3, gradient="discrete").y
-    cotangent = torch.zeros_like(solution)
+def test_a_cotangent_that_is_not_finite_is_rejected(bad):
+    model = coarse(pad__elements_x=24)
+    y = simulate(model, times(4e-3, 5), y0=grasped(model), step=1e-3, gradient="discrete").y
+    cotangent = torch.zeros_like(y)
     cotangent[3, model.layout.slices["velocity", "disc"]] = bad
     with pytest.raises(GradientFailed, match="the cotangent of output 3 is not finite"):
-        solution.backward(cotangent)
+        y.backward(cotangent)

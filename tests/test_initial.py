@@ -14,25 +14,26 @@ from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Grid, Recording
 from torchsoft.testing import check_gradients
 
-E, MASS, TAU = "materials.rubber.E", "bodies.disc.mass", "materials.rubber.tau"
+E, MASS = "materials.rubber.E", "bodies.disc.mass"
 COARSE = {f"pads.{pad}.elements_{axis}": n for pad in ("lower", "upper")
-          for axis, n in (("x", 30), ("y", 1))}  # fmt: skip
-PRESSED = {"x": 60.3e-3, "y": {"force": 4.0}}
+          for axis, n in (("x", 20), ("y", 1))}  # fmt: skip
 FILE = RigFile.ready("light_grasp").override(
-    COARSE | {"bodies.bracket.start": PRESSED},
+    COARSE | {"bodies.bracket.start": {"x": 60.3e-3, "y": {"force": 4.0}}},
     motion={
-        "y_d": {"kind": "spline", "times": [0.0, 0.05, 0.1], "values": ["start", 49.6e-3, "start"]},
-        "x_d": {"kind": "profile", "offset": "start", "times": [0.0, 0.1], "values": [0.0, 4e-3]},
+        "y_d": {"kind": "spline", "times": [0.0, 0.02, 0.04],
+                "values": ["start", 49.6e-3, "start"]},
+        "x_d": {"kind": "profile", "offset": "start", "times": [0.0, 0.04], "values": [0.0, 2e-3]},
         "F_ff": {"kind": "hold", "value": "held"},
     },
-    outputs={"duration": 0.1, "interval": 5e-3, "snapshots": []},
-)
+    outputs={"duration": 0.04, "interval": 5e-3, "snapshots": []},
+)  # fmt: skip
 """A rig pressed together, whose set-points follow the start and whose feed-forward holds it."""
+TOUCHING = FILE.override({"bodies.bracket.start.y": "touch", "motion.F_ff.value": -4.0})
 CHANNELS = "x_disc", "y_disc", "y_bracket", "effort_y"
 
 
-def anew(values: dict[str, float], **options: object) -> Trajectory:
-    return FILE.override(values).build().run(**options)
+def anew(values: dict[str, float], file: RigFile = FILE, **options: object) -> Trajectory:
+    return file.override(values).build().run(**options)
 
 
 def changed(values: dict[str, float]) -> BuiltRig:
@@ -50,44 +51,36 @@ def assert_same(run: Trajectory, expected: Trajectory) -> None:
 
 
 def test_a_run_starts_from_the_equilibrium_of_the_present_parameters():
+    """Set in place, loaded or copied; a set-point changed in place keeps its change."""
     values = {E: 0.3e6, MASS: 0.6}
-    built, expected = changed(values), anew(values)
-    assert_same(built.run(knots=expected.knots), expected)
+    built, expected, other = changed(values), anew(values), FILE.build()
     assert (built.run().y[0] - built.y0).abs().max() > 1e-5  # the start did move
-    other = FILE.build()
     other.rig.load_state_dict(FILE.override(values).build().rig.state_dict())
-    for one in (other, copy.deepcopy(built)):
+    for one in (built, other, copy.deepcopy(built)):
         assert_same(one.run(knots=expected.knots), expected)
-
-
-def test_a_set_point_changed_in_place_keeps_its_change():
-    built = changed({E: 0.3e6})
     with torch.no_grad():
         built.rig.reference["y_d"].values[1] -= 1e-4
-    expected = anew({E: 0.3e6, "motion.y_d.values": ["start", 49.5e-3, "start"]})
+    expected = anew(values | {"motion.y_d.values": ["start", 49.5e-3, "start"]})
     assert_same(built.run(knots=expected.knots), expected)
 
 
-@pytest.mark.parametrize("channel", ["y_disc", "effort_y"])
-def test_gradients_include_the_start_the_set_points_and_the_feed_forward(channel):
-    built, names = FILE.build(), [E, MASS, TAU]
-    run = built.run(gradient="discrete")
-    run[channel][-1].backward()
-    for name in names:
-        value = built.rig.parameter(name)
-        high, low = (
-            anew({name: value.item() * (1 + h)}, knots=run.knots)[channel][-1]
-            for h in (1e-4, -1e-4)
-        )
-        assert value.grad.item() == pytest.approx(float(high - low) / (2e-4 * value.item()), 1e-4)
-
-
-def test_forward_sensitivities_are_those_of_the_adjoint():
-    built, names = FILE.build(), [E, MASS, "actuators.y.Kp"]
+def test_derivatives_include_the_start_the_set_points_and_the_feed_forward():
+    """Adjoint, forward, and differences of rigs built anew."""
+    built, names = FILE.build(), [E, MASS]
     run = built.run(gradient="discrete")
     ahead = built.run(gradient="forward", wrt=names, knots=run.knots)
+    leaves = [*map(built.rig.parameter, names)]
+    ends = [
+        [anew({name: value.item() * (1 + h)}, knots=run.knots) for h in (1e-4, -1e-4)]
+        for name, value in zip(names, leaves)
+    ]
+    for channel in ("y_disc", "effort_y"):
+        slopes = torch.autograd.grad(run[channel][-1], leaves, retain_graph=True)
+        for value, (high, low), slope in zip(leaves, ends, slopes):
+            difference = float(high[channel][-1] - low[channel][-1]) / (2e-4 * value.item())
+            assert float(slope) == pytest.approx(difference, 1e-4)
     at = built.rig.layout.slices["pose", "disc"].start + 1
-    slopes = torch.autograd.grad(run["y_disc"][-1], [*map(built.rig.parameter, names)])
+    slopes = torch.autograd.grad(run["y_disc"][-1], leaves)
     assert ahead.sensitivities[-1, at].tolist() == pytest.approx([*map(float, slopes)], rel=1e-7)
 
 
@@ -115,40 +108,41 @@ def test_every_run_of_a_batch_starts_at_its_own_parameters():
 
 
 def test_a_check_of_gradients_moves_the_start():
-    built = FILE.build()
-    checked = check_gradients(
-        built.rig, built.t, built.initial, wrt=[E], of=["y_disc"], step_error=False
-    )
-    (one,) = checked.derivatives
+    built = TOUCHING.build()
+    t = built.t[:3]
+    (one,) = check_gradients(
+        built.rig, t, built.initial, wrt=[E], of=["y_disc"], step_error=False
+    ).derivatives
     assert one.difference == pytest.approx(one.adjoint, rel=1e-4)
-    run = built.run(gradient="discrete", rtol=checked.rtol)
-    run["y_disc"][-1].backward()
-    assert one.adjoint == pytest.approx(built.rig.parameter(E).grad.item() * 0.75e6, rel=1e-2)
+    held = built.run(t, y0=built.y0, gradient="discrete")["y_disc"][-1]
+    (slope,) = torch.autograd.grad(held, built.rig.parameter(E))
+    assert abs(one.adjoint - 0.75e6 * float(slope)) > 0.1 * abs(one.adjoint)
 
 
 def test_a_plan_for_a_parameter_moves_the_start():
-    built, goal = FILE.build(), float(anew({E: 0.5e6})["y_disc"][-1])
-    target = Target(channel="y_disc", value=goal, tolerance=1e-7)
+    built = TOUCHING.build()
+    t, at = built.t[:2], 0.7e6
+    goal = float(TOUCHING.override({E: at}).build().run(t)["y_disc"][-1])
+    target = Target(channel="y_disc", value=goal, tolerance=1e-8)
     found = plan(
-        built.rig, built.t, {E: (0.3e6, 0.9e6)}, targets={"y": target}, y0=built.initial,
-        iterations=8, threads=1,
+        built.rig, t, {E: (0.65e6, 0.8e6)}, targets={"y": target}, y0=built.initial, iterations=5,
+        threads=1,
     )  # fmt: skip
     assert found.reached
-    assert float(found.parameters[E]) == pytest.approx(0.5e6, rel=1e-3)
+    assert float(found.parameters[E]) == pytest.approx(at, rel=2e-3)
 
 
 def test_identification_follows_the_start_and_its_set_points():
     """With springs that are "auto", a bracket that touches, and set-points that follow it."""
     auto = {f"laws.wet.{name}": "auto" for name in ("K_n", "R_n", "K_t", "R_t")}
-    file = FILE.override(auto | {"bodies.bracket.start.y": "touch", "motion.F_ff.value": -4.0})
+    file = TOUCHING.override(auto)
     built = file.build()
     samples = {name: (built.t.numpy(), built.t.numpy()) for name in ("y_bracket", "effort_y")}
     made = Recording("bench", built.rig, samples, Standing.built(built, 0.0))
-    begun, grid, at = made.begin(), Grid(built.t, 0), 0.5e6
-    found = predict(begun, {E: at}, grid, [E], 1e-6)
+    at = 0.5e6
+    found = predict(made.begin(), {E: at}, Grid(built.t, 0), [E], 1e-6)
     knots = torch.from_numpy(found.knots)
-    anew = lambda value: file.override({E: value}).build().run(knots=knots)
-    expected, high, low = (anew(value) for value in (at, at * (1 + 1e-4), at * (1 - 1e-4)))
+    expected, high, low = (anew({E: at * by}, file, knots=knots) for by in (1, 1 + 1e-4, 1 - 1e-4))
     for name in samples:
         column, size = made.channels.index(name), float(np.ptp(expected[name].numpy()))
         assert found.signals[:, column] == pytest.approx(expected[name].numpy(), abs=1e-6 * size)

@@ -14,11 +14,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest import mock
 
-import dask
 import pytest
-from matplotlib.figure import Figure
 
 from hostile.processes import (
     DIED,
@@ -27,18 +24,13 @@ from hostile.processes import (
     ended,
     execute,
     fork,
-    kernel,
     performed,
     restore,
     tree,
 )
-from hostile.specimens import IDENTIFICATION, cells, csv_text, dataset, make, problem, run
+from hostile.specimens import IDENTIFICATION, cells, csv_text, dataset, make, run
 from hostile.trial import Tally, count, random
 from torchsoft.cli import main
-from torchsoft.datasets import check
-from torchsoft.solve.kernel import objects
-from torchsoft.sysid import identify
-from torchsoft.sysid import report as page
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
@@ -94,33 +86,14 @@ def test_generation(begun, number, memory, tally):
     assert difference(place / "set", tree(memory / "whole")) == ""
 
 
-def test_results(memory, tally):
-    """The picture of a check, trajectory files, new and written over, and the answer and the page
-    of an identification."""
-    make(dataset(memory), memory / "set")
-    out, ran, recorded = memory / "place" / "out", run(), problem()
-    result = identify(recorded, rtol=1e-3)
-    text = page.page(result, *page.traces(result, recorded, None))
+def test_a_trajectory_file(memory, tally):
+    """New, and written over."""
+    ran, out = run(), memory / "place" / "out"
     shifted = replace(ran, channels=ran.channels | {"effort_x": ran.channels["effort_x"] + 1.0})
     shifted.save(memory / "old" / "run.nc")
-    picture = ["--picture", str(out / "coverage.png")]
-
-    def report() -> None:
-        result.save(out / "answer.json")
-        page.report(result, recorded, out / "report.html")
-
-    with (
-        dask.config.set(scheduler="synchronous"),  # whose threads would be missing after a fork
-        mock.patch.object(check, "figure", return_value=Figure(figsize=(1, 1))),  # is drawn slowly
-        mock.patch.object(page, "page", return_value=text),
-        mock.patch.object(page, "traces", return_value=([], {})),
-    ):
-        checked = lambda: main(["dataset", "check", str(memory / "set"), *picture])
-        crash(tally("crash points of a check"), checked, out, 20)
-        crash(tally("crash points of an identification's results"), report, out, 60)
-        for begin in ("none", "old"):
-            line = tally(f"crash points of a trajectory file, over {begin}")
-            crash(line, lambda: ran.save(out / "run.nc"), out, 30, memory / begin)
+    for begin in ("none", "old"):
+        line = tally(f"crash points of a trajectory file, over {begin}")
+        crash(line, lambda: ran.save(out / "run.nc"), out, 30, memory / begin)
 
 
 # at random moments
@@ -181,12 +154,9 @@ def survivors(group: int) -> bool:
 STOPS: dict[str, tuple[Callable[[Path], Work], int, signal.Signals, int]] = {
     "generations": (generation, 1, signal.SIGKILL, 40),
     "one of two generations at once": (generation, 2, signal.SIGKILL, 14),
-    "commands of a generation": (partial(generation, workers=1), 1, signal.SIGKILL, 8),
     "commands with two workers": (partial(generation, workers=2), 1, signal.SIGKILL, 8),
-    "identifications": (partial(identification, workers=1), 1, signal.SIGKILL, 20),
     "identifications in two threads": (partial(identification, workers=2), 1, signal.SIGKILL, 10),
-    "identifications interrupted": (partial(identification, workers=1), 1, signal.SIGINT, 6),
-    "interrupted in two threads": (partial(identification, workers=2), 1, signal.SIGINT, 3),
+    "interrupted in two threads": (partial(identification, workers=2), 1, signal.SIGINT, 6),
 }
 """The work, how many work on one folder at once, the signal that ends one, and how often."""
 
@@ -233,29 +203,3 @@ def test_stopped_it_ends_the_same(stops, memory, tally):
         same = status == 0 and work.result(out) == expected
         line.held(same, f"{trial}: the last start ended with {status}, or left something else")
         shutil.rmtree(out)
-
-
-# kernels
-# ----------------------------------------------------------------------
-
-
-def test_many_at_one_cache(tmp_path, tally, monkeypatch):
-    """Processes that compile at once, some of them killed at it: every other has what it needs, and
-    nothing is left."""
-    line, folder = tally("processes at one cache, a third of them killed"), tmp_path / "kernels"
-    monkeypatch.setattr(objects, "FOLDERS", [folder])
-    monkeypatch.setattr(objects, "_said", set())
-    wrong = lambda: int(not kernel()[0])
-    for number in range(count(20)):
-        pids = [fork(wrong) for _ in range(6)]
-        time.sleep(0.4 * random("cache", number).random())
-        for pid in pids[::3]:
-            os.kill(pid, signal.SIGKILL)
-        for k, status in enumerate(map(ended, pids)):
-            line.held(status == 0 or (k % 3 == 0 and status == -signal.SIGKILL), f"{status}")
-        line.held(not wrong(), f"{number}: wrong")
-        if number % 4 == 3:
-            for path in folder.glob("*.o"):
-                path.unlink()
-            line.held(not wrong() and not list(folder.glob("*.partial")), f"{number}: left over")
-            shutil.rmtree(folder)

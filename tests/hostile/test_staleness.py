@@ -1,8 +1,10 @@
-"""Random sequences of changes between runs of one rig: what is kept of a rig from run to run is
+"""Changes to a rig between its runs, and between a run and its gradient: what is kept of a rig is
 never what it was before.
 
 After every change the rig runs twice: as it is, with what is kept of earlier runs, and as a rig of
-which nothing is known. Both have the same bits, or are refused with the same words.
+which nothing is known. Both have the same bits, or are rejected with the same words. A gradient
+that is asked for after changes equals central differences of a copy that was made when it ran;
+where two sizes of differences disagree, a run straddles a touch-down, which only few may.
 """
 
 import copy
@@ -19,7 +21,7 @@ from conftest import f64, grasp, still, times
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from hostile.trial import SEED, count
+from hostile.trial import SEED, count, sentence
 from torchsoft import (
     Actuator,
     Circle,
@@ -37,8 +39,9 @@ from torchsoft import (
 from torchsoft.physics.motion import Lines
 from torchsoft.physics.parts import PD, Guide
 from torchsoft.solve import model as models
+from torchsoft.solve.gradients import GradientFailed
 
-MESH = {"pad.elements_x": 30, "pad.elements_y": 2, "contact.v_s": 0.05}
+MESH = {"pad.elements_x": 24, "pad.elements_y": 1, "contact.v_s": 0.05}
 T = times(4e-3, 3)
 GAIN = 1.0
 """A number that a law below reads from its module."""
@@ -98,17 +101,9 @@ class Changes:
         owner, name = self.place()
         owner.get_parameter(name).copy_(self.near(owner.get_parameter(name)))
 
-    def data(self) -> None:
-        owner, name = self.place()
-        owner.get_parameter(name).data = self.near(owner.get_parameter(name))
-
     def numpy(self) -> None:
         owner, name = self.place()
         owner.get_parameter(name).detach().numpy()[...] *= self.rng.uniform(0.97, 1.03)
-
-    def parameter(self) -> None:
-        owner, name = self.place()
-        setattr(owner, name, nn.Parameter(self.near(owner.get_parameter(name))))
 
     def state_dict(self) -> None:
         table = {k: self.near(x) if x.ndim == 0 else x for k, x in self.rig.state_dict().items()}
@@ -117,37 +112,19 @@ class Changes:
     def wrong_value(self) -> None:
         owner, name = self.place()
         value = owner.get_parameter(name).detach()
-        wrong = torch.full_like(value, self.some(float("nan"), -1.0, 1e300))
         old = value.clone()
-        value.copy_(wrong)
+        value.fill_(self.some(float("nan"), -1.0, 1e300))
         self.compare()
         value.copy_(old)
-
-    def wrong_dtype(self) -> None:
-        owner, name = self.place()
-        old = owner._parameters[name]
-        owner._parameters[name] = nn.Parameter(old.detach().float())
-        self.compare()
-        owner._parameters[name] = old
 
     def buffer(self) -> None:
         pad = self.some(*self.rig.pads.values())
         pad.positions.numpy()[0, 0] += 1e-6
         pad.origin += f64(1e-6, 0.0) * self.rng.uniform(-1, 1)
 
-    def shares(self) -> None:
-        self.some(*self.rig.pads.values()).point_lengths[3] *= 1.01
-
-    def spacing(self) -> None:
-        self.some(*self.rig.contacts.values()).law.node_spacing *= self.rng.uniform(0.97, 1.03)
-
     def friction(self) -> None:
         law = self.some(*self.rig.contacts.values()).law
         law.friction = self.some(SmoothSlip(0.5, 0.4, 0.08), Coulomb(0.4, 0.38))
-
-    def power(self) -> None:
-        law = self.some(*self.rig.contacts.values()).law
-        law.power = self.some(None, nn.Parameter(f64(1.2)[0]))
 
     def shape(self) -> None:
         self.rig.bodies["disc"].shape = self.some(Circle(0.02), Ellipse(0.02, 0.0201))
@@ -156,19 +133,9 @@ class Changes:
         pad = self.some(*self.rig.pads.values())
         pad.material = KelvinVoigt(7e5, self.some(0.4, 0.45), 1100.0, 0.01, 0.044)
 
-    def stiffer(self) -> None:
-        pad = self.some(*self.rig.pads.values())
-        pad.E_ratio = self.some(None, nn.Parameter(f64(1.1)[0]))
-
     def tie(self) -> None:
         law = self.some(*self.rig.contacts.values()).law
         law.R_t = law.R_n
-
-    def weight(self) -> None:
-        self.rig.bodies["disc"].weighted = self.some(True, False)
-
-    def may_leave(self) -> None:
-        self.some(*self.rig.contacts.values()).may_leave = self.some(True, False)
 
     def guide(self) -> None:
         guide = Actuator("disc.x", "disc.x", Guide(0.1, 1.0), setpoint=())
@@ -191,9 +158,6 @@ class Changes:
     def hook(self) -> None:
         law = self.some(*self.rig.actuators.values())
         law.register_forward_hook(lambda *given: 1.01 * given[-1])
-
-    def training(self) -> None:
-        self.rig.train(self.some(True, False))
 
     def copied(self) -> None:
         self.rig = copy.deepcopy(self.rig)
@@ -232,25 +196,16 @@ class Changes:
         assert found == outcome(self.rig, self.y0, **how)
 
 
+HELPERS = "some", "near", "place", "compare"
 OPERATIONS: list[Callable[[Changes], None]] = [
-    one for name, one in vars(Changes).items()
-    if not name.startswith("_") and name not in ("some", "near", "place", "compare")
-]  # fmt: skip
-
-
-def sequence(key: int, length: int = 6) -> None:
-    changes = Changes(key)
-    outcome(changes.rig, changes.y0)
-    for _ in range(length):
-        operation = OPERATIONS[changes.rng.integers(len(OPERATIONS))]
-        operation(changes)
-        changes.compare()
+    one for name, one in vars(Changes).items() if name[0] != "_" and name not in HELPERS
+]
 
 
 @pytest.mark.parametrize("operation", OPERATIONS, ids=lambda one: one.__name__)
 def test_nothing_is_stale_after_a_change(operation):
     changes = Changes(0)
-    for _ in range(3):
+    for _ in range(2):
         outcome(changes.rig, changes.y0)
         operation(changes)
         changes.compare()
@@ -260,6 +215,104 @@ def test_nothing_is_stale_after_a_change(operation):
 @pytest.mark.timeout(3600)
 def test_nothing_is_stale_after_any_sequence(tally):
     line = tally("sequences of changes between runs, bits")
+
+    def sequence(key: int) -> None:
+        changes = Changes(key)
+        for _ in range(6):
+            changes.some(*OPERATIONS)(changes)
+            changes.compare()
+
     for key in range(count(1000)):
         line.call(f"sequence {key}", lambda key=key: sequence(key), (), limit=100.0)
-        line.held(True)
+
+
+# gradients
+# ----------------------------------------------------------------------
+
+WEIGHTS = {"theta": 1.0, "x_C": 1e2, "y_Br": 1e2, "v_x": 1.0, "omega": 0.1, "F_x": 1e-2}
+REFUSALS = ValueError, TypeError, SimulationFailed, GradientFailed
+STEPS = 1e-4, 3e-5, 1e-5, 1e-6
+"""Of the differences, relative to the values; taken until two that follow each other agree."""
+ALIKE, CLEAR, SMALL, PART = 1e-5, 1e-4, 1e-4, 0.3
+"""Relative difference that a gradient may have, beside what the differences have among themselves,
+which is at most `CLEAR`; of derivatives below `SMALL` that size is taken. The most that each value
+adds to the derivative."""
+
+
+class Ran:
+    """One run: its loss, and a copy of the rig with the places of the tensors in it."""
+
+    def __init__(self, rig: Rig, y0: Tensor) -> None:
+        self.globals, self.copy, y0 = (GAIN, Push.share), copy.deepcopy(rig), y0.requires_grad_()
+        twins = zip(rig.parameters(), self.copy.parameters())
+        twins = [(p, q) for p, q in twins if p.requires_grad]
+        self.places = [(y0, y0.detach().clone()), *twins]
+        self.value = self.loss(rig, y0, "discrete")
+
+    def loss(self, rig: Rig, y0: Tensor, gradient: str) -> Tensor:
+        run = simulate(rig, T, y0=y0, gradient=gradient, step=1e-3, tolerance=1e-10)
+        lost = np.nan if run.stats.failed_steps else 0.0  # halved: it may jump there
+        return lost + sum((w * (run[name] - run[name][0])).sum() for name, w in WEIGHTS.items())
+
+    def shifted(self, h: float, directions: dict[int, Tensor]) -> float:
+        """The loss of the copy with tensors moved by `h` along directions, by the tensor's id."""
+        global GAIN
+        now, (GAIN, Push.share) = (GAIN, Push.share), self.globals
+        with torch.no_grad():
+            old = [place.detach().clone() for _, place in self.places]
+            for leaf, place in self.places:
+                place.add_(h * directions.get(id(leaf), torch.zeros(())))
+            ended = float(self.loss(self.copy, self.places[0][1], "none"))
+            for (_, place), value in zip(self.places, old):
+                place.copy_(value)
+        GAIN, Push.share = now
+        return ended
+
+
+def compared(key: int) -> bool | None:
+    """Whether differences along a random direction are clear, None where there was no run; raises
+    `AssertionError` where they are and the gradient is another."""
+    changes = Changes(key)
+    after = [one for one in OPERATIONS if one is not Changes.parametrised]  # drops gradients
+    for _ in range(changes.rng.integers(4)):
+        changes.some(*OPERATIONS)(changes)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            ran = Ran(changes.rig, changes.y0.clone())
+            for _ in range(1 + changes.rng.integers(4)):
+                changes.some(*after)(changes)
+            leaves = [leaf for leaf, _ in ran.places]
+            bars = torch.autograd.grad(ran.value, leaves, allow_unused=True, materialize_grads=True)
+        except REFUSALS as refusal:
+            if sentence(str(refusal)):
+                return None
+            raise
+        directions, expected = dict[int, Tensor](), 0.0
+        for i in changes.rng.permutation(len(leaves))[: changes.some(1, len(leaves))]:
+            leaf, bar = leaves[i], bars[i]
+            noise = torch.from_numpy(changes.rng.standard_normal(tuple(leaf.shape)))
+            d = ran.places[i][1].detach().abs().clamp(min=1e-12) * noise
+            d = d * 1e-3 if leaf.ndim else d
+            d = d * min(1.0, PART / max(abs(float((bar * d).sum())), 1e-300))
+            directions[id(leaf)], expected = d, expected + float((bar * d).sum())
+        found: list[float] = []
+        for h in STEPS:
+            found.append((ran.shifted(h, directions) - ran.shifted(-h, directions)) / (2 * h))
+            size = max(abs(found[-1]), SMALL)
+            spread = abs(found[-1] - found[-2]) if found[1:] else np.inf
+            if spread <= CLEAR * size:  # never where one is not a number
+                assert abs(expected - found[-1]) <= ALIKE * size + 2 * spread, (expected, found)
+                return True
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_gradients_after_any_sequence_are_those_of_what_ran(tally):
+    line, results = tally("sequences of changes before a gradient"), list[bool | None]()
+    for key in range(count(1000)):
+        results.append(line.call(f"sequence {key}", lambda key=key: compared(key), (), limit=100.0))
+    clear, unclear = results.count(True), results.count(False)
+    enough = clear >= 0.5 * len(results) and unclear <= 0.1 * len(results) + 3
+    line.held(enough, f"{clear} of {len(results)} compared, {unclear} with nothing to compare with")

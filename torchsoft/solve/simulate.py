@@ -148,6 +148,9 @@ def prepare(
 ) -> Task:  # fmt: skip
     """Checks the arguments of `simulate`, and takes `values` in the place of some parameters of
     the rig of a `structure`, by their id; raises its `ValueError`s."""
+    if not isinstance(rig, Rig):
+        given = rig if isinstance(rig, type) else type(rig).__name__
+        raise ValueError(f"`rig` must be a Rig, but is {given}")
     t = tensor("t", t)
     knots, dy0 = (
         x if x is None else tensor(name, x) for name, x in (("knots", knots), ("dy0", dy0))

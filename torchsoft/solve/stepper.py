@@ -93,11 +93,6 @@ class ImplicitStepper:
         structure: Structure | None = None, values: Mapping[int, Tensor] | None = None,
         differentiable: bool = True,
     ) -> None:  # fmt: skip
-        if not isinstance(rig, Rig):
-            raise ValueError(
-                "`rig` must be a Rig, but is "
-                f"{rig if isinstance(rig, type) else type(rig).__name__}"
-            )
         if not isinstance(reference, Reference | None):
             raise ValueError(f"`reference` must be a Reference, but is {type(reference).__name__}")
         self.step = None if step is None else positive("step", step)
