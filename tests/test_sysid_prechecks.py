@@ -169,7 +169,9 @@ MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str]] = {
     ),
     "exchanged columns": (
         "rolling",
-        lambda r: changed(r, x_C=lambda t, x: r.samples["x_Br"][1], x_Br=lambda t, x: r.samples["x_C"][1]),
+        lambda r: replace(
+            r, samples=r.samples | {"x_C": r.samples["x_Br"], "x_Br": r.samples["x_C"]}
+        ),
         SETPOINT, "or are x_Br and x_C exchanged?",
     ),
     "no force fed forward": (
@@ -315,7 +317,9 @@ def test_sparse_set_points_are_judged_by_what_they_do(recordings, rates):
         ("shaking", 1.001, 1.0, "is a clock, or a unit of time, a little off?"),
     ],
 )
-def test_a_rate_that_is_not_that_of_its_set_point_is_named(recordings, motion, clock, factor, words):
+def test_a_rate_that_is_not_that_of_its_set_point_is_named(
+    recordings, motion, clock, factor, words
+):
     one = at_rows(recordings[motion], 1000.0, rates=True)
     x_d = one.rig.reference["x_d"]
     other: Any = Sampled(clock * x_d.times, x_d.values.detach(), factor * x_d.rates)

@@ -118,7 +118,7 @@ def test_nothing_speaks_against_what_is_right(answers):
     assert (whole.verdict, whole.notices, whole.doubts) == ("holds", [], [])
     names = {one.name for one in whole.assumptions}
     assert {
-        "mesh", "contact points", "mesh phase", "start of ball.x", "Coulomb friction",
+        "mesh", "contact points", "mesh phase", "Coulomb friction",
         "actuators.y.Kp", "bodies.ball.shape.radius", "bias x_ball", "gain theta_ball",
         "clock of the set-points", "tilt of the pad floor", "limit of the controller x",
     } <= names  # fmt: skip
@@ -151,7 +151,7 @@ def off(channel: str, add: float = 0.0, factor: float = 1.0) -> Reading:
 
 FINER = BALL.override({"pads.floor.elements_x": 60, "pads.floor.elements_y": 2})
 CAUSES: dict[str, tuple[Callable[[], Recording], float]] = {
-    "delay x_ball": (lambda: recorded(late("x_ball", 1e-3)), 1.0),
+    "delay x_ball": (lambda: recorded(late("x_ball", 3e-4)), 0.3),
     "bias theta_ball": (lambda: recorded(off("theta_ball", 3e-3)), 3e-3),
     "gain effort_y": (lambda: recorded(off("effort_y", factor=1.05)), 5.0),
     "bodies.ball.mass": (lambda: recorded(bodies__ball__mass=0.44), 10.0),
@@ -166,7 +166,7 @@ CAUSES: dict[str, tuple[Callable[[], Recording], float]] = {
 def test_the_cause_of_a_misfit_is_named_with_its_amount(name):
     """Alone, or beside what acts alike, such as a low-pass beside a delay."""
     make, amount = CAUSES[name]
-    answer = fitted(explain, make(), effort=1.0 if name == "delay x_ball" else 4.0)
+    answer = fitted(explain, make(), effort=0.5 if name == "delay x_ball" else 4.0)
     found, (doubt, *_) = named(answer), answer.doubts
     assert name in found
     assert answer.explained
@@ -224,16 +224,16 @@ LEFT: dict[str, Any] = {"alarms": (ALARM,), "left": (ALARM,)}
     ("tests", "found", "explains", "says"),
     [
         ([none], {"as_stated": ()}, False, None),
-        ([a, none], {}, True, r"^the data contradict that a is 1: .* falls by 300 in a new fit with "
-         r"a = 1\.05 \(\+5 %, \+- 0\.5\); .*E would move by 0\.4 .* estimates under it: .*E = 8e\+05"),
-        ([a, suspect("b", 299.0), suspect("c", 200.0)], {}, True, r"one of 2 assumptions, .* do not "
-         r"tell which: .* a with .*, odds 0\.56; b with .*, odds 0\.44; estimates under one or"),
-        ([suspect("b", 300.0, passed=False), suspect("a", 280.0)], {}, True, "contradict that a is"),
-        ([linear("a", 31.0)], {"as_stated": ()}, False, "^something is not as stated, most like a: "
+        ([a, none], {}, True, r"^the data contradict that a is 1: .* falls by 300 in a new fit "
+         r"with a = 1\.05 \(\+5 %, \+- 0\.5\); .*E would move by 0\.4 .* under it: .*E = 8e\+05"),
+        ([a, suspect("b", 299.0), suspect("c", 200.0)], {}, True, r"one of 2 assumptions, .* do "
+         r"not tell which: .* a with .*, odds 0\.56; b with .*, odds 0\.44; estimates under"),
+        ([suspect("b", 300.0, passed=False), suspect("a", 280.0)], {}, True, "that a is 1"),
+        ([linear("a", 31.0)], {"as_stated": ()}, False, "^something is not as stated, most like a"
          ".* would fall by 31 .* nothing confirms the cause"),
         ([linear("a", 531.0, moves={E: 3.6})], {"candidates": ("a",)}, True,
-         "most like a: .* E would move by 18 standard deviations, too far .* `explain` fits again"),
-        ([suspect("a", 531.0, under={})], {}, True, "contradict that a is 1.* has not come to rest"),
+         "most like a: .*E would move by 18 standard deviations, too far .* `explain` fits again"),
+        ([suspect("a", 531.0, under={})], {}, True, "that a is 1.* has not come to rest"),
         ([a], LEFT, False, r"none of the assumptions tested: .* nearest one, a, .* falls by 300 .* "
          "but residuals follow the motion in x of `roll`"),
         ([linear("a", 300.0)], LEFT, False, "which only a new fit can exclude, is a: .* but resid"),
@@ -241,7 +241,7 @@ LEFT: dict[str, Any] = {"alarms": (ALARM,), "left": (ALARM,)}
          "; nothing would be left with d with d = 1.05"),
         ([linear("a", 300.0), linear("b", 250.0)], {"candidates": ("a", "b")}, True,
          r"one of 2 assumptions, .*: a \(by 300\); b \(by 250\): `explain` compares them"),
-        ([none], LEFT, False, "none of 1 suspects explains the misfit: residuals follow the motion"),
+        ([none], LEFT, False, "none of 1 suspects explains the misfit: residuals follow"),
         ([linear("c", 2.0)], LEFT | {"candidates": ("c",)}, False,
          r"no suspect explains .* c \(0% of .*: `explain` fits again with each of 1"),
         ([linear("a", 900.0, favoured=-208.0)], LEFT, False, None),  # a negative mass is no cause
@@ -260,7 +260,7 @@ def test_odds_are_shares_of_the_tempered_evidence_of_what_passes():
     odds = [one.odds for one in concluded([a, suspect("b", 299.0), suspect("c", 200.0)]).checks]
     assert odds[0] / odds[1] == pytest.approx(np.exp(0.5 * 0.46), rel=1e-6)
     assert odds[0] + odds[1] == pytest.approx(1.0, abs=1e-8)
-    law = suspect("law", 300.0 - np.log(990), kind="law", parameter="")  # it has no amplitude
+    law = replace(suspect("law", 300.0 - np.log(990)), kind="law")  # it has no amplitude
     assert [one.odds for one in concluded([a, law]).checks] == pytest.approx([0.5, 0.5])
     more = concluded([suspect("b", 300.0, passed=False), suspect("a", 280.0)])
     assert [one.odds for one in more.checks] == [0.0, 1.0]
@@ -299,12 +299,12 @@ def test_what_would_not_be_seen_is_stated_with_its_size_or_its_price():
     assert said[3] == f"{E} takes far as exact: 1 % of it is +1.2 % of {E}"
     more = [hidden("x", 4.0, 3.0), hidden("y", 8.0, 2.0), hidden("z", 7.0, 1.0)]
     last = unseen(concluded([*tests, *more]))[-1]
-    assert re.match("1 more would .* by up to 6 standard .*: a", last)
+    assert re.match("2 more would .* by up to 7 standard .*: z, a", last)
 
 
 def test_constants_of_the_computation_widen_intervals_and_are_named():
     rng = np.random.default_rng(0)
-    J, columns = rng.standard_normal((40, 2)), rng.standard_normal((40, 3))
+    J, columns = rng.standard_normal((9, 2)), rng.standard_normal((9, 3))
     rows = np.concatenate([J, columns], 1)
     precision = rows.T @ rows + np.diag([0.0, 0.0, 1.0, 1.0, 1.0])
     mesh = AssumptionTest("mesh", "numerical", "pads have 10 elements", "they had 20",
