@@ -21,7 +21,7 @@ from torchsoft import (
     hold,
     register_method,
 )
-from torchsoft.physics.state import State
+from torchsoft.physics.state import State, begin_states
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import good_sensors
 
@@ -194,7 +194,11 @@ def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
 
 def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
     """A state (size,) shaken about: touching and separated nodes, stick and slip, stretched
-    springs."""
+    springs; nodes that touch down are as old as the others, so that f(t, y) is the whole step."""
+    old = {
+        name: begin_states(rig.contacts[name].law.friction, s.shape).mT
+        for name, s in state.stretch.items()
+    }
     generator = torch.Generator().manual_seed(seed)
 
     def moved(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
@@ -212,6 +216,7 @@ def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
             pose=moved(state.pose, f64(1e-4, 1e-4, 0.02)),
             rates=moved(state.rates, 0.01 * slip),
             velocity=moved(state.velocity, slip * f64(1.0, 1.0, 50.0)),
+            friction=old,
         )
     )
 

@@ -61,6 +61,9 @@ def test_grasp_and_roll_smoke(tmp_path):
     lines = module.table(numbers).splitlines()
     assert lines[1].startswith("| ---")
     assert "23.20" in next(line for line in lines if "y_C in the grasp" in line)
+    finer = numbers["F_x_peak_finer_N"]
+    assert f"{finer:.3f}" in next(line for line in lines if "4 points an element" in line)
+    assert 0 < finer < 0.9 * numbers["F_x_peak_N"]
 
 
 def test_pad_fidelity_smoke(tmp_path):

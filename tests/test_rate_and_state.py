@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchsoft import BuiltRig, RateAndState, Reference, RigFile, Trajectory, simulate
+from torchsoft.physics.contact import FADING
 from torchsoft.physics.motion import Lines
 from torchsoft.rigs.check import check
 
@@ -119,17 +120,101 @@ def test_a_spring_that_is_too_soft_for_the_fall_of_friction_is_told_of():
     assert not [one for one in check(sled()) if "single-valued" in one.message]
 
 
-def test_points_without_load_age_and_runs_are_saved(tmp_path):
-    """Away from contact theta' = 1; states of friction are kept with the run."""
+def test_points_out_of_contact_have_no_age_and_runs_are_saved(tmp_path):
     built = sled(theta_0=0.5).build()
     run = drawn(built, 50)
     theta, touches = run.state.friction["track"][:, 0], run.force["track"][..., 0].amax(0) > 0
     assert 0 < int(touches.sum()) < len(touches)
-    assert torch.allclose(theta[:, ~touches], 0.5 + run.t[:, None], rtol=1e-12)
+    assert torch.equal(theta[0], 0.5 * touches)
+    assert not theta[:, ~touches].any()
     run.save(tmp_path / "run.nc")
     again = type(run).load(tmp_path / "run.nc")
     assert torch.equal(again.state.friction["track"], run.state.friction["track"])
     assert torch.equal(again.y, run.y)
+
+
+@pytest.mark.parametrize("friction", [{}, {"kind": "ageing", "mu_s": 0.6, "mu_k": 0.6}])
+def test_the_age_of_a_contact_starts_at_touch_down(friction):
+    """A disc comes down at 2.4 mm/s and stays: its lowest point then is as old as it is since its
+    height was the radius, and the adjoint has the derivative of that time with respect to the
+    start's height. After it has gone up the age fades."""
+    tree = sled(**friction).model_dump(exclude_unset=True)
+    shape = {"kind": "circle", "radius": 10e-3}
+    tree["bodies"]["block"] |= {"x": 0.0, "y": "driven", "shape": shape}
+    tree["motion"] = {"block.y": {"kind": "hold", "value": 20.02e-3}}
+    tree["outputs"]["duration"] = 0.35
+    built = RigFile.from_tree(tree).build()
+    heights = torch.tensor([20.02e-3, 19.9e-3, 19.9e-3, 20.02e-3]).double().requires_grad_()
+    way = Reference(**{"block.y": Lines(torch.tensor([0.0, 0.05, 0.3, 0.31]).double(), heights)})
+    run = simulate(built.rig, built.t, y0=built.y0, reference=way, gradient="discrete")
+    lowest = run.y[:, built.rig.layout.slices["friction", "track"]][:, 20]
+    touches = 0.05 * (20.02e-3 - 20e-3) / 0.12e-3
+    assert lowest[300].item() == pytest.approx(0.3 - touches, rel=2e-3)
+    parts = 0.3 + 0.01 * (20e-3 - 19.9e-3) / 0.12e-3
+    faded = (parts - touches) * np.exp(-(0.35 - parts) / FADING)
+    assert lowest[-1].item() == pytest.approx(faded, rel=0.05)
+    lowest[300].backward()
+    by_height = -0.05 * (20e-3 - 19.9e-3) / 0.12e-3**2
+    assert float(heights.grad[0]) == pytest.approx(by_height, rel=0.1)
+
+
+SLIDER_MASS, G, SPEED = 1.0, 9.81, 1e-3
+CRITICAL = (B - A) * SLIDER_MASS * G / D_C
+
+
+def rates_of(k: float) -> complex:
+    """Rate of growth and frequency [1/s] of a slider on a spring k [N/m] of steady slip, for one
+    age: u' = V - v, m v' = k u - F_N (mu_v dv + mu_theta dtheta), theta' = 1 - v theta / D_c."""
+    theta = D_C / SPEED
+    J = np.array([
+        [0.0, -1.0, 0.0],
+        [k / SLIDER_MASS, -G * A / SPEED, -G * B / theta],
+        [0.0, -theta / D_C, -SPEED / D_C],
+    ])  # fmt: skip
+    return max(np.linalg.eigvals(J), key=lambda rate: rate.imag)
+
+
+@pytest.mark.parametrize(
+    "ratio", [1.3, *(pytest.param(ratio, marks=pytest.mark.slow) for ratio in (1.1, 1.5))]
+)
+def test_a_spring_slider_is_as_stable_as_linear_theory_has_it(ratio):
+    """Over ten nodes, whose points begin with an old age; k_c is that of the mass too,
+    1.17 (b - a) F_N / D_c. A thousandth of the age is the disturbance, in a run along the same
+    steps."""
+    tree = sled(theta_0=100.0).model_dump(exclude_unset=True)
+    tree["bodies"]["block"] = {
+        "mass": SLIDER_MASS, "theta": 0.0, "start": {"x": 0.0, "v_x": SPEED, "y": "rest"},
+        "shape": {"kind": "circle", "radius": 0.1},
+    }  # fmt: skip
+    tree["pads"]["track"] |= {"origin": [-64e-3, 0.0], "length": 140e-3, "elements_x": 140}
+    tree["laws"]["dry"]["K_n"] = 1e4
+    tree["actuators"] = {"spring": {"pushes": "block.x", "setpoint": "pull", "Kp": 1.0, "Kd": 0.0}}
+    tree["motion"] = {"pull": {"kind": "hold", "value": 0.0}}
+    built = RigFile.from_tree(tree).build()
+
+    def pulled(k: float, start: torch.Tensor, x: float, end: float, **how: Any) -> Trajectory:
+        with torch.no_grad():
+            built.rig.parameter("actuators.spring.Kp").fill_(k)
+        t = torch.arange(0.0, end + 1e-9, 5e-3, dtype=torch.float64)
+        way = Lines(np.array([0.0, end]), np.array([x, x + SPEED * end]))
+        return simulate(built.rig, t, y0=start, reference=Reference(pull=way), **how)
+
+    ahead = steady(SPEED) * SLIDER_MASS * G / (3 * CRITICAL)
+    first = pulled(3 * CRITICAL, built.y0, ahead, 1.0, rtol=1e-4)
+    ahead = float(first.force["track"][-1, :, 1].sum().abs()) / (ratio * CRITICAL)
+    start, x = first.y[-1], float(first["x_block"][-1]) + ahead
+    run = pulled(ratio * CRITICAL, start, x, 10.0, rtol=1e-4)
+    other = start.clone()
+    other[built.rig.layout.slices["friction", "track"]] *= 1 + 1e-3
+    changed = pulled(ratio * CRITICAL, other, x, 10.0, knots=run.knots)
+    expected = rates_of(ratio * CRITICAL)
+    dx, dv = ((changed[name] - run[name]).numpy() for name in ("x_block", "v_x_block"))
+    late = run.t.numpy() >= 1.0
+    size = np.log(np.hypot(abs(expected) * dx[late], dv[late]))
+    growth = np.polyfit(run.t.numpy()[late], size, 1)[0]
+    assert growth == pytest.approx(expected.real, rel=0.05)
+    force = run.force["track"].sum(1)
+    assert float((force[:, 1] / force[:, 0]).mean()) == pytest.approx(steady(SPEED), abs=5e-5)
 
 
 def test_its_numbers_are_found_again_from_a_velocity_step():

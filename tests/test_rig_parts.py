@@ -129,11 +129,12 @@ def changed(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def coarse_tree() -> dict[str, Any]:
-    """The template on a coarse mesh."""
+    """The template on a coarse mesh, its contact points on the nodes."""
     tree = template("t").model_dump(exclude_unset=True)
     return tree | {
         "pads": {
-            name: pad | {"elements_x": 40, "elements_y": 2} for name, pad in tree["pads"].items()
+            name: pad | {"elements_x": 40, "elements_y": 2, "points": 0}
+            for name, pad in tree["pads"].items()
         }
     }
 

@@ -27,13 +27,14 @@ class AgeingSlip(SmoothSlip):
         mu_s + ageing ln(1 + age / t_0),    age' = 1 - |gamma'| age / D_c
 
     so that it rises by `ageing` for every factor e of the time at rest beyond t_0. The age is a
-    state of every point [s], `age_0` at the start; apart from the body it goes to t_0 within that
-    time. Not smooth at slip onset. The slip rate is single-valued where the tangential spring
+    state of every point [s], zero at touch-down (`SoftContact`) and `age_0` at the start of points
+    in contact. Not smooth at slip onset. The slip rate is single-valued where the tangential spring
     outweighs the fall of friction with slip, K_t >= ageing F_N / D_c, beside what `SmoothSlip`
     needs. Without `ageing` it is that law.
     """
 
     states: ClassVar = {"age": OwnState("s", "age_0")}
+    ages: ClassVar = True
 
     def __init__(
         self,
@@ -49,7 +50,7 @@ class AgeingSlip(SmoothSlip):
         t_0: Annotated[
             float, Quantity("s", 1e-9, 1e6, "time at rest from which on mu_s rises")
         ] = 1e-3,
-        age_0: Annotated[float, Quantity("s", 0.0, 1e12, "age at the start of a run")] = 1.0,
+        age_0: Annotated[float, Quantity("s", 0.0, 1e12, "age of contacts at the start")] = 1.0,
     ) -> None:  # fmt: skip
         super().__init__(mu_s, mu_k, v_s)
         self.ageing = parameter(ageing)
@@ -91,5 +92,5 @@ class AgeingSlip(SmoothSlip):
             secant = torch.where(far, slope.clamp(0.0, STEEP), secant)
             old, before = rate, there
             rate = torch.where(presses, rate + (there - rate) / (1 - secant), first)
-        renewed = torch.where(presses, rate / self.D_c, 1 / self.t_0)  # how often [1/s]
+        renewed = rate / self.D_c  # how often [1/s]
         return rate, ((1 - renewed * age) / (1 + stage * renewed))[..., None]

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes import Shape, parameter
-from torchsoft.physics.state import begin_states, own_states
+from torchsoft.physics.state import ages, begin_states, own_states
 from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Ratio, Stiffness
 
 SlipLaw = Callable[..., Any]
@@ -30,7 +30,9 @@ where nothing presses, R |gamma'| = E at F_N = 0: friction is continuous at touc
 A module with a mapping `states`, of names to `OwnState`, has states of its own at every point:
 it is called with two more arguments, the states z* (..., n) at the stage's start and the stage's
 length a h [s], and gives the slip rate and the rates z' (..., n) of the states, with the values
-z* + a h z' that act at the end of the stage."""
+z* + a h z' that act at the end of the stage. If it has `ages = True`, its one state is the age of
+the contact [s], which starts at touch-down: `SoftContact` then takes care of points that do not
+touch, and the law states z' of those that do."""
 
 
 def slip_of(
@@ -289,13 +291,39 @@ ADHERING_DEPTH = 1e-6
 """Penetration [m] at which half of the adhesion acts, which sets in smoothly."""
 
 
+INSTANT = 1e-12
+"""Length of a stage [s] up to which it is one moment of a step."""
+
+FADING = 1e-2
+"""Time [s] within which the age of a point that has lost contact falls by a factor of e. Steps
+resolve it, so that a shorter one makes runs longer."""
+
+NEW, KNOWN = 2.5, 10.0
+"""Time since touch-down, in stages, up to which an age is that time, and from which on it follows
+from its rate: three quarters of a step, and three steps."""
+
+
+def touched_down(
+    g: Tensor, g_dot: Tensor, age: Tensor, stage: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """Which points (...) have just touched down, from 1 to 0 as time passes, and the time since
+    then, g / g', in stages (1 where it is 0). Of penetrations g [m] and their rates at the end of a
+    stage [s], and ages at its start [s]; old points stay old, however fast their load grows."""
+    way = stage * g_dot
+    lately = (g > 0) & (g < KNOWN * way) & (age < KNOWN * stage)
+    since, aged = (x / torch.where(lately, per, 1.0) for x, per in ((g, way), (age, stage)))
+    new = ((KNOWN - torch.maximum(since, aged)) / (KNOWN - NEW)).clamp(max=1.0)
+    return torch.where(lately, new, 0.0), torch.where(lately, since, 1.0)
+
+
 class SoftContact(LawPart):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
     R_n, R_t [N.s/m], and a friction law. `weight` scales them to the length of surface that a point
     stands for. With a `power` m [1] the normal spring's force is K_n g_0 (g / g_0)^m, g_0 being
     `REFERENCE_DEPTH`. An `adhesion` A [N] pulls with A g / (g + `ADHERING_DEPTH`) while the point
     touches, and adds to the force that friction follows (Derjaguin, Muller and Toporov). Friction
-    is `friction_ratio` [1] times that of its law."""
+    is `friction_ratio` [1] times that of its law. The age of a contact starts at touch-down, and
+    out of contact it fades within `FADING`."""
 
     def __init__(
         self,
@@ -401,13 +429,34 @@ class SoftContact(LawPart):
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
         held = F_N if self.friction_ratio is None else self.friction_ratio * F_N
-        slip, z_dot = slip_of(self.friction, sign * trial, held, R, z, stage)
+        slip, z_dot = self.slips(sign * trial, held, R, z, stage, g, g_dot)
         gamma_dot = sign * slip  # (12), (13)
         s_dot = slides - gamma_dot
         e = self.K_t * s + R * s_dot
         F_T = torch.where(spring > 0, e, 0.0)
         F_N = F_N if self.adhesion is None else F_N - self.pull(g)
         return ContactState(weight * F_N, weight * F_T, s_dot, gamma_dot, weight * e, z_dot)
+
+    def slips(
+        self, E: Tensor, F_N: Tensor, R: Tensor, z: Tensor | None, stage: Tensor | float,
+        g: Tensor, g_dot: Tensor,
+    ) -> tuple[Tensor, Tensor | None]:  # fmt: skip
+        """`slip_of` the law of friction, whose contact ages from touch-down on.
+
+        The rate of an age jumps at touch-down, and a discrete derivative would miss how a parameter
+        moves the time of touch-down. In the first steps the law is therefore given the age 0 and
+        the time since touch-down, in place of the age and the length of the stage.
+        """
+        if z is None or not ages(self.friction):
+            return slip_of(self.friction, E, F_N, R, z, stage)
+        age, stage = z[..., 0], stage + 0.0 * E
+        age = torch.where(stage <= INSTANT, age.clamp(min=0.0), age)  # interpolation may overshoot
+        new, since = touched_down(g, g_dot, age, stage)
+        lived, first = 1 + new * (since - 1), age * (1 - new)
+        slip, z_dot = self.friction(E, F_N, R, first[..., None], stage * lived)
+        lost = torch.where(new > 0, new * age / torch.where(new > 0, stage, 1.0), 0.0)
+        touching = lived[..., None] * z_dot - lost[..., None]
+        return slip, torch.where((g > 0)[..., None], touching, -z / (FADING + stage)[..., None])
 
     def dissipated(
         self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float

@@ -34,6 +34,7 @@ from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import (
     Layout,
     State,
+    ages,
     begin_states,
     body_blocks,
     own_blocks,
@@ -264,14 +265,21 @@ class Graph(nn.Module):
         those of the reference at t."""
         return self.layout.unpack(y, *self.held(self.follow(t) if signals is None else signals))
 
-    def pack(self, state: State, t: float = 0.0) -> Tensor:
+    def pack(self, state: State, t: float = 0.0, reference: Reference | None = None) -> Tensor:
         """The flat vector (..., size) of a state; states of friction and of actuators that it lacks
-        are those that they begin with, at t [s]."""
+        are those that they start with, at t [s] of a reference, by default the rig's; ages only at
+        points that touch."""
         friction = {name: self.friction_of(name, state) for name in self.contacts}
         own = {name: both[0] for name, both in friction.items() if both}
+        for name, z in own.items():
+            if name not in state.friction and ages(self.contacts[name].law.friction):
+                touches = (self.penetration(name, state) > 0)[..., None, :]
+                own[name] = torch.where(touches, z, 0.0)
         control = dict(state.control)
         if missing := [k for k, one in self.actuators.items() if one.states and k not in control]:
-            signals = self.follow(t).expand(*state.pose[next(iter(self.bodies))].shape[:-1], -1, -1)
+            signals = self.follow(t, reference).expand(
+                *state.pose[next(iter(self.bodies))].shape[:-1], -1, -1
+            )
             control |= {k: self.actuator_response(k, state, signals)[2] for k in missing}
         return self.layout.pack(state._replace(friction=own, control=control))
 

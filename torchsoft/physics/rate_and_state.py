@@ -19,6 +19,9 @@ ITERATIONS = 9
 """Newton steps for the slip rate: of 200,000 random points none was left with an error above 1e-9
 of its effort (a from 0.001 to 0.03, b up to 2 a, efforts from 1e-6 to 100 N)."""
 
+YOUNGEST = 1e-20
+"""Age [s] that is added to others: the logarithm of an age that has just started is finite."""
+
 SMALLEST = 1e-300
 """Effort [N] that keeps the logarithm of none finite."""
 
@@ -29,14 +32,18 @@ class RateAndState(nn.Module):
         mu = a asinh(|gamma'| / (2 V_0) exp((mu_0 + b ln(V_0 theta / D_c)) / a)),
         theta' = 1 - |gamma'| theta / D_c.
 
-    A point apart from the body ages whatever its spring does. Friction has no threshold: below
-    mu_0 F_N a point creeps, the slower the lower the effort by a, and counts as slipping. Smooth.
-    The slip rate is single-valued where the dashpot and the tangential spring outweigh the fall of
-    friction with slip, which needs K_t >= (b - a) F_N / D_c in a weakening contact. `theta_0` is
-    the age of all points at the start.
+    The age starts with zero at touch-down (`SoftContact`), so that a point which enters a sliding
+    contact has the age D_c / V of steady slip after a few D_c, whatever it did before. Friction of
+    a body that slides over nodes is then that of one with a single age, but for b D_c over the
+    contact's length, and a spring slider has the growth rates of linear theory. Friction has no
+    threshold: below mu_0 F_N a point creeps, the slower the lower the effort by a, and counts as
+    slipping. Smooth. The slip rate is single-valued where the dashpot and the tangential spring
+    outweigh the fall of friction with slip, which needs K_t >= (b - a) F_N / D_c in a weakening
+    contact. `theta_0` is the age at the start of points in contact.
     """
 
     states: ClassVar = {"theta": OwnState("s", "theta_0")}
+    ages: ClassVar = True
 
     def __init__(
         self,
@@ -49,7 +56,7 @@ class RateAndState(nn.Module):
         ],
         D_c: Annotated[float, Quantity("m", 1e-9, 1.0, "slip over which the age is renewed")],
         V_0: Annotated[float, Quantity("m/s", 1e-12, 1e3, "slip rate of mu_0")] = 1e-6,
-        theta_0: Annotated[float, Quantity("s", 1e-12, 1e12, "age at the start of a run")] = 1.0,
+        theta_0: Annotated[float, Quantity("s", 1e-12, 1e12, "age of contacts at the start")] = 1.0,
     ) -> None:  # fmt: skip
         super().__init__()
         self.mu_0, self.a, self.b, self.D_c = (parameter(x) for x in (mu_0, a, b, D_c))
@@ -73,7 +80,7 @@ class RateAndState(nn.Module):
         self, E: Tensor, F_N: Tensor, R: Tensor, z: Tensor, stage: Tensor | float
     ) -> tuple[Tensor, Tensor]:
         """Slip rate (...) [m/s] and theta' (..., 1), with the age at the end of the stage."""
-        theta, presses = z[..., 0], F_N > 0
+        theta, presses = z[..., 0] + YOUNGEST, F_N > 0
         E, A = E + SMALLEST, torch.where(presses, self.a * F_N, 1.0)
         x = torch.log(E / R)  # ln of the slip rate, at most: where nothing presses
         # where friction alone takes the effort, with the age of the fastest slip
@@ -87,8 +94,7 @@ class RateAndState(nn.Module):
             step = (R * V + A * rise - E) / (R * V + A * slope * (1 - fall))
             x = torch.where(presses, x - step.clamp(-4.0, 4.0), x)
         V = torch.exp(x)
-        renewed = torch.where(presses, V * self.aged(theta, stage, x) / self.D_c, 0.0)
-        return V, (1 - renewed)[..., None]
+        return V, (1 - V * self.aged(theta, stage, x) / self.D_c)[..., None]
 
     def aged(self, theta: Tensor, stage: Tensor | float, x: Tensor) -> Tensor:
         """Age [s] at the end of a stage that begins with theta, under the slip rate e^x [m/s]."""

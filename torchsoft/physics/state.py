@@ -23,6 +23,12 @@ def own_states(law: object) -> dict[str, OwnState]:
     return dict(getattr(law, "states", {}))
 
 
+def ages(law: object) -> bool:
+    """Whether the state of a law of friction is the age of the contact, which starts at
+    touch-down."""
+    return getattr(law, "ages", False)
+
+
 def begin_states(law: object, shape: Sequence[int]) -> Tensor:
     """States (*shape, states) that a law begins with."""
     zero = torch.zeros((), dtype=torch.float64)

@@ -19,6 +19,7 @@ from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.balance import Balance
 from torchsoft.physics.contact import cross, turned
 from torchsoft.physics.graph import Graph
+from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.pads import nodal_forces
 from torchsoft.physics.parts import COORDINATES
@@ -63,10 +64,11 @@ def settled(
     velocity: Mapping[str, Tensor],
     stretch: Mapping[str, Tensor],
     t: float = 0.0,
+    reference: Reference | None = None,
 ) -> Tensor:
     """State (size,) with pads settled around bodies at `pose` [m, rad], by body (3,), contacts
     whose points are stretched by `stretch` [m], by contact (points,), and states of actuators that
-    begin at t [s].
+    start at t [s] of a reference, by default the rig's.
 
     The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry the loads of bodies
     that stand still: under a body that rolls at v the pads lag behind by v tau only, whereas pads
@@ -98,7 +100,7 @@ def settled(
     moving = still._replace(velocity=dict(velocity))
     inertial = [name for name, pad in rig.pads.items() if pad.inertial]
     rates = {name: carried_along(rig, name, moving, pads[name]) for name in inertial}
-    return rig.pack(moving._replace(pads=pads, rates=rates), t)
+    return rig.pack(moving._replace(pads=pads, rates=rates), t, reference)
 
 
 def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, int]) -> None:
@@ -193,11 +195,23 @@ def condensed(rig: Graph) -> Graph:
     )  # fmt: skip
 
 
-def standing(rig: Graph, pose: Mapping[str, Tensor], t: float = 0.0) -> Tensor:
+def standing(
+    rig: Graph, pose: Mapping[str, Tensor], t: float = 0.0, reference: Reference | None = None
+) -> Tensor:
     """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled
     around them and no point stretched, at t [s]. Differentiable and raises as `settled`."""
     still = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
-    return settled(rig, pose, still, unstretched(rig, ()), t)
+    return settled(rig, pose, still, unstretched(rig, ()), t, reference)
+
+
+@one_torch_thread()
+def standing_loads(rig: Graph, pose: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Forces and moments left on bodies that stand at `pose` (3,) [N, N, N.m], no actuator pushing.
+    Differentiable and raises as `settled`."""
+    still = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
+    state = State({}, unstretched(rig, ()), dict(pose), {}, still)
+    state = state._replace(pads={name: carried(rig, name, state) for name in rig.pads})
+    return net_loads(rig, state, torch.zeros(len(rig.signals), 2, dtype=torch.float64), ())
 
 
 def unstretched(rig: Graph, batch: Sequence[int]) -> dict[str, Tensor]:

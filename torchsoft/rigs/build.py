@@ -42,6 +42,7 @@ from torchsoft.rigs.parts import (
     TaxelsTable,
 )
 from torchsoft.rigs.places import entries, entry, listed, place, replaced, unit
+from torchsoft.solve.simulate import Initial
 from torchsoft.tables import LISTED, InvalidTable, from_toml, line
 
 M = TypeVar("M")
@@ -519,7 +520,7 @@ class RigFile(Shown, Group):
         driven = [f"{body}.{axis}" for body, axis, kind in self.coordinates() if kind == "driven"]
         poses = initial_poses(self, rig, {name: signal(self, name) for name in driven})
         rig.reference = reference(self, poses, partial(holding_effort, self, rig, poses))
-        y0 = settled_pads(self, rig, poses)
+        y0 = settled_pads(self, rig, poses, rig.reference)
         warn_of_moments(rig, y0, starts)
         followed = {
             name: (one, one.values.detach().clone())
@@ -528,7 +529,7 @@ class RigFile(Shown, Group):
         }  # fmt: skip
         solver, y0 = self.solver.model_dump(exclude_none=True), moving(rig, y0, starts)
         built = BuiltRig(rig, y0, self.outputs.times(), self, followed, solver)
-        built.last["start"] = built.key(rig), y0, {k: values for k, (_, values) in followed.items()}
+        built.last.update(key=built.key(rig), start=Initial(y0, rig.reference))
         return built
 
     def rests(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:

@@ -32,7 +32,7 @@ class BuiltRig:
 
     `file` is the rig file that it was built from, and `solver` the choice of steps. `followed`
     holds the motions that have a value given as "start" or "held", by name, and their values (k,)
-    as built; `last` the last start that was computed. Unpacks to rig, y0, t.
+    as built; `last` the last start without a gradient. Unpacks to rig, y0, t.
     """
 
     rig: Rig
@@ -59,34 +59,27 @@ class BuiltRig:
         Values of motions given as "start" or "held" follow the start; what was added to them in
         place is kept. Raises `ValueError` naming the field where there is no equilibrium.
         """
-        own = self.rig.reference
         rig = self.rig if rig is None else rig
+        key = () if torch.is_grad_enabled() else self.key(rig)
+        if key and self.last.get("key") == key:
+            return self.last["start"]
         check_values(rig)
-        y0, now = self._started(rig)
-        signals = {}
+        own, signals = self.rig.reference, {}
+        poses = initial_poses(self.file, rig, self.driven)
+        now = started_values(self.file, rig, poses)
         for name, (signal, built) in self.followed.items():
             if name.replace(".", ":") in own.signals and own[name] is signal:
                 signals[name] = signal.with_values(following(signal.values, built, now[name]))
-        return Initial(y0, own.replaced(signals))
-
-    def _started(self, rig: Rig) -> tuple[Tensor, dict[str, Tensor]]:
-        """The state at the start, and the values of the motions that follow it; the last ones again
-        for the same rig where no gradient is wanted."""
-        key = () if torch.is_grad_enabled() else self.key(rig)
-        known = self.last.get("start")
-        if key and known is not None and known[0] == key:
-            return known[1].clone(), known[2]
-        poses = initial_poses(self.file, rig, self.driven)
-        y0 = moving(rig, settled_pads(self.file, rig, poses), self.starts)
-        now = started_values(self.file, rig, poses)
+        reference = own.replaced(signals)
+        y0 = moving(rig, settled_pads(self.file, rig, poses, reference), self.starts)
         if key:
-            self.last["start"] = key, y0.clone(), now
-        return y0, now
+            self.last.update(key=key, start=Initial(y0, reference))
+        return Initial(y0, reference)
 
     def key(self, rig: Rig) -> tuple[Any, ...]:
         """All that the start of a rig depends on; empty where that is not known."""
-        none = torch.zeros((), dtype=torch.float64)
-        return values_of(rig, *(signal(none)[0] for signal in self.driven.values()))
+        found, motion = values_of(rig), values_of(self.rig.reference)
+        return (*found, *motion) if found and motion else ()
 
     @property
     def driven(self) -> dict[str, Piecewise]:

@@ -12,7 +12,7 @@ from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import NoPlace, Poses, placed
-from torchsoft.physics.statics import NoEquilibrium, net_loads, resting, standing
+from torchsoft.physics.statics import NoEquilibrium, resting, standing, standing_loads
 from torchsoft.rigs.geometry import at
 from torchsoft.rigs.motion import HELD, MotionContext
 
@@ -50,11 +50,11 @@ def initial_poses(file: RigFile, rig: Rig, driven: Mapping[str, Piecewise]) -> P
         ) from None
 
 
-def settled_pads(file: RigFile, rig: Rig, poses: Poses) -> Tensor:
-    """State (size,) of bodies that stand at `poses`, their pads settled around them. Raises
-    `ValueError`."""
+def settled_pads(file: RigFile, rig: Rig, poses: Poses, reference: Reference) -> Tensor:
+    """State (size,) of bodies that stand at `poses`, their pads settled around them, at the start
+    of a reference. Raises `ValueError`."""
     try:
-        return standing(rig, poses)
+        return standing(rig, poses, 0.0, reference)
     except NoEquilibrium as error:
         raise ValueError(
             too_stiff(file, rig) or f"bodies: the pads cannot settle where bodies start: {error}"
@@ -105,14 +105,14 @@ def holding_effort(file: RigFile, rig: Rig, start: Poses, coordinate: str, time:
     try:
         if rests:
             poses = resting(rig, poses, rests, signals=still, actuators=())
-        y = standing(rig, poses)
+        loads = standing_loads(rig, poses)
     except NoEquilibrium as error:
         raise ValueError(
             f'"{HELD}" asks for balance where set-points are at t = {time:g} s, and there is '
             f"none: {error}"
         ) from None
     body, axis = at(coordinate)
-    return -net_loads(rig, rig.unpack(y, still), still, ())[body][axis]
+    return -loads[body][axis]
 
 
 def at_setpoints(

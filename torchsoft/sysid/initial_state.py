@@ -200,7 +200,8 @@ class Standing(NamedTuple):
                         rig, pose, self.rests, signals=still, actuators=(), residual=BALANCED
                     )
                 pose = pressed(rig, pose, self.presses, self.rests)
-                found = rig.unpack(standing(rig, pose, at))
+                reference = reference_from(rig, self, pose)
+                found = rig.unpack(standing(rig, pose, at, reference))
             except NoEquilibrium as error:
                 raise SimulationFailed(f"the run cannot begin there: {error}", at) from None
             moving = {name: velocity[name] for name in found.velocity}
@@ -229,9 +230,9 @@ class Known(NamedTuple):
         return f"{self.lead:g} s early, in a known state"
 
 
-def reference_from(rig: Rig, start: Start, y0: Tensor) -> Reference:
-    """The reference of a run from y0 (size,), whose set-points follow the start."""
-    signals, pose = {}, rig.unpack(y0).pose
+def reference_from(rig: Rig, start: Start, pose: Mapping[str, Tensor]) -> Reference:
+    """The reference of a run whose bodies start at `pose` (3,), with set-points that follow."""
+    signals = {}
     for name, (coordinate, place, weights) in getattr(start, "followed", {}).items():
         body, axis = coordinate.split(".")
         moved = pose[body][COORDINATES.index(axis)] - place

@@ -440,7 +440,7 @@ def predict(
     wrt = tuple(name for name in names if not name.startswith(PREFIX))
     leaves = [rig.parameter(name) for name in wrt]
     along = torch.stack([x - x.detach() for x in leaves]) if leaves else y0.new_zeros(0)
-    reference = reference_from(rig, begun.start, y0 + dy0[:, : len(wrt)] @ along)
+    reference = reference_from(rig, begun.start, rig.unpack(y0 + dy0[:, : len(wrt)] @ along).pose)
     if begun.drift.changes:
         return drifting(begun, grid, names, steps, y0, dy0, wrt, touch, reference)
     out = unjudged(
@@ -472,7 +472,7 @@ def run_doubts(
     """Warnings of the run at the end of a fit, which those on the way to it do not give. Raises
     `SimulationFailed`."""
     y0, _ = prepared(begun, values, ())
-    reference = reference_from(begun.rig, begun.start, y0.detach())
+    reference = reference_from(begun.rig, begun.start, begun.rig.unpack(y0.detach()).pose)
     run = unjudged(begun.rig, grid.t, y0=y0.detach(), reference=reference, **choice(steps))
     return list(doubts(run, begun.rig, differentiated=True).values())
 
@@ -534,7 +534,7 @@ def misfit(
         by = np.einsum("gc,gcn->n", weights, np.array(made.derivatives))
         return Misfit(loss, by, nuisances)
     y0, inputs = prepared(begun, values, names)
-    reference = reference_from(begun.rig, begun.start, y0)
+    reference = reference_from(begun.rig, begun.start, begun.rig.unpack(y0).pose)
     out = unjudged(
         begun.rig, grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps)
     )
