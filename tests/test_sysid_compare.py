@@ -157,7 +157,7 @@ def laws(excitation: Excitation, alpha: float) -> dict[str, Problem]:
 
 def plans(problems: dict[str, Problem]) -> dict[str, list[Stage]]:
     return {
-        name: [Stage("all", one.names, one.coordinates.labels, 1e-4, tolerance=1e-3)]
+        name: [Stage("all", one.names, one.coordinates.labels, 1e-4, tolerance=1e-2)]
         for name, one in problems.items()
     }
 
