@@ -1,10 +1,13 @@
-"""The answer as a file: its published schema, damaged and other files, and the rig that comes back
-from it."""
+"""The answer of an identification: its verdict, its file, the rig that comes back from it, and the
+report, one page that stands alone."""
 
+import base64
 import json
 import re
+import struct
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
+from html.parser import HTMLParser
 from math import isnan, nan
 from pathlib import Path
 from types import UnionType
@@ -14,11 +17,12 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, excited, stroked, times
+from conftest import PAPER, excited, stroked, times
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from test_sysid_friction import Viscous
 
-from torchsoft import Rig, RigFile, simulate
-from torchsoft.physics.motion import Reference
+from torchsoft import RigFile, simulate
 from torchsoft.sysid import (
     IdentificationResult,
     Prior,
@@ -27,34 +31,165 @@ from torchsoft.sysid import (
     Stage,
     Unknown,
     identify,
+    load_answer,
     record,
 )
-from torchsoft.sysid.estimate import Number, contributions, estimates
-from torchsoft.sysid.fit import Fit
-from torchsoft.sysid.identification import Settings
-from torchsoft.sysid.result import checksum, load_answer, recorded_rigs, schema
+from torchsoft.sysid import report as sections
+from torchsoft.sysid.assumption_tests import AssumptionTest
+from torchsoft.sysid.estimate import Number, estimates
+from torchsoft.sysid.figures import direction_name, estimates_figure
+from torchsoft.sysid.fit import Combination, Fit
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.prediction import FailedRun
+from torchsoft.sysid.report import report, traces
+from torchsoft.sysid.result import ChannelNoise, checksum, recorded_rigs, schema
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.unknowns import Coordinate
 
-ROOT = Path(__file__).parents[1]
+SCHEMA = Path(__file__).parents[1] / "docs" / "answer.schema.json"
 PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
-BASE = PAPER.override(COARSE)
-SENSORS = {
-    "theta_C": Sensor(noise=5e-4, bias=0.02),
-    "y_Br": Sensor(noise=1e-5),
-    "effort_y": Sensor(noise=0.1),
-}
-GRASP = stroked(0.0, 0.1, duration=0.25, depth=1.08e-3, grasp=0.15, since=0.15)
+BASE = PAPER.override({"pad.elements_x": 60, "pad.elements_y": 1, "contact.v_s": 0.05})
 E, NU, FRICTION = "materials.rubber.E", "materials.rubber.nu", "laws.steel_on_rubber.friction"
-K_N, R_N, ALPHA = "laws.steel_on_rubber.K_n", "laws.steel_on_rubber.R_n", f"{FRICTION}.alpha"
-MU_S, MU_K, V_S = (f"{FRICTION}.{name}" for name in ("mu_s", "mu_k", "v_s"))
-UNKNOWNS = {
-    R_N: Unknown(per="recording"), E: Unknown(), V_S: Unknown(),
-    "pad.tau": Unknown(prior=Prior(median=0.01, sd=0.3, kind="log-normal")),
-}  # fmt: skip
-
+K_N, R_N = "laws.steel_on_rubber.K_n", "laws.steel_on_rubber.R_n"
+ALPHA, MU_S, MU_K, V_S = (f"{FRICTION}.{name}" for name in ("alpha", "mu_s", "mu_k", "v_s"))
+SENSORS = {"y_Br": Sensor(noise=1e-5, bias=1e-3), "effort_y": Sensor(noise=0.1)}
+NOISE = Autoregression((0.8,), 0.7, 5e-3)
 HOSTILE = 'a<b> & "$x_1$"'
 """What HTML or matplotlib would read as their own."""
+
+DEPTHS = {HOSTILE: 1.2e-3, "shallow": 0.9e-3, "held": 1e-3}
+FITTED = (HOSTILE, "shallow")
+
+
+def grasp(depth: float) -> Any:
+    return excited(stroked(0.0, 0.1, duration=0.25, grasp=0.15, since=0.15, depth=depth), BASE)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """Two grasps, of which one starts at a place that is not known well, and one to hold out; the
+    viscosity of slip is not identifiable."""
+    recordings = [
+        record(name, grasp(depth), {K_N: 1.6e5, E: 0.9e6}, SENSORS, rtol=1e-3, seed=seed)
+        for seed, (name, depth) in enumerate(DEPTHS.items())
+    ]
+    start = recordings[1].start._replace(position_sd={"disc.x": 2e-5})
+    recordings[1] = replace(recordings[1], start=start)
+    prior = Prior(median=1e6, sd=0.5, kind="log-normal")
+    unknowns = {
+        K_N: Unknown(), E: Unknown(prior=prior), V_S: Unknown(), R_N: Unknown(per="recording"),
+    }  # fmt: skip
+    return Problem(recordings, SENSORS, unknowns)
+
+
+@pytest.fixture(scope="module")
+def result(problem):
+    plan = [Stage("all", FITTED, problem.coordinates.labels, 1e-3, evaluations=4)]
+    return identify(problem, plan=plan, tightenings=0, heldout=["held"], assumptions="trusted")
+
+
+@pytest.fixture(scope="module")
+def full(result):
+    """The result with what else an answer may hold."""
+    harmless = AssumptionTest(
+        "a", "known", "<b> is so", "it were not", 2.0, "%", moves={E: 0.1}, gain=0.5,
+        favoured=0.3, favoured_sd=1.2, value=1.0,
+    )  # fmt: skip
+    heavy = replace(
+        harmless, name="b", stated="the disc weighs 1 kg", moves={E: -4.2}, gain=99.0,
+        favoured=-3.1, suspected=True,
+    )  # fmt: skip
+    lost = replace(
+        harmless, name="c", kind="law", stated="slip is smooth", unchecked="a run failed"
+    )
+    return replace(
+        result, assumptions=[harmless, heavy, lost], noise=[ChannelNoise("effort_y", NOISE, [])],
+        combinations=[Combination({E: 1.0, K_N: -0.5}, {E: 0.3, K_N: 0.4}, 0.02)],
+        command="torchsoft identify '<a>.csv' rig.toml --out out",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def path(full, tmp_path_factory):
+    path = tmp_path_factory.mktemp("answer") / "answer.json"
+    full.save(path)
+    return path
+
+
+# Numbers of an answer
+
+
+@pytest.mark.parametrize(
+    ("stated", "doubts", "verdict", "says"),
+    [
+        (1.0, [], "holds", "^4 of 6 parameters identifiable, "),
+        (1.0, ["x"], "doubtful", "^The model is doubtful, a note below .* if it holds, 4 of 6 "),
+        (29.0, [], "does not explain", r"effort_y are 29 times the stated noise \(χ² = 200\)"),
+    ],
+)
+def test_the_first_line_is_the_verdict(result, stated, doubts, verdict, says):
+    """By the noise that sensors state, whatever colour was found."""
+    residuals = [
+        replace(one, stated=stated if one.channel == "effort_y" else 1.0)
+        for one in result.residuals
+    ]
+    chi2 = 200.0 if stated > 1 else result.chi2
+    answer = replace(result, residuals=residuals, chi2=chi2, doubts=doubts)
+    assert answer.verdict == json.loads(answer.to_json())["verdict"] == verdict
+    assert re.search(says, answer.headline)
+    assert answer.table().startswith(answer.headline[:40])
+    assert ("identifiable" in answer.headline) == (stated == 1.0)
+
+
+def test_a_prediction_with_values_of_its_own_names_them(result):
+    value = result.recorded("held").identified[R_N]
+    assert any("`held` is predicted" in text and f"{value:.3g}" in text for text in result.notices)
+
+
+@pytest.mark.filterwarnings("ignore:not identifiable")
+def test_draws_are_those_of_the_covariance(result):
+    """The estimates come first; parameters that are not identifiable stay."""
+    drawn = result.draws(2000, "shallow", seed=1)
+    seen = {e.name: e for e in result.estimates if e.identifiable and e.kind == "parameter"
+            and e.recording in (None, "shallow")}  # fmt: skip
+    assert 0 < len(seen) < len(drawn)
+    for name, values in drawn.items():
+        assert values.shape == (2001,)
+        assert values[0] == pytest.approx(result.recorded("shallow").identified[name])
+        sd = np.log(values[1:]).std()
+        expected = seen[name].relative_sd if name in seen else 0.0
+        assert sd == pytest.approx(expected, rel=0.1, abs=1e-12)
+
+
+def at(problem: Problem, x: np.ndarray, which: tuple[str, ...]) -> Fit:
+    """A fit that is at x (n,)."""
+    c = problem.coordinates
+    free = tuple(one.label for one in c.within(c.free))
+    return Fit(problem, Runner(problem.recordings), x, Stage("all", which, free, 1e-3))
+
+
+def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinates(problem):
+    sure, unknowns = Prior(median=0.8, sd=0.1), {
+        MU_S: Unknown(prior=Prior(median=0.8, sd=0.1)),
+        MU_K: Unknown(nominal=0.5, ratio_to=MU_S, fixed=True),
+        NU: Unknown(scale="linear", low=0.3, high=0.49),
+    }  # fmt: skip
+    own = Problem(problem.recordings[:1], {"effort_y": Sensor(noise=0.1)}, unknowns)
+    x = own.coordinates.start + np.array([np.log(1.1), 0.0, -0.05 / 0.19])
+    C, shift = np.diag([0.1**2, 0.0, 0.2**2]), np.array([0.05, 0.0, 0.0])
+    found = {e.name: e for e in estimates(at(own, x, (HOSTILE,)), C, shift)}
+    assert [e.prior for e in found.values()] == [sure, None, None]
+    for name, start in ((MU_S, 0.8), (MU_K, 0.4)):
+        e, ends = found[name], 1.1 * start * np.exp([-0.196, 0.196])
+        assert (e.start, e.value) == pytest.approx((start, 1.1 * start))
+        assert e.ci95 == pytest.approx(ends, rel=1e-4)
+        assert e.step_bias_sd == pytest.approx(0.5)
+    nu = found[NU]
+    assert (nu.start, nu.value, nu.unit) == (0.45, pytest.approx(0.4), "1")
+    assert nu.ci95 == pytest.approx((0.4 - 0.196 * 0.38, 0.4 + 0.196 * 0.38), rel=1e-4)
+    assert nu.relative_sd == pytest.approx(0.2 * 0.19 / 0.4)
+
+
+# The file
 
 
 def example(kind: Any) -> Any:
@@ -73,121 +208,39 @@ def example(kind: Any) -> Any:
         return kind(**{one.name: example(hints[one.name]) for one in fields(kind)})
     if origin in (Union, UnionType) or hasattr(kind, "__metadata__"):
         return example(inner[0] if inner else kind.__origin__)
-    if origin is Literal:
-        return inner[0]
-    if origin is list:
-        return [example(inner[0])]
-    if origin is dict:
-        return {HOSTILE: example(inner[1])}
-    assert origin is tuple, kind
+    if origin in (Literal, list, dict):
+        first = inner[0] if origin is Literal else example(inner[-1])
+        return {Literal: first, list: [first], dict: {HOSTILE: first}}[origin]
     return tuple(example(one) for one in inner if one is not Ellipsis)
 
 
-@pytest.fixture(scope="module")
-def problem():
-    """Two short grasps, one of them from a place that is not known well."""
-    recordings = [
-        record(name, excited(GRASP, BASE), {K_N: 1.6e5}, SENSORS, rtol=1e-3, seed=seed)
-        for seed, name in enumerate(("first", "second"))
-    ]
-    start = recordings[1].start._replace(position_sd={"disc.x": 2e-5})
-    recordings[1] = replace(recordings[1], start=start)
-    return Problem(recordings, SENSORS, UNKNOWNS)
-
-
-@pytest.fixture(scope="module")
-def result(problem):
-    plan = [Stage("all", problem.names, problem.coordinates.labels, 1e-3, evaluations=3)]
-    return identify(problem, plan=plan, tightenings=0, assumptions="trusted")
-
-
-@pytest.fixture(scope="module")
-def path(result, tmp_path_factory):
-    path = tmp_path_factory.mktemp("answer") / "answer.json"
-    result.save(path)
-    return path
-
-
-def test_draws_are_those_of_the_covariance(result):
-    """The estimates first; parameters that are not identifiable stay, and a ratio is multiplied."""
-    with pytest.warns(UserWarning, match="not identifiable"):
-        drawn = result.draws(2000, "second", seed=1)
-    seen = {e.name: e for e in result.estimates if e.identifiable and e.kind == "parameter"
-            and e.recording in (None, "second")}  # fmt: skip
-    assert 0 < len(seen) < len(drawn)
-    for name, values in drawn.items():
-        assert values.shape == (2001,)
-        assert values[0] == pytest.approx(result.recorded("second").identified[name])
-        if name in seen:
-            sd = np.log(values[1:]).std()
-            assert sd == pytest.approx(seen[name].relative_sd, rel=0.1)
-        else:
-            assert (values == values[0]).all()
-    at = next(i for i, c in enumerate(result.coordinates) if c.name == E)
-    ratio = replace(result.coordinates[at], ratio_to=K_N)
-    others = [ratio if i == at else c for i, c in enumerate(result.coordinates)]
-    with pytest.warns(UserWarning, match="not identifiable"):
-        ends = [one.draws(3, "second", seed=1)[E]
-                for one in (result, replace(result, coordinates=others))]  # fmt: skip
-    assert ends[0] == pytest.approx(ends[1])  # K_n is known
-    with pytest.raises(ValueError, match="`count`"):
-        result.draws(0, "second")
-
-
-def test_the_published_schema_is_current():
-    published = json.loads((ROOT / "docs" / "answer.schema.json").read_text(encoding="utf-8"))
+def test_what_is_saved_comes_back_and_is_what_the_published_schema_says(full, path, tmp_path):
+    published = json.loads(SCHEMA.read_text(encoding="utf-8"))
     assert published == schema(), f"write it anew: {PUBLISH}"
-    jsonschema.Draft202012Validator.check_schema(published)
-
-
-def test_files_are_what_the_schema_says(path):
+    whole = example(IdentificationResult)
+    whole.save(tmp_path / "answer.json")
     check = jsonschema.Draft202012Validator(schema())
-    for text in (path.read_text(encoding="utf-8"), example(IdentificationResult).to_json()):
+    for one, file in ((full, path), (whole, tmp_path / "answer.json")):
+        text = file.read_text(encoding="utf-8")
         content = json.loads(text)
         assert [error.message for error in check.iter_errors(content)] == []
-        assert "more" in next(check.iter_errors(content | {"more": 1})).message
+        assert not check.is_valid(content | {"more": 1})
         content["estimates"][0]["seen"] = "yes"
-        assert [list(error.path) for error in check.iter_errors(content)] == [
-            ["estimates", 0, "seen"]
-        ]
-
-
-def test_what_was_saved_comes_back(result, path):
-    answer = load_answer(path)
-    assert type(answer) is IdentificationResult
-    assert not answer.rigs
-    assert replace(answer, rigs=result.rigs) == result
-    assert answer.to_json() == path.read_text(encoding="utf-8")
-    assert answer.table() == result.table()
-    assert answer.recordings[1].began == {"start.disc.x": result["start.disc.x"].last}
-
-
-def test_an_answer_says_what_was_asked_for(result):
-    """The tolerance too, beside the one at which the fit ended."""
-    asked = Settings(tightenings=0, assumptions="trusted").model_dump() | {
-        "rtol_asked": 1e-3,
-        "acknowledged": [],
-    }
-    assert {name: result.made_by[name] for name in asked} == asked | {"rtol": 1e-3}
-
-
-def test_everything_that_an_answer_can_hold_comes_back(tmp_path):
-    whole = example(IdentificationResult)
-    assert all(getattr(whole, one.name) for one in fields(IdentificationResult))
-    whole.save(tmp_path / "answer.json")
-    answer = load_answer(tmp_path / "answer.json")
+        assert [[*e.path] for e in check.iter_errors(content)] == [["estimates", 0, "seen"]]
+        answer = load_answer(file)
+        assert answer.to_json() == text == one.to_json()
+        assert answer.table() == one.table()
+        assert not answer.rigs
     assert isnan(answer.chi2)
-    assert isnan(answer.assumptions[0].favoured_sd)
-    assert answer.to_json() == whole.to_json()
     assert answer.noise == whole.noise
+    began = load_answer(path).recordings[1].began
+    assert began == {"start.disc.x": full["start.disc.x"].last}
 
 
-def test_a_file_may_be_written_otherwise(path, tmp_path):
-    content = json.loads(path.read_text(encoding="utf-8"))
-    text = json.dumps(dict(sorted(content.items())))
-    assert "7500000.0," in text
-    (tmp_path / "answer.json").write_text(text.replace("7500000.0,", "7500000,"), encoding="utf-8")
-    assert load_answer(tmp_path / "answer.json") == load_answer(path)
+def test_an_answer_states_what_was_asked_for(result):
+    """The tolerance too, beside the one at which the fit ended."""
+    asked = {"tightenings": 0, "assumptions": "trusted", "rtol": 1e-3, "rtol_asked": 1e-3}
+    assert asked.items() <= result.made_by.items()
 
 
 def forge(content: dict[str, Any]) -> None:
@@ -198,211 +251,269 @@ def forge(content: dict[str, Any]) -> None:
 
 
 DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "a digit": (lambda c: c["estimates"][1].update(last=1.25),
-        "is damaged: its content is not what was saved"),
-    "no checksum": (lambda c: c.pop("checksum"), "is damaged: its content is not what was saved"),
-    "another form": (lambda c: c.update(schema="torchsoft-answer-9"),
-        "its `schema` is 'torchsoft-answer-9'"),
-    "an old one": (lambda c: c.pop("schema"), "an older version wrote it, so identify again"),
+    "a digit": (lambda c: c["estimates"][1].update(last=1.25), "is damaged"),
+    "no checksum": (lambda c: c.pop("checksum"), "is damaged"),
+    "another form": (lambda c: c.update(schema="torchsoft-answer-9"), "'torchsoft-answer-9'"),
+    "an old one": (lambda c: c.pop("schema"), "identify again"),
     "forged": (forge, r"\.x\.\d+ should be a valid number, not '0'"),
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize("how", DAMAGE)
-def test_a_damaged_file_is_refused_with_a_sentence(path, tmp_path, how):
-    change, said = DAMAGE[how]
-    content, other = json.loads(path.read_text(encoding="utf-8")), tmp_path / "answer.json"
-    change(content)
-    other.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(ValueError, match=said) as caught:
+@pytest.mark.parametrize("how", [*DAMAGE, "", "[1, 2]", '{"a": 1}', "\xff", "[" * 100_000, "cut"])
+def test_damaged_and_other_files_are_rejected_by_name(path, tmp_path, how):
+    whole, other = path.read_bytes(), tmp_path / "answer.json"
+    data, says = how.encode("latin-1"), "is not an answer"
+    if how in DAMAGE:
+        change, says = DAMAGE[how]
+        content = json.loads(whole)
+        change(content)
+        data = json.dumps(content).encode()
+    other.write_bytes(whole[: len(whole) // 2] if how == "cut" else data)
+    with pytest.raises(ValueError, match=says) as caught:
         load_answer(other)
     assert str(other) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("text", ["", "[1, 2]", '{"a": 1}', "\xff", "[" * 100_000, "cut"])
-def test_other_files_are_refused_with_a_sentence(path, tmp_path, text):
-    other = tmp_path / "other.json"
-    whole = path.read_bytes()
-    other.write_bytes(whole[: len(whole) // 2] if text == "cut" else text.encode("latin-1"))
-    with pytest.raises(ValueError, match=re.escape(f"{other} is not an answer")) as caught:
-        load_answer(other)
     assert len(str(caught.value)) < 600
-    with pytest.raises(FileNotFoundError):
-        load_answer(tmp_path / "nothing.json")
+
+
+# The rig of an answer
 
 
 @pytest.mark.filterwarnings("ignore:not identifiable")
-def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result, path):
-    mine, its = result.model("second"), load_answer(path).model("second")
+def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(full, path):
+    mine, its = full.model("shallow"), load_answer(path).model("shallow")
     for name, value in mine.named_parameters():
         if not name.startswith("reference."):
             assert torch.equal(its.parameter(name), value), name
-    assert float(its.parameter(E).detach()) == result[E].last
-    own = [e.last for e in result.estimates if e.name == R_N]
-    assert [
-        float(result.model(name).parameter(R_N).detach()) for name in ("first", "second")
-    ] == own
+    assert float(its.parameter(E).detach()) == full[E].last
+    own = [e.last for e in full.estimates if e.name == R_N and e.recording in FITTED]
+    assert own == [float(full.model(name).parameter(R_N).detach()) for name in FITTED]
     assert own[0] != own[1]
-    t = times(0.2, 30)
-    begun = result.rigs["second"]
-    y0 = excited(GRASP, BASE).y0
-    runs = [simulate(rig, t, y0=y0, reference=begun.reference, rtol=1e-3).y for rig in (mine, its)]
+    t, began, y0 = times(0.2, 30), full.rigs["shallow"], grasp(0.9e-3).y0
+    runs = [simulate(rig, t, y0=y0, reference=began.reference, rtol=1e-3).y for rig in (mine, its)]
     assert torch.equal(*runs)
-    assert not torch.equal(runs[0], simulate(begun, t, y0=y0, rtol=1e-3).y)
-    assert torch.equal(
-        mine.follow(t), begun.follow(t)
-    )  # the result's rig follows what the recording followed
-    assert mine is not begun
+    assert not torch.equal(runs[0], simulate(began, t, y0=y0, rtol=1e-3).y)
+    assert torch.equal(mine.follow(t), began.follow(t))
 
 
-def test_what_is_not_identifiable_is_named_when_it_is_used(result, path):
-    assert not result[V_S].identifiable
-    for answer in (result, load_answer(path)):
-        with pytest.warns(
-            UserWarning, match=rf"only where the search ended: .*{V_S} = \S+$"
-        ) as caught:
-            answer.model("first")
+def test_what_is_not_identifiable_is_named_when_it_is_used(full, path):
+    """So is what only a recording that was not fitted would tell."""
+    assert not full[V_S].identifiable
+    for answer in (full, load_answer(path)):
+        with pytest.warns(UserWarning, match=rf"search ended: .*{V_S} = \S+$") as caught:
+            answer.model(HOSTILE)
         assert [Path(one.filename).name for one in caught] == [Path(__file__).name]
         assert E not in str(caught[0].message)
+        assert R_N not in str(caught[0].message)
+    with pytest.warns(UserWarning, match=rf"search ended: .*{R_N} = \S+"):
+        full.model("held")
 
 
-def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
-    result,
-):
-    def left_out(c: Coordinate) -> Coordinate:
-        return replace(c, fixed=True) if c.recording == "second" else c
-
-    out = [e for e in result.estimates if e.recording != "second"]
-    answer = replace(result, estimates=out, coordinates=[left_out(c) for c in result.coordinates])
-    with pytest.warns(
-        UserWarning, match=rf"only where the search ended: {R_N} = \S+, {V_S} = \S+$"
-    ):
-        answer.model("second")
-    with pytest.warns(UserWarning, match=rf"only where the search ended: .*{V_S} = \S+$"):
-        answer.model("first")
+@pytest.mark.parametrize(
+    ("given", "says"), [((), "say in which one, of `"), (("third",), "'third'; there are `")]
+)
+def test_a_recording_must_be_named_where_rigs_differ(result, given, says):
+    with pytest.raises(ValueError, match=says):
+        result.model(*given)
 
 
-def test_a_recording_must_be_named_where_rigs_differ(result):
-    for given, said in (
-        ((), "not the same in all recordings: say in which one, of `first`, `second`"),
-        (("third",), "there is no recording 'third'; there are `first`, `second`"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            result.model(*given)
-
-
-def at(problem: Problem, x: np.ndarray) -> Fit:
-    """A fit that is at x (n,)."""
-    c = problem.coordinates
-    free = tuple(one.label for one in c.within(c.free))
-    return Fit(problem, Runner(problem.recordings), x, Stage("all", problem.names, free, 1e-3))
-
-
-@pytest.fixture(scope="module")
-def slippery(problem, result):
-    """A result for rigs with a law of the user's own, whose alpha is not identifiable."""
-    own = [replace(r, rig=slide(BASE, r.rig.reference)) for r in problem.recordings]
-    mine = Problem(own, SENSORS, {ALPHA: Unknown(), E: Unknown()})
-    c, C = mine.coordinates, np.zeros((len(mine.coordinates),) * 2)
-    x, C[0, 0] = c.start + 0.1, 1.0
-    fit = at(mine, x)
-    found = estimates(fit, C, np.zeros(len(x)))
-    rigs = {r.name: r.rig for r in own}
-    recordings = recorded_rigs(fit)
-    return replace(
-        result, estimates=found, x=x.tolist(), coordinates=list(c.all), unknowns=mine.unknowns,
-        recordings=recordings, rigs=rigs,
-    )  # fmt: skip
-
-
-def slide(file: RigFile, reference: Reference) -> Rig:
+def slide(file: RigFile, like: Any) -> Any:
     rig = file.assemble({FRICTION: Viscous(0.6, 30.0)})
-    rig.reference = reference
+    rig.reference = like.reference
     return rig
 
 
-def test_a_law_of_the_users_own_needs_the_users_rig(slippery, tmp_path):
+def test_a_custom_law_needs_the_rig_of_the_user(problem, result, tmp_path):
+    """Of which alpha is not identifiable."""
+    own = [replace(r, rig=slide(BASE, r.rig)) for r in problem.recordings]
+    mine = Problem(own, SENSORS, {ALPHA: Unknown(), E: Unknown()})
+    c, C = mine.coordinates, np.zeros((len(mine.coordinates),) * 2)
+    x, C[0, 0] = c.start + 0.1, 1.0
+    fit, rigs = at(mine, x, FITTED), {r.name: r.rig for r in own}
+    slippery = replace(
+        result, estimates=estimates(fit, C, np.zeros(len(x))), x=x.tolist(),
+        coordinates=list(c.all), unknowns=mine.unknowns, recordings=recorded_rigs(fit), rigs=rigs,
+    )  # fmt: skip
     slippery.save(tmp_path / "answer.json")
-    answer, reference = load_answer(tmp_path / "answer.json"), slippery.rigs["first"].reference
-    said = r"Rig with parts of its own, which the answer does not hold: .* `applied_to\(rig\)`"
-    with pytest.raises(ValueError, match=said):
-        answer.model()
-    mine, weak = (
-        slide(BASE, reference),
-        rf"only where the search ended: {ALPHA} = 0\.663$",
-    )
+    answer, like = load_answer(tmp_path / "answer.json"), own[0].rig
+    with pytest.raises(ValueError, match=r"parts of its own.*`applied_to\(rig\)`"):
+        answer.model(HOSTILE)
+    weak, given = rf"search ended: {ALPHA} = 0\.663$", slide(BASE, like)
     with pytest.warns(UserWarning, match=weak) as caught:
-        its = answer.applied_to(mine)
+        its = answer.applied_to(given, HOSTILE)
     assert len(caught) == 1  # it is the right rig
     with pytest.warns(UserWarning, match=weak):
-        own = slippery.model()
-    for name, value in own.named_parameters():
+        same = slippery.model(HOSTILE)
+    for name, value in same.named_parameters():
         assert torch.equal(its.parameter(name), value), name
     assert float(its.parameter(E).detach()) == slippery[E].last != 0.75e6
-    assert float(mine.parameter(E).detach()) == 0.75e6  # it is a copy that was changed
-    another = slide(BASE.override({"pad.nu": 0.4}), reference)
+    assert float(given.parameter(E).detach()) == 0.75e6  # it is a copy that was changed
+    another = slide(BASE.override({"pad.nu": 0.4}), like)
     with (
         pytest.warns(UserWarning, match=weak),
-        pytest.warns(UserWarning, match=rf"its values may mislead: {NU} is 0\.4 and was 0\.45$"),
+        pytest.warns(UserWarning, match=rf"may mislead: {NU} is 0\.4 and was 0\.45$"),
     ):
-        answer.applied_to(another)
+        answer.applied_to(another, HOSTILE)
     with pytest.raises(ValueError, match=f"`{ALPHA}` is not a parameter of this rig"):
-        answer.applied_to(BASE.assemble())
+        answer.applied_to(BASE.assemble(), HOSTILE)
 
 
-def test_contributions_are_those_of_the_inverse_matrices(problem, result):
-    """Against numpy's inverses of what Fisher's matrices of the recordings add up to."""
-    fit = at(problem, np.array(result.x)).begun()
-    J = fit.at.J
-    m, k = problem.samples(["first"]), list(problem.coordinates.labels)
-    parts = {"first": J[:m], "second": J[m:-2], None: J[-2:]}
-    known = [i for i, label in enumerate(k) if label != V_S]
-    J[:, k.index(V_S)] = 0.0
-    stage = replace(fit.stage, free=tuple(k[i] for i in known))
-    F = {name: rows[:, known].T @ rows[:, known] for name, rows in parts.items()}
-    C = np.linalg.inv(sum(F.values()))
-    for one in contributions(fit._replace(stage=stage)):
-        left = np.linalg.pinv(sum(part for name, part in F.items() if name != one.source))
-        for i, label in enumerate(k[i] for i in known):
-            assert one.shares[label] == pytest.approx(
-                (C @ F[one.source] @ C)[i, i] / C[i, i], rel=1e-6, abs=1e-9
-            )
-            if one.without[label] is not None:
-                assert one.without[label] == pytest.approx(
-                    (left[i, i] / C[i, i]) ** 0.5, rel=1e-6
-                ), label
-        if one.source == "second":
-            assert one.without[f"{R_N} in second"] is None  # nothing else sees it
-            assert one.without[E] > 1.1
-    assert [one.source for one in result.contributions] == list(parts)
+# The report
 
 
-def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinates(
-    problem,
-):
-    sure, unknowns = Prior(median=0.8, sd=0.1), {
-        MU_S: Unknown(prior=Prior(median=0.8, sd=0.1)),
-        MU_K: Unknown(nominal=0.5, ratio_to=MU_S, fixed=True),
-        NU: Unknown(scale="linear", low=0.3, high=0.49),
-    }  # fmt: skip
-    own = Problem(problem.recordings[:1], {"theta_C": Sensor(noise=5e-4)}, unknowns)
-    c = own.coordinates
-    x = c.start + np.array([np.log(1.1), 0.0, -0.05 / 0.19])
-    found = {
-        e.name: e
-        for e in estimates(at(own, x), np.diag([0.1**2, 0.0, 0.2**2]), np.array([0.05, 0.0, 0.0]))
-    }
-    assert list(found) == list(unknowns)
-    for name, start in ((MU_S, 0.8), (MU_K, 0.4)):
-        e = found[name]
-        assert (e.start, e.value) == pytest.approx((start, 1.1 * start))
-        assert e.ci95 == pytest.approx(
-            (1.1 * start * np.exp(-0.196), 1.1 * start * np.exp(0.196)), rel=1e-4
-        )
-        assert e.step_bias_sd == pytest.approx(0.5)
-    assert [e.prior for e in found.values()] == [sure, None, None]
-    nu = found[NU]
-    assert (nu.start, nu.value, nu.unit) == (0.45, pytest.approx(0.4), "1")
-    assert nu.ci95 == pytest.approx((0.4 - 0.196 * 0.38, 0.4 + 0.196 * 0.38), rel=1e-4)
-    assert nu.relative_sd == pytest.approx(0.2 * 0.19 / 0.4)
+class Page(HTMLParser):
+    """Tags with their attributes, the text, and whether every tag that was opened was closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text, self.open = "", []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("img", "meta"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] != ["style"]:
+            self.text += data + "\n"
+
+
+def written(answer: IdentificationResult, problem: Problem, folder: Path) -> Page:
+    report(answer, problem, folder / "report.html")
+    assert [path.name for path in folder.iterdir()] == ["report.html"]
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def page(path, problem, tmp_path_factory):
+    """Of the answer that was loaded from its file."""
+    return written(load_answer(path), problem, tmp_path_factory.mktemp("report"))
+
+
+def test_the_page_stands_alone(page):
+    assert page.open == []
+    tags = {tag for tag, _ in page.tags}
+    assert tags.isdisjoint({"script", "link", "iframe", "object", "b", "a"})
+    pictures = [attributes for tag, attributes in page.tags if tag == "img"]
+    assert len(pictures) > len(DEPTHS) * len(SENSORS)
+    for attributes in pictures:
+        kind, _, data = str(attributes["src"]).partition(",")
+        png = base64.b64decode(data)
+        width, height = struct.unpack(">II", png[16:24])
+        assert (kind, png[:8]) == ("data:image/png;base64", b"\x89PNG\r\n\x1a\n")
+        assert 600 < width < 1200
+        assert 200 < height < 1600
+        assert len(str(attributes["alt"])) > 20
+    addresses = [1 for _, attributes in page.tags for k in attributes if k in ("src", "href")]
+    assert len(addresses) == len(pictures)
+
+
+def test_the_page_holds_what_the_answer_holds(page, full):
+    text = page.text.replace("\u202f", "").replace("−", "-")
+    known = [e for e in full.estimates if e.identifiable]
+    assert {e.name for e in known} >= {E, "start.disc.x", "bias of y_Br"}
+    numbers = [float(f"{v:.5g}") for e in known for v in (e.value, *(e.ci95 or ()))]
+    for shown in (
+        *(f"{number:.12g}" for number in numbers),
+        f"\n{V_S}\nnot identifiable\nnone\nm/s\n",
+        *(f"{100 * value:.3g} %" for one in full.heldout.values() for value in one.values()),
+        HOSTILE,  # escaped once, and not twice
+        f"\n{full.command}\n",
+        "×/÷ 1.65",  # the prior: a factor of exp(0.5)
+        f"only {E} / {K_N}^0.5 is determined (2 %), not each ({E} 30 %, {K_N} 40 %)\n",
+    ):
+        assert shown in text
+    for name in (direction_name(d) for d in full.directions if not d.identifiable):
+        assert f"\n{name} may change without a trace in the data\n" in page.text
+
+
+def test_warnings_come_first_then_parameters_starts_and_sensors(page, full):
+    assert full.notices
+    order = [
+        *(f"\n{notice}\n" for notice in full.notices), "\nEstimates\n", f"\n{E}\n", f"\n{V_S}\n",
+        f"\n{R_N}\n{HOSTILE}\n", f"\n{R_N}\nshallow\n", "\nstart.disc.x\nshallow\n",
+        "\nbias of y_Br\n",
+    ]  # fmt: skip
+    places = [page.text.index(text) for text in order]
+    assert sorted(places) == places
+
+
+def test_assumptions_that_matter_stand_open_and_others_are_folded(page):
+    folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
+    assert page.text.index(f"\n−4.2 sd of {E}\nyes −3.1 ± 1.2 %: the sum of squares ") < folded
+    assert page.text.index("\nnot checked: a run failed\n") < folded
+    assert page.text.index(f"\n<b> is so\nit were not\n+0.1 sd of {E}\nno: +0.3 ± 1.2 %\n") > folded
+
+
+def test_traces_are_those_of_the_model_and_whitened_by_its_noise(problem, result, full):
+    drawn, lost = traces(full, problem, None)
+    assert not lost
+    assert len(drawn) == len(DEPTHS) * len(SENSORS)
+    runner, x = Runner(problem.recordings), np.array(result.x)
+    own = problem.residuals(runner, x, problem.names, result.made_by["rtol"]).r
+    r = np.concatenate([one.residual for one in drawn])
+    np.testing.assert_array_equal(r, own[: problem.samples()])
+    fitted = {(one.recording, one.channel): one.rms for one in result.residuals}
+    for one in drawn:
+        noise, rms = SENSORS[one.channel].noise, float(np.sqrt(np.mean(one.residual**2)))
+        np.testing.assert_allclose(one.predicted - one.measured, noise * one.residual, atol=1e-12)
+        if one.recording == "held":
+            nrmse = rms * noise / np.ptp(one.measured)
+            assert nrmse == pytest.approx(result.heldout["held"][one.channel], rel=1e-6)
+        else:
+            assert rms == pytest.approx(fitted[one.recording, one.channel], rel=1e-6)
+        white = one.residual.copy()
+        if one.channel == "effort_y":
+            white = np.append(white[0] / NOISE.sd, (white[1:] - 0.8 * white[:-1]) / 0.7)
+        np.testing.assert_allclose(one.white, white, rtol=1e-9, atol=1e-9)
+
+
+def test_an_answer_to_other_data_is_rejected(problem, result, tmp_path):
+    other = Problem(problem.recordings[:1], problem.sensors, problem.unknowns)
+    with pytest.raises(ValueError, match="other recordings"):
+        report(result, other, tmp_path / "report.html")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_lost_recording_is_named(problem, result, tmp_path, monkeypatch):
+    run = Runner.run
+
+    def losing(self: Runner, jobs: Any) -> list[Any]:
+        lost = FailedRun("it < went", 0.1)
+        return [lost if job.recording == 2 else one for job, one in zip(jobs, run(self, jobs))]
+
+    monkeypatch.setattr(Runner, "run", losing)
+    monkeypatch.setattr(sections, "png", lambda figure: "")
+    answer = replace(result, notices=[], contributions=result.contributions[:1])
+    page = written(answer, problem, tmp_path)
+    alts = " ".join(str(attributes.get("alt")) for _, attributes in page.tags)
+    assert "Could not be simulated: it < went" in page.text
+    assert f"y_Br of {HOSTILE}" in alts
+    assert "y_Br of held" not in alts
+    assert "nothing to warn of" in page.text
+    for heading in ("Contribution of each recording", "Assumptions"):
+        assert f"\n{heading}\n" not in page.text  # where there is nothing to report
+
+
+def test_no_text_of_a_picture_is_cut_or_overlaps(full):
+    figure = estimates_figure(full.estimates)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    texts = [one for one in figure.findobj(Text) if one.get_visible() and one.get_text().strip()]
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        low, high = sorted(axis.get_view_interval())  # some ticks are there but not drawn
+        ticks = [one for one in axis.get_major_ticks() if not low <= one.get_loc() <= high]
+        beyond = [one.label1 for one in (*ticks, *axis.get_minor_ticks())]
+        texts = [one for one in texts if one not in beyond]
+    drawn = [one.get_window_extent(canvas.get_renderer()) for one in texts]
+    width, height = figure.canvas.get_width_height()
+    assert len(drawn) > 5
+    for i, box in enumerate(drawn):
+        assert min(box.x0, box.y0, width - box.x1, height - box.y1) > -1, texts[i]
+        for k, its in enumerate(drawn[:i]):
+            gap = max(box.x0 - its.x1, its.x0 - box.x1, box.y0 - its.y1, its.y0 - box.y1)
+            assert gap >= -1, f"{texts[i]} lies over {texts[k]}"

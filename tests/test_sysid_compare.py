@@ -2,21 +2,20 @@
 and laws of friction."""
 
 import json
-from copy import deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE, PAPER, RIG, rolled, stroked, towards
+from conftest import COARSE, PAPER, RIG, rolled, stroked
 from scipy import stats
 from test_sysid_friction import ALPHA, FRICTION, Viscous
 
-from torchsoft import Profile, excite
+from torchsoft import excite
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import Problem, Sensor, Stage, Unknown, record
-from torchsoft.sysid.compare import Density, LawFit, compare, density, judged, ratio, versus
+from torchsoft.sysid.compare import Density, LawFit, compare, density, judged, versus
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import Part
 
@@ -54,39 +53,31 @@ def shares(D: float, draws: list[np.ndarray]) -> dict[str, float]:
     return {one: said.count(one) / len(said) for one in ("right", "wrong", "cannot tell")}
 
 
-def test_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ():
+@pytest.mark.parametrize(
+    ("D", "least", "most"), [(0.5, 0.0, 0.0), (5.0, 0.45, 0.9), (9.0, 0.97, 1)]
+)
+def test_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ(D, least, most):
     """As a normal distribution has it: z is (D / 2, 1) where the first law made the data."""
     rng = np.random.default_rng(0)
-    draws = list(rng.standard_normal((50, len(T))))
-    near, middle, far = (shares(D, draws) for D in (0.5, 5.0, 9.0))
-    assert near["cannot tell"] == 1.0
-    assert middle["right"] == pytest.approx(stats.norm.sf(2.0 - 2.5), abs=0.2)
-    assert far["right"] > 0.97
-    assert max(one["wrong"] for one in (near, middle, far)) == 0.0
+    found = shares(D, list(rng.standard_normal((30, len(T)))))
+    assert found["wrong"] == 0.0
+    assert least <= found["right"] <= most
 
 
-def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named(
-    monkeypatch,
-):
+def test_under_coloured_noise_that_is_called_white_a_wrong_law_is_not_named():
     """The likelihood ratio is then some standard deviations of the stated noise from zero by
     chance."""
-    rng, colour = np.random.default_rng(1), Autoregression.stated((0.95,), 5e-3)
-    L = np.linalg.cholesky(
-        colour.autocovariance(len(T))[np.abs(np.subtract.outer(*2 * [np.arange(len(T))]))]
-    )
-    draws = [L @ rng.standard_normal(len(T)) for _ in range(60)]
-    assert shares(5.0, draws)["wrong"] <= 0.02
-    monkeypatch.setattr(
-        "torchsoft.sysid.compare.fit_noise", lambda series, most: SimpleNamespace(noise=None)
-    )
-    assert shares(5.0, draws)["wrong"] > 0.05
+    rng, lags = np.random.default_rng(1), np.abs(np.subtract.outer(*2 * [np.arange(len(T))]))
+    colour = Autoregression.stated((0.95,), 5e-3).autocovariance(len(T))
+    draws = np.linalg.cholesky(colour[lags]) @ rng.standard_normal((len(T), 30))
+    assert shares(5.0, list(draws.T))["wrong"] == 0.0
 
 
 def test_a_law_is_not_named_for_having_fewer_parameters_and_pays_for_more():
     r = np.random.default_rng(2).standard_normal(len(T))
     same = versus(law("a", r, k=1), law("b", r.copy(), k=9))
     assert same.evidence == same.z == 0.0
-    assert "these motions and sensors cannot tell them apart" in same.doubts[0]
+    assert "cannot tell them apart" in same.doubts[0]
     fewer, more = (versus(law("a", r, k=k), law("b", r + apart(6.0), k=3)) for k in (1, 6))
     assert fewer.evidence - more.evidence == pytest.approx(1.5 * np.log(len(T)))
 
@@ -104,35 +95,39 @@ def test_heldout_recordings_count_and_may_contradict():
     assert "held-out recordings speak for `b`" in torn.doubts[0]
 
 
-def fitted(
-    name: str,
-    p: float = 0.5,
-    converged: bool = True,
-    heldout_p: float | None = None,
-    patterned: bool = False,
-) -> LawFit:
-    return LawFit(
-        name, 2, {}, 0.0, 1.0, p, 0.0, 0.0, 0.0, 0.5, None, heldout_p, 0.0, converged, [], patterned
-    )
+def fitted(name: str, **more: Any) -> LawFit:
+    numbers = dict.fromkeys(("log_likelihood", "aic", "aicc", "bic", "numerical"), 0.0)
+    usual = {"parameters": 2, "estimates": {}, "chi2": 1.0, "p": 0.5, "weight": 0.5, "left": [],
+             "heldout": None, "heldout_p": None, "converged": True, "patterned": False}  # fmt: skip
+    return LawFit(name, **usual | numbers | more)
 
 
-def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_converged():
+@pytest.mark.parametrize(
+    ("a", "b", "rough", "outcome", "says"),
+    [
+        ({}, {"p": 0.0}, 0.0, "law", "`a`"),
+        (
+            {"p": 1e-6},
+            {},
+            0.0,
+            "none fits",
+            "it is nearer than `b`, but that does not make it right",
+        ),
+        ({"heldout_p": 1e-9}, {}, 0.0, "none fits", "misses the held-out recordings"),
+        ({"patterned": True}, {}, 0.0, "none fits", "leaves residuals that follow the motion"),
+        ({}, {"converged": False}, 0.0, "cannot tell", "the fit of `b` has not converged"),
+        ({}, {}, 1.0, "cannot tell", "take a tighter tolerance"),
+    ],
+)
+def test_the_conclusion_is_that_of_the_numbers(a, b, rough, outcome, says):
+    """Two laws of which one leaves much more; `rough` is the part of the evidence that a tenth of
+    the tolerance changes."""
     r = np.random.default_rng(4).standard_normal(len(T))
     clear = versus(law("a", r), law("b", r + apart(30.0)))
-    assert judged([fitted("a"), fitted("b", p=0.0)], [clear])[:2] == ("law", "a")
-    outcome, none, verdict = judged([fitted("a", p=1e-6), fitted("b")], [clear])
-    assert (outcome, none) == ("none fits", None)
-    assert "it is nearer than `b`, but that does not make it right" in verdict
-    assert judged([fitted("a", heldout_p=1e-9), fitted("b")], [clear])[0] == "none fits"
-    assert (
-        "leaves residuals that follow the motion"
-        in judged([fitted("a", patterned=True), fitted("b")], [clear])[2]
-    )
-    outcome, _, verdict = judged([fitted("a"), fitted("b", converged=False)], [clear])
-    assert outcome == "cannot tell"
-    assert "the fit of `b` has not converged" in verdict
-    rough = replace(clear, numerical=clear.evidence)
-    assert "take a tighter tolerance" in judged([fitted("a"), fitted("b")], [rough])[2]
+    clear = replace(clear, numerical=rough * clear.evidence)
+    found, named, verdict = judged([fitted("a", **a), fitted("b", **b)], [clear])
+    assert (found, named) == (outcome, "a" if outcome == "law" else None)
+    assert says in verdict
 
 
 BASE = PAPER.override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
@@ -162,7 +157,7 @@ def laws(excitation: Excitation, alpha: float) -> dict[str, Problem]:
 
 def plans(problems: dict[str, Problem]) -> dict[str, list[Stage]]:
     return {
-        name: [Stage("all", one.names, one.coordinates.labels, 1e-4, tolerance=1e-3)]
+        name: [Stage("all", one.names, one.coordinates.labels, 1e-4, tolerance=1e-2)]
         for name, one in problems.items()
     }
 
@@ -175,7 +170,14 @@ def stroke():
 def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
     found = compare(stroke, plans=plans(stroke))
     assert (found.outcome, found.law) == ("law", "viscous"), found.verdict
-    assert found["viscous"].weight > 0.999 > found["viscous"].p > 1e-3
+    one, n = (
+        found["viscous"],
+        sum(len(t) for t, _ in stroke["viscous"].recordings[0].samples.values()),
+    )
+    assert one.weight > 0.999 > one.p > 1e-3
+    k = one.parameters
+    assert one.aicc - one.aic == pytest.approx(2 * k * (k + 1) / (n - k - 1))
+    assert one.bic + 2 * one.log_likelihood == pytest.approx(k * np.log(n))
     assert found["viscous"].estimates[ALPHA] == pytest.approx(0.55, rel=0.02)
     assert found["smooth"].bic - found["viscous"].bic > 20
     found.save(tmp_path / "comparison.json")
@@ -183,6 +185,7 @@ def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
     assert found.table().count("\n") == 2
 
 
+@pytest.mark.slow
 def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another():
     problems = laws(GENTLE, 0.6)
     found = compare(problems, plans=plans(problems))
@@ -199,19 +202,15 @@ def test_laws_that_were_not_given_the_same_data_are_refused(stroke):
         return Problem([replace(recording, **changes)], sensors, UNKNOWNS["smooth"])
 
     noisier = {channel: (t, y + 1e-9) for channel, (t, y) in recording.samples.items()}
-    moved = deepcopy(recording.rig)
-    moved.reference = towards(moved, Profile([0.0], [60e-3]))
     elsewhere = {"a": [Stage("all", (), (), 1e-4)]}
     for others, how, message in (
         ({}, {}, "needs two laws or more, not 1"),
         ({"b": other(name="two")}, {}, "`a` and `b` have other recordings: one and two"),
         ({"b": other(samples=noisier)}, {}, "`one` of the laws `a` and `b` has other samples"),
         ({"b": other({"x_C": SENSORS["x_C"]})}, {}, "have other sensors"),
-        ({"b": other(rig=moved)}, {},
-         "follow another reference in recording `one`"),
         ({"b": p}, {"heldout": ["one"]}, r"`heldout` must name some of \['one'\], but not all"),
         ({"b": p}, {"plans": elsewhere}, "the last stage of the plan of `a` must fit one"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=message):
             compare({"a": one, **others}, **how)
 
@@ -237,6 +236,3 @@ def test_densities_are_those_of_the_normal_distribution():
     S: Any = K + J @ J.T
     assert wide.log == pytest.approx(stats.multivariate_normal(cov=S).logpdf(e), rel=1e-12)
     assert wide.p == pytest.approx(stats.chi2.sf(e @ np.linalg.solve(S, e), n))
-    white = density(SimpleNamespace(**vars(problem) | {"noise": {}}), ["one"], e / sigma)
-    score = white.s / sigma - np.linalg.solve(K, e)
-    assert ratio(plain, white).stated == pytest.approx(score @ K @ score, rel=1e-9)

@@ -55,15 +55,11 @@ def jerks():
 def test_its_parameters_are_found_beside_those_of_the_pads(jerks):
     problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, E)})
     plan = [Stage("all", ("jerks",), problem.coordinates.labels, 1e-6)]
-    answer = identify(
-        problem, plan=plan, assumptions="trusted"
-    )  # three sensors do not tell beta from the mesh
+    answer = identify(problem, plan=plan, assumptions="trusted")
     assert answer.converged
     for name, value in (*TRUTH.items(), (E, 0.9e6)):
         assert answer[name].identifiable, name
-        assert abs(answer[name].last / value - 1) < 0.1 * answer[name].relative_sd, (
-            name
-        )  # of the steps, which differ
+        assert abs(answer[name].last / value - 1) < 0.1 * answer[name].relative_sd, name
     assert answer[ALPHA].unit == ""
 
 
@@ -74,25 +70,14 @@ def test_its_derivatives_by_both_routes_are_those_of_differences(jerks):
     check_derivatives(problem, problem.coordinates.start, 3e-5, 2e-4)
 
 
-def test_it_can_be_sent_to_another_process(jerks):
-    there = pickle.loads(pickle.dumps(jerks))
-    assert isinstance(there.begin().rig.contacts["L"].law.friction, Viscous)
-    assert there.fingerprint == jerks.fingerprint
-
-
 def test_only_what_the_model_has_can_be_identified(jerks):
-    own = {*TRUTH, E, "actuators.y.Kd", "bodies.disc.shape.radius"}
-    assert own <= set(jerks.parameters)
+    assert {*TRUTH, E} <= set(jerks.parameters)
     for name in (f"{FRICTION}.mu_s", f"{FRICTION}.gamma"):
         with pytest.raises(ValueError, match=f"`{name}` cannot be identified; .*{ALPHA}"):
             Problem([jerks], SENSORS, {name: Unknown()})
     negative = given(jerks, Viscous(-1.0, 100.0))
     with pytest.raises(ValueError, match=r"friction\.alpha = -1 is not on a logarithmic scale"):
         Problem([negative], SENSORS, {ALPHA: Unknown()})
-
-
-def frictionless(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-    return E / R
 
 
 def scaled(factor: float) -> SlipLaw:
@@ -103,17 +88,19 @@ def weighted(E: Tensor, F_N: Tensor, R: Tensor, factor: float) -> Tensor:
     return factor * E / R
 
 
-def test_a_checkpoint_of_another_law_is_not_read(jerks, tmp_path):
-    """Neither of other numbers, nor of another function, of one that holds others, nor of a changed
-    one."""
-    laws: list[SlipLaw | None] = [Viscous(0.6, 100.0), None, Viscous(0.61, 100.0), frictionless]
+def test_recordings_of_other_laws_have_other_fingerprints(jerks, tmp_path):
+    """Of other numbers, another function, one that holds others, or another file; not in another
+    process."""
+    laws: list[SlipLaw | None] = [Viscous(0.6, 100.0), None, Viscous(0.61, 100.0)]
     for factor in (0.5, 0.25):
         laws += [scaled(factor), partial(weighted, factor=factor)]
     for number, text in enumerate(("E / R", "E / (2 * R)")):
-        path = tmp_path / f"{number}" / "laws.py"
-        path.parent.mkdir()
+        path = tmp_path / f"laws_{number}.py"
         path.write_text(f"def law(E, F_N, R):\n    return {text}\n")
         laws.append(runpy.run_path(str(path))["law"])
     prints = [given(jerks, law).fingerprint for law in laws]
-    assert len(set(prints)) == len(laws) == 10
+    assert len(set(prints)) == len(laws)
     assert prints == [given(jerks, law).fingerprint for law in laws]
+    there = pickle.loads(pickle.dumps(jerks))
+    assert isinstance(there.begin().rig.contacts["L"].law.friction, Viscous)
+    assert there.fingerprint == jerks.fingerprint

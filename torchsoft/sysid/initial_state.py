@@ -21,7 +21,7 @@ from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.start import REST, pressed
+from torchsoft.physics.start import AWAY, REST, at_height, pressed
 from torchsoft.physics.statics import NoEquilibrium, resting, settled, standing
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.progress import SimulationFailed
@@ -187,6 +187,8 @@ class Standing(NamedTuple):
 
         def state(values: Mapping[str, Tensor]) -> Tensor:
             pose = dict(given)
+            for name in self.presses:  # bodies rest before others press them
+                pose[name] = at_height(pose[name], torch.tensor(AWAY, dtype=torch.float64))
             for name in self.position_sd:
                 if (place := values.get(f"{PREFIX}{name}")) is not None:
                     body, axis = name.split(".")

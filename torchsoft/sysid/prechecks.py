@@ -9,7 +9,7 @@ of an actuator is compared with its known law at the measured coordinates.
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -337,7 +337,9 @@ def controller_findings(
         by = slopes[:, len(read) :: 2].square().mean(0).tolist()
         noise = [sensors[force].noise ** 2]
         noise += [slope * sensors[one].noise ** 2 for slope, one in zip(by, others)]
-        off = float(np.mean(F - given.detach().numpy()))
+        apart = F - given.detach().numpy()
+        apart -= shift_of_start(recording, actuator, t, apart, slopes[:, 0].numpy())
+        off = float(np.mean(apart))
         if abs(off) <= 2 * sum(noise) ** 0.5 + ROUGH * float(np.sqrt(np.mean(F**2))):
             continue
         ask = "are its gains, units, zeros and set-points right?"
@@ -348,6 +350,21 @@ def controller_findings(
             f"controller gives: {ask}"
         )
         yield found(feed or f"loop of {force}", recording, text)
+
+
+def shift_of_start(
+    recording: Recording, actuator: Actuator, t: Array, apart: Array, slope: Array
+) -> Array:
+    """Part (k,) of the difference `apart` of a force from its controller's that is the shift of a
+    set-point with the start of a body, which the parameters that are not known yet decide: as large
+    as the first samples have it. `slope` is the derivative with respect to the set-point."""
+    followed = getattr(recording.start, "followed", {}).get(actuator.setpoint)
+    if followed is None or not slope[:FEWEST].all():
+        return np.zeros_like(apart)
+    signal: Any = recording.rig.reference[actuator.setpoint]
+    weights = torch.tensor(followed.weights, dtype=torch.float64).expand(signal.values.shape)
+    by_start = slope * signal.with_values(weights)(torch.tensor(t))[0].detach().numpy()
+    return float(np.mean(apart[:FEWEST] / slope[:FEWEST])) * by_start
 
 
 MOVES = 5.0

@@ -6,7 +6,7 @@ data cannot determine it.
 """
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
@@ -165,16 +165,16 @@ def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) 
     return near if len(near) > 1 or any(checks[one.name].far for one in near) else []
 
 
-def compared(checked: Checked, judge: "Judge") -> Checked:
+def with_odds(checks: Sequence[AssumptionTest], dof: int) -> list[AssumptionTest]:
     """Tests with odds: shares of the evidence, by Schwarz's criterion and `TEMPERED`, of the
-    suspects that pass the tests of a fit, or of all where none does. A new fit with a law that
-    holds or does not has no amplitude."""
-    out = list(checked.checks)
+    suspects that pass the tests of a fit with `dof` degrees of freedom, or of all where none does.
+    A new fit with a law that holds or does not has no amplitude."""
+    out = list(checks)
     favoured = [one for one in out if one.suspected]
-    if not favoured:
-        return checked._replace(alarms=checked.as_stated)
     some = [one for one in favoured if one.passed] or favoured
-    rest = max(1.0, min(one.left for one in some) / judge.dof)
+    if not some:
+        return out
+    rest = max(1.0, min(one.left for one in some) / dof)
     amplitudes = [
         one.amount
         if one.kind == "several"
@@ -182,9 +182,18 @@ def compared(checked: Checked, judge: "Judge") -> Checked:
         for one in some
     ]
     left = np.array([one.left for one in some])
-    score = left / rest + np.log(judge.dof) * np.array(amplitudes)
+    score = left / rest + np.log(dof) * np.array(amplitudes)
     odds = np.exp(-0.5 * TEMPERED * (score - score.min()))
     for one, share in zip(some, odds / odds.sum()):
         out[out.index(one)] = replace(one, odds=float(share))
-    besides, alone, left = judge.besides(some[int(score.argmin())], out)
+    return out
+
+
+def compared(checked: Checked, judge: Judge) -> Checked:
+    """Tests with odds, and what is left under the likeliest suspect."""
+    out = with_odds(checked.checks, judge.dof)
+    favoured = [one for one in out if one.suspected]
+    if not favoured:
+        return checked._replace(alarms=checked.as_stated)
+    besides, alone, left = judge.besides(max(favoured, key=lambda one: one.odds), out)
     return checked._replace(checks=out, besides=besides, alarms=tuple(alone), left=tuple(left))
