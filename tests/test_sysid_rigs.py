@@ -49,7 +49,8 @@ effort_left_x.noise = 0.05
 """
 PLAN = FIT.replace(
     'start = {kind = "rest", lead = 0.0}',
-    'rehearsal = {duration = 0.6, seed = 3}\nfit = {assumptions = "trusted", rtol = 1e-3}',
+    "rehearsal = {duration = 0.6, seed = 3}\n"
+    'fit = {assumptions = "trusted", rtol = 1e-3, tightenings = 0}',
 )
 
 
@@ -111,7 +112,7 @@ def test_parameters_of_a_rig_file_are_found_by_their_names(folder):
     assert first == "Problem: 2 unknowns, recordings run"
     assert rows[0].split() == ["materials.silicone.E", "5e+04", "to", "5e+06,", "from", "5e+05"]
     assert rows[-1].split() == ["effort_left_x", "measured", "to", "0.05", "N"]
-    result = identify(problem, assumptions="trusted", rtol=1e-3)
+    result = identify(problem, assumptions="trusted", rtol=1e-3, tightenings=0)
     for one in result.estimates:
         assert one.value == pytest.approx(TRUTH[one.name], rel=4 * one.relative_sd)
         assert one.relative_sd < 0.05
