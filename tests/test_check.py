@@ -278,11 +278,14 @@ def test_what_is_wrong_is_reported_with_its_field(name, quiet, tmp_path):
     "changes",
     [
         moved({"theta": 0.0}, 20e-3, -30.0),  # 20 %
-        *(pytest.param(one, marks=pytest.mark.slow) for one in (
-            moved(BOX, 2e-3, -30.0),  # 13 %
-            moved(BOX, 20e-3, -30.0, mu=0.2),  # it slides: 11 %
-            moved({}, 20e-3, -300.0),  # it rolls: 22 %
-        )),
+        *(
+            pytest.param(one, marks=pytest.mark.slow)
+            for one in (
+                moved(BOX, 2e-3, -30.0),  # 13 %
+                moved(BOX, 20e-3, -30.0, mu=0.2),  # it slides: 11 %
+                moved({}, 20e-3, -300.0),  # it rolls: 22 %
+            )
+        ),
     ],
 )
 def test_pads_that_are_moved_gently_are_not_warned_about(changes, tmp_path):

@@ -1,97 +1,76 @@
-"""Recordings that begin in motion: where they begin, by their first samples; derivatives; and
+"""Recordings that begin in motion: the initial state from the first samples, its derivatives, and
 parameters found all the same."""
 
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RIG, RUBBER, dry, excited, still, stroked
+from conftest import COARSE, PAPER, RIG, excited, still, stroked
 from test_experiments import experiment
-from test_sysid import check_derivatives
+from test_sysid import check_derivatives, fit
 from torch import Tensor
 
-from torchsoft import (
-    Body,
-    Circle,
-    Contact,
-    Pad,
-    PadMesh,
-    Rig,
-    SimulationFailed,
-    SmoothSlip,
-    SoftContact,
-    hold,
-)
-from torchsoft.physics.material import KelvinVoigt
-from torchsoft.physics.motion import Profile, Reference
-from torchsoft.sysid import Known, Problem, Recording, Sensor, Stage, Unknown, identify
-from torchsoft.sysid.first_samples import WIDER, beginning, estimate_initial_state, lasting_stretch
-from torchsoft.sysid.initial_state import SETTLE, MovingStart, Standing, Stretch
+from torchsoft import Contact, SimulationFailed, SmoothSlip, SoftContact
+from torchsoft.sysid import Problem, Recording, Sensor, Unknown, estimate_initial_state
+from torchsoft.sysid.first_samples import WIDER, beginning, lasting_stretch
+from torchsoft.sysid.initial_state import SETTLE, Standing, Stretch
 from torchsoft.sysid.runs import Runner
 
 E, TAU, MU_S = "materials.rubber.E", "materials.rubber.tau", "laws.steel_on_rubber.friction.mu_s"
 SINCE = 0.4
 """When the recording begins [s]: in the middle of the first stroke."""
 
-Cut = tuple[Recording, Tensor]
-
 
 @pytest.fixture(scope="module")
 def cut():
-    """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
+    """A recording without noise that begins in mid-roll, as though at rest, and the bodies' poses
+    and velocities there."""
     motion = stroked(12e-3, 0.3, duration=0.86, grasp=0.2, since=0.25)
     built = excited(motion, PAPER.override(COARSE))
     model, y0, t = built
     at = np.arange(SINCE, float(t[-1]), 5e-3)
     run = built.run(torch.from_numpy(np.append(-SETTLE, at)), rtol=1e-6)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
-    at_rest = Standing.of(model, y0, rests={"disc": [1]})
-    return Recording("roll", model, samples, at_rest), run.y[1].detach()
+    recording = Recording("roll", model, samples, Standing.of(model, y0, rests={"disc": [1]}))
+    return recording, model.unpack(run.y[1].detach())
 
 
-def noisy(recording: Recording, seed: int = 0) -> Recording:
-    rng = np.random.default_rng(seed)
+@pytest.fixture(scope="module")
+def moving(cut):
+    return estimate_initial_state(cut[0], RIG)
+
+
+@pytest.fixture(scope="module")
+def noisy(cut):
+    rng = np.random.default_rng(3)
     samples = {
         c: (t, y + RIG[c].noise * rng.standard_normal(len(t)))
-        for c, (t, y) in recording.samples.items()
+        for c, (t, y) in cut[0].samples.items()
     }
-    return replace(recording, samples=samples)
+    return replace(cut[0], samples=samples)
 
 
-def true_bodies(recording: Recording, y0: Tensor) -> dict[str, float]:
-    state = recording.rig.unpack(y0)
-    parts = (("", state.pose), ("v_", state.velocity))
+def true_bodies(state: Any) -> dict[str, float]:
     return {
         f"{body}.{v}{axis}": float(part[body][i])
-        for v, part in parts
+        for v, part in (("", state.pose), ("v_", state.velocity))
         for body in part
         for i, axis in enumerate(("x", "y", "theta"))
     }
 
 
-def underway(recording: Recording) -> MovingStart:
-    start = recording.start
-    assert isinstance(start, MovingStart)
-    return start
-
-
 def tensors(values: Mapping[str, float]) -> dict[str, Tensor]:
-    return {
-        name: torch.tensor(value, dtype=torch.float64, requires_grad=True)
-        for name, value in values.items()
-    }
+    make = lambda x: torch.tensor(x, dtype=torch.float64, requires_grad=True)
+    return {name: make(value) for name, value in values.items()}
 
 
-def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut):
-    recording, y0 = cut
-    out, truth = (
-        estimate_initial_state(noisy(recording), RIG, lead=0.05),
-        true_bodies(recording, y0),
-    )
-    start = underway(out)
+def test_the_first_samples_determine_the_start_and_do_not_count(cut, noisy):
+    recording, state = cut
+    out, truth = estimate_initial_state(noisy, RIG, lead=0.05), true_bodies(state)
+    start: Any = out.start
     assert start.lead == pytest.approx(0.05)
     assert out.times[0] == pytest.approx(SINCE + 0.05)
     assert len(out.samples["x_C"][0]) == len(recording.samples["x_C"][0]) - 10
@@ -99,93 +78,81 @@ def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut):
     for name, (mean, sd) in start.bodies.items():
         assert abs(mean - truth[name]) < sd, name  # deviations are `WIDER` times those of the fit
     assert start.bodies["disc.x"][1] < 2 * WIDER * RIG["x_C"].noise
-    state = recording.rig.unpack(y0)
-    for name, s in state.stretch.items():
-        basis, known = start.stretch[name].basis(recording.rig.pads[name]), start.stretch[name]
+    for name, s in state.stretch.items():  # every point that touches can be stretched
+        basis = start.stretch[name].basis(recording.rig.pads[name])
         touching = recording.rig.penetration(name, state).detach() > 0
-        assert basis[touching.numpy()].sum(1) == pytest.approx(
-            1.0
-        )  # every point that touches can be stretched
-        assert float(s[touching].abs().max()) < 2 * known.sd
+        assert basis[touching.numpy()].sum(1) == pytest.approx(1.0)
+        assert float(s[touching].abs().max()) < 2 * start.stretch[name].sd
 
 
-def test_samples_out_of_a_sensors_range_say_nothing():
+def test_faults_of_a_sensor_widen_what_its_first_samples_tell():
+    """Samples out of its range tell nothing."""
     t = 5e-3 * np.arange(10.0)
     y = np.minimum(1.0 + 20 * t, 1.5)
-    sensor = Sensor(noise=1e-3, high=1.5)
-    (value, sd), (rate, _) = beginning("y", t, y, sensor, 0.0)
-    assert value == pytest.approx(1.0)
-    assert rate == pytest.approx(20.0)
-    blind = beginning("y", t, y, Sensor(noise=1e-3), 0.0)
-    assert blind[1][0] != pytest.approx(20.0, rel=0.1)
-    biased = beginning("y", t, y, Sensor(noise=1e-3, high=1.5, bias=0.1), 0.0)
-    assert biased[0][1] == pytest.approx(np.hypot(sd, 0.1))
-    late = beginning("y", t, y, Sensor(noise=1e-3, high=1.5, delay=0.01), 0.0)
-    assert late[0][1] == pytest.approx(np.hypot(sd, 0.2), rel=1e-3)
+
+    def at(**faults: float) -> Any:
+        return beginning("y", t, y, Sensor(noise=1e-3, **faults), 0.0)
+
+    (value, sd), (rate, rate_sd) = at(high=1.5)
+    assert (value, rate) == pytest.approx((1.0, 20.0))
+    assert at()[1][0] != pytest.approx(20.0, rel=0.1)
+    for fault, amount, wrong, wrong_rate in (
+        ("bias", 0.1, 0.1, 0.0), ("delay", 0.01, 0.2, 0.0), ("gain", 0.1, 0.1, 2.0),
+        ("drift", 3.0, 0.0, 3.0),
+    ):  # fmt: skip
+        wide = at(high=1.5, **{fault: amount})
+        assert wide[0][1] == pytest.approx(np.hypot(sd, wrong), rel=1e-3), fault
+        assert wide[1][1] == pytest.approx(np.hypot(rate_sd, wrong_rate), rel=1e-3), fault
 
 
-def test_what_no_sensor_measures_is_assumed(cut):
-    recording, y0 = cut
-    truth = true_bodies(recording, y0)
+def test_what_no_sensor_measures_is_assumed_or_given(cut, noisy):
+    truth = true_bodies(cut[1])
     few = {channel: RIG[channel] for channel in ("x_C", "effort_x", "effort_y")}
-    start = underway(estimate_initial_state(noisy(recording), few))
+    start: Any = estimate_initial_state(noisy, few).start
     assert start.bodies["disc.theta"] == (0.0, 0.0)  # a circle has no angle
     for name in ("disc.y", "bracket.x", "bracket.y", "disc.v_theta", "disc.v_y", "bracket.v_x"):
         mean, sd = start.bodies[name]
         assert abs(mean - truth[name]) < 2 * sd, name
-    turn, _ = start.bodies["disc.v_theta"]
-    assert turn == pytest.approx(truth["disc.v_theta"], rel=0.1)  # rolling
-    given = underway(
-        estimate_initial_state(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)})
-    )
-    assert given.bodies["disc.y"] == (0.0233, 1e-3)
+    assert start.bodies["disc.v_theta"][0] == pytest.approx(truth["disc.v_theta"], rel=0.1)
+    stated: Any = estimate_initial_state(noisy, few, given={"disc.y": (0.0233, 1e-3)}).start
+    assert stated.bodies["disc.y"] == (0.0233, 1e-3)
     none = {name: RIG[name] for name in ("effort_x", "theta_C")}
     with pytest.raises(ValueError, match=r"no sensor tells where `disc\.x` is"):
-        estimate_initial_state(recording, none)
+        estimate_initial_state(cut[0], none)
 
 
-def test_stretches_last_as_long_as_friction_holds_them():
-    def contact(mu: float) -> Contact:
-        return Contact(
-            "L", "disc", SoftContact(1e5, 4e2, 1e5, 4e2, friction=SmoothSlip(mu, mu, 0.05))
-        )
-
-    assert lasting_stretch(contact(0.8), 10.0, 0.05) == pytest.approx(0.8 * 10.0 / 1e5, rel=0.1)
-    assert lasting_stretch(contact(0.0), 10.0, 0.05) < 1e-6
-    assert lasting_stretch(contact(1e6), 10.0, 0.05) == 1e-3
+@pytest.mark.parametrize(
+    ("mu", "low", "high"), [(0.8, 7.2e-5, 8.8e-5), (0, 0, 1e-6), (1e6, 1e-3, 1e-3)]
+)
+def test_stretches_last_as_long_as_friction_holds_them(mu, low, high):
+    """mu_s F_N / K_t, with a bound where friction has none."""
+    law = SoftContact(1e5, 4e2, 1e5, 4e2, friction=SmoothSlip(mu, mu, 0.05))
+    assert low <= lasting_stretch(Contact("L", "disc", law), 10.0, 0.05) <= high
 
 
-def test_derivatives_of_the_state_are_those_of_differences(cut):
-    recording, _ = cut
-    out = estimate_initial_state(recording, RIG)
-    begun = out.begin()
-    weights = torch.linspace(-1, 1, begun.rig.layout.size, dtype=torch.float64)
-    means = {c.name: c.mean for c in out.start_coordinates}
+def test_derivatives_of_the_initial_state_are_those_of_differences(moving):
+    start = moving.begin()
+    weights = torch.linspace(-1, 1, start.rig.layout.size, dtype=torch.float64)
+    means = {c.name: c.mean for c in moving.start_coordinates}
     names = ("start.disc.x", "start.bracket.y", "start.disc.v_theta", "start.L.stretch.3")
-    values, modulus = tensors(means), begun.rig.parameter(E)
-    *exact, by_E = torch.autograd.grad(
-        weights @ begun.y0(values), [*(values[name] for name in names), modulus]
+    values, modulus = tensors(means), start.rig.parameter(E)
+    inputs = [*(values[name] for name in names), modulus]
+    *exact, by_E = torch.autograd.grad(weights @ start.y0(values), inputs)
+    value = lambda name, h: float(
+        (weights @ start.y0(tensors(means | {name: means[name] + h}))).detach()
     )
-
-    def value(name: str, by: float) -> float:
-        return float((weights @ begun.y0(tensors(means | {name: means[name] + by}))).detach())
-
     for name, slope in zip(names, exact):
-        assert float(slope) == pytest.approx(
-            (value(name, 1e-8) - value(name, -1e-8)) / 2e-8, rel=1e-4, abs=1e-5
-        ), name
+        difference = (value(name, 1e-8) - value(name, -1e-8)) / 2e-8
+        assert float(slope) == pytest.approx(difference, rel=1e-4, abs=1e-5), name
     assert float(by_E) != 0.0
-    again, before = out.begin(), begun.y0(values)
-    assert torch.equal(before, again.y0(tensors(means)))
+    assert torch.equal(start.y0(values), moving.begin().y0(tensors(means)))
 
 
-def test_residuals_and_gradient_know_the_start(cut):
-    recording, _ = cut
-    out = estimate_initial_state(noisy(recording), RIG)
-    problem = Problem([out], RIG, {E: Unknown(), MU_S: Unknown()})
-    c, runner = problem.coordinates, Runner(problem.recordings)
-    r = problem.residuals(runner, c.start, problem.names, 1e-3).r
-    assert len(r) == problem.samples() + len(out.start_coordinates)
+def test_residuals_and_gradient_depend_on_the_start(moving):
+    problem = Problem([moving], RIG, {E: Unknown(), MU_S: Unknown()})
+    c = problem.coordinates
+    r = problem.residuals(Runner([moving]), c.start, problem.names, 1e-3).r
+    assert len(r) == problem.samples() + len(moving.start_coordinates)
     assert r[problem.samples() :] == pytest.approx(0.0, abs=1e-12)  # from the priors' means
     moved = [f"start.{name} in roll" for name in ("disc.y", "disc.v_x", "U.stretch.4")]
     check_derivatives(
@@ -193,94 +160,68 @@ def test_residuals_and_gradient_know_the_start(cut):
     )  # larger steps cross kinks of contact
 
 
-def test_the_start_does_not_depend_on_the_mesh(cut):
-    recording, _ = cut
-    out = estimate_initial_state(recording, RIG)
-    rig = recording.rig
+def test_the_start_does_not_depend_on_the_mesh(moving):
     finer = still(COARSE | {"pad.elements_x": 120, "contact.points": 2})
-    finer.reference = rig.reference
-    other = replace(out, rig=finer)
-    assert other.start_coordinates == out.start_coordinates
-    values = {
-        c.name: 1e-5 * k for k, c in enumerate(other.start_coordinates) if "stretch" in c.name
-    }
-    coarse, fine = (r.rig.unpack(r.begin().y0(tensors(values)).detach()) for r in (out, other))
-    for name, s in coarse.stretch.items():
-        at, knots = (one.pads[name].point_positions[:, 0].numpy() for one in (finer, rig))
-        assert fine.stretch[name].numpy() == pytest.approx(
-            np.interp(at, knots, s.numpy()), abs=1e-15
-        )
-        forces = [float(state.pads[name][0, :, 1].sum()) for state in (coarse, fine)]
+    finer.reference = moving.rig.reference
+    other = replace(moving, rig=finer)
+    assert other.start_coordinates == moving.start_coordinates
+    names = [c.name for c in other.start_coordinates]
+    values = {name: 1e-5 * k for k, name in enumerate(names) if "stretch" in name}
+    states = [r.rig.unpack(r.begin().y0(tensors(values)).detach()) for r in (moving, other)]
+    for name in moving.rig.contacts:
+        knots, at = (one.pads[name].point_positions[:, 0].numpy() for one in (moving.rig, finer))
+        coarse, fine = (state.stretch[name].numpy() for state in states)
+        assert fine == pytest.approx(np.interp(at, knots, coarse), abs=1e-15)
+        forces = [float(state.pads[name][0, :, 1].sum()) for state in states]
         assert forces[0] == pytest.approx(forces[1], rel=0.1)
 
 
-def test_another_rig_may_begin_underway():
-    """A cylinder driven over a pad, of which only the place is free, from the samples of its
-    rate."""
-    rubber, law = KelvinVoigt(**RUBBER, tau=0.01), dry(node_spacing=2e-3)
-    rig = Rig(
-        bodies={"roll": Body(0.4, Circle(0.02), x="driven", theta="driven")},
-        contacts={"P": Contact("P", "roll", law)},
-        pads={"P": Pad(PadMesh(0.12, 4.59e-3, 60, 2), rubber)},
-        reference=Reference(**{"roll.x": Profile([0.0, 1.0], [0.04, 0.08]),
-        "roll.theta": hold(a=0.0)["a"]}),
-    )  # fmt: skip
-    t = np.arange(0.2, 0.5, 5e-3)
-    sensors = {"y_roll": Sensor(noise=1e-6)}
-    samples = {"y_roll": (t, np.full(len(t), 0.0245))}
-    recording = Recording("over a pad", rig, samples, Known(torch.zeros(rig.layout.size)))
-    out = estimate_initial_state(recording, sensors)
-    assert [c.name for c in out.start_coordinates][:2] == ["start.roll.y", "start.roll.v_y"]
-    state = rig.unpack(out.begin().y0({}).detach(), t=float(t[0]))
-    assert float(state.pose["roll"][0]) == pytest.approx(float(rig.follow(0.2)[0, 0]))
-    assert float(state.pads["P"][0, :, 1].sum()) < -1.0  # [N]
+def test_a_body_starts_at_its_unknown_place(cut):
+    begun = replace(cut[0], start=cut[0].start._replace(position_sd={"disc.x": 1e-3})).begin()
+    pose = begun.rig.unpack(begun.y0(tensors({"start.disc.x": 0.0608}))).pose
+    assert pose["disc"][0].item() == pytest.approx(0.0608, rel=1e-12)
 
 
-def test_a_run_that_cannot_begin_is_lost(cut):
-    out = estimate_initial_state(cut[0], RIG)
-    far = {"start.disc.y": 0.01} | {
-        c.name: 1e-3 for c in out.start_coordinates if ".L.stretch" in c.name
-    }
+def test_a_run_that_cannot_begin_is_lost(moving):
+    names = [c.name for c in moving.start_coordinates]
+    far = {"start.disc.y": 0.01} | dict.fromkeys((n for n in names if ".L.stretch" in n), 1e-3)
     with pytest.raises(SimulationFailed, match="cannot begin there: the pad `L` does not settle"):
-        out.begin().y0(tensors(far))
+        moving.begin().y0(tensors(far))
 
 
-def test_parameters_are_found_from_the_middle_of_a_roll(cut):
-    out = estimate_initial_state(noisy(cut[0], seed=3), RIG)
-    truth = {
-        name: float(cut[0].rig.parameter(name).detach()) for name in (E, "materials.rubber.tau")
-    }
-    problem = Problem(
-        [out], RIG, {name: Unknown(nominal=1.1 * value) for name, value in truth.items()}
-    )
-    plan = [Stage("all", problem.names, problem.coordinates.labels, 3e-4, tolerance=1e-3)]
-    found = identify(problem, plan=plan, tightenings=0, assumptions="trusted")
+def test_parameters_are_found_from_the_middle_of_a_roll(noisy):
+    out = estimate_initial_state(noisy, RIG)
+    truth = {name: float(noisy.rig.parameter(name).detach()) for name in (E, TAU)}
+    unknowns = {name: Unknown(nominal=1.1 * value) for name, value in truth.items()}
+    found = fit(out, unknowns, sensors=RIG, tightenings=0)
     for name, value in truth.items():
-        e = found[name]
-        assert e.ci95[0] <= value <= e.ci95[1]
-        assert e.relative_sd < 0.1
-    assert found.chi2 == pytest.approx(1.0, abs=4 * (2 / problem.samples()) ** 0.5)
+        assert found[name].ci95[0] <= value <= found[name].ci95[1]
+        assert found[name].relative_sd < 0.1
+    samples = sum(len(t) for t, _ in out.samples.values())
+    assert found.chi2 == pytest.approx(1.0, abs=4 * (2 / samples) ** 0.5)
 
 
-def test_refusals(cut):
-    recording, _ = cut
-    start = underway(estimate_initial_state(recording, RIG))
-    rig, samples = recording.rig, recording.samples
-
-    for change, message in (
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
         ({"bodies": {"disc.x": (0.0, 1.0)}}, "`disc.y` is missing"),
-        ({"bodies": {**start.bodies, "ball.x": (0.0, 1.0)}}, "`ball.x` is none of them"),
-        (
-            {"bodies": {**start.bodies, "disc.x": (0.06, -1.0)}},
-            "`start.disc.x` needs a finite mean",
-        ),
+        ({"more": {"ball.x": (0.0, 1.0)}}, "`ball.x` is none of them"),
+        ({"more": {"disc.x": (0.06, -1.0)}}, "`start.disc.x` needs a finite mean"),
         ({"stretch": {"M": Stretch((0.06,), 1e-5)}}, "speaks of `M`; the contacts are L, U"),
         ({"stretch": {"L": Stretch((0.06, 0.05), 1e-5)}}, "must be finite and increase"),
         ({"lead": -0.1}, "`lead` of the start must not be negative"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            start._replace(**change).coordinates(rig, samples)
-    for how, message in (
+    ],
+)
+def test_a_start_that_does_not_fit_its_rig_is_rejected(moving, change, message):
+    if "more" in change:
+        change = {"bodies": {**moving.start.bodies, **change["more"]}}
+    with pytest.raises(ValueError, match=message):
+        moving.start._replace(**change).coordinates(moving.rig, moving.samples)
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
         ({"lead": 0.01}, "`x_C` of recording `roll` has 2 samples in .*take a longer `lead`"),
         ({"lead": 5.0}, "no two samples of `x_C` left"),
         (
@@ -288,18 +229,18 @@ def test_refusals(cut):
             "`x_C` may come late by 0.08 s, but runs are known only from 0.05 s",
         ),
         ({"given": {"disc.z": (0.0, 1.0)}}, r"`given` speaks of `disc\.z`"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            estimate_initial_state(recording, **{"sensors": RIG} | how)
-    deep = deepcopy(dict(start.bodies)) | {"disc.y": (-1.0, 1.0)}
-    assert MovingStart(deep, {}).coordinates(rig, samples)
+    ],
+)
+def test_first_samples_that_do_not_suffice_are_rejected(cut, how, message):
+    with pytest.raises(ValueError, match=message):
+        estimate_initial_state(cut[0], **{"sensors": RIG} | how)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Newton did not converge")  # where rest is assumed, wrongly
-def test_unknown_start_smoke(tmp_path):
-    """The experiment: errors of a few standard deviations, a price for not knowing the start, and
-    rest not assumed in silence."""
+def test_the_experiment_with_an_unknown_start(tmp_path):
+    """Errors of a few standard deviations, a price for not knowing the start, and rest not assumed
+    in silence."""
     module = experiment("unknown_start")
     result = module.run(module.Config(out=tmp_path, smoke=True))
     ((case, (found,)),) = result.found.items()

@@ -6,15 +6,7 @@ from typing import Any
 import pytest
 from conftest import still
 
-from torchsoft.sysid.estimate import nuisance_unit
-from torchsoft.sysid.unknowns import (
-    NUISANCES,
-    Coordinate,
-    Coordinates,
-    Prior,
-    Unknown,
-    in_full,
-)
+from torchsoft.sysid.unknowns import Coordinates, Prior, Unknown, in_full
 
 RIG = still()
 FRICTION, ALPHA = "laws.steel_on_rubber.friction", "contacts.L.law.friction.alpha"
@@ -22,12 +14,13 @@ GIVEN = {
     "materials.rubber.E": 0.75e6, "materials.rubber.nu": 0.45, f"{FRICTION}.mu_s": 0.8,
     f"{FRICTION}.mu_k": 0.7, ALPHA: 2.0,
 }  # fmt: skip
+TIED = {"ratio_to": "mu_s", "fixed": True}
 
 
 def full(name: str) -> str:
-    """The full name of a number by a short one, with `__` for a dot."""
-    name = name.replace("__", ".")
-    return ALPHA if name == "contact.alpha" else RIG.full(name)
+    """The full name of a parameter by a short one: E, mu_s, alpha."""
+    kind = "pad" if name in ("E", "nu", "Young") else "contact"
+    return ALPHA if name == "alpha" else RIG.full(f"{kind}.{name}")
 
 
 def coordinates(*others: dict[str, float], **unknowns: dict[str, Any]) -> Coordinates:
@@ -36,115 +29,110 @@ def coordinates(*others: dict[str, float], **unknowns: dict[str, Any]) -> Coordi
         full(name): Unknown(**{k: full(x) if k == "ratio_to" else x for k, x in one.items()})
         for name, one in unknowns.items()
     }
-    values = [GIVEN | {full(name): x for name, x in one.items()} for one in ({}, *others)]
     recordings: list[Any] = [
-        SimpleNamespace(name=name, rig=RIG, parameters=own, start_coordinates=())
-        for name, own in zip(("one", "two", "three"), values)
-    ]
+        SimpleNamespace(
+            name=name, rig=RIG, start_coordinates=(),
+            parameters=GIVEN | {full(key): x for key, x in one.items()},
+        )
+        for name, one in zip(("one", "two", "three"), ({}, *others))
+    ]  # fmt: skip
     return Coordinates(tables, {}, recordings)
 
 
-def ends(found: Coordinates, name: str) -> tuple[float, float]:
+@pytest.mark.parametrize(
+    ("unknowns", "name", "ends"),
+    [
+        ({"nu": {}}, "nu", (0.045, 0.4999)),
+        ({"E": {}}, "E", (0.75e5, 0.75e7)),
+        ({"alpha": {}}, "alpha", (0.2, 20.0)),
+        ({"mu_k": {}}, "mu_k", (0.07, 0.8)),
+        ({"mu_s": {}}, "mu_s", (0.7, 8.0)),
+        ({"mu_k": {"ratio_to": "mu_s"}, "mu_s": {}}, "mu_k", (0.7 / 8, 1.0)),
+        ({"mu_k": {"ratio_to": "mu_s"}, "mu_s": {}}, "mu_s", (0.08, 8.0)),
+        ({"mu_s": {"ratio_to": "mu_k"}, "mu_k": {}}, "mu_s", (1.0, 80 / 7)),
+        # coefficients that cannot cross may both be free
+        ({"mu_k": {"high": 0.75}, "mu_s": {"low": 0.75}}, "mu_k", (0.07, 0.75)),
+        # the file's value of a tied parameter does not bound what it is tied to
+        ({"mu_k": TIED, "mu_s": {"low": 0.1, "high": 2.0}}, "mu_s", (0.1, 2.0)),
+        ({"mu_k": TIED | {"nominal": 0.5}}, "mu_k", (0.05, 1.0)),
+    ],
+)
+def test_bounds_that_are_not_given_end_where_the_parameters_do(unknowns, name, ends):
+    found = coordinates(**unknowns)
     (one,) = (c for c in found.all if c.name == full(name))
-    return one.low, one.high
+    assert (one.low, one.high) == pytest.approx(ends)
 
 
-def test_bounds_that_are_not_given_end_where_the_parameters_do():
-    assert ends(coordinates(pad__nu={}), "pad.nu") == (0.045, 0.4999)
-    assert ends(coordinates(pad__E={}), "pad.E") == (0.75e5, 0.75e7)
-    assert ends(coordinates(contact__mu_k={}), "contact.mu_k")[1] == GIVEN[f"{FRICTION}.mu_s"]
-    assert ends(coordinates(contact__mu_s={}), "contact.mu_s")[0] == GIVEN[f"{FRICTION}.mu_k"]
-    ratio = coordinates(contact__mu_k={"ratio_to": "contact.mu_s"}, contact__mu_s={})
-    assert ends(ratio, "contact.mu_k")[1] == 1.0
-    assert ends(ratio, "contact.mu_s")[0] == pytest.approx(0.08)
-    assert ends(coordinates(contact__alpha={}), "contact.alpha") == (0.2, 20.0)
+@pytest.mark.parametrize("tie", [{}, {"nominal": 0.9}])
+def test_a_tied_parameter_follows_its_base(tie):
+    found = coordinates(mu_k=TIED | tie, mu_s={"low": 0.1, "high": 2.0})
+    values = found.values(found.start, "one", GIVEN)
+    assert values[full("mu_k")] == pytest.approx(tie.get("nominal", 0.7 / 0.8) * 0.8)
+
+
+def tied(mu_k: float, mu_s: float) -> dict[str, Any]:
+    """Both to alpha."""
+    both = {"ratio_to": "alpha", "fixed": True}
+    return {
+        "mu_k": both | {"nominal": mu_k}, "mu_s": both | {"nominal": mu_s}, "alpha": {},
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("unknowns", "message"),
     [
+        ({"nu": {"high": 4.5}}, r"^unknowns\.mat.*\.nu\.high = 4\.5 is beyond .* to 0\.4999$"),
+        ({"E": {"nominal": 1e20}}, r"rubber\.E\.nominal = 1e\+20 is beyond"),
+        ({"mu_k": {"high": 0.9}}, r"friction\.mu_k\.high = 0\.9 is beyond"),
+        ({"mu_k": {"ratio_to": "mu_s", "high": 1.2}}, r"high = 1\.2 is beyond .*mu_k / .*mu_s may"),
+        ({"mu_k": {}, "mu_s": {}}, r"give unknowns\..*mu_k\.ratio_to = '.*mu_s'"),
+        ({"E": {"prior": Prior(median=1e8, sd=1e3)}}, r"prior\.median = 1e\+08 is not between"),
+        ({"E": {"low": 1e6, "high": 2e6}}, r"rubber\.E\.nominal = 750000 is not between"),
+        ({"mu_k": {"ratio_to": "friction"}}, "ratio_to = .*friction' is not another parameter"),
+        ({"mu_k": {"ratio_to": "mu_s"}, "mu_s": {"ratio_to": "mu_k"}}, "is a ratio itself"),
+        ({"Young": {}}, r"^unknowns: `pad\.Young` cannot be identified; known: .*materials\."),
+        # two ratios to one parameter are compared as ratios, one with a known value as a value
+        (tied(0.4, 0.3), r"mu_k must not exceed .*, but may be up to 0\.4 "),
         (
-            {"pad__nu": {"high": 4.5}},
-            r"^unknowns\.materials\.rubber\.nu\.high = 4\.5 is beyond what materials\.rubber\.nu "
-            r"may be, from -0\.999 to 0\.4999$",
+            {"mu_k": {"ratio_to": "alpha", "fixed": True, "nominal": 0.3}, "alpha": {}},
+            r"mu_k must not exceed .*, but may be up to 6 .* to 0\.8: give",
         ),
-        (
-            {"pad__nu": {"scale": "linear", "low": -2.0, "high": 0.4}},
-            r"unknowns\.materials\.rubber\.nu\.low = -2 is beyond",
-        ),
-        (
-            {"pad__E": {"nominal": 1e20}},
-            r"rubber\.E\.nominal = 1e\+20 is beyond",
-        ),
-        (
-            {"contact__mu_k": {"high": 0.9}},
-            r"unknowns\..*friction\.mu_k\.high = 0\.9 is beyond",
-        ),
-        (
-            {"contact__mu_k": {"ratio_to": "contact.mu_s", "high": 1.2}},
-            r"high = 1\.2 is beyond what laws\..*\.friction\.mu_k / laws\..*\.friction\.mu_s",
-        ),
-        (
-            {"contact__mu_k": {}, "contact__mu_s": {}},
-            r"give unknowns\.laws\..*\.friction\.mu_k\.ratio_to = 'laws\..*\.friction\.mu_s'",
-        ),
-        (
-            {"pad__E": {"prior": Prior(median=1e8, sd=1e3)}},
-            r"^unknowns\.materials\.rubber\.E\.prior\.median = 1e\+08 is not between",
-        ),
-        (
-            {
-                "pad__E": {
-                    "low": 8e4,
-                    "high": 1.4e6,
-                    "prior": Prior(median=1.5e6, sd=0.1, kind="log-normal"),
-                }
-            },
-            r"prior\.median = 1\.5e\+06 is not between low = 80000 and high = 1\.4e\+06$",
-        ),
-        (
-            {"pad__E": {"low": 1e6, "high": 2e6}},
-            r"rubber\.E\.nominal = 750000 is not between",
-        ),
-        ({"pad__E": {"low": 2e6, "high": 1e6}}, "low = 2000000.0 must be below"),
-        ({"pad__E": {"scale": "linear"}}, "needs `low` and `high`"),
-        ({"pad__E": {"nominal": -1.0}}, "needs nominal > 0"),
-        ({"contact__mu_k": {"ratio_to": "friction"}}, "ratio_to = 'friction'"),
-        ({"pad__Young": {}}, r"^unknowns: `pad\.Young` cannot be identified; known: .*materials\."),
     ],
 )
-def test_bounds_beyond_are_refused_by_their_field(unknowns, message):
+def test_unknowns_that_may_leave_the_possible_are_rejected_by_their_field(unknowns, message):
     with pytest.raises(ValueError, match=message):
         coordinates(**unknowns)
 
 
 @pytest.mark.parametrize(
-    "others", [({"contact.mu_s": 0.3},), ({}, {"contact.mu_s": 0.3}), ({"contact.mu_s": 0.3}, {})]
+    ("table", "message"),
+    [
+        ({"low": 2e6, "high": 1e6}, "low = 2000000.0 must be below"),
+        ({"scale": "linear"}, "needs `low` and `high`"),
+        ({"nominal": -1.0}, "needs nominal > 0"),
+        ({"fixed": True, "prior": Prior(median=1.0, sd=1.0)}, "a fixed unknown needs no prior"),
+        (None, "log-normal prior needs median > 0"),
+    ],
 )
+def test_tables_that_contradict_themselves_are_rejected(table, message):
+    with pytest.raises(ValueError, match=message):
+        Prior(median=-1.0, sd=1.0, kind="log-normal") if table is None else Unknown(**table)
+
+
+@pytest.mark.parametrize("others", [({"mu_s": 0.3},), ({}, {"mu_s": 0.3}), ({"mu_s": 0.3}, {})])
 def test_bounds_hold_in_every_recording(others):
-    assert ends(coordinates(*others, contact__mu_k={"nominal": 0.2}), "contact.mu_k") == (0.02, 0.3)
-    for field, value in (("high", 0.5), ("nominal", 0.5)):
-        with pytest.raises(
-            ValueError,
-            match=f"mu_k.{field} = 0.5 is beyond what .* may be in all recordings, from 0 to 0.3",
-        ):
-            coordinates(*others, contact__mu_k={"nominal": 0.2, field: value})
+    assert coordinates(*others, mu_k={"nominal": 0.2}).all[0].high == 0.3
+    with pytest.raises(ValueError, match=r"mu_k\.high = 0\.5 is .* all recordings, from 0 to 0\.3"):
+        coordinates(*others, mu_k={"nominal": 0.2, "high": 0.5})
 
 
-def test_a_search_starts_where_all_rigs_are():
-    assert ends(coordinates({}, pad__E={}), "pad.E") == (0.75e5, 0.75e7)
-    for others, second in ((({"pad.E": 1e6},), "two"), (({}, {"pad.E": 1e6}), "three")):
-        with pytest.raises(
-            ValueError,
-            match=f"`one` and 1e\\+06 in that of `{second}`: say by `nominal` where the search",
-        ):
-            coordinates(*others, pad__E={})
-        assert len(coordinates(*others, pad__E={"nominal": 1e6})) == 1
-
-
-def test_friction_coefficients_may_both_be_free_where_they_cannot_cross():
-    found = coordinates(contact__mu_k={"high": 0.75}, contact__mu_s={"low": 0.75})
-    assert (ends(found, "contact.mu_k")[1], ends(found, "contact.mu_s")[0]) == (0.75, 0.75)
+@pytest.mark.parametrize(("others", "name"), [(({"E": 1e6},), "two"), (({}, {"E": 1e6}), "three")])
+def test_a_search_starts_where_all_rigs_are_or_where_nominal_states(others, name):
+    with pytest.raises(
+        ValueError, match=rf"`one` and 1e\+06 in that of `{name}`: say by `nominal`"
+    ):
+        coordinates(*others, E={})
+    assert len(coordinates(*others, E={"nominal": 1e6})) == 1
 
 
 def test_a_name_means_one_thing_and_is_given_once():
@@ -152,53 +140,5 @@ def test_a_name_means_one_thing_and_is_given_once():
     assert in_full([RIG, other], {"F_x": 1, "theta_C": 2}) == {"effort_x": 1, "theta_C": 2}
     with pytest.raises(ValueError, match="`theta_C` and `theta` are one, given twice"):
         in_full([RIG], {"theta": 1, "theta_C": 2})
-    with pytest.raises(
-        ValueError, match="`theta` is short for theta_C and theta_ball in different"
-    ):
+    with pytest.raises(ValueError, match="`theta` is short for theta_C and theta_ball in differen"):
         in_full([RIG, other], {"theta": 1})
-
-
-def test_a_tied_ratio_leaves_its_base_free():
-    """The file's own number of a tied parameter is no limit of what it is tied to."""
-    for more in ({}, {"nominal": 0.9}):
-        tie = {"ratio_to": "contact.mu_s", "fixed": True, **more}
-        found = coordinates(contact__mu_k=tie, contact__mu_s={"low": 0.1, "high": 2.0})
-        assert ends(found, "contact.mu_s") == (0.1, 2.0)
-        values = found.values(found.start, "one", GIVEN)
-        assert values[full("contact.mu_k")] == pytest.approx(more.get("nominal", 0.7 / 0.8) * 0.8)
-    found = coordinates(contact__mu_s={"ratio_to": "contact.mu_k"}, contact__mu_k={})
-    assert ends(found, "contact.mu_s")[0] == 1.0
-    assert ends(found, "contact.mu_k") == pytest.approx((0.07, 7.0))
-    known = {"ratio_to": "contact.mu_s", "fixed": True, "nominal": 0.5}  # of a number that is known
-    assert ends(coordinates(contact__mu_k=known), "contact.mu_k")[1] == 1.0
-
-
-def test_two_ratios_to_one_number_are_compared_as_ratios():
-    def tied(mu_k: float, mu_s: float) -> Coordinates:
-        both = {"ratio_to": "contact.alpha", "fixed": True}
-        mu = {"contact__mu_k": both | {"nominal": mu_k}, "contact__mu_s": both | {"nominal": mu_s}}
-        return coordinates(**mu, contact__alpha={})
-
-    assert len(tied(0.3, 0.4)) == 3
-    with pytest.raises(ValueError, match=r"mu_k must not exceed .*, but may be up to 0\.4 "):
-        tied(0.4, 0.3)
-
-
-def test_a_tie_that_may_cross_a_known_number_is_refused():
-    tie = {"ratio_to": "contact.alpha", "fixed": True, "nominal": 0.3}
-    with pytest.raises(
-        ValueError, match=r"mu_k must not exceed .*, but may be up to 6 .* to 0\.8: give"
-    ):
-        coordinates(contact__mu_k=tie, contact__alpha={})
-
-
-def test_every_fault_of_a_sensor_has_a_unit():
-    problem: Any = SimpleNamespace(unit=lambda channel: "rad")
-    found = {
-        kind: nuisance_unit(Coordinate("theta", kind, None, 0.0, -1.0, 1.0), problem)
-        for kind in NUISANCES
-    }
-    assert found == {
-        "bias": "rad", "delay": "s", "gain": "1", "drift": "rad/s", "misalignment": "rad",
-        "inertia": "kg", "clock": "1", "lag": "s", "backlash": "rad",
-    }  # fmt: skip

@@ -279,8 +279,8 @@ def iterate(
     """The run with derivatives (T, components, n) of the states by the scalar tensors `wrt`, and
     those of sums of forces (T, sums, n), as it grows; `columns` are the components of the state
     that are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its
-    columns beyond those of `wrt` are directions of the start alone. `of_signals` are the tensors
-    `wrt` of which the reference was made."""
+    columns beyond those of `wrt` are directions of the start, and of the reference as far as it is
+    made of the tensors `of_signals`, one for each column."""
     size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wrt))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]

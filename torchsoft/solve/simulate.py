@@ -135,7 +135,7 @@ class Task(NamedTuple):
     touch: tuple[str, ...]
     rig: Rig | None = None
     leaves: tuple[Tensor, ...] = ()
-    """The parameters `wrt`, of which the start and the reference were made."""
+    """The parameters `wrt`, and more tensors, of which the start and the reference were made."""
 
 
 def prepare(
@@ -144,10 +144,11 @@ def prepare(
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
     touch: Sequence[str] = (), structure: Structure | None = None,
-    values: Mapping[int, Tensor] | None = None,
+    values: Mapping[int, Tensor] | None = None, more: Sequence[Tensor] = (),
 ) -> Task:  # fmt: skip
     """Checks the arguments of `simulate`, and takes `values` in the place of some parameters of
-    the rig of a `structure`, by their id; raises its `ValueError`s."""
+    the rig of a `structure`, by their id; raises its `ValueError`s. The reference may be made of
+    scalar tensors for columns of dy0 beyond those of `wrt`: these are `more`."""
     if not isinstance(rig, Rig):
         given = rig if isinstance(rig, type) else type(rig).__name__
         raise ValueError(f"`rig` must be a Rig, but is {given}")
@@ -191,7 +192,7 @@ def prepare(
     felt = _channels_of_touch(rig, touch)
     return Task(
         stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid, felt, rig,
-        leaves,
+        (*leaves, *more),
     )  # fmt: skip
 
 

@@ -32,7 +32,7 @@ from torchsoft.plan.knots import Moves
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import unjudged
 from torchsoft.sysid.fit import fisher
-from torchsoft.sysid.initial_state import PREFIX
+from torchsoft.sysid.initial_state import PREFIX, reference_from
 from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choice, predict, prepared
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Mask, Recording, RunContext
@@ -326,14 +326,14 @@ class Planner:
         """Gradient by z of the signals of the run at x, weighted with `weights` (G, channels).
         Raises `SimulationFailed`."""
         variables = torch.tensor(z, requires_grad=True)
-        reference = self.moves.reference(variables)
         with self._begun() as begun:
+            begun.rig.reference = self.moves.reference(variables)
             y0 = prepared(begun, self.problem.values(x, self.k), ())[0].detach()
             run = unjudged(
                 begun.rig,
                 self.grid.t,
                 y0=y0,
-                reference=reference,
+                reference=reference_from(begun.rig, begun.start, begun.rig.unpack(y0).pose),
                 gradient="discrete",
                 **choice(steps),
             )

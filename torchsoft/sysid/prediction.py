@@ -377,17 +377,22 @@ def prepared(
     return begun.y0(at), inputs
 
 
-def derivatives(rig: Rig, run: Trajectory, names: Sequence[str], reference: Reference) -> Array:
+def derivatives(
+    rig: Rig, run: Trajectory, names: Sequence[str], reference: Reference, places: Sequence[Tensor]
+) -> Array:
     """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start. Those
     of touch come from the run; others follow from the sensitivities of the bodies' motion, and from
-    the controllers' own parameters and set-points, of the `reference`."""
+    the controllers' own parameters and set-points, of the `reference`, which is also made of the
+    start's `places`."""
     slopes = {name: slope.numpy() for name, slope in run.touch_sensitivities.items()}
     if moved := [name for name in names if name not in slopes]:
-        slopes |= dict(zip(moved, by_motion(rig, run, moved, reference).swapaxes(0, 1)))
+        slopes |= dict(zip(moved, by_motion(rig, run, moved, reference, places).swapaxes(0, 1)))
     return np.stack([slopes[name] for name in names], 1)
 
 
-def by_motion(rig: Rig, run: Trajectory, names: Sequence[str], reference: Reference) -> Array:
+def by_motion(
+    rig: Rig, run: Trajectory, names: Sequence[str], reference: Reference, places: Sequence[Tensor]
+) -> Array:
     """Derivatives (T, channels, n) of channels that the bodies' motion determines."""
     assert run.sensitivities is not None
     signals = rig.follow(run.t, reference)
@@ -401,9 +406,9 @@ def by_motion(rig: Rig, run: Trajectory, names: Sequence[str], reference: Refere
     state = rig.layout.without_surfaces().unpack(q, *rig.held(signals))
     known = read(Seen(rig, state, signals), names)
     measured = torch.stack([known[name] for name in names], -1)
-    out = directions(measured, along)
-    out[..., : len(run.wrt)] += directions(measured, [rig.parameter(name) for name in run.wrt])
-    return out
+    return directions(measured, along) + directions(
+        measured, [*map(rig.parameter, run.wrt), *places]
+    )
 
 
 def choice(steps: Steps) -> dict[str, Any]:
@@ -438,11 +443,12 @@ def predict(
     set_parameters(rig, values)
     touch = [key for key in keys if key not in measurable(rig)] if names else ()
     wrt = tuple(name for name in names if not name.startswith(PREFIX))
-    leaves = [rig.parameter(name) for name in wrt]
+    places = [y0.new_zeros(()).requires_grad_() for _ in names[len(wrt) :]]  # of the start
+    leaves = [*map(rig.parameter, wrt), *places]
     along = torch.stack([x - x.detach() for x in leaves]) if leaves else y0.new_zeros(0)
-    reference = reference_from(rig, begun.start, rig.unpack(y0 + dy0[:, : len(wrt)] @ along).pose)
+    reference = reference_from(rig, begun.start, rig.unpack(y0 + dy0 @ along).pose)
     if begun.drift.changes:
-        return drifting(begun, grid, names, steps, y0, dy0, wrt, touch, reference)
+        return drifting(begun, grid, names, steps, y0, dy0, wrt, touch, reference, places)
     out = unjudged(
         rig,
         grid.t,
@@ -453,10 +459,11 @@ def predict(
         dy0=dy0 if names else None,
         rigid=bool(names),
         touch=touch,
+        more=places,
         **choice(steps),
     )
     rows = slice(grid.early, None)
-    slopes = derivatives(rig, out, keys, reference)[rows] if names else None
+    slopes = derivatives(rig, out, keys, reference, places)[rows] if names else None
     knots = None if isinstance(steps, Frozen) else out.knots.numpy()
     return Prediction(
         grid.t[rows].numpy(),
@@ -483,7 +490,7 @@ PIECES = 24
 
 def drifting(
     begun: RunContext, grid: Grid, names: Sequence[str], steps: Steps, y: Tensor, dy: Tensor,
-    wrt: Sequence[str], touch: Sequence[str], reference: Reference,
+    wrt: Sequence[str], touch: Sequence[str], reference: Reference, places: Sequence[Tensor],
 ) -> Prediction:  # fmt: skip
     """`predict` from the state y (size,) with derivatives dy (size, n), of a run whose rig drifts:
     piece after piece, by the frozen steps, or by those that a tolerance chooses without drift."""
@@ -503,14 +510,14 @@ def drifting(
         between = [knots[first], *own, *([] if own.size and end - own[-1] <= SAME else [end])]
         out = unjudged(
             rig, between, y0=y, reference=reference, gradient="forward" if names else "none",
-            wrt=wrt, dy0=dy / torch.from_numpy(scale) if names else None, touch=touch,
+            wrt=wrt, dy0=dy / torch.from_numpy(scale) if names else None, touch=touch, more=places,
             **choice(Frozen(knots[first : last + 1])),
         )  # fmt: skip
         rows = np.isin(out.t.numpy(), t if first == 0 else own)
         values.append(out.together(*keys).detach().numpy()[rows])
         y = out.y[-1].detach()
         if out.sensitivities is not None:
-            slopes.append(derivatives(rig, out, keys, reference)[rows] * scale)
+            slopes.append(derivatives(rig, out, keys, reference, places)[rows] * scale)
             dy = out.sensitivities[-1] * torch.from_numpy(scale)
     set_parameters(rig, stated)
     rows = slice(grid.early, None)
