@@ -35,6 +35,7 @@ from torchsoft.plot.animation import animate, frame_times, pace
 from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
 from torchsoft.plot.diagram import LAYER, dot, graph_of, multibond_graph, positions
 from torchsoft.plot.scene import Scene, instants, straight_up
+from torchsoft.rigs import RigFile
 
 Done = tuple[Rig, Trajectory]
 
@@ -248,6 +249,25 @@ def test_a_dashboard_that_there_is_not_is_refused(done, how, message):
 def test_text_of_a_saved_page_is_text_in_a_font_that_journals_take(done, tmp_path):
     dashboard(done[1], look="page", only=["disc.y"]).savefig(tmp_path / "page.pdf")
     assert b"Type3" not in (tmp_path / "page.pdf").read_bytes()
+
+
+def test_panels_show_what_their_axes_name(done):
+    """The friction over the largest that the cone allows [%], and moments [N mm]."""
+    run, mu = done[1], done[0].parameter("contact.mu_s").item()
+    lines = dashboard(run, only=["friction in its cone"]).axes[0].lines
+    for force, line in zip(run.force.values(), lines):
+        share = 100 * force[..., 1].abs().sum(-1) / (mu * force[..., 0].sum(-1))
+        np.testing.assert_allclose(line.get_ydata()[5:], share[5:], rtol=1e-9)
+    lean = {"kind": "profile", "times": [0.0, 0.01], "values": [0.0, 0.02]}
+    outputs = {"duration": 0.01, "interval": 5e-3, "snapshots": []}
+    file = RigFile.ready("fingertips").override(outputs=outputs, motion={"lean": lean})
+    built = file.build()
+    run = simulate(built.rig, built.t, y0=built.y0, rtol=1e-3)
+    axes = dashboard(run, only=["effort_left_turn"]).axes[0]
+    assert "N mm" in axes.get_ylabel()
+    moment = 1e3 * run["effort_left_turn"]
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), moment, rtol=1e-9)
+    assert float(moment.abs().max()) > 1.0
 
 
 def test_ripples_are_explained_in_a_whole_dashboard_only(done, monkeypatch):
