@@ -1,168 +1,186 @@
-"""Configurations of datasets: what cannot be carried out is refused by the field that says it, in
-one sentence."""
+"""Configurations of datasets: their distributions, and mistakes that are named by their field."""
 
 import copy
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import truncnorm
+from test_datasets import CONFIG, KINDS, written
 
 from torchsoft.cli import main
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.distributions import Uniform
+from torchsoft.datasets.distributions import Choice, Normal, Uniform
 from torchsoft.datasets.generate import points
 from torchsoft.datasets.rig_files import embedded
 from torchsoft.tables import InvalidTable
 
 PATH = Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml"
 SMOKE = embedded(tomllib.loads(PATH.read_text()), PATH.parent)
-LAW, LIGHT = "laws.steel_on_rubber", {"low": 49.6e-3, "high": 49.8e-3}
+E, MASS, MU, SPAN = (
+    "materials.rubber.E", "bodies.disc.mass", "laws.dry.friction.mu_k", {"low": 0.3, "high": 0.7},
+)  # fmt: skip
 
 
-def changed(place: tuple[str | int, ...], value: Any) -> Any:
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("config")
+    return embedded(tomllib.loads(written(folder, CONFIG + KINDS).read_text()), folder)
+
+
+def changed(tree: Any, place: tuple[str | int, ...], value: Any) -> Any:
     """The configuration with another value in a place."""
-    tree = copy.deepcopy(SMOKE)
-    inner = tree
+    inner = tree = copy.deepcopy(tree)
     for key in place[:-1]:
         inner = inner[key]
     inner[place[-1]] = value
     return tree
 
 
-def test_numbers_that_are_whole_are_numbers():
-    assert Config.model_validate(changed(("duration",), 1)) == Config.model_validate(SMOKE)
+MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
+    (("parameters", "materials.silicone.E"), SPAN,
+     r"`materials.silicone.E` is not in the rig file: materials has rubber"),
+    (("parameters", "motion.y_d.values_8"), SPAN, "it has motion.y_d.values_1 to _2"),
+    (("parameters", "materials.rubber.nu"), SPAN, r"nu.high = 0.7: impossible: .*nu.*0\.4999"),
+    (("parameters", MASS), {"choices": [0.3, -0.4]}, r"mass.choices.1 = -0.4: impossible"),
+    (("parameters", "bodies.disc.start.x"), {"mean": 0.06, "sd": 1e19},
+     r"start.x: mean - 4 sd = -4e\+19: impossible"),
+    (("parameters", MASS), {"mean": 0.4}, r"parameters.bodies.disc.mass.sd is missing"),
+    (("parameters", MASS), {"mean": 0.4, "sd": 0.01, "low": 0.5}, "low = 0.5 should be below high"),
+    (("parameters", MASS), {"mean": 0.4, "sd": 0.01, "low": 1.5, "high": 1.6},
+     "next to nothing of mean = 0.4"),
+    (("parameters", E), {"low": 9e5, "high": 8e5}, "rubber.E: low = 9"),
+    (("parameters", E, "low"), -1.0, "logarithmic range needs low > 0"),
+    (("parameters", MU), {"low": 0.75, "high": 0.9}, r"mu_k.high = 0.9: .* must not exceed mu_s"),
+    (("parameters", MU, "ratio_to"), "laws.dry.mu", "mu_k.ratio_to: `laws.dry.mu` is not in the"),
+    (("parameters", E), SPAN | {"ratio_to": MU}, "mu_k is a ratio itself"),
+    (("parameters", "pads.upper.elements_x"), SPAN, "the same in every trajectory; set it in `fix"),
+    (("parameters", "pads.upper.length"), {"low": 70e-3, "high": 80e-3},
+     "length.low = 0.07: it changes the contact points of pads.upper"),
+    (("parameters", "bodies.disc.theta"), {"low": 0.0, "high": 1e-3},
+     "theta.low = 0: it changes the coordinates and energies of the rig"),
+    (("parameters", "contacts.above.pad"), SPAN, "is no number, but 'upper'"),
+    (("parameters", "outputs.duration"), SPAN, "`outputs.duration` has no part in a dataset"),
+    (("parameters", "pads.lower.elements_x"), SPAN, "is in `fixed` as well"),
+    (("fixed", "pads.lower.elements"), 3, "fixed.pads.lower.elements: .*you mean `elements_y`"),
+    (("channels",), ["x_disk"], "channels: `x_disk` is no channel of the rig; there are x_disc"),
+    (("channels",), ["x_disc", "x_disc"], "channels: every name once"),
+    (("workers",), 3, "`workers` is not known here"),
+    (("grasp_depth",), {}, r"grasp_depth is of torchsoft 0\.2\.0 and before"),
+    (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
+    (("rig",), None, "rig should be a table"),
+    (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),
+    (("kinds", 0, "name"), "grip", "kinds: every name once"),
+    (("kinds", 0, "fixed", "motion.x_e"), {"kind": "hold"}, "kinds.0.*x_e.*did you mean `x_d`"),
+    (("kinds", 0, "fixed", E), 1e6, "kinds.0.parameters.materials.rubber.E is in `fixed` as well"),
+    (("kinds", 0, "parameters", "motion.x_d.values_2"), SPAN, "kinds.0.*values_2` is not in the"),
+    (("kinds", 0, "parameters", "motion.x_d.stroke_time"), {"low": 1e-6, "high": 1e-2},
+     "kinds.0.*stroke_time.low = 1e-06: impossible: .* makes 50000 strokes"),
+    (("kinds", 0, "fixed", "motion.y_d"), {"kind": "hold", "value": 49e-3},
+     "kinds.0.parameters in their middle: impossible: `motion.y_d.values_2` is not in"),
+    (("kinds", 0, "fixed", "motion.y_d.values"), ["held", 49e-3], '"held" stands for the effort'),
+    (("kinds", 0, "fixed", "pads.lower.points"), 2, "kinds.0.fixed: it changes the contact points"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("place", "value", "message"),
-    [
-        (("fixed", "pads.L.height"), "abc", "fixed.pads.L.height: pads.L"),
-        (("fixed", "pads.L.elements_x"), 40_000, "elements_x = 40000"),
-        (("parameters", f"{LAW}.friction.mu_k", "high"), 1.5, "mu_k.high = 1.5: impossible"),
-        (("kinds", 0, "name"), 3, "kinds.0.name should be a valid string, not 3"),
-        (("kinds", 0, "name"), "press", "kinds: every name once"),
-        (("kinds", 0, "weight"), 0.0, "kinds.0.weight should be greater than or equal to"),
-        (
-            ("kinds", 0, "fixed", "motion.x_e"),
-            {"kind": "hold"},
-            "kinds.0.fixed.motion.x_e: `motion.x_e` is not in the rig file: did you mean `x_d`",
-        ),
-        (
-            ("kinds", 0, "fixed", "motion.x_d", "times"),
-            [0.5, 0.2],
-            "kinds.0.fixed.motion.x_d: motion.x_d: times must increase",
-        ),
-        (
-            ("kinds", 0, "fixed", "materials.rubber.E"),
-            1e6,
-            "kinds.0.parameters.materials.rubber.E is in `fixed` as well",
-        ),
-        (
-            ("kinds", 1, "parameters", "motion.x_d.values_2"),
-            {"low": 0.0, "high": 1.0},
-            "kinds.1.parameters.motion.x_d.values_2: `motion.x_d.values_2` is not in the rig file",
-        ),
-        (
-            ("kinds", 1, "parameters", "motion.x_d.stroke_time", "low"),
-            1e-6,
-            "kinds.1.parameters.motion.x_d.stroke_time.low = 1e-06: impossible: "
-            "motion.x_d.stroke_time = 1e-06 s makes 500000 strokes",
-        ),
-        (
-            ("kinds", 3, "fixed", "motion.x_d", "since"),
-            0.8,
-            "kinds.3.fixed: impossible: motion.x_d.since = 0.8 s leaves",
-        ),
-        (
-            ("kinds", 4, "fixed", "motion.y_d"),
-            {"kind": "hold", "value": 48.6e-3},
-            "kinds.4.parameters.motion.y_d.components_1.amplitude: `motion.y_d.components",
-        ),
-        (
-            ("kinds", 0, "fixed", "motion.y_d"),
-            {"kind": "hold", "value": 48.6e-3},
-            "kinds.0.parameters in their middle: impossible: `motion.y_d.values_2` is not in",
-        ),
-        (
-            ("kinds", 0, "fixed", "motion.x_d", "values"),
-            ["held", 0.0],
-            'kinds.0.fixed: impossible: motion.x_d.values: "held" stands for the effort that holds',
-        ),
-        (
-            ("kinds", 0, "fixed", "pads.L.elements_x"),
-            60,
-            "kinds.0.fixed: it changes the contact points of pads.L",
-        ),
-        (("workers",), 3, "`workers` is not known here"),
-        (("parameters", "materials.rubber.E"), {"low": 9e5, "high": 8e5}, "rubber.E: low = 9"),
-        (("parameters", "materials.rubber.E", "low"), -1.0, "logarithmic range needs low > 0"),
-        (("duration",), 0.4, "kinds.1.fixed: impossible: motion.x_d.stroke_time = 0.3 s makes 0"),
-        (("step",), 0.05, "step should be less than or equal to 0.02"),
-        (("rig",), None, "rig should be a table"),
-    ],
-)
-def test_a_mistake_is_blamed_on_its_field(place, value, message):
+@pytest.mark.parametrize(("place", "value", "message"), MISTAKES)
+def test_a_mistake_is_named_by_its_field(tree, place, value, message):
+    if "grasp_depth" in place:
+        tree = {name: one for name, one in tree.items() if name != "rig"}
     with pytest.raises(InvalidTable) as error:
-        Config.model_validate(changed(place, value))
-    assert message in str(error.value)
+        Config.model_validate(changed(tree, place, value))
+    assert re.search(message, str(error.value)), str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_configuration_of_before_says_what_reads_it():
-    before = {name: x for name, x in SMOKE.items() if name != "rig"} | {"grasp_depth": {}}
-    with pytest.raises(InvalidTable, match=r"grasp_depth is of torchsoft 0\.2\.0 and before"):
-        Config.model_validate(before)
+def test_mistakes_of_the_whole_are_named(tree):
+    nothing = {name: one for name, one in tree.items() if name != "kinds"} | {"parameters": {}}
+    with pytest.raises(InvalidTable, match="parameters is missing: nothing would differ"):
+        Config.model_validate(nothing)
+    same = copy.deepcopy(tree) | {"channels": None, "kinds": []}
+    same["rig"]["motion"]["steps"] = same["rig"]["motion"].pop("x_d")
+    same["rig"]["actuators"]["x"]["setpoint"] = "steps"
+    with pytest.raises(InvalidTable, match="two arrays of the dataset would be called `steps`"):
+        Config.model_validate(same)
 
 
-def test_kinds_are_drawn_by_weight_with_their_own_numbers():
-    """Files that a kind names are part of the configuration; its numbers may be those of all
-    kinds, otherwise distributed."""
-    light = {"name": "light", "weight": 3.0, "parameters": {"motion.y_d.values_2": LIGHT}}
-    config = Config.model_validate(SMOKE | {"trajectories": 256, "kinds": [*SMOKE["kinds"], light]})
+def test_another_file_is_another_dataset(tmp_path):
+    """However its numbers are written."""
+    path = written(tmp_path)
+    config = Config.from_toml(path)
+    path.write_text(CONFIG.replace("high = 1.0", "high = 1"))
+    assert Config.from_toml(path).hash == config.hash
+    licensed = config.model_copy(update={"license": "CC-BY-4.0"})
+    assert Config.model_validate(licensed.model_dump()) == licensed
+    (tmp_path / "rigs" / "x_d.csv").write_text("t [s],x [mm]\n0,0\n0.05,0\n0.1,0.3\n")
+    assert Config.from_toml(path).hash != config.hash
+    (tmp_path / "rigs" / "x_d.csv").unlink()
+    with pytest.raises(OSError, match=r"x_d\.csv"):
+        Config.from_toml(path)
+
+
+def test_kinds_are_drawn_by_weight_with_their_own_parameters(tree):
+    """Which may be those of all kinds, otherwise distributed."""
+    config = Config.model_validate(tree | {"trajectories": 96})
     tasks = [config.subject.task(i, u) for i, u in enumerate(points(config))]
-    of = {
-        kind.name: [one for one in tasks if one.labels["kind"] == kind.name]
-        for kind in config.kinds
-    }
-    assert [len(of[name]) for name in of] == [32, 32, 32, 32, 32, 96]
-    for name, low, high in (("light", 49.6e-3, 49.8e-3), ("chirp", 48.5e-3, 48.9e-3)):
+    of = {name: [one for one in tasks if one.labels["kind"] == name] for name in ("stroke", "grip")}
+    assert [len(some) for some in of.values()] == pytest.approx([32, 64], abs=1)
+    for name, low, high in (("grip", 49.1e-3, 49.2e-3), ("stroke", 49.4e-3, 49.6e-3)):
         heights = [one.labels["motion.y_d.values_2"] for one in of[name]]
         assert low <= min(heights) < max(heights) <= high
-    travel = np.array([one.values["motion.x_d.travel"] for one in of["strokes"]])
-    assert (np.abs(np.abs(travel) - 1.5e-3) <= 0.5e-3).all()
+    travel = np.array([one.values["motion.x_d.travel"] for one in of["stroke"]])
+    assert (np.abs(np.abs(travel) - 1.5e-4) <= 0.5e-4).all()
     assert 8 < (travel < 0).sum() < 24
     assert all("motion.x_d.travel" not in one.labels for one in tasks)
 
 
-@pytest.mark.parametrize("high", [0.4999, 0.3, 0.7e6, 3e-5])
-def test_a_logarithmic_range_does_not_go_beyond_its_ends(high):
-    r = Uniform(low=high / 7, high=high, scale="log")
-    assert r.low <= r.at(0.0) <= r.at(1e-16) <= r.at(1.0) <= r.high
+@settings(max_examples=50, derandomize=True)
+@given(
+    st.floats(1e-6, 1e8), st.floats(1.0, 1e6), st.floats(0, 1), st.sampled_from(["log", "linear"])
+)
+def test_a_uniform_quantile_lies_within_its_ends_where_it_should(low, ratio, u, scale):
+    """For either sign symmetrically about zero."""
+    one = Uniform(low=low, high=low * ratio, scale=scale)
+    assert one.low <= one.at(u) <= one.high
+    expected = low * ratio**u if scale == "log" else low + u * (one.high - low)
+    assert one.at(u) == pytest.approx(expected, rel=1e-9)
+    both = one.model_copy(update={"either_sign": True})
+    assert both.at(0.5 + u / 2) == pytest.approx(expected, rel=1e-9)
+    assert both.at(0.5 - u / 2) == pytest.approx(-expected, rel=1e-9) or u == 0.0
+
+
+def test_normal_and_chosen_values_have_their_distributions():
+    u = np.linspace(0, 1, 101)
+    one = Normal(mean=2.0, sd=0.5, low=1.0, high=4.5)
+    wanted = truncnorm.ppf(u, (1.0 - 2.0) / 0.5, (4.5 - 2.0) / 0.5, loc=2.0, scale=0.5)
+    np.testing.assert_allclose([one.at(x) for x in u], wanted, rtol=1e-9)
+    assert (Normal(mean=1.0, sd=0.1).low, Normal(mean=1.0, sd=0.1).high) == (0.6, 1.4)
+    choice = Choice(choices=(3.0, 1.0, 2.0))
+    assert [choice.at(x) for x in (0.0, 0.33, 0.34, 0.67, 1.0)] == [3.0, 3.0, 1.0, 2.0, 2.0]
 
 
 @pytest.mark.parametrize(
     ("file", "out", "message"),
     [
-        ("million.toml", "set", "or say --yes to begin"),
+        ("large.toml", "set", "or say --yes to begin"),
         ("none.toml", "set", "No such file"),
-        (str(PATH), "nowhere://set", "Protocol not known: nowhere"),
+        ("set.toml", "nowhere://set", "Protocol not known: nowhere"),
     ],
 )
-def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, file, out, message):
-    monkeypatch.chdir(tmp_path)
-    text = PATH.read_text()
-    Path("million.toml").write_text(text.replace("trajectories = 8", "trajectories = 1000000"))
+def test_the_command_rejects_in_one_line(tmp_path, monkeypatch, capsys, file, out, message):
+    monkeypatch.chdir(written(tmp_path).parent)
+    monkeypatch.setattr("torchsoft.cost.LONG", 1.0)  # [s]
+    Path("large.toml").write_text(CONFIG.replace("trajectories = 5", "trajectories = 150"))
     assert main(["dataset", "make", file, "--out", out, "--workers", "0"]) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert message in reported
+    assert reported.count("\n") == 1
     assert not Path("set").exists()
-
-
-def test_the_command_takes_no_nonsense_for_workers(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["dataset", "make", "set.toml", "--out", "set", "--workers", "-3"])
-    assert end.value.code == 2
+    with pytest.raises(SystemExit):
+        main(["dataset", "make", file, "--out", out, "--workers", "-3"])
     assert "--workers: should be from 0 to 1000, not -3" in capsys.readouterr().err

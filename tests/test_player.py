@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,12 +16,10 @@ from conftest import COARSE, paper, times
 from matplotlib.figure import Figure
 from PIL import Image
 
-from torchsoft import simulate
+from torchsoft import Trajectory, simulate
 from torchsoft.plot.animation import charts, frame_rows, packed, player
 from torchsoft.plot.scene import Scene, curve_height, instants
 from torchsoft.rigs import RigFile
-
-ROOT = Path(__file__).parents[1]
 
 SEEN = "return [...document.querySelectorAll('.chart span')].map(x => x.textContent)"
 SLIDE = """const s = document.getElementById('slider'); s.value = arguments[0];
@@ -37,16 +36,6 @@ def run():
     return paper(COARSE).run(times(0.5, 51))
 
 
-def test_a_title_does_not_hold_the_script_open(run, tmp_path):
-    """A comment that begins a script lasts to the end of the page, which stayed empty."""
-    title = "<!--<script> & friends"
-    run.animate(tmp_path / "run.html", frames=2, title=title)
-    text = (tmp_path / "run.html").read_text(encoding="utf-8")
-    found = re.search(r"const data = (\{.*\});\n", text)[1]
-    assert "<" not in found
-    assert json.loads(found)["title"] == title
-
-
 @pytest.fixture(scope="module")
 def page(run, tmp_path_factory):
     if MISSING:
@@ -58,23 +47,30 @@ def page(run, tmp_path_factory):
         yield page
 
 
+def held(path: Path) -> dict[str, Any]:
+    """The data in a page."""
+    return json.loads(re.search(r"const data = (\{.*\});\n", path.read_text("utf-8"))[1])
+
+
 def test_the_file_holds_everything(run, tmp_path):
-    """And asks for nothing: no address, no module, no other file."""
-    run.animate(tmp_path / "run.html", frames=20, title="</script><script>alert(1)</script>")
-    text = (tmp_path / "run.html").read_text(encoding="utf-8")
-    data = json.loads(re.search(r"const data = (\{.*\});\n", text)[1])
+    """And asks for nothing: no address, no module, no other file. No title holds the script open:
+    a comment that begins a script lasts to the end of the page."""
+    title = "<!--<script></script><script>alert(1)</script> & friends"
+    run.animate(path := tmp_path / "run.html", frames=20, title=title)
+    text, data = path.read_text(encoding="utf-8"), held(path)
     shell = text.replace(json.dumps(data), "")
     assert text.count("</script>") == 1
     assert not re.search(r"https?://|src=|import |fetch\(|XMLHttp|@import|url\(", shell)
+    assert data["title"] == title
     assert len(data["times"]) <= 20
-    assert {"disc", "bracket"} == set(data["bodies"])
+    assert {"disc", "bracket"} == {*data["bodies"]}
     with pytest.raises(ValueError, match="`frames` must be 2 or more"):
-        player(run, tmp_path / "run.html", frames=1)
+        player(run, path, frames=1)
 
 
-def first_shown(run, path):
+def first_shown(run: Trajectory, path: Path) -> int:
     player(run, path, frames=30)
-    data = json.loads(re.search(r"const data = (\{.*\});\n", path.read_text(encoding="utf-8"))[1])
+    data = held(path)
     row = run.at(data["times"][data["opening"]])
     largest = max(float(x[row].abs().max()) for x in run.force.values())
     assert data["scale"] * largest <= curve_height(run.setup) * (1 + 1e-9)  # it fits the picture
@@ -151,21 +147,15 @@ def test_frames_are_denser_where_steps_are_short(run):
     assert (t < middle).sum() / middle > (t >= middle).sum() / (0.5 - middle)
 
 
-def test_the_page_opens_without_errors_and_without_a_network(page):
+def test_the_page_opens_with_its_first_frame_and_without_errors_or_a_network(page):
     assert page.run("return document.title") == "A grasp & </script> more"
+    shown = page.run("return [frame, +$('slider').value, data.opening, time, data.times[frame]]")
+    assert shown[0] == shown[1] == shown[2] > 0
+    assert shown[3] == shown[4]
     assert [one for one in page.log("browser") if one["level"] == "SEVERE"] == []
     asked = [json.loads(one["message"])["message"] for one in page.log("performance")]
-    urls = [
-        one["params"]["request"]["url"]
-        for one in asked if one["method"] == "Network.requestWillBeSent"
-    ]  # fmt: skip
-    assert all(url.startswith(("file:", "data:")) for url in urls), urls
-
-
-def test_the_page_shows_the_first_frame_and_its_time(page):
-    shown = page.run("return [frame, +$('slider').value, time, data.times[data.opening]]")
-    assert shown[0] == shown[1] == page.run("return data.opening") > 0
-    assert shown[2] == shown[3]
+    asked = [one["params"] for one in asked if one["method"] == "Network.requestWillBeSent"]
+    assert all(one["request"]["url"].startswith(("file:", "data:")) for one in asked), asked
 
 
 def test_charts_follow_the_slider(page, run):
