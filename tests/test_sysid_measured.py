@@ -141,7 +141,7 @@ REJECTED_DATA: list[tuple[Change, str]] = [
     (put(9, X_C, "n/a"), r"row 9, column `x_C`: 'n/a' is not a finite number; leave the cell empt"),
     (put(9, F_Y, "１２"), r"row 9, column `effort_y`: '１２' is not a finite number"),
     (put(12, Y_D, " "), r"row 12, column `y_d` is empty; only measured channels may have gaps"),
-    (both(*(put(row, X_C, "") for row in range(3, 63))), r"`x_C` has 1 samples, but needs at leas"),
+    (both(*(put(row, X_C, "") for row in range(3, 63))), r"`x_C` has 1 samples, but needs at"),
     # times
     (put(12, T, "0.045"), r"row 12, column `t`: the time 0.045 s is there twice: delete one"),
     (put(12, T, "0.01"), r"row 12, column `t`: time goes back, from 0.045 to 0.01 s: sort"),

@@ -140,5 +140,5 @@ def test_a_name_means_one_thing_and_is_given_once():
     assert in_full([RIG, other], {"F_x": 1, "theta_C": 2}) == {"effort_x": 1, "theta_C": 2}
     with pytest.raises(ValueError, match="`theta_C` and `theta` are one, given twice"):
         in_full([RIG], {"theta": 1, "theta_C": 2})
-    with pytest.raises(ValueError, match="`theta` is short for theta_C and theta_ball in differen"):
+    with pytest.raises(ValueError, match="`theta` is short for theta_C and theta_ball in"):
         in_full([RIG, other], {"theta": 1})
