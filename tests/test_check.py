@@ -163,6 +163,8 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "taken name": ({"bodies.keys": {"x": 0.0, "y": 0.0, "theta": 0.0}},
         r"bodies\.keys: the name is taken by torch"),
     # what cannot be built
+    "loop over nothing": ({"actuators.x": {"measures": "disc.theta", "Kp": 1000.0, "Kd": 4.0}},
+        "nothing that touches ties disc.theta"),
     "memory": ({"pads.lower": {"kind": "fingertip", "material": "rubber", "radius": 1e-2,
         "elements_around": 4000}}, r"elements_around = 4000 take about"),
     "no mesh": ({"x.csv": "x", "pads.lower": {"kind": "mesh", "material": "rubber", "unit": "mm",
@@ -219,12 +221,8 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "early end": (csv("t [s],x_d [mm]\n0,0\n1,1\n"), r"x\.csv ends at 1 s, .* lasts until 2 s"),
     "no column": (csv("t [s],x [mm]\n0,0\n1,1\n"),
         r"no column `x_d \[m\]`, in this unit .*; it has `t`, `x`; .* in `column`"),
-    "no time": (csv("Time (s),x_d (m)\n0,0\n1,1\n"),
-        r"no column `t \[s\]`, .*; it has `x_d`, `Time`; say which one in `time`"),
-    "a force": (csv("t [s],x_d [N]\n0,0\n1,1\n"), r"column `x_d` cannot be in 'N'; .* m, cm"),
     "a gap": (csv("t [s],x_d [mm]\n0,0\n1,\n"), r"row 3, column `x_d` is empty"),
     "backwards": (csv("t [s],x_d [mm]\n1,0\n0,1\n"), r"row 3, .* 0 s follows 1 s; times must incr"),
-    "one row": (csv("t [s],x_d [mm]\n0,0\n"), r"has 1 rows of numbers"),
     "a clock": (csv("t [s],x_d [mm]\n1.7e9,0\n1.7000001e9,1\n"),
         r"begins at 1\.7e\+09 s, and the run ends at 2 s: .* say from_first = true"),
     "an encoder, strain": (
@@ -260,7 +258,7 @@ def quiet(tmp_path_factory):
     return "\n".join(found)
 
 
-SLOW = "too heavy", "cannot roll"
+SLOW = "too heavy", "no room", "cannot roll"
 
 
 @pytest.mark.parametrize(
@@ -296,8 +294,6 @@ def test_pads_that_are_moved_gently_are_not_warned_about(changes, tmp_path):
     ("arrays", "expected"),
     [
         ({"0.weight": np.zeros((1, 3)), "0.bias": np.zeros(1)}, r"0\.weight has .* \(1, 3\)"),
-        ({"a": np.zeros(3)}, r"it has a, but a network has 0\.weight, 0\.bias"),
-        ({"0.weight": np.full((1, 4), np.nan), "0.bias": np.zeros(1)}, "must be finite numbers"),
         ({"0.weight": np.zeros((600, 4)), "0.bias": np.zeros(600)}, "more than 2000 numbers"),
         ({"0.weight": np.array([object()]), "0.bias": np.zeros(1)}, "no.* file of numbers: Object"),
     ],
@@ -308,6 +304,7 @@ def test_weights_that_are_no_network_are_reported(tmp_path, arrays, expected):
     assert re.search(rf"^error: actuators\.x\.network: .*{expected}", found), found
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_about_to_close_is_not_judged():
     """The bracket does not hold the disc yet, so that the loop over both is unstable there."""
     file = RigFile.ready("paper")

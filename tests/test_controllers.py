@@ -96,7 +96,6 @@ def test_a_network_of_the_state_in_a_file(tmp_path):
             {"measures": ["bracket.x", "disc.z"]},
             r"controllers\.jaw\.measures: `disc\.z` is not a coordinate",
         ),
-        ({"measures": ["bracket.x", "bracket.x"]}, r"measures: every name once"),
         (
             {"pushes": ["bracket.x", "bracket.theta"]},
             r"controllers\.jaw\.pushes: bracket\.theta is fixed at 0",

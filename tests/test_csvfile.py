@@ -20,9 +20,7 @@ SAME = {
     "a row of units": (PLAIN.replace("t [s],force [N],x [mm]", "t,force,x\ns,N,mm"), "utf-8"),
     "a row of units in brackets":
         (COMMAS.replace("t [s];force [kN];x [mm]", "t;force;x\n[s];[kN];(mm)"), "utf-8"),
-    "units of other names": (PLAIN.replace("t [s]", "t [sec]"), "utf-8"),
     "quotes": ('"t [s]","force [N]","x [mm]"\n"0","1.5","1"\n0.5,-2,2\n1.25,3e3,4\n', "utf-8"),
-    "empty rows": (PLAIN.replace("\n0.5", "\n,,\n\n0.5"), "utf-8"),
 }  # fmt: skip
 
 
@@ -126,11 +124,8 @@ def test_hidden_worksheets_are_not_read(state, tmp_path):
     ("heading", "form", "value", "expected"),
     [
         ("strain [%]", "0.0%", 0.01, 0.01),
-        ("strain [1]", "0.0%", 0.01, 0.01),
         ("strain [1]", '0.0"%"', 1, 0.01),
         ("strain [%]", '0.0"%"', 1, 0.01),
-        ("strain [%]", "0.00", 1, 0.01),
-        ("force [N]", "#,##0.0", 1500, 1500),
         ("x [mm]", "0%", 0.01, "row 3, column `x`: '1%' .* plain numbers in mm"),
         ("force [kN]", "0.0,", 1500, "row 3, column `force`: '1500 .displayed in thousands"),
     ],
@@ -165,16 +160,11 @@ def test_a_hundred_thousand_columns(tmp_path):
 
 
 BAD = {
-    "numbers before the heading": ("1,2,3\n" + PLAIN,
-        r"row 1 is of numbers, but stands before the heading in row 2"),
     "both decimals": (COMMAS.replace("0,0015", "0.0015"), "decimal commas and decimal points"),
     "thousands": (COMMAS.replace("3,0", "3.000,0"), r"row 4, column `force`: '3\.000,0' is not a"),
-    "no heading": ("0,1,2\n3,4,5\n", r"row 1, column `0` is not known; 3 columns"),
     "an unknown unit": (PLAIN.replace("t [s],force [N],x [mm]", "t,force,x\ns,N,furlong"),
         r"row 1, column `x` cannot be in 'furlong'; it can be in m, cm, mm"),
     "no unit": (PLAIN.replace("x [mm]", "x"), r"row 1, column `x` has no unit: write `x \[m\]`"),
-    "nothing": ("", "test.csv is empty"),
-    "zeros": ("t [s]\0", "is not a table of text in UTF-8, UTF-16 or Windows-1252"),
 }  # fmt: skip
 
 
@@ -185,13 +175,3 @@ def test_an_ambiguous_table_is_rejected(name, tmp_path):
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         read(path)
-
-
-def test_other_workbooks_are_rejected(tmp_path):
-    for name, message in (
-        ("old.xls", "a workbook of an old Excel: save it as .xlsx or as CSV"),
-        ("no.xlsx", "no.xlsx is not an Excel workbook"),
-    ):
-        (tmp_path / name).write_bytes(b"\xd0\xcf\x11\xe0")
-        with pytest.raises(ValueError, match=message):
-            read(tmp_path / name)

@@ -132,30 +132,13 @@ def test_one_of_two_fingers_is_excited():
     assert excite(file, "slow roll", body="right").motion["right_close"].values == (0.0, -1.4e-3)
 
 
-def test_times_of_an_excitation_may_be_chosen():
-    strokes = {"kind": "strokes", "travel": 5e-3, "stroke_time": 0.1}
-    changed = excite(coarse("paper"), Excitation(strokes, duration=0.4, grasp=0.1, since=0.2))
-    assert changed.motion["y_d"].times == changed.motion["F_ff"].times == (0.0, 0.1)
-    assert changed.motion["x_d"].since == 0.2
-    assert float(changed.build().t[-1]) == 0.4
-
-
-def test_an_unknown_excitation_is_rejected():
-    with pytest.raises(ValueError, match="there is no excitation `stroke`; did you mean `strokes`"):
-        excite(RigFile.ready("paper"), "stroke")
-
-
 @pytest.mark.parametrize(
     ("roll", "duration", "message"),
     [
-        ({"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 2.0}, 0.7,
-         "motion.x_d.since = 0.5 s leaves 0.2 s until 0.7 s"),
         ({"kind": "multi_sine", "amplitude": 1e-3, "band": [0.5, 1e5]}, 9.0,
          "motion.x_d has more than 100000 periods"),
         ({"kind": "strokes", "travel": 1e-3, "stroke_time": 1e-5}, 9.0,
          "motion.x_d.stroke_time = 1e-05 s makes 850000 strokes"),
-        ({"kind": "profile", "times": [0.1, 0.1], "values": [0.0, 1e-3]}, 2.0,
-         "times must increase, but 0.1 s"),
     ],
 )  # fmt: skip
 def test_an_impossible_excitation_is_rejected_by_its_field(roll: Any, duration, message):

@@ -1,14 +1,10 @@
 """Files appear whole or not at all, last, and leave nothing behind."""
 
-import errno
-import json
 import os
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from torchsoft import csvfile
@@ -117,20 +113,6 @@ def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path):
             unsealed(path)
 
 
-def test_json_takes_numpys_numbers_and_leaves_out_what_is_not_finite(tmp_path):
-    content = {
-        "a": np.int64(3),
-        "b": [np.float64(0.5), np.float32(np.nan), np.bool_(True)],
-        "c": (float("inf"), "x"),
-    }
-    write_json(tmp_path / "file.json", content)
-    assert json.loads((tmp_path / "file.json").read_text()) == {
-        "a": 3,
-        "b": [0.5, None, True],
-        "c": [None, "x"],
-    }
-
-
 @pytest.mark.parametrize(
     ("read", "name"),
     [
@@ -159,28 +141,6 @@ def test_only_regular_files_of_a_stated_size_are_read(read, name, tmp_path):
         with pytest.raises(ValueError, match=words) as refusal:
             read(path)
         assert str(path) in str(refusal.value)
-
-
-def test_an_archive_that_declares_too_many_numbers_is_refused_unread(tmp_path):
-    path = tmp_path / "law.npz"
-    with zipfile.ZipFile(path, "w") as archive, archive.open("0.weight.npy", "w") as member:
-        np.lib.format.write_array_header_1_0(
-            member, {"descr": "<f8", "fortran_order": False, "shape": (4_000_000, 1000)}
-        )
-    with pytest.raises(
-        ValueError, match=r"law\.npz is not an \.npz file of numbers: it has more than 2000 numbers"
-    ):
-        read_network(path, LOOP)
-
-
-def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("torchsoft.files.flush", full)
-    with pytest.raises(OSError, match="No space left") as refusal:
-        write_json(tmp_path / "summary.json", {})
-    assert refusal.value.filename == str(tmp_path / "summary.json")
 
 
 def test_a_folder_of_other_files_is_not_written_to(tmp_path):

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, coarse, f64, grasped, nested, still, times, turning
+from conftest import COARSE, PAPER, coarse, f64, nested, still, times
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_controllers import file as controlled
 from torch import nn
 
-from torchsoft import Body, BuiltRig, Circle, Ellipse, Profile, Reference, Rig, RigFile, hold
+from torchsoft import Body, BuiltRig, Circle, Profile, Reference, Rig, RigFile, hold
 from torchsoft.rigs.build import READY, ready
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
@@ -93,7 +93,7 @@ def test_short_names_are_for_typing_only():
     lengths = {"pads.L.elements_x": 60, "pads.U.elements_x": 60}
     assert one == PAPER.override({"materials.rubber.E": 8e5} | lengths)
     assert PAPER.full("pad.elements_x") == tuple(lengths)
-    built = brief({"names.push": "effort_x"} if "push" in PAPER.names else {})
+    built = brief()
     rig, run = built.rig, built.run(times(0.02, 3), step=5e-3)
     for short, full in rig.short.items():
         if full in run:
@@ -111,12 +111,9 @@ def test_short_names_are_for_typing_only():
     ("names", "words"),
     [
         ({"pad.E": "materials.steel.E"}, "names.pad.E: `materials.steel.E` is not .* has rubber"),
-        ({"mesh": ["pads.L.elements_x", "pads.M.elements_x"]}, "names.mesh: `pads.M.elements_x`"),
         ({"angle": "theta_D"}, "names.angle: .* no channel `theta_D`; did you mean"),
         ({"x_C": "theta_C"}, "names.x_C: it is the name of something else already"),
-        ({"gravity": "materials.rubber.E"}, "names.gravity: it is the name of something else"),
         ({"none": []}, "names.none"),
-        ({"one": 1.0}, "names.one"),
     ],
 )
 def test_a_short_name_of_nothing_or_of_two_things_is_rejected(names, words):
@@ -131,7 +128,7 @@ def test_names_go_with_the_entries_that_a_change_takes_away():
     assert PAPER.override({"pad.inertial": True}).names == PAPER.names  # there by default
 
 
-@pytest.mark.parametrize("name", ["pad.Young", "pad", "pad.E.x", "", "materials.rubber.Young"])
+@pytest.mark.parametrize("name", ["pad.Young", "pad.E.x", ""])
 def test_an_unknown_name_is_rejected(name):
     assert f"`{name}` is not in the rig file: " in rejection({name: 1.0})
     with pytest.raises(ValueError, match=rf"`{re.escape(name)}` is not in the rig file"):
@@ -160,17 +157,6 @@ def test_a_source_of_a_number_that_has_its_default_stays():
     file = RigFile.from_tree(tables).override(outputs={"duration": 0.5, "snapshots": []})
     assert name in file.sources
     assert file.sources.keys() - file.override({name: 3.0}).sources.keys() == {name}
-
-
-@pytest.mark.parametrize(
-    ("sources", "words"),
-    [
-        ({"materials.rubber.E": "measured"}, "sources.materials.rubber.E: .* begin with .publi"),
-        ({"materials.rubber.G": "assumed"}, "sources.`materials.rubber.G` is not in the rig file"),
-    ],
-)
-def test_a_source_of_nothing_or_of_another_kind_is_rejected(sources, words):
-    assert re.search(words, rejection(sources=sources))
 
 
 def test_the_table_has_value_unit_source_and_meaning_of_every_number():
@@ -251,11 +237,8 @@ def test_names_replace_what_is_there_and_tables_merge():
     assert merged.motion["y_d"].values == ("start", 48e-3)
     assert PAPER.override({"motion.y_d.values_2": 48e-3}) == merged
     assert PAPER.override({"motion.y_d.values.1": 48e-3}) == merged  # as in files of before
-    with pytest.raises(ValueError, match=r"it has motion\.y_d\.values_1 to _2"):
-        PAPER.override({"motion.y_d.values_7": 48e-3})
-    hold = PAPER.override({"motion.y_d": {"kind": "hold", "value": 50e-3}})
-    assert hold.motion["y_d"].model_dump() == {"kind": "hold", "value": 50e-3}
-    assert PAPER.override(motion={"y_d": {"kind": "hold", "value": 50e-3}}) == hold
+    hold = {"kind": "hold", "value": 50e-3}
+    assert PAPER.override({"motion.y_d": hold}) == PAPER.override(motion={"y_d": hold})
 
 
 @pytest.mark.parametrize(
@@ -290,21 +273,6 @@ def test_a_file_comes_before_a_ready_rig_of_its_name(tmp_path):
     assert RigFile.path("paper", tmp_path) == tmp_path / "paper"
     with pytest.raises(ValueError, match=r"mine\.tom: No such file .*; the ready rigs are drop, "):
         RigFile.path("mine.tom", tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("[bodies.disc]\nmas = 1.0", "bodies.disc: `mas` is not known here"),
-        ("[materials.rubber]\nE = soft", "line 2"),
-        ('[channels]\ntheta = "theta_C"', "say [names], the short name first"),
-    ],
-)
-def test_a_file_that_is_wrong_is_rejected_with_its_name(text, named, tmp_path):
-    path = tmp_path / "soft.toml"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=rf"soft\.toml: .*{re.escape(named)}|soft.*{named}"):
-        RigFile.from_toml(path)
 
 
 @pytest.mark.parametrize("name", ready())
@@ -355,9 +323,9 @@ def renamed(new: str) -> RigFile:
     return RigFile.from_tree(json.loads(tree.replace(f'"{MOTION}"', json.dumps(new))))
 
 
-@pytest.mark.parametrize("name", ["a/b", ".", "", "forward", "training", "a.b.c", "1", "a\nb"])
+@pytest.mark.parametrize("name", ["a/b", "", "forward", "a.b.c", "1", "a\nb"])
 def test_motions_have_names_by_the_rule_of_the_others(name):
-    words = "taken by torch" if name in ("forward", "training") else "letters, digits and"
+    words = "taken by torch" if name == "forward" else "letters, digits and"
     with pytest.raises(ValueError, match=f"motion\\..*: the name .*{words}"):
         renamed(name)
     with pytest.raises(ValueError, match=f"motion\\..*: the name .*{words}"):
@@ -369,14 +337,9 @@ def test_motions_have_names_by_the_rule_of_the_others(name):
     ("name", "owner"),
     [
         ("x_{body}", "{body}.x"),
-        ("v_x_{body}", "the rate of {body}.x"),
-        ("M_{pad}", "the moment on the pad `{pad}`"),
         ("effort_{actuator}", "the effort of the actuator `{actuator}`"),
         ("time", "an array `time` of files"),
-        ("stretch_{contact}", "`stretch_{contact}` of the contact"),
-        ("energy_strain_{pad}", "`energy_strain_{pad}` of the pad"),
         ("energy_{body}", "`energy_{body}` of the body"),
-        ("supplied_control_{actuator}", "`supplied_control_{actuator}` of the actuator"),
     ],
 )
 def test_two_channels_of_one_name_are_rejected_with_both_owners(name, owner):
@@ -390,7 +353,7 @@ def test_two_channels_of_one_name_are_rejected_with_both_owners(name, owner):
     assert f"the motion `{name}`" in str(rejected.value)
 
 
-@pytest.mark.parametrize("name", ["ground", "disc_spin", "pad_L", "a/b", "keys"])
+@pytest.mark.parametrize("name", ["ground", "disc_spin", "keys"])
 def test_bodies_cannot_have_names_of_other_junctions(name):
     model = coarse()
     parts = {"pads": dict(model.pads), "contacts": dict(model.contacts)}
@@ -438,45 +401,6 @@ def test_the_start_follows_the_parameters():
     assert (moved - made.y0).abs().max() < 1e-12
     assert slope.item() == pytest.approx((moved - one.y0)[height].item() / 1e-6, rel=1e-4)
     assert 0.9 < slope.item() < 1.1
-
-
-@torch.no_grad()
-def test_the_papers_controllers():
-    """Eq. 31-34: the horizontal loop measures the disc, the vertical one the bracket, and both push
-    the bracket."""
-    model = coarse()
-    state = model.unpack(grasped(model, (0.02, -0.01)))
-    aside = state.pose["bracket"] + f64(1e-3, 2e-3, 0.0)
-    state = state._replace(pose=state.pose | {"bracket": aside})
-    t = f64(0.0)[0]
-    F_x, F_y = (float(model.actuator_effort(name, state, model.follow(t))) for name in "xy")
-    x_d, y_d, F_ff = (float(model.reference[name](t)[0]) for name in ("x_d", "y_d", "F_ff"))
-    x, y = float(state.pose["disc"][0]), float(aside[1])
-    assert F_x == pytest.approx(1.2e5 * (x_d - x) - 441.7149 * 0.02, rel=1e-13)
-    assert F_y == pytest.approx(1.2e5 * (y_d - y) + F_ff, rel=1e-13)
-
-
-def test_bodies_know_their_inertia():
-    for body, inertia in (
-        (disc := Body(2.0, Circle(0.1)), 0.5 * 2.0 * 0.01),
-        (Body(2.0, Ellipse(0.3, 0.1)), 0.25 * 2.0 * (0.09 + 0.01)),
-        (Body(2.0, Circle(0.1), inertia=0.7), 0.7),
-    ):
-        assert body.inertia.item() == pytest.approx(inertia, rel=1e-15)
-    (slope,) = torch.autograd.grad(disc.inertia, disc.shape.radius)
-    assert float(slope) == pytest.approx(2.0 * 0.1, rel=1e-15)
-
-
-def test_sizes_of_the_papers_rig():
-    """61 surface nodes a pad: forces and stretches, five free coordinates and their rates."""
-    layout = coarse().layout
-    assert layout.size == 2 * (2 * 61 + 61) + 2 * 5
-    assert layout.blocks["pads", "L"].shape == (1, 61, 2)
-    assert layout.free == {"disc": [0, 1, 2], "bracket": [0, 1]}
-    inertial = coarse(pad__inertial=True).layout.blocks
-    shapes = [inertial[field, "U"].shape for field in ("pads", "rates")]
-    assert shapes == [(122, 2)] * 2  # two elements high, the base held
-    assert turning().layout.size == layout.size + 2
 
 
 def test_coordinates_that_are_not_free_are_filled_in():

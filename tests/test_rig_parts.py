@@ -1,8 +1,5 @@
 """Every shape, material, pad and control law that a rig file may have."""
 
-import json
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -20,7 +17,6 @@ from torchsoft.physics.material import GeneralisedKelvin, KelvinVoigt, Prony
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, QuadMesh
 from torchsoft.physics.shapes import Contour, RoundedBox, RoundedPolygon, Superellipse
 from torchsoft.rigs import RigFile
-from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.geometry import Scene, collision, surface
 from torchsoft.rigs.written import template, to_toml
@@ -261,41 +257,6 @@ def test_a_mesh_is_counted_before_it_is_built(mesh):
     )
 
 
-CONDENSING = """
-from torchsoft import CurvedPadMesh, PadMesh
-from torchsoft.physics.mesh import unit_compliance
-
-def memory(name):
-    with open("/proc/self/status") as file:
-        return next(int(line.split()[1]) for line in file if line.startswith(name)) / 2**20
-
-unit_compliance(PadMesh(0.1, 0.01, 40, 4), 0.45)
-mesh = {}
-_ = mesh.matrices, mesh.surface
-with open("/proc/self/clear_refs", "w") as file:
-    file.write("5")  # the peak begins anew
-before = memory("VmRSS")
-unit_compliance(mesh, 0.45)
-print((memory("VmHWM") - before) / mesh.memory)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    not Path("/proc/self/clear_refs").exists(), reason="the peak of memory is Linux's"
-)
-@pytest.mark.parametrize("mesh", [
-    "PadMesh(0.1, 5e-3, 600, 4)", "PadMesh(0.05, 0.05, 100, 100)",
-    "CurvedPadMesh(0.1, 2e-2, 400, 24, radius=0.1)",
-])  # fmt: skip
-def test_the_memory_of_a_pad_is_estimated_before_it_is_built(mesh):
-    """By the order of what condensing takes at its peak, in a process of its own: freed memory of
-    another mesh would be used again."""
-    code = CONDENSING.format(mesh)
-    taken = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert 0.6 < float(taken.stdout) < 1.3
-
-
 # control laws
 # ----------------------------------------------------------------------
 
@@ -315,13 +276,6 @@ def test_a_network_from_a_file_is_the_module_in_python(folder):
             seen = [run[name] for name in ("x_d", "x_d_dot", "x_bracket", "v_x_bracket")]
             wanted = law(torch.stack(seen, -1))
             assert torch.allclose(run["effort_x"], wanted, rtol=1e-9, atol=1e-9)
-
-
-def test_a_run_that_ends_where_it_begins_has_its_summary(folder, tmp_path):
-    running.run(rig(folder, pads={"upper": {"origin": (5.0, 0.0)}}), tmp_path)
-    numbers = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    assert numbers["simulated_s"] == 0.0
-    assert "`disc` was lost: it left the space over the pad `upper`" in numbers["stopped"]
 
 
 # A friction law of a Python file
@@ -351,9 +305,8 @@ def test_a_law_of_a_python_file_is_run_where_the_user_says_so(tmp_path, monkeypa
     given = RigFile.ready("drop").override({"outputs.duration": 0.1, "outputs.snapshots": []})
     expected = given.build({"laws.dry.friction": file.build().rig.contacts["ground"].law.friction})
     assert torch.equal(found["theta_ellipse"], expected.run(rtol=1e-3)["theta_ellipse"])
-    for law, name in (("none", "no function"), ("torch", "no function")):
-        with pytest.raises(ValueError, match=f"laws.dry.friction.law: .*{name}"):
-            of_a_file(tmp_path, law).build()
+    with pytest.raises(ValueError, match=r"laws.dry.friction.law: .*no function"):
+        of_a_file(tmp_path, "none").build()
     (tmp_path / "law.py").unlink()
     with pytest.raises(ValueError, match="is not a Python file"):
         file.build()
