@@ -135,8 +135,8 @@ def test_a_rig_file_has_integral_lag_and_limit_with_units_and_runs_keep_their_st
     assert not torch.allclose(batch.y[1], run.y)
 
 
-@pytest.mark.parametrize("lag", [2e-3, 2e-7])
-def test_a_lag_is_the_fastest_mode_of_a_rig(lag):
+def test_a_lag_is_the_fastest_mode_of_a_rig():
+    lag = 2e-7
     built = PAPER.override(COARSE | {LAG_Y: lag}).build()
     A = linearised(built.rig, built.y0, built.rig.reference)
     assert float(torch.linalg.eigvals(A).real.min()) <= -0.9 / lag

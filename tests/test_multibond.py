@@ -3,7 +3,10 @@
 import pytest
 import torch
 from conftest import coarse, random_state
+from rig_tester import at_random
+from test_every_rig import RIGS
 
+from torchsoft.physics.contact import turned
 from torchsoft.physics.multibond import net_efforts, to_dot, topology
 
 
@@ -29,6 +32,22 @@ def test_the_moment_on_the_bracket_is_that_of_the_bonded_nodes():
     cross = lambda r, F: float((r[:, 0] * F[:, 1] - r[:, 1] * F[:, 0]).sum())
     expected = cross(base[bonded], -force[bonded]) + cross(u, port.effort)
     assert moment == pytest.approx(expected, rel=1e-9)
+
+
+@torch.no_grad()
+def test_flows_of_nodes_are_the_rates_of_their_places_on_turning_bases():
+    start, t, h = RIGS["turning jaws"](), 0.01, 1e-7
+    rig, y = start[0], at_random(start, 0)
+    rate, flows = rig(t, y), rig.evaluate(t, rig.unpack(y, t=t)).flows
+
+    def places(name: str, h: float) -> torch.Tensor:
+        state = rig.unpack(y + h * rate, t=t + h)
+        (place, _), u = rig.base_motion(name, state), rig.displacement(name, state)
+        return place[:2] + turned(rig.pads[name].positions + u, place[2])
+
+    for name in rig.pads:
+        expected = (places(name, h) - places(name, -h)) / (2 * h)
+        assert (flows[f"pad_{name}"] - expected).abs().max() < 1e-6 * expected.abs().max()
 
 
 @pytest.mark.parametrize("senses", ["disc.x", "bracket.x"])
