@@ -367,7 +367,6 @@ def test_what_cannot_be_compiled_is_rejected_with_its_line(law, reason):
     assert source in Path(__file__).read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
 def test_a_law_that_torch_compiled_says_so():
     law = torch.compile(lambda x, p: x * p["a"], backend="aot_eager")
     with pytest.raises(UnknownOperation, match=r"torch\.compile is around it, .* leave that out"):
@@ -390,7 +389,7 @@ def test_a_law_with_a_state_or_a_captured_parameter_is_rejected():
     [
         {"x": torch.ones(2)}, {"parameters": {"a": torch.ones(2)}}, {"linear": 3},
         {"x": torch.ones(2, 2).double()}, {"function": lambda x, p: x[0]},
-        {"function": lambda x, p: (x, x)},
+        {"function": lambda x, p: (x, x)}, {"differentiated": -1},
     ],
 )  # fmt: skip
 def test_wrong_arguments_and_results_are_rejected(changes):
@@ -423,3 +422,10 @@ def test_threads_that_compile_one_law_together_share_its_code(monkeypatch):
         laws = list(pool.map(lambda _: compile_law(law, *arguments), range(8)))
     held = {engine.get_function_address("value") for engine in emit._engines.values()}
     assert {law.value for law in laws} <= held
+
+
+@pytest.mark.parametrize(("law", "x"), [(1, np.ones(4)[::2]), (1.5, np.ones(2))])
+def test_arrays_of_another_kind_are_rejected_when_numba_compiles(law, x):
+    call = numba.njit(lambda law, x, p, out: call_value(law, x, p, out))
+    with pytest.raises(numba.TypingError, match=r"C-contiguous float64|integer"):
+        call(law, x, np.ones(0), np.ones(2))

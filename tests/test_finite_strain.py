@@ -77,7 +77,10 @@ def forces(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
 # elements
 
 
-@KINDS
+@pytest.mark.parametrize(
+    "kind",
+    ["neo_hookean", "mooney_rivlin", "yeoh", pytest.param("ogden", marks=pytest.mark.slow)],
+)
 def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kind):
     """Several at once, of which one is at rest: a product whose first factor vanishes has a
     derivative."""

@@ -441,7 +441,9 @@ def test_a_deck_gives_its_series(tmp_path):
     assert found.values == pytest.approx(expected)
     t = np.array([0.0, 0.1, 30.0])
     relaxed = 0.7e6 * (1 - 0.2 * (1 - np.exp(-t / 0.01)) - 0.3 * (1 - np.exp(-t / 0.5)))
+    solid = found.material(rho=1100.0, depth=0.04)
     assert np.allclose(found.relaxation(t), relaxed, rtol=1e-12)
+    assert np.allclose(solid.relaxation(torch.from_numpy(t)).detach(), relaxed, rtol=1e-12)
     assert len(found.notices) == 1
     found = read_deck(decked(tmp_path, (", moduli=INSTANTANEOUS", "")), unit=1e6)
     assert found.values["E"] == pytest.approx(0.7e6)
@@ -468,6 +470,8 @@ def test_a_hyperelastic_deck_whose_bulk_does_not_relax(tmp_path):
     ("old", "new", "message"),
     [
         ("*Viscoelastic", "*Depvar", "0 materials with *VISCOELASTIC"),
+        ("time=PRONY", "time=FREQUENCY DATA", "must say TIME=PRONY"),
+        ("moduli=INSTANTANEOUS", "type=ORTHOTROPIC", "must be isotropic"),
         ("0.3, 0.3", "0.9, 0.3", "below one in sum, which is 1.1"),
         ("*Elastic, moduli=INSTANTANEOUS\n0.7, 0.45\n", "", "no *ELASTIC and no *HYPERELASTIC"),
         ("0.7, 0.45", "soft, 0.45", "`SOFT, 0.45` should be 2 numbers"),
