@@ -77,7 +77,10 @@ def forces(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
 # elements
 
 
-@KINDS
+@pytest.mark.parametrize(
+    "kind",
+    ["neo_hookean", "mooney_rivlin", "yeoh", pytest.param("ogden", marks=pytest.mark.slow)],
+)
 def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kind):
     """Several at once, of which one is at rest: a product whose first factor vanishes has a
     derivative."""
@@ -164,28 +167,6 @@ def test_dissipation_is_never_negative_and_is_the_work_that_is_lost(material):
     power = float(forces(lambda x: potentials(material, x), x).detach() @ x[n : 2 * n])
     lost = 2 * float(potentials(material, x)[1].detach())
     assert power - (ahead - behind) / h == pytest.approx(lost, rel=1e-6)
-
-
-@KINDS
-def test_uniform_strain_passes_the_patch_test(kind):
-    """Nodes inside of a skewed mesh are balanced, and the energy is that of the area."""
-    material = energy(kind)
-    generator = np.random.default_rng(0)
-    mesh = PadMesh(4e-3, 3e-3, 4, 3)
-    nodes = mesh.nodes.copy()
-    inner = ((nodes > 1e-9) & (nodes < [4e-3 - 1e-9, 3e-3 - 1e-9])).all(1)
-    nodes[inner] += generator.uniform(-2e-4, 2e-4, (inner.sum(), 2))
-    F = np.array([[1.2, 0.3], [-0.1, 0.75]])
-    u = torch.from_numpy((nodes @ (F - np.eye(2)).T)[mesh.elements].reshape(-1, 8))
-    constants = torch.from_numpy(element_constants(nodes[mesh.elements]))
-    x = torch.cat((u, torch.zeros_like(u), constants), -1).requires_grad_()
-    stored = potentials(material, x)[..., 0].sum()
-    (f,) = torch.autograd.grad(stored, x)
-    total = np.zeros_like(nodes)
-    np.add.at(total, mesh.elements.ravel(), f[:, :8].reshape(-1, 2).numpy())
-    W = float(material.energy(plane(torch.from_numpy(F))).detach())
-    assert np.abs(total[inner]).max() < 1e-13 * np.abs(total).max()
-    assert float(stored.detach()) == pytest.approx(W * 0.044 * 12e-6, rel=1e-12)
 
 
 def test_forces_are_those_of_another_program(monkeypatch):
@@ -342,9 +323,9 @@ def test_the_ratio_of_times_counts_for_branches_and_inertia_allows_none():
         Pad(mesh, rubber, inertial=True).check_chain("P")
 
 
-def pressed(nu: float, depth: float, kind: str = "neo_hookean", finer: int = 1) -> float:
-    """Force [N] of the lower pad on the paper's disc, held so deep [m] in it."""
-    rubber = {"kind": kind, "E": 7.5e5, "nu": nu, "tau": 0.01, "depth": 0.044}
+def pressed(nu: float, finer: int) -> float:
+    """Force [N] of the lower pad on the paper's disc, held 0.4 mm deep in it."""
+    rubber = {"kind": "neo_hookean", "E": 7.5e5, "nu": nu, "tau": 0.01, "depth": 0.044}
     mesh = {"elements_x": 30 * finer, "elements_y": 2 * finer, "length": 0.06}
     changes = {f"pads.L.{name}": value for name, value in mesh.items()}
     changes |= {"materials.rubber": rubber, "laws.steel_on_rubber.K_n": 4e6}
@@ -352,21 +333,13 @@ def pressed(nu: float, depth: float, kind: str = "neo_hookean", finer: int = 1) 
     rig = still(changes)
     with torch.no_grad():
         y = rig.state(
-            disc={"x": 60e-3, "y": 4.59e-3 + 19.37e-3 - depth}, bracket={"x": 60e-3, "y": 1.0}
+            disc={"x": 60e-3, "y": 4.59e-3 + 19.37e-3 - 0.4e-3}, bracket={"x": 60e-3, "y": 1.0}
         )
         return float(rig.evaluate(0.0, rig.unpack(y)).interfaces["L"].law.force[:, 0].sum())
 
 
-@pytest.mark.parametrize(("nu", "low", "high"), [(0.45, 1.15, 1.30), (0.49, 1.25, 1.45)])
-def test_a_layer_that_is_pressed_by_a_sixth_is_stiffer_than_linear(nu, low, high):
-    finite, linear = (pressed(nu, 0.75e-3, kind) for kind in ("neo_hookean", "kelvin_voigt"))
-    assert low < finite / linear < high
-    finite, linear = (pressed(nu, 1e-6, kind) for kind in ("neo_hookean", "kelvin_voigt"))
-    assert finite == pytest.approx(linear, rel=2e-3)
-
-
 def test_nearly_incompressible_pads_do_not_lock():
-    assert 0.94 < pressed(0.499, 0.4e-3) / pressed(0.499, 0.4e-3, finer=2) < 1.0
+    assert 0.94 < pressed(0.499, 1) / pressed(0.499, 2) < 1.0
 
 
 ELASTIC = {"kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044}

@@ -34,6 +34,7 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.physics.hyperelastic import KINDS, again, described
+from torchsoft.physics.material import Branch
 from torchsoft.sysid import Standing
 
 REST = {"nu": 0.45, "rho": 1100.0, "depth": 0.044}
@@ -109,7 +110,8 @@ def made(name: str) -> Any:
 @EVERY
 @torch.no_grad()
 def test_the_modulus_is_that_of_springs_and_dashpots(name):
-    """And the chain is one: positive fractions of one compliance, which all creep at last."""
+    """And the chain is one: positive fractions of one compliance, which all creep at last. A branch
+    added takes its fraction from the others."""
     material, modulus = made(name), MATERIALS[name][1]
     omega = torch.logspace(-4, 6, 41, dtype=torch.float64)
     expected = torch.from_numpy(modulus(1j * omega.numpy()))
@@ -120,6 +122,9 @@ def test_the_modulus_is_that_of_springs_and_dashpots(name):
     creep = material.creep(torch.tensor([0.0, 1e6]).double()) * material.E
     assert creep.tolist() == pytest.approx([0.0, 1.0], abs=1e-12)
     assert material.well_posed() == ""
+    material.added.append(Branch(0.2, 0.05))
+    softer = 0.8 / expected + 0.2 / (material.E * (1 + 0.05j * omega))
+    assert float((material.complex_modulus(omega) * softer - 1).abs().max()) < 1e-12
 
 
 @EVERY
