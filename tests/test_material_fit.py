@@ -392,11 +392,7 @@ WRONG: list[tuple[Mapping[str, Any], dict[str, Any], str]] = [
     (TRIANGLE, {"test": "tension", "strains": (20, 30)}, "has 0 rows with strains from 20 to 30"),
     (TRIANGLE, PRESSED, "row 3: the strain is -1, but"),
     (FROM_NOTHING, {}, "row 12: the strain is -1, but"),
-<<<<<<< HEAD
-    ({name: x[:10] for name, x in FROM_NOTHING.items()}, PULLED, "strain is negative, -0.9: a "),
-=======
     ({name: x[:10] for name, x in FROM_NOTHING.items()}, PULLED, "the strain is negative, -0.9"),
->>>>>>> t3
     ({"stretch [1]": 1 + COUNT, "stress [Pa]": COUNT}, PRESSED, "up to 21, but"),
     ({name: np.r_[x, 2 * x] for name, x in TRIANGLE.items()}, PULLED, "keep the rows of one load"),
     (SWEEP, {}, "the storage modulus falls from 1000 Pa"),
