@@ -107,6 +107,7 @@ def test_every_run_of_a_batch_starts_at_its_own_parameters():
         assert moduli.grad[i].item() == pytest.approx(alone.rig.parameter(E).grad.item(), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_check_of_gradients_moves_the_start():
     built = TOUCHING.build()
     t = built.t[:3]
@@ -119,6 +120,7 @@ def test_a_check_of_gradients_moves_the_start():
     assert abs(one.adjoint - 0.75e6 * float(slope)) > 0.1 * abs(one.adjoint)
 
 
+@pytest.mark.slow
 def test_a_plan_for_a_parameter_moves_the_start():
     built = TOUCHING.build()
     t, at = built.t[:2], 0.7e6

@@ -23,7 +23,7 @@ SCALE = float(os.environ.get("HOSTILE_SCALE", "1"))
 SEED = int(os.environ.get("HOSTILE_SEED", "0"))
 TABLE = Path(os.environ.get("HOSTILE_OUT", "out/hostile"))
 LIMIT = 20.0
-"""Longest time [s] that one call may take."""
+"""Most processor time [s] that one call may take, so that nothing hangs."""
 
 
 class Late(BaseException):
@@ -32,17 +32,18 @@ class Late(BaseException):
 
 @contextmanager
 def in_time(limit: float = LIMIT) -> Iterator[None]:
-    """Raises `Late` in the body after `limit` [s]; an alarm that was set before goes on."""
+    """Raises `Late` in the body after `limit` [s] of processor time."""
 
     def late(*_: object) -> None:
         raise Late(f"still busy after {limit} s")
 
-    before, left = signal.signal(signal.SIGALRM, late), signal.setitimer(signal.ITIMER_REAL, limit)
+    before = signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, limit)
     try:
         yield
     finally:
-        signal.signal(signal.SIGALRM, before)
-        signal.setitimer(signal.ITIMER_REAL, *left)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
 
 
 class Tally:
