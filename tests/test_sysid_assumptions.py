@@ -143,6 +143,7 @@ def test_pads_keep_their_faces_and_first_ends_or_turn_about_the_middle(name):
             assert getattr(new.mesh, extent) == pytest.approx(1.02 * getattr(pad.mesh, extent))
             np.testing.assert_allclose(face(other, name)[0], at[0], atol=1e-15)
             assert new.material.E is not pad.material.E
+            assert other.parameters.keys() == stated.parameters.keys()
     turned = face(varied(stated, f"tilt of the pad {name}", 5.0), name)
     np.testing.assert_allclose(turned.mean(0), at.mean(0), atol=1e-15)
     slope = (turned[-1, 1] - turned[0, 1]) / (turned[-1, 0] - turned[0, 0])
