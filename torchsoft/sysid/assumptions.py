@@ -585,9 +585,10 @@ def with_pads(
 
     def change(rig: Rig) -> None:
         modules: nn.ModuleDict = rig.pads  # pyright: ignore[reportAssignmentType]
-        made = {rig.pads[name]: other(rig.pads[name]) for name in names}
+        made = dict[nn.Module, nn.Module]()
         for name in names:
-            modules[name] = made[rig.pads[name]]
+            old, modules[name] = rig.pads[name], other(rig.pads[name])
+            made[old] = modules[name]
         for law in laws(rig):
             if isinstance(source := law._modules.get("source"), Matched):
                 source.pads = nn.ModuleList(made.get(pad, pad) for pad in source.pads)
