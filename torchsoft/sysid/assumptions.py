@@ -589,9 +589,9 @@ def with_pads(
         for name in names:
             old, modules[name] = rig.pads[name], other(rig.pads[name])
             made[old] = modules[name]
-        for law in laws(rig):
-            if isinstance(source := law._modules.get("source"), Matched):
-                source.pads = nn.ModuleList(made.get(pad, pad) for pad in source.pads)
+        for part in rig.contacts.modules():  # pyright: ignore[reportAttributeAccessIssue]
+            if isinstance(part, Matched):
+                part.pads = nn.ModuleList(made.get(pad, pad) for pad in part.pads)
 
     return with_rig(recording, change)
 
