@@ -21,6 +21,7 @@ from torchsoft.sysid.runs import Runner
 
 E, MU_K = "materials.rubber.E", "laws.steel_on_rubber.friction.mu_k"
 SENSORS = {"x_C": Sensor(noise=1e-5), "effort_x": Sensor(noise=0.1), "effort_y": Sensor(noise=0.1)}
+FINER = {"pad.elements_x": 120, "pad.elements_y": 4}
 STROKES = stroked(travel=8e-3, stroke_time=0.15, duration=0.4, grasp=0.15, since=0.2)
 
 
@@ -155,6 +156,17 @@ def test_pads_keep_their_faces_and_first_ends_or_turn_about_the_middle(name):
     np.testing.assert_allclose(fine.positions[[0, -1]], pad.positions[[0, -1]], atol=1e-15)
     step = face(varied(stated, "mesh phase", 1.0), name) - at
     np.testing.assert_allclose(np.abs(step[:, 0]), 0.25 * pad.mesh.length / 60, rtol=1e-9)
+
+
+def test_springs_that_follow_the_pads_follow_those_of_a_variation():
+    coarse, finer = (
+        PAPER.override(COARSE | {"contact.K_n": "auto"} | more).assemble() for more in ({}, FINER)
+    )
+    coarse.reference = strokes().rig.reference
+    made = varied(replace(strokes(), rig=coarse), "mesh", 1.0).rig
+    stated, found, built = (rig.contacts["U"].law.K_n.item() for rig in (coarse, made, finer))
+    assert found == pytest.approx(built)
+    assert found > 1.5 * stated
 
 
 def test_a_run_from_a_state_of_the_pads_has_no_other_pads():

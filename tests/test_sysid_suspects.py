@@ -62,9 +62,13 @@ BALL = RigFile.from_tree({
 Reading = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
 
 
+FINER = {"pads.floor.elements_x": 60, "pads.floor.elements_y": 2}
+
+
 @cache
-def exact(file: RigFile = BALL, **truth: float) -> Recording:
+def exact(finer: bool = False, **truth: float) -> Recording:
     named = {name.replace("__", "."): value for name, value in truth.items()}
+    file = BALL.override(FINER) if finer else BALL
     return record("press", file.build(), TRUTH | named, SENSORS, rtol=1e-5, noise=0.0)
 
 
@@ -149,14 +153,13 @@ def off(channel: str, add: float = 0.0, factor: float = 1.0) -> Reading:
     return lambda name, t, y: factor * y + add if name == channel else y
 
 
-FINER = BALL.override({"pads.floor.elements_x": 60, "pads.floor.elements_y": 2})
 CAUSES: dict[str, tuple[Callable[[], Recording], float]] = {
     "delay x_ball": (lambda: recorded(late("x_ball", 3e-4)), 0.3),
     "bias theta_ball": (lambda: recorded(off("theta_ball", 3e-3)), 3e-3),
     "gain effort_y": (lambda: recorded(off("effort_y", factor=1.05)), 5.0),
     "bodies.ball.mass": (lambda: recorded(bodies__ball__mass=0.44), 10.0),
     "bodies.ball.shape.radius": (lambda: recorded(bodies__ball__shape__radius=20.1e-3), 0.5),
-    "mesh": (lambda: recorded(file=FINER), 1.0),
+    "mesh": (lambda: recorded(finer=True), 1.0),
 }
 
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.extensions import extensions, undelayed
 from torchsoft.physics.hyperelastic import NeoHookean
+from torchsoft.physics.matched import Matched
 from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
@@ -577,14 +578,20 @@ def tilted(recording: Recording, name: str, angle: float) -> Recording | None:
 def with_pads(
     recording: Recording, names: Collection[str], other: Callable[[Pad], Pad]
 ) -> Recording | None:
-    """Replace some pads; None where the start is a state of the pads as they were."""
+    """Replace some pads, also those that numbers of contact laws follow; None where the start is a
+    state of the pads as they were."""
     if not isinstance(recording.start, Standing):
         return None
 
     def change(rig: Rig) -> None:
         modules: nn.ModuleDict = rig.pads  # pyright: ignore[reportAssignmentType]
+        made = dict[nn.Module, nn.Module]()
         for name in names:
-            modules[name] = other(rig.pads[name])
+            old, modules[name] = rig.pads[name], other(rig.pads[name])
+            made[old] = modules[name]
+        for part in rig.contacts.modules():  # pyright: ignore[reportAttributeAccessIssue]
+            if isinstance(part, Matched):
+                part.pads = nn.ModuleList(made.get(pad, pad) for pad in part.pads)
 
     return with_rig(recording, change)
 
