@@ -123,7 +123,7 @@ def test_data_without_noise_return_the_truth_and_intervals_contain_it(strokes, s
     for name in FOUR:
         e = answer[name]
         error = np.log(e.value / TRUTH[name]) / e.relative_sd
-        assert error == pytest.approx(e.step_bias_sd, rel=0.1), "what is left is due to the steps"
+        assert error == pytest.approx(e.step_bias_sd, abs=2e-3), "what is left is due to the steps"
         assert abs(error) < 0.03
         assert e.ci95[0] < TRUTH[name] < e.ci95[1]
     assert answer.converged
