@@ -104,7 +104,7 @@ def cut(case: str, config: Config) -> Cut:
     until = since + 0.5 if config.smoke else file.outputs.duration
     at = since + np.arange(0.0, until - since + 0.5 / RATE, 1.0 / RATE)
     t = torch.from_numpy(np.append(-SETTLE, at))
-    run = replace(planned, rig=real).run(t, rtol=1e-2 * config.rtol)
+    run = replace(planned, rig=real).run(t, y0=planned.y0, rtol=1e-2 * config.rtol)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
     at_rest = Standing.of(given, planned.y0, rests={"disc": [1]})
     return Cut(Recording(case, given, samples, at_rest), run.y[1].detach())

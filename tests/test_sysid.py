@@ -123,7 +123,7 @@ def test_data_without_noise_return_the_truth_and_intervals_contain_it(strokes, s
     for name in FOUR:
         e = answer[name]
         error = np.log(e.value / TRUTH[name]) / e.relative_sd
-        assert error == pytest.approx(e.step_bias_sd, rel=0.1), "what is left is due to the steps"
+        assert error == pytest.approx(e.step_bias_sd, abs=2e-3), "what is left is due to the steps"
         assert abs(error) < 0.03
         assert e.ci95[0] < TRUTH[name] < e.ci95[1]
     assert answer.converged
@@ -143,6 +143,7 @@ def test_a_fit_reports_what_its_runs_warn_of_once_at_its_end():
     assert all(one.startswith("the run of recording `short`: contact `") for one in jumps)
 
 
+@pytest.mark.slow
 def test_a_misfit_far_above_the_noise_is_not_refined(short):
     """Half a millimetre of a wave in a reading of 10 um; chi2 of the file is that of the
     headline."""
@@ -175,15 +176,15 @@ def test_what_the_data_do_not_determine_has_no_value():
     assert "not identifiable" in answer.table()
 
 
-def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes):
-    t, theta = strokes.samples["theta_C"]
+def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(short):
+    t, theta = short.samples["theta_C"]
     late = np.interp(t - 1.5e-3, t, theta) + 2e-3
-    samples = strokes.samples | {
+    samples = short.samples | {
         "theta_C": (t[3::2], late[3::2]),
-        "effort_x": tuple(x[:60] for x in strokes.samples["effort_x"]),
+        "effort_x": tuple(x[:30] for x in short.samples["effort_x"]),
     }
     sensors = SENSORS | {"theta_C": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
-    data = replace(strokes, name="gaps", samples=samples)
+    data = replace(short, name="gaps", samples=samples)
     answer = fit(data, {E: Unknown()} | known(K_N, MU_S, MU_K, TAU), 1e-4, sensors, tightenings=0)
     assert answer[E].value == pytest.approx(TRUTH[E], rel=2e-3)
     assert answer["bias of theta_C"].value == pytest.approx(2e-3, abs=1e-4)
@@ -198,6 +199,7 @@ def test_a_regular_grid_between_the_samples_changes_nothing(short):
     assert np.abs(between - exact).max() < 0.2 < np.abs(exact).max()
 
 
+@pytest.mark.slow
 def test_a_tolerance_too_coarse_for_the_data_is_reported_and_tightened():
     hard = Excitation(*waves(4e-3, 2e-4, (10, 40)), duration=0.55, grasp=0.15, since=0.2)
     data = record("hard", excited(hard, BASE), {}, SENSORS, rtol=1e-6, noise=0.0)

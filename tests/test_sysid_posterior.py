@@ -94,7 +94,7 @@ def test_the_density_on_a_rig_has_its_gradient():
         "effort_y": Sensor(noise=0.1, low=-60.0),
     }
     data = record("roll", excited(motion, PAPER.override(COARSE)), {}, sensors, rtol=1e-4, noise=0)
-    prior = Prior(median=0.75e6, sd=0.1, kind="log-normal")
+    prior = Prior(median=0.74e6, sd=0.01, kind="log-normal")
     unknowns = {"pad.E": Unknown(prior=prior), "pad.tau": Unknown(low=5e-3, high=20e-3)}
     problem = Problem([data], sensors, unknowns, {"F_x": Autoregression.stated((0.8,), 5e-3)})
     c = problem.coordinates

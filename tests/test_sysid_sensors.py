@@ -132,7 +132,9 @@ def test_every_other_kind_of_coordinate_has_its_derivatives(strokes):
     rows = len(problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3).r)
     assert rows == problem.samples() + 3  # of the priors, the place's own among them
     assert sensors["effort_x"].saturated(strokes.samples["effort_x"][1]).any()
-    check_derivatives(problem, x, 1e-3, 2e-5)
+    place = "start.disc.x in moved"
+    check_derivatives(problem, x, 1e-3, 1e-4, only=[one for one in c.labels if one != place])
+    check_derivatives(problem, x, 1e-3, 1e-6, h=1e-6, only=[place])  # a kink is near
 
 
 def test_a_prior_is_one_more_measurement(strokes):
