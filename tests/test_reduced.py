@@ -192,9 +192,7 @@ def test_records_that_determine_nothing_are_rejected(motions, records, how, mess
 
 def test_terms_that_depend_on_each_other_or_on_nothing_are_rejected(motions):
     terms = LIBRARY | {"v_C": [variable("x_C"), variable("x_Br"), LIBRARY["v_C"][0]]}
-    with pytest.raises(
-        ValueError, match=r"column `.*` of v_C' is a combination of the other"
-    ):
+    with pytest.raises(ValueError, match=r"column `.*` of v_C' is a combination of the other"):
         assemble([motions[0]], terms, RECIPE)
     with pytest.raises(ValueError, match="needs the variable 'F_y'"):
         ReducedModel(("v_C",), (), {}, {"v_C": [(variable("F_y"), 1.0)]})
