@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from hostile.processes import ended, fork
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from torchsoft import simulate
@@ -226,7 +226,10 @@ SHM = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
 """Where waiting for a disk takes no time."""
 
 
-@settings(max_examples=5, derandomize=True, deadline=None)
+@example(
+    store="memory://", order=[2, 1, 3], workers=0, killed=None, lost="record", torn=True, size=2
+)
+@settings(max_examples=4, derandomize=True, deadline=None)
 @given(
     store=st.sampled_from(["", "file://", "memory://"]), order=st.permutations(range(1, 4)),
     workers=st.sampled_from([0, 2]), killed=st.none() | st.integers(0, COUNT - 1),
