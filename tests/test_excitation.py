@@ -9,8 +9,10 @@ from conftest import f64
 from torchsoft import BuiltRig, RigFile
 from torchsoft.rigs.excite import CATALOGUE, GRIP, OFF_NODE, SINCE, Excitation, excite
 
-RIGS = "paper", "light_grasp", *(
-    pytest.param(name, marks=pytest.mark.slow) for name in ("ellipse", "rounded_box")
+RIGS = (
+    "paper",
+    "light_grasp",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("ellipse", "rounded_box")),
 )
 COARSE = {"elements_x": 40, "elements_y": 1}
 ROLL = {"kind": "profile", "times": [0.5, 0.8], "values": [0.0, 4e-3], "offset": "start"}

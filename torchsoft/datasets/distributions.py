@@ -86,8 +86,9 @@ class Normal(Related):
     def _is_cut(cls, data: Any) -> Any:
         given = data if isinstance(data, Mapping) else {}
         mean, sd = (given.get(key) for key in ("mean", "sd"))
-        numbers = isinstance(mean, int | float) and isinstance(sd, int | float)
-        if not numbers or is_huge(mean) or is_huge(sd):
+        if not isinstance(mean, int | float) or not isinstance(sd, int | float):
+            return data
+        if is_huge(mean) or is_huge(sd):
             return data
         return {"low": mean - WIDTH * sd, "high": mean + WIDTH * sd} | dict(data)
 
