@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +168,12 @@ def test_neither_locale_nor_window_system_matters(tmp_path):
     )  # fmt: skip
     assert ended.returncode == 2
     assert re.fullmatch(rb"torchsoft: error: \\u\w+\\u\w+\.toml: No such.*\n", ended.stderr)
+
+
+def test_a_fitted_material_has_the_assumed_numbers_that_the_test_does_not_tell(folder):
+    assert main(["material", "fit", "test.csv", "--rho", "1200"]) == 0
+    (table,) = tomllib.loads(Path("out/material/material.toml").read_text())["materials"].values()
+    assert (table["depth"], table["nu"], table["rho"]) == (44e-3, 0.45, 1200.0)
 
 
 # identification

@@ -77,6 +77,13 @@ def test_other_headings_and_columns_to_ignore(tmp_path):
     assert read(path, headings={"Zeit": "t"}, ignore=None).ignored == ("Kraft", "Temp", "Weg")
 
 
+@pytest.mark.parametrize(("unit", "newtons"), [("gf", 9.80665e-3), ("kgf", 9.80665), ("kN", 1e3)])
+def test_forces_are_in_newtons(unit, newtons, tmp_path):
+    path = tmp_path / "test.csv"
+    path.write_text(f"t [s],force [{unit}]\n0,1\n1,2\n")
+    assert read(path).values["force"] == pytest.approx([newtons, 2 * newtons], rel=1e-12)
+
+
 def test_workbooks(tmp_path):
     from openpyxl import Workbook
 
