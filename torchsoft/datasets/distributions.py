@@ -86,11 +86,7 @@ class Normal(Related):
     def _is_cut(cls, data: Any) -> Any:
         given = data if isinstance(data, Mapping) else {}
         mean, sd = (given.get(key) for key in ("mean", "sd"))
-<<<<<<< HEAD
-        if not (isinstance(mean, int | float) and isinstance(sd, int | float)):
-=======
         if not isinstance(mean, int | float) or not isinstance(sd, int | float):
->>>>>>> t1
             return data
         if is_huge(mean) or is_huge(sd):
             return data
