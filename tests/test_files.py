@@ -82,24 +82,6 @@ def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["file", "file.old.partial", "file.partial"]
 
 
-def test_files_are_flushed_before_they_appear(tmp_path, monkeypatch):
-    """Content first, then the name, then the folder that holds it, new folders in theirs."""
-    done: list[str] = []
-    flush, rename = os.fsync, Path.replace
-
-    def name(handle: int) -> str:
-        return PARTIAL.sub(
-            ".partial", str(Path(os.readlink(f"/proc/self/fd/{handle}")).relative_to(tmp_path))
-        )
-
-    monkeypatch.setattr(os, "fsync", lambda handle: (done.append(name(handle)), flush(handle)))
-    monkeypatch.setattr(
-        Path, "replace", lambda self, to: (done.append("replace"), rename(self, to))[1]
-    )
-    write(tmp_path / "a" / "b" / "file", b"x")
-    assert done == [".", "a", "a/b/file.partial", "replace", "a/b"]
-
-
 def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path):
     path, content = tmp_path / "file", bytes(range(256))
     path.write_bytes(whole := sealed(content))
