@@ -161,7 +161,8 @@ def test_taxels_are_sensors_of_a_fit_and_columns_of_its_recordings():
     grasp = {f"motion.{name}.times": [0.0, 0.1] for name in ("y_d", "F_ff")}
     coarse_pads = {"pad.elements_x": 30, "pad.elements_y": 1, "contact.v_s": 0.05}
     built = RigFile.ready("paper").override(
-        coarse_pads | grasp, taxels={"skin": skin}, outputs={"duration": 0.2, "interval": 0.01, "snapshots": []}
+        coarse_pads | grasp, taxels={"skin": skin},
+        outputs={"duration": 0.2, "interval": 0.01, "snapshots": []},
     ).build()  # fmt: skip
     recorded = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
     recorded |= {"L.centre": Sensor(noise=1e-4), "bracket_moment": Sensor(noise=1e-3)}
