@@ -41,15 +41,20 @@ rtol = 1e-3
 """
 
 
-def recorded(path: Path, count: int, **scales: float) -> Path:
-    """The first `count` rows of the example, with columns multiplied."""
+def recorded(path: Path, count: int, without: str = "", **changes: tuple[float, float]) -> Path:
+    """The first `count` rows of the example, without a column, and with factors of others and what
+    is added then."""
     with EXAMPLE.open(newline="") as file:
-        heading, *rows = list(csv.reader(file))[:count]
-    for name, factor in scales.items():
-        i = next(i for i, one in enumerate(heading) if one.startswith(f"{name} "))
-        for row in rows:
-            row[i] = repr(factor * float(row[i]))
-    path.write_text("\n".join(map(",".join, [heading, *rows])))
+        columns = [*zip(*list(csv.reader(file))[:count])]
+    kept = []
+    for heading, *values in columns:
+        name = heading.partition(" ")[0]
+        if name in changes:
+            factor, offset = changes[name]
+            values = [repr(factor * float(x) + offset) for x in values]
+        if name != without:
+            kept.append((heading, *values))
+    path.write_text("\n".join(map(",".join, zip(*kept))))
     return path
 
 
@@ -184,8 +189,11 @@ def test_a_fitted_material_has_the_assumed_numbers_that_the_test_does_not_tell(f
 def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder, capsys):
     unstable = "actuators.x.Kp = 1e6\nactuators.x.Kd = 0.0\n[unknowns"
     config = CONFIG.replace('"bracket.x"', '"disc.x"').replace("[unknowns", unstable, 1)
-    (folder / "rig.toml").write_text(config)
-    recorded(folder / "data.csv", 122)
+    (folder / "rig.toml").write_text(config.replace("60.3e-3", "60e-3"))
+    to_60 = (1.0, -0.3)
+    recorded(
+        folder / "data.csv", 122, "x_d_dot", x_C=to_60, x_Br=to_60, x_d=(0.5, 0.5 * -0.3 + 30.0)
+    )
     assert identify() == 2
     message = capsys.readouterr().err
     where = r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: "
@@ -241,7 +249,7 @@ def test_options_come_before_the_configuration(answered, capsys):
 
 
 def test_a_recording_that_looks_wrong_is_rejected_with_the_way_on(folder, capsys):
-    recorded(folder / "data.csv", 62, F_y=-1.0)
+    recorded(folder / "data.csv", 62, F_y=(-1.0, 0.0))
     assert identify() == 2
     message = capsys.readouterr().err
     assert "recording `data`: effort_y looks as if its sign were opposite: " in message
