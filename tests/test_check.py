@@ -12,7 +12,6 @@ from test_rig_parts import RUBBER, changed, coarse_tree
 
 from torchsoft import RigFile
 from torchsoft.rigs.check import check
-from torchsoft.rigs.course import Estimate
 
 # one pad and one body; compressions of runs are in comments
 # ----------------------------------------------------------------------
@@ -329,20 +328,3 @@ def test_a_body_that_falls_freely_asks_for_finer_steps():
     """It comes down with sqrt(2 g h), though it starts at rest."""
     file = on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 0.1}, solver={"step": 0.05})
     assert any("a body comes flying" in one.message for one in check(file))
-
-
-def test_what_two_pads_grip_is_taken_along():
-    """Fingertips go around a box that they hold, and the box with them, as in the run."""
-    file = RigFile.ready("fingertips")
-    estimate = Estimate(file, file.build())
-    for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
-        assert estimate(time)["box"] == pytest.approx([0.0, 45e-3, angle], abs=2e-4)
-    assert estimate(0.5)["box"][1] < 22e-3  # not lifted yet
-
-
-def test_the_estimate_by_statics_is_where_the_run_ends(tmp_path):
-    file = RigFile.from_tree(coarse_tree()).override(outputs={"duration": 0.45})
-    built = file.build()
-    expected, run = Estimate(file, built).balanced(0.45), built.run()
-    for name in ("disc", "bracket"):
-        assert float(run[f"y_{name}"][-1]) == pytest.approx(expected[name][1], abs=3e-5)

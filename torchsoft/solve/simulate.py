@@ -243,10 +243,11 @@ class RunOutcome(NamedTuple):
 
 
 def run(
-    task: Task, tape_bytes: float, progress: bool = False, explained: bool = True
-) -> RunOutcome:
+    task: Task, tape_bytes: float, progress: bool = False, explained: bool = True,
+    effort: float = float("inf"),
+) -> RunOutcome:  # fmt: skip
     """Carry out a task by one of the compiled routes; `explained` looks for the cause of a failure,
-    which takes seconds.
+    which takes seconds. The run stops early after an `effort` of so many Newton iterations.
 
     Raises `SimulationFailed` and `Interrupted` with the run so far.
     """
@@ -268,6 +269,8 @@ def run(
                 if bar is not None and not bar.disable:
                     bar.n = float(t[solved.out.rows - 1] - t[0])
                     bar.refresh()
+                if solved.out.solves > effort:
+                    break
     except SimulationFailed as failure:
         if done is None:
             raise
@@ -364,7 +367,7 @@ def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> Sim
         if cause
         else str(failure)
     )
-    out = SimulationFailed(reason, failure.time)
+    out = SimulationFailed(reason, failure.time, failure.contact, failure.left)
     out.trajectory = trajectory
     return out
 
