@@ -55,7 +55,7 @@ def run_rig(options: argparse.Namespace) -> int:
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
-    from torchsoft.rigs.run import cost, largest_strains, notes, run
+    from torchsoft.rigs.run import cost, run
     from torchsoft.solve.progress import SimulationFailed
 
     out: Path = options.out or Path("out") / options.file.stem
@@ -83,10 +83,6 @@ def run_rig(options: argparse.Namespace) -> int:
         f"steps), energies balanced to {done.trajectory.energy_residual_rel:.1e} of what was "
         f"injected; written to {out}"
     )
-    said = {one.where for one in found}
-    for one in notes(done.trajectory, largest_strains(done.trajectory)):
-        if one.where not in said:
-            say(one, error=True)
     return 0
 
 

@@ -239,7 +239,7 @@ def untied(run: Run) -> Iterator[Diagnostic]:
     reported, loops = set[str](), run.file.loops()
     for row in (0, run.loaded()) if loops else ():
         state = run.state(row)
-        gaps = {name: -float(run.rig.penetration(name, state).max()) for name in run.rig.contacts}
+        gaps = {name: -float(run.rig.penetration(name, state).detach().max()) for name in run.rig.contacts}
         if any(0 < gap < NEAR for gap in gaps.values()):
             continue
         graph = tied(run.rig, [name for name, gap in gaps.items() if gap < 0])
