@@ -42,8 +42,8 @@ FLOWS = {
     "testing": "energy laws gradients .",
     "plan": "knots problem search planning .",
     "rigs": """
-        fields places parts control motion outputs geometry initial built build excite written
-        course recorded gripped alone check goal run .
+        fields places parts control motion outputs schema naming geometry initial built assembly
+        build excite written recorded findings check goal run .
     """,
     "cli": "results rigs plan identify design material dataset reduce plot .",
     "solve.kernel": """

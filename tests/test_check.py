@@ -1,5 +1,5 @@
-"""What `check` reports of a rig: impossible files, rigs that make no sense, and what a run of the rig
-at a loose tolerance does to its pads and bodies."""
+"""What `check` reports of a rig: impossible files, rigs that make no sense, and what a run at a
+loose tolerance does to pads and bodies."""
 
 import re
 from pathlib import Path

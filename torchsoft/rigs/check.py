@@ -19,6 +19,7 @@ from torchsoft.rigs.findings import Run, overlapping, tied
 from torchsoft.rigs.geometry import Scene, at, nodes
 from torchsoft.rigs.motion import ProfileTable
 from torchsoft.rigs.recorded import recordings
+from torchsoft.rigs.schema import RigTables
 from torchsoft.solve import simulate
 from torchsoft.solve.kernel.arrays import PASSED
 from torchsoft.solve.progress import SimulationFailed
@@ -97,13 +98,12 @@ def ties(ready: BuiltRig) -> Iterator[Diagnostic]:
 
 
 def travels(ready: BuiltRig) -> Iterator[Diagnostic]:
-    """Warnings on motions that go much farther than the rig is large, or turn it round and round."""
-    scene, rig = start(ready), ready.rig
-    shapes = [scene.outline(name) for name, body in rig.bodies.items() if body.shape is not None]
-    places = np.concatenate([*(nodes(pad, scene.pose) for pad in rig.pads.values()), *shapes])
+    """Warnings on motions that go much farther than the rig is large, or turn round and round."""
+    poses, rig = start(ready).pose, ready.rig
+    places = np.concatenate([nodes(pad, poses) for pad in rig.pads.values()])
     size = float(np.ptp(places, axis=0).max())
     limits = {
-        "m": (FARTHER * size, f"the whole rig is {size:.2g} m large", "millimetres"),
+        "m": (FARTHER * size, f"the pads together are {size:.2g} m large", "millimetres"),
         "rad": (TURNED, f"that is more than {TURNED / (2 * np.pi):g} turns", "degrees"),
     }
     values = rig.follow(torch.linspace(0.0, float(ready.t[-1]), ROWS, dtype=torch.float64))
@@ -214,12 +214,13 @@ def trial(ready: BuiltRig) -> list[Diagnostic]:
         found = [findings.stopped(run)]
     found += [one for judge in JUDGES for one in judge(run)]
     if file.loops() or file.solver.step is not None:
-        stable = findings.stability(run)
-        found += [*stable.findings, *steps(file, stable.fastest, findings.landing(run))]
+        finding, fastest = findings.stability(run)
+        found += [finding] if finding else []
+        found += steps(file, fastest, findings.landing(run))
     return found
 
 
-def steps(file: RigFile, fastest: float, landing: float) -> Iterator[Diagnostic]:
+def steps(file: RigTables, fastest: float, landing: float) -> Iterator[Diagnostic]:
     """Warnings on equal steps that are too long for the rig's motions, for its `fastest` mode
     [rad/s], or for the `landing` of a body, its speed over its size [1/s]."""
     step, limits = file.solver.step, list[tuple[float, str]]()
@@ -235,10 +236,10 @@ def steps(file: RigFile, fastest: float, landing: float) -> Iterator[Diagnostic]
     if landing > 0:
         cause = "a body comes flying and may be through a pad between two of them"
         limits.append((PASSED / landing, cause))
-    limits += [
-        (2 * np.pi / rate / STEPS_PER_PERIOD, f"{cause}, and a period takes {STEPS_PER_PERIOD} steps")
-        for cause, rate in swings.items() if rate > 0
-    ]  # fmt: skip
+    for cause, rate in swings.items():
+        if rate > 0:
+            needs = f"{cause}, and a period takes {STEPS_PER_PERIOD} steps"
+            limits.append((2 * np.pi / rate / STEPS_PER_PERIOD, needs))
     for most, cause in limits:
         if step > most:
             yield Diagnostic(

@@ -1,5 +1,5 @@
-"""Findings on a run of a rig file, each with its time: strains of pads, contacts, friction, overlaps,
-loops, and the end of a run that stops early."""
+"""Findings on a run of a rig file: its early end, strains of pads, contacts, friction, overlaps,
+and loops."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,21 +14,20 @@ from torchsoft.physics.graph import Graph
 from torchsoft.physics.motion import hold
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, condensed, standing
-from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.control import Loop
 from torchsoft.rigs.geometry import Scene, at
+from torchsoft.rigs.schema import RigTables
 from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, UNSTABLE, modes, strained
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.trajectory import Trajectory
 
 LINEAR = 0.25
-"""Largest displacement of a pad's nodes over its height without a warning (assumed): strains under a
-contact are of that order, and there the stress of rubber deviates from linear elasticity by some ten
-per cent."""
+"""Largest displacement of a pad's nodes over its height without a warning (assumed): strains under
+a contact are of that order, and there the stress of rubber deviates from linear elasticity by some
+ten per cent."""
 
 TIPPED, FLAT = 0.05, 0.1
-"""Angle [rad] from which a body with a flat face counts as tipped, and the curvature of a flat face,
-over that of a circle around the body."""
+"""Angle [rad] from which a body with a flat face counts as tipped, and the largest curvature of a
+flat face, over that of a circle around the body."""
 
 SOFTENED = 0.05
 """Part of the give that the springs of a law may take without a note."""
@@ -46,7 +45,7 @@ NEAR = 1e-4
 class Run(NamedTuple):
     """A run of a rig file, and whether it is complete."""
 
-    file: RigFile
+    file: RigTables
     trajectory: Trajectory
     complete: bool
 
@@ -75,10 +74,11 @@ class Run(NamedTuple):
 
     def loaded(self) -> int:
         """Output at which the contacts carry most."""
-        return int(torch.stack([self.normal(name).sum(-1) for name in self.rig.contacts]).sum(0).argmax())
+        loads = [self.normal(name).sum(-1) for name in self.rig.contacts]
+        return int(torch.stack(loads).sum(0).argmax())
 
 
-def end(file: RigFile, failure: SimulationFailed) -> Diagnostic:
+def end(file: RigTables, failure: SimulationFailed) -> Diagnostic:
     """The end of a run that stops early: an error where it is certain, a warning where a body that
     moves freely leaves its pad, or where another tolerance may help."""
     if not failure.contact:
@@ -129,9 +129,9 @@ def strains(run: Run) -> Iterator[Diagnostic]:
                 severity = "error" if across > COMPRESSED * pad.mesh.height else "warning"
             yield Diagnostic(
                 severity, f"pads.{name}",
-                f"the strain leaves linear elasticity: at t = {run.time(row):.3g} s {how} {part:.0%} "
-                f"of its height{cause}, and forces are wrong above {LINEAR:.0%}; press or move less, "
-                "take less friction, or a thicker or stiffer pad",
+                f"the strain leaves linear elasticity: at t = {run.time(row):.3g} s {how} "
+                f"{part:.0%} of its height{cause}, and forces are wrong above {LINEAR:.0%}; press "
+                "or move less, take less friction, or a thicker or stiffer pad",
             )  # fmt: skip
         elif (strain := float(setup.largest_strain(u[row].detach().numpy()))) > SMALL_STRAIN:
             yield Diagnostic("note", f"pads.{name}", strained(strain, run.time(row)))
@@ -183,8 +183,8 @@ def springs(run: Run) -> Iterator[Diagnostic]:
         if in_springs[row] > SOFTENED * whole[row]:
             yield Diagnostic(
                 "note", f"contacts.{name}",
-                f"the springs of its law take {float(in_springs[row] / whole[row]):.0%} of the give "
-                "under load, so that contact is softer than the pad; raise K_n, or say "
+                f"the springs of its law take {float(in_springs[row] / whole[row]):.0%} of the "
+                "give under load, so that contact is softer than the pad; raise K_n, or say "
                 'K_n = "auto"',
             )  # fmt: skip
 
@@ -201,22 +201,19 @@ def overlaps(run: Run) -> Iterator[Diagnostic]:
     """Errors on overlapping things without a contact between them."""
     reported = set[tuple[str, str]]()
     for row in np.unique(np.linspace(0, len(run.trajectory.t) - 1, SCENES).astype(int)):
-        for one in overlapping(run.scene(int(row)), run.time(int(row)), reported):
-            yield one
+        yield from overlapping(run.scene(int(row)), run.time(int(row)), reported)
 
 
-def overlapping(
-    scene: Scene, time: float, reported: set[tuple[str, str]]
-) -> Iterator[Diagnostic]:
+def overlapping(scene: Scene, time: float, reported: set[tuple[str, str]]) -> Iterator[Diagnostic]:
     """Errors on overlaps at a time [s], without and then with those that are reported already."""
     for (one, other), depth in scene.overlaps().items():
         if depth > TOUCH and (one, other) not in reported:
             reported.add((one, other))
             yield Diagnostic(
                 "error", one,
-                f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no contact "
-                "is between them: they would pass through each other; move one of them, or let a "
-                "pad be between",
+                f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no "
+                "contact is between them: they would pass through each other; move one of them, or "
+                "let a pad be between",
             )  # fmt: skip
 
 
@@ -238,62 +235,64 @@ def untied(run: Run) -> Iterator[Diagnostic]:
     about to touch, or where the contacts carry most."""
     reported, loops = set[str](), run.file.loops()
     for row in (0, run.loaded()) if loops else ():
-        state = run.state(row)
-        gaps = {name: -float(run.rig.penetration(name, state).detach().max()) for name in run.rig.contacts}
+        state, rig = run.state(row), run.rig
+        gaps = {name: -float(rig.penetration(name, state).detach().max()) for name in rig.contacts}
         if any(0 < gap < NEAR for gap in gaps.values()):
             continue
-        graph = tied(run.rig, [name for name, gap in gaps.items() if gap < 0])
+        graph = tied(rig, [name for name, gap in gaps.items() if gap < 0])
         for loop in loops:
             (measured, _), (pushed, _) = at(loop.measured), at(loop.pushes)
             if loop.field not in reported and not nx.has_path(graph, measured, pushed):
                 reported.add(loop.field)
                 yield Diagnostic(
                     "warning", loop.field,
-                    f"at t = {run.time(row):.3g} s nothing that touches ties {loop.measured}, which "
-                    f"it measures, to {loop.pushes}: what `{measured}` does by itself drives "
+                    f"at t = {run.time(row):.3g} s nothing that touches ties {loop.measured}, "
+                    f"which it measures, to {loop.pushes}: what `{measured}` does by itself drives "
                     f"`{pushed}` away; start where they touch, or measure {loop.pushes}",
                 )  # fmt: skip
 
 
 class Stability(NamedTuple):
-    """What the modes where contacts carry most say: findings, and the fastest swing [rad/s]."""
+    """A finding on the modes of a rig, if there is one, and the fastest swing [rad/s]."""
 
-    findings: list[Diagnostic]
-    fastest: float
+    finding: Diagnostic | None
+    fastest: float = 0.0
 
 
 @torch.no_grad()
 def stability(run: Run) -> Stability:
-    """Judge the modes of a rig with loops where its contacts carry most, by the growth of those that
-    a loop reaches: a disc on the top of a node rolls off it in any case."""
-    row, soft, loops = run.loaded(), condensed(run.rig), run.file.loops()
+    """Judge the modes where the contacts carry most by the growth of one that a loop reaches: a
+    disc on the top of a node rolls off it in any case."""
+    row, rig, loops = run.loaded(), condensed(run.rig), run.file.loops()
+    poses = {name: pose[row].detach() for name, pose in run.trajectory.state.pose.items()}
+    still = hold(**{name: float(run.trajectory[name][row]) for name in rig.signals})
     try:
-        y = standing(soft, {name: pose[row].detach() for name, pose in run.trajectory.state.pose.items()})
-    except NoEquilibrium:
-        return Stability([], 0.0)
-    still = hold(**{name: float(run.trajectory[name][row]) for name in soft.signals})
-    values, moves = modes(soft, y, still)
+        values, moves = modes(rig, standing(rig, poses), still)
+    except NoEquilibrium as error:
+        message = f"stability is not judged: {error}"
+        return Stability(Diagnostic("warning", "actuators", message) if loops else None)
     if not len(values):
-        return Stability([], 0.0)
-    swinging = values[values.imag.abs() > values.real.abs()].imag.abs()
-    fastest = float(swinging.max()) if len(swinging) else 0.0
-    touching = [name for name in run.rig.contacts if run.normal(name)[row].sum() > 0]
-    reached = nx.node_connected_component(tied(run.rig, touching), moves.partition(".")[0])
+        return Stability(None)
+    swings = values[values.imag.abs() > values.real.abs()].imag.abs()
+    fastest = float(swings.max()) if len(swings) else 0.0
+    touching = [name for name in rig.contacts if run.normal(name)[row].sum() > 0]
+    reached = nx.node_connected_component(tied(rig, touching), moves.partition(".")[0])
+    judged = [one for one in loops if {at(one.measured)[0], at(one.pushes)[0]} & reached]
     leading, time = complex(values[0]), run.time(row)
     decaying = values[values.real < -NEUTRAL]
-    if leading.real > NEUTRAL and any(
-        at(q)[0] in reached for loop in loops for q in (loop.measured, loop.pushes)
-    ):
-        field = next((loop.field for loop in loops if loop.measured != loop.pushes), "actuators")
+    finding = None
+    if judged and leading.real > NEUTRAL:
+        field = next((one.field for one in loops if one.measured != one.pushes), "actuators")
         message = (
-            f"the rig is unstable at t = {time:.3g} s: its leading mode is {shown(leading)}, mostly "
-            f"of {moves}, and grows by a factor of e in {1 / leading.real:.2g} s; {UNSTABLE}"
+            f"the rig is unstable at t = {time:.3g} s: its leading mode is {shown(leading)}, "
+            f"mostly of {moves}, and grows by a factor of e in {1 / leading.real:.2g} s; {UNSTABLE}"
         )
-        return Stability([Diagnostic("error", field, message)], fastest)
-    if not loops or not len(decaying):
-        return Stability([], fastest)
-    message = f"stable; the mode that lasts longest is {shown(complex(decaying[0]))}, at t = {time:.3g} s"
-    return Stability([Diagnostic("note", "actuators", message)], fastest)
+        finding = Diagnostic("error", field, message)
+    elif loops and len(decaying):
+        slowest = shown(complex(decaying[0]))
+        message = f"stable; the mode that lasts longest is {slowest}, at t = {time:.3g} s"
+        finding = Diagnostic("note", "actuators", message)
+    return Stability(finding, fastest)
 
 
 def shown(mode: complex) -> str:
