@@ -148,8 +148,6 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
         r"contacts\.lower: the pad `lower` is bonded to the body `disc`"),
     "nothing to touch with": ({"contacts.lower.body": "bracket"},
         r"contacts\.lower\.body: `bracket` has no shape"),
-    "loop without a motion": ({"actuators.x.setpoint": None},
-        r"actuators\.x: setpoint is missing: the gains Kp, Kd and Ki need"),
     "no such motion": ({"actuators.x.setpoint": "w"}, r"motion\.w is missing: .* of bracket\.x"),
     "motion of nothing": ({"motion.wave": {"kind": "hold"}}, r"motion\.wave: nothing follows it"),
     "law of nothing": ({"laws.wet": DRY}, r"laws\.wet: no contact follows it; name it as the law"),
@@ -160,8 +158,6 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
         r"mass and density each say how heavy it is; give one"),
     "no density": ({"bodies.disc": {"depth": 1e-2}}, r"density is missing: depth is given"),
     "two moduli": ({"materials.rubber.shore_a": 30}, r"E and shore_a each say how stiff it is"),
-    "slender": ({"bodies.disc.shape": {"kind": "ellipse", "a": 40e-3, "b": 10e-3}},
-        r"bodies\.disc\.shape: the axes a and b differ by more than a factor of 3"),
     "inertial": ({"materials.rubber": {"kind": "prony", **RUBBER, "moduli": [1e5], "tau": [0.1]},
         "pads.lower.inertial": True}, r"lower\.inertial: an inertial pad has one retardation time"),
     "taken name": ({"bodies.keys": {"x": 0.0, "y": 0.0, "theta": 0.0}},
@@ -326,3 +322,14 @@ def test_a_body_that_falls_freely_asks_for_finer_steps():
     """It comes down with sqrt(2 g h), though it starts at rest."""
     file = on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 0.1}, solver={"step": 0.05})
     assert any("a body comes flying" in one.message for one in check(file))
+
+
+def test_a_long_run_is_checked_until_it_takes_too_long():
+    """Shaken quickly for minutes; the time until which it was checked is reported."""
+    shake = {"kind": "chirp", "amplitude": 1e-3, "first": 20.0, "last": 20.0}
+    file = RigFile.from_tree(coarse_tree()).override(
+        motion={"x_d": shake}, outputs={"duration": 300.0, "interval": 0.01}
+    )
+    (found,) = (one for one in check(file) if one.where == "solver")
+    assert found.severity == "note"
+    assert re.search(r"what happens after t = \d+(\.\d+)? s is not checked", found.message)

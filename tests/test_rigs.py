@@ -29,8 +29,6 @@ from torchsoft.rigs.written import template, to_toml
 from torchsoft.solve.diagnostics import linearised, modes
 from torchsoft.solve.formats import load
 
-QUICK = "paper", "drop"
-
 
 def changed(file: RigFile, **values: Any) -> RigFile:
     """The rig with fields replaced by their dotted names, `__` for a dot."""
@@ -67,15 +65,9 @@ def doubts(file: RigFile) -> list[str]:
 # ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in QUICK)) for x in ready()]
-)
-def test_a_ready_rig_checks_clean_and_runs(name):
-    file = coarse(RigFile.ready(name))
-    assert doubts(file) == []
-    run = shorter(file, 0.1).build().run()
-    assert float(run.t[-1]) == pytest.approx(0.1)
-    assert run.energy_residual_rel < 1e-3
+@pytest.mark.parametrize("name", ready())
+def test_a_ready_rig_checks_clean(name):
+    assert doubts(coarse(RigFile.ready(name))) == []
 
 
 @pytest.mark.slow
@@ -223,16 +215,6 @@ def test_efforts_ripple_by_less_than_a_twentieth(name):
 # ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("inertial", [False, True])
-def test_a_body_rests_where_nothing_accelerates_it(inertial):
-    file = coarse(template("t"), pads__lower__inertial=inertial)
-    built = file.build()
-    rate = built.rig.unpack(built.rig(0.0, built.y0)).velocity["disc"]
-    assert float(rate[1].detach().abs()) < 1e-5
-    hovering = changed(file, bodies__disc__start__y=60e-3).build()
-    assert float(hovering.y0[hovering.rig.layout.slices["pads", "lower"]].abs().max()) == 0.0
-
-
 @torch.no_grad()
 def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate():
     rig = coarse(RigFile.ready("drop")).build().rig
@@ -244,13 +226,6 @@ def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate():
 
 # writing
 # ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ready())
-def test_what_is_written_is_what_was_read(name):
-    file = RigFile.ready(name)
-    again = RigFile.from_tree(tomllib.loads(to_toml(file)))
-    assert again.model_dump() == file.model_dump()
 
 
 @settings(max_examples=20, derandomize=True)
