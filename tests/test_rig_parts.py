@@ -151,7 +151,7 @@ def in_a_rig(kind: str, table: dict[str, Any]) -> dict[str, Any]:
     pads = {"lower": part, "upper": {"base": "bracket", "mirrored": True} | part}
     if kind != "fingertip":
         return {"pads": pads}
-    higher = {"bracket": {"start": {"y": 80.1e-3}}}
+    higher = {"bracket": {"start": {"y": 80.1e-3}}, "disc": {"start": {"x": 0.0}}}  # on the top
     return {"pads": pads, "bodies": higher, "motion": {"y_d": {"values": ["start", 79e-3]}}}
 
 

@@ -17,11 +17,11 @@ from torchsoft.physics.structure import values_of
 from torchsoft.physics.validity import check_values
 from torchsoft.rigs.initial import (
     Followed,
-    RigFile,
     holding_effort,
     initial_poses,
     settled_pads,
 )
+from torchsoft.rigs.schema import RigTables
 from torchsoft.solve.simulate import Initial, simulate
 from torchsoft.solve.trajectory import Trajectory
 
@@ -45,7 +45,7 @@ class BuiltRig:
     rig: Rig
     y0: Tensor
     t: Tensor
-    file: RigFile = field(repr=False)
+    file: RigTables = field(repr=False)
     followed: Mapping[str, Followed] = field(repr=False)
     solver: Mapping[str, Any] = field(default_factory=dict, repr=False)
     last: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
