@@ -228,7 +228,7 @@ def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate():
 # ----------------------------------------------------------------------
 
 
-@settings(max_examples=20, derandomize=True)
+@settings(max_examples=20, derandomize=True, deadline=None)
 @given(
     st.fixed_dictionaries({}, optional={
         "gravity": st.floats(0.0, 30.0), "title": st.text(max_size=20),

@@ -101,15 +101,13 @@ def checked(part: M) -> M:
 def build(file: RigTables, parts: Mapping[str, Any] | None = None) -> BuiltRig:
     """The rig of a file with its start and its output times. Raises `ValueError`."""
     rig = assemble(file, parts)
-    starts = {name: body.given for name, body in file.bodies.items()}
-    driven = [f"{body}.{axis}" for body, axis, kind in file.coordinates() if kind == "driven"]
-    poses = initial_poses(file, rig, {name: signal(file, name) for name in driven})
+    poses = initial_poses(file, rig, {name: signal(file, name) for name in file.driven})
     held = partial(holding_effort, file, rig, poses, setpoints(file, poses))
     rig.reference = reference(file, poses, held)
     y0 = settled_pads(file, rig, poses, rig.reference)
-    warn_of_moments(rig, y0, starts)
+    warn_of_moments(rig, y0, file.starts)
     followed = followed_motions(file, poses, held, rig.reference)
-    solver, y0 = file.solver.model_dump(exclude_none=True), moving(rig, y0, starts)
+    solver, y0 = file.solver.model_dump(exclude_none=True), moving(rig, y0, file.starts)
     built = BuiltRig(rig, y0, file.outputs.times(), file, followed, solver)
     built.last.update(key=built.key(rig), start=Initial(y0, rig.reference))
     return built

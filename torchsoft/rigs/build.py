@@ -10,7 +10,7 @@ from torchsoft.rigs import assembly, naming
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.fields import called_alike
 from torchsoft.rigs.motion import flattened
-from torchsoft.rigs.places import replaced
+from torchsoft.rigs.places import listed, replaced
 from torchsoft.rigs.schema import RigTables
 from torchsoft.tables import InvalidTable, from_toml, line
 
@@ -91,7 +91,11 @@ class RigFile(Shown, RigTables):
         bare = {key: x for key, x in tree.items() if key not in ("names", "sources")}
         made = type(self).from_tree(bare, self._folder)
         kept = naming.still_true(self, made, tree)
-        return type(self).from_tree(bare | kept, self._folder) if kept else made
+        known = {"names": self.names, "sources": self.sources}
+        own = {key: {name: known[key].get(name) for name in x} for key, x in kept.items()}
+        if listed(own) == listed(kept):  # nothing that was not validated before
+            return made.model_copy(update=own)
+        return type(self).from_tree(bare | kept, self._folder)
 
     def changed(self, settings: Mapping[str, Any], /) -> Self:
         """A copy with some entries replaced as by `override`, names and tables in one. Raises

@@ -252,17 +252,10 @@ def untied(run: Run) -> Iterator[Diagnostic]:
                 )  # fmt: skip
 
 
-class Stability(NamedTuple):
-    """A finding on the modes of a rig, if there is one, and the fastest swing [rad/s]."""
-
-    finding: Diagnostic | None
-    fastest: float = 0.0
-
-
 @torch.no_grad()
-def stability(run: Run) -> Stability:
-    """Judge the modes where the contacts carry most by the growth of one that a loop reaches: a
-    disc on the top of a node rolls off it in any case."""
+def stability(run: Run) -> tuple[Diagnostic | None, float]:
+    """A finding on the modes where the contacts carry most, by the growth of one that a loop
+    reaches: a disc on the top of a node rolls off it in any case. And the fastest swing [rad/s]."""
     row, rig, loops = run.loaded(), condensed(run.rig), run.file.loops()
     poses = {name: pose[row].detach() for name, pose in run.trajectory.state.pose.items()}
     still = hold(**{name: float(run.trajectory[name][row]) for name in rig.signals})
@@ -270,9 +263,9 @@ def stability(run: Run) -> Stability:
         values, moves = modes(rig, standing(rig, poses), still)
     except NoEquilibrium as error:
         message = f"stability is not judged: {error}"
-        return Stability(Diagnostic("warning", "actuators", message) if loops else None)
+        return Diagnostic("warning", "actuators", message) if loops else None, 0.0
     if not len(values):
-        return Stability(None)
+        return None, 0.0
     swings = values[values.imag.abs() > values.real.abs()].imag.abs()
     fastest = float(swings.max()) if len(swings) else 0.0
     touching = [name for name in rig.contacts if run.normal(name)[row].sum() > 0]
@@ -292,7 +285,7 @@ def stability(run: Run) -> Stability:
         slowest = shown(complex(decaying[0]))
         message = f"stable; the mode that lasts longest is {slowest}, at t = {time:.3g} s"
         finding = Diagnostic("note", "actuators", message)
-    return Stability(finding, fastest)
+    return finding, fastest
 
 
 def shown(mode: complex) -> str:

@@ -40,9 +40,8 @@ def initial_poses(file: RigTables, rig: Rig, driven: Mapping[str, Piecewise]) ->
     for name, one in driven.items():
         body, axis = at(name)
         held[body][axis] = one(none)[0]
-    starts = {name: body.given for name, body in file.bodies.items()}
     try:
-        return placed(rig, starts, {name: torch.stack(rows) for name, rows in held.items()})
+        return placed(rig, file.starts, {name: torch.stack(rows) for name, rows in held.items()})
     except NoPlace as error:
         raise ValueError(f"bodies.{error.body}.start.{error.axis}: {error.reason}") from None
     except NoEquilibrium as error:

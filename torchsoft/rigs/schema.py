@@ -8,7 +8,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from torchsoft.physics.names import check_names
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
-from torchsoft.physics.start import REST
+from torchsoft.physics.start import REST, Starts
 from torchsoft.quantity import Gravity
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.fields import Group
@@ -98,33 +98,36 @@ class RigTables(Group):
         groups = *self.actuators.items(), *self.controllers.items()
         return [loop for name, one in groups for loop in one.loops(name)]
 
+    @property
+    def starts(self) -> Starts:
+        """Coordinates and rates at which bodies start, by body."""
+        return {name: body.given for name, body in self.bodies.items()}
+
+    @property
+    def driven(self) -> list[str]:
+        """The coordinates that their motions drive, such as "table.theta"."""
+        return [f"{body}.{axis}" for body, axis, kind in self.coordinates() if kind == "driven"]
+
     def followers(self) -> dict[str, list[tuple[str, str]]]:
         """Followers of each motion: roles ("setpoint", "feed_forward" or "driven") and coordinates
         by the motion's name."""
-        fed = [
+        users = [(loop.setpoint, "setpoint", loop.measured) for loop in self.loops()]
+        users += [
             (one.feed_forward, "feed_forward", one.pushes)
-            for one in self.actuators.values()
-            if one.feed_forward
-        ]
-        driven = [f"{body}.{axis}" for body, axis, kind in self.coordinates() if kind == "driven"]
+            for one in self.actuators.values() if one.feed_forward
+        ]  # fmt: skip
+        users += [(name, "driven", name) for name in self.driven]
         out: dict[str, list[tuple[str, str]]] = {}
-        for motion, role, coordinate in (
-            *((loop.setpoint, "setpoint", loop.measured) for loop in self.loops()), *fed,
-            *((name, "driven", name) for name in driven),
-        ):  # fmt: skip
+        for motion, role, coordinate in users:
             out.setdefault(motion, []).append((role, coordinate))
         return out
 
     def unit(self, motion: str) -> str:
         """Unit of a motion, from its followers."""
         (role, coordinate), *_ = self.followers()[motion]
-        return (
-            coordinate_unit(coordinate)
-            if role != "feed_forward"
-            else "N.m"
-            if coordinate.endswith(".theta")
-            else "N"
-        )
+        if role == "feed_forward":
+            return "N.m" if coordinate.endswith(".theta") else "N"
+        return coordinate_unit(coordinate)
 
     def rests(self, but: Collection[tuple[str, int]] = ()) -> dict[str, list[int]]:
         """Coordinates with the start "rest", by body, without those in `but`."""
@@ -142,22 +145,18 @@ class RigTables(Group):
             check_names(group, getattr(self, group), dotted=group == "motion")
         for name, body in self.bodies.items():
             check_names(f"bodies.{name}.symbol", [body.symbol] if body.symbol else [])
-        for short in self.names:
-            for name in self.full(short):
-                try:
-                    _ = "." not in name or place(self, name)
-                except ValueError as error:
-                    raise ValueError(f"names.{short}: {error}") from None
         for name, text in self.sources.items():
             if not text.startswith(SOURCES):
                 raise ValueError(
                     f'sources.{name}: it should begin with "published" or "assumed", not '
                     f"{line(text, 40)}"
                 )
+        entries = [(f"names.{short}: ", name) for short in self.names for name in self.full(short)]
+        for field, name in entries + [("sources.", name) for name in self.sources]:
             try:
-                place(self, name)
+                _ = ("." not in name and field != "sources.") or place(self, name)
             except ValueError as error:
-                raise ValueError(f"sources.{error}") from None
+                raise ValueError(f"{field}{error}") from None
         return self
 
     @model_validator(mode="before")
