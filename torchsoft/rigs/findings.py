@@ -35,8 +35,8 @@ SOFTENED = 0.05
 TOUCH = 1e-6
 """Depth [m] up to which touching things do not count as overlapping."""
 
-SCENES = 61
-"""Most outputs of a run that are searched for overlaps."""
+SAMPLES = 61
+"""Most outputs of a run that are searched for overlaps and soft springs."""
 
 NEAR = 1e-4
 """Gap [m] below which a body is about to touch a pad."""
@@ -54,6 +54,12 @@ class Run(NamedTuple):
         assert self.trajectory.rig is not None
         return self.trajectory.rig
 
+    @property
+    def samples(self) -> list[int]:
+        """Some outputs, the first and the last included."""
+        rows = np.linspace(0, len(self.trajectory.t) - 1, SAMPLES).astype(int)
+        return np.unique(rows).tolist()
+
     def time(self, row: int) -> float:
         """Time [s] of an output."""
         return float(self.trajectory.t[row])
@@ -63,8 +69,8 @@ class Run(NamedTuple):
         poses = self.trajectory.state.pose
         return Scene(self.rig, {name: pose[row].detach().numpy() for name, pose in poses.items()})
 
-    def state(self, row: int) -> State:
-        """State at an output."""
+    def state(self, row: int | list[int]) -> State:
+        """State at an output, or at several."""
         parts = self.trajectory.state
         return State(*({name: x[row].detach() for name, x in part.items()} for part in parts))
 
@@ -174,9 +180,9 @@ def touches(run: Run) -> Iterator[Diagnostic]:
 def springs(run: Run) -> Iterator[Diagnostic]:
     """Notes on contacts whose springs take a good part of the give under load."""
     for name, contact in run.rig.contacts.items():
-        pad, u = run.rig.pads[contact.pad], run.trajectory.displacement[contact.pad].detach()
-        force = run.normal(name)
-        depth = run.rig.penetration(name, run.trajectory.state, u).detach().clamp(min=0.0)
+        pad, force = run.rig.pads[contact.pad], run.normal(name)[run.samples]
+        u = run.trajectory.displacement[contact.pad][run.samples].detach()
+        depth = run.rig.penetration(name, run.state(run.samples), u).detach().clamp(min=0.0)
         in_springs = (force * depth).sum(-1)
         whole = in_springs + (force * pad.at_points(u).norm(dim=-1)).sum(-1)
         row = int(whole.argmax())
@@ -200,8 +206,8 @@ def slips(run: Run) -> Iterator[Diagnostic]:
 def overlaps(run: Run) -> Iterator[Diagnostic]:
     """Errors on overlapping things without a contact between them."""
     reported = set[tuple[str, str]]()
-    for row in np.unique(np.linspace(0, len(run.trajectory.t) - 1, SCENES).astype(int)):
-        yield from overlapping(run.scene(int(row)), run.time(int(row)), reported)
+    for row in run.samples:
+        yield from overlapping(run.scene(row), run.time(row), reported)
 
 
 def overlapping(scene: Scene, time: float, reported: set[tuple[str, str]]) -> Iterator[Diagnostic]:
