@@ -202,11 +202,14 @@ def trial(ready: BuiltRig) -> list[Diagnostic]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run of the user repeats them
         try:
-            task = simulate.prepare(ready.rig, t, y0=ready.y0, rtol=LOOSE)
+            tolerance = file.solver.tolerance
+            task = simulate.prepare(ready.rig, t, y0=ready.y0, rtol=LOOSE, tolerance=tolerance)
             done = simulate.run(task, 0.0, explained=False, effort=EFFORT)
             trajectory = done.trajectory(done.solved.rows)
         except SimulationFailed as failure:
             found, trajectory = [findings.end(file, failure)], failure.trajectory
+        except ValueError as error:
+            return [Diagnostic("error", "solver", str(error))]
     if trajectory is None:
         return found
     run = Run(file, trajectory, len(trajectory.t) == ROWS)

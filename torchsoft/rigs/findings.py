@@ -166,8 +166,8 @@ def touches(run: Run) -> Iterator[Diagnostic]:
         if not len(rows) and run.complete:
             yield Diagnostic(
                 "warning", f"contacts.{name}",
-                f"`{contact.pad}` never touches `{contact.body}` in the run; bring it nearer, or "
-                "leave the contact out",
+                f"`{contact.pad}` never touches `{contact.body}` in the run; bring it nearer, run "
+                "longer, or leave the contact out",
             )  # fmt: skip
         elif len(rows) and int(rows[-1]) < len(run.trajectory.t) - 1:
             last = run.time(int(rows[-1]))
