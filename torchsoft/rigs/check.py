@@ -212,7 +212,7 @@ def trial(ready: BuiltRig) -> list[Diagnostic]:
             return [Diagnostic("error", "solver", str(error))]
     if trajectory is None:
         return found
-    run = Run(file, trajectory, len(trajectory.t) == ROWS)
+    run = Run(ready, trajectory)
     if not found and not run.complete:
         found = [findings.stopped(run)]
     found += [one for judge in JUDGES for one in judge(run)]

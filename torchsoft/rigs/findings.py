@@ -12,12 +12,15 @@ from torch import Tensor
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.graph import Graph
 from torchsoft.physics.motion import hold
+from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, condensed, standing
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.geometry import Scene, at
 from torchsoft.rigs.schema import RigTables
 from torchsoft.solve.diagnostics import COMPRESSED, NEUTRAL, SMALL_STRAIN, UNSTABLE, modes, strained
 from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.simulate import Interrupted
 from torchsoft.solve.trajectory import Trajectory
 
 LINEAR = 0.25
@@ -43,16 +46,25 @@ NEAR = 1e-4
 
 
 class Run(NamedTuple):
-    """A run of a rig file, and whether it is complete."""
+    """A run of a rig, complete or up to its early end, and the cause of that end if there is one
+    besides its effort."""
 
-    file: RigTables
+    ready: BuiltRig
     trajectory: Trajectory
-    complete: bool
+    stopped: SimulationFailed | Interrupted | None = None
 
     @property
-    def rig(self) -> Graph:
-        assert self.trajectory.rig is not None
-        return self.trajectory.rig
+    def file(self) -> RigTables:
+        return self.ready.file
+
+    @property
+    def rig(self) -> Rig:
+        return self.ready.rig
+
+    @property
+    def complete(self) -> bool:
+        """Whether it went on until the end of the motion."""
+        return float(self.trajectory.t[-1]) == float(self.ready.t[-1])
 
     @property
     def samples(self) -> list[int]:

@@ -4,7 +4,7 @@ video."""
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from tqdm import tqdm
 
@@ -18,7 +18,6 @@ from torchsoft.physics.mesh.mesh import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.check import EFFORT, LOOSE, ROWS
 from torchsoft.rigs.fields import at_field
 from torchsoft.rigs.findings import Run, strains
@@ -32,15 +31,7 @@ FLOPS = 1e10
 """Floating-point operations a second [1/s] of block products on one core of a usual machine."""
 
 
-class RunOutcome(NamedTuple):
-    """A run, complete or up to its early end, and the cause of that end."""
-
-    ready: BuiltRig
-    trajectory: Trajectory
-    stopped: SimulationFailed | Interrupted | None
-
-
-def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
+def carry_out(file: RigFile, *, progress: bool = False) -> Run:
     """Simulate a rig file. A failure or Ctrl-C ends the run early; the outcome then holds the run
     so far.
 
@@ -55,13 +46,13 @@ def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
     except (SimulationFailed, Interrupted) as stop:
         if stop.trajectory is None:
             raise
-        return RunOutcome(ready, stop.trajectory, stop)
-    return RunOutcome(ready, run, None)
+        return Run(ready, stop.trajectory, stop)
+    return Run(ready, run, None)
 
 
 def run(
     file: RigFile, out: Path, *, found: list[Diagnostic] | None = None, progress: bool = False
-) -> RunOutcome:
+) -> Run:
     """Simulate and write the results to the folder `out`: data first, pictures only of complete
     runs. `found` are findings of the check, for the summary. Raises `OSError` for a folder that
     cannot be made, and the errors of `carry_out`."""
@@ -76,7 +67,7 @@ def run(
     return done
 
 
-def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[str, Any]:
+def summary(file: RigFile, done: Run, found: list[Diagnostic]) -> dict[str, Any]:
     """The run in numbers, in SI units, and its provenance."""
     run, rig = done.trajectory, done.ready.rig
     stopped = done.stopped
@@ -120,7 +111,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             "worst_imbalance_over_injected": run.energy_residual_rel,
         },
         "doubts": list(doubts(run, rig).values()),
-        "notes": [str(one) for one in strains(Run(file, run, stopped is None))],
+        "notes": [str(one) for one in strains(done)],
         "stepping": vars(run.stats) | {"newton_per_step": run.stats.newton_per_step},
         "findings": [one._asdict() for one in found],
         "torchsoft": version("torchsoft"),
