@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from foreign.numbers import Numbers
+from experiments.validation.foreign.numbers import Numbers
 
 Array = NDArray[np.float64]
 

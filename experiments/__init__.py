@@ -1,0 +1,1 @@
+"""Programs that measure what torchsoft does; run one by `python -m experiments.NAME`."""
