@@ -1,1 +1,1 @@
-"""Programs that measure what torchsoft does; run one by `python -m experiments.NAME`."""
+"""Programs that measure what torchsoft does: `python -m experiments.NAME`."""

@@ -83,19 +83,14 @@ class Table:
         return markdown(self.head, self.rows)
 
 
-def numbers(title: str, rows: Mapping[str, Mapping[str, float]], digits: int = 4) -> Table:
+def numbers(title: str, rows: Mapping[str, Mapping[str, float]], form: str = ".4g") -> Table:
     """A table of numbers: one row for each of `rows`, one column for each name in the first."""
     names = list(next(iter(rows.values())))
     cells = [
-        (key, *(f"{row[name]:.{digits}g}" if name in row else "" for name in names))
+        (key, *(f"{row[name]:{form}}" if name in row else "" for name in names))
         for key, row in rows.items()
     ]
     return Table((title, *names), cells)
-
-
-def percent(part: float) -> str:
-    """A ratio less one, or a deviation, in percent."""
-    return f"{100 * part:+.2f} %"
 
 
 def commit() -> str:

@@ -318,7 +318,7 @@ def tables(found: dict[str, Any]) -> dict[str, Table]:
     return {
         "regimes": numbers("regime", regimes),
         "coefficients": Table(head, coefficients),
-        "strokes": numbers("stroke under slip", strokes, 2),
+        "strokes": numbers("stroke under slip", strokes, ".2g"),
     }
 
 

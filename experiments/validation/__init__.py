@@ -1,1 +1,1 @@
-"""Programs that show that torchsoft is right; run one by `python -m experiments.validation.NAME`."""
+"""Programs that show that torchsoft is right: `python -m experiments.validation.NAME`."""
