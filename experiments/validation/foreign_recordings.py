@@ -7,10 +7,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from experiments.frame import COARSE, repeated
+from experiments.frame import repeated
 from experiments.identify_contact import (
     LAW,
-    MU_S,
     RUBBER,
     SENSORS,
     TRUTH,
@@ -23,9 +22,6 @@ from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import Problem, Recording
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.recording import Array
-
-FEW = {name: TRUTH[name] for name in (MU_S, f"{LAW}.K_n", f"{RUBBER}.E", f"{RUBBER}.tau")}
-"""The truth of a smoke run."""
 
 SIGNALS = ("x_d", "y_d", "F_ff")
 CALLED = {"theta_C": "theta", "effort_x": "F_x", "effort_y": "F_y"}
@@ -82,35 +78,31 @@ MOTIONS = {
     "hard shaking": sines(12.5e-3, (4.0, 20.0), 1.2, 2e-4),
     "long shaking": sines(12.5e-3, (4.0, 20.0), 1.5, 2e-4),
     "gentle roll": strokes(10e-3, 0.6, 1.5, 1.4e-3),
-    "pressing": pressing(8e-3, 4e-4, 12.0, 0.9, 1.4e-3),
     "shaking": sines(6e-3, (4.0, 17.0), 0.9, 3e-4),
 }
-"""Motions of a second or so; the last two are those of smoke runs."""
+"""Motions of a second or so; the last one is that of smoke runs."""
 
 
 class Order(NamedTuple):
     """One run that is to be made: a motion by name, and how the rig differs, by the names of
-    `foreign.Numbers`; `smoke`: on a coarse mesh."""
+    `foreign.Numbers`."""
 
     motion: str
-    differs: tuple[tuple[str, Any], ...] = ()
-    smoke: bool = False
+    differs: tuple[tuple[str, Any], ...]
 
 
 class Made(NamedTuple):
-    """One run: times (n,) [s] every `KEPT`, channels (n,) by the simulator's names, and the fastest
-    slip [m/s]."""
+    """One run: its motion, times (n,) [s] every `KEPT`, and channels (n,) by the simulator's
+    names."""
 
+    motion: str
     t: Array
     channels: dict[str, Array]
-    slip: float
 
 
-def planned(motion: str, smoke: bool) -> RigFile:
-    """What the laboratory knows and has planned; the unknown numbers are the usual ones."""
-    known = {name: value for name, value in TRUTH.items() if name not in FEW}
-    coarse = COARSE | known if smoke else {}
-    file = RigFile.ready("paper").override({"contact.v_s": 0.05} | coarse)
+def planned(motion: str) -> RigFile:
+    """What the laboratory has planned; the unknown numbers are the usual ones."""
+    file = RigFile.ready("paper").override({"contact.v_s": 0.05})
     return excite(file, MOTIONS[motion]._replace(grip=-CLEAR))
 
 
@@ -137,12 +129,12 @@ def numbers(file: RigFile, differs: Mapping[str, Any]) -> Numbers:
 
 def run(order: Order, step: float) -> Made:
     """A run of the independent simulator on steps of `step` [s]."""
-    file = planned(order.motion, order.smoke)
+    file = planned(order.motion)
     count = round((file.outputs.duration + SETTLE) / step)
     t = step * (np.arange(count + 1) - round(SETTLE / step))
     signals = file.build().rig.reference(torch.from_numpy(t), SIGNALS).detach().numpy()
     made = simulate(numbers(file, dict(order.differs)), t, signals, round(KEPT / step))
-    return Made(made.t, made.channels, float(np.max(made.slip)))
+    return Made(order.motion, made.t, made.channels)
 
 
 def make(order: Order, step: float) -> Made:
@@ -194,24 +186,33 @@ class Case:
     alter: Alter | None = None
     noted: Mapping[str, Any] = field(default_factory=dict)
     setpoints: Noting | None = None
+    unknowns: tuple[str, ...] = tuple(TRUTH)
     motions: tuple[str, ...] = GENTLE
 
-    def orders(self, smoke: bool = False) -> list[Order]:
+    @property
+    def orders(self) -> list[Order]:
         differs = tuple(sorted(self.differs.items()))
-        return [Order(motion, differs, smoke) for motion in self.motions]
+        return [Order(motion, differs) for motion in self.motions]
 
-    def recording(self, order: Order, made: Made, seed: int) -> Recording:
+    def problem(self, made: Sequence[Made], seed: int) -> Problem:
+        """The identification of the unknowns from one run a motion, every one off by `FACTOR`."""
+        recordings = [self.recording(one, seed + 10 * k) for k, one in enumerate(made)]
+        initial = {name: TRUTH[name] * FACTOR ** (-1) ** i for i, name in enumerate(self.unknowns)}
+        return problem(recordings, initial)
+
+    def recording(self, made: Made, seed: int) -> Recording:
         """One run as the laboratory hands it over, sampled by its sensors."""
-        file = planned(order.motion, order.smoke)
+        file = planned(made.motion)
         reference = file.build().rig.reference
         if self.setpoints is not None:
             reference = self.setpoints(reference, file.outputs.duration)
         if self.sensed is not None:
             made = made._replace(channels={**made.channels, **self.sensed(made.channels)})
-        rig, y0, _ = file.override(self.noted).build()
+        known = {name: value for name, value in TRUTH.items() if name not in self.unknowns}
+        rig, y0, _ = file.override({**known, **self.noted}).build()
         rig.reference = reference
         at_rest = Standing.of(rig, y0, rests={"disc": [1]})
-        recording = Recording(order.motion, rig, sampled(made, seed, self.colour), at_rest)
+        recording = Recording(made.motion, rig, sampled(made, seed, self.colour), at_rest)
         if self.alter is not None:
             recording = self.alter(recording, np.random.default_rng(1000 + seed))
         return recording
@@ -242,12 +243,6 @@ def sampled(
         exact = made.channels[CALLED.get(channel, channel)][at]
         out[channel] = (made.t[at], exact + sensor.noise * noise)
     return out
-
-
-def stated(recordings: list[Recording], truth: Mapping[str, float]) -> Problem:
-    """The identification, every parameter off by `FACTOR`."""
-    initial = {name: value * FACTOR ** (-1) ** i for i, (name, value) in enumerate(truth.items())}
-    return problem(recordings, initial)
 
 
 def chosen(cases: Iterable[Case], only: Sequence[str]) -> list[Case]:

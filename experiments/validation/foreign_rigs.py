@@ -16,35 +16,20 @@ Expected: every interval holds, or a warning names the cause; no case is silent.
 two cores, the recordings included.
 """
 
-import textwrap
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
-from typing import Any
 
 import numpy as np
 import torch
 
-from experiments.frame import Table, options, write
-from experiments.identify_contact import TRUTH, judged
-from experiments.validation.foreign_recordings import (
-    FEW,
-    RATE,
-    SIGNALS,
-    Case,
-    Made,
-    Sensing,
-    chosen,
-    make_all,
-    stated,
-)
+from experiments.frame import options
+from experiments.identify_contact import FEW
+from experiments.validation import suspects
+from experiments.validation.foreign_recordings import RATE, SIGNALS, Case, Sensing, chosen
 from torchsoft import Reference
 from torchsoft.physics.motion import Profile, Sampled
-from torchsoft.sysid import Unreachable, explain
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.runs import forget
 
 
 def late(rows: int) -> Sensing:
@@ -95,82 +80,18 @@ SMOKE = ("same assumptions, gentle", "sign of F_x flipped")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(suspects.Settings):
     out: Path = Path("out/foreign_rigs")
-    rtol: float = 1e-5  # of the fits' last stage
-    step: float = 20e-6  # of the simulator [s]; 1 ms is a multiple of twice as much
-    seed: int = 7  # of the noise
-    workers: int = 2
-    only: tuple[str, ...] = ()  # names of cases; all of them by default
-    smoke: bool = False  # two cases, four parameters, two short recordings on a coarse mesh
-
-
-def study(case: Case, made: Sequence[Made], config: Config) -> dict[str, Any]:
-    """Identify one case: its estimates, what is reported, and the verdict on both.
-
-    Its runs are kept until it is done: a second start goes through them in seconds.
-    """
-    runs = config.out / f"runs-{case.name.replace(' ', '-').replace('/', '-')}"
-    truth, start, chi2 = FEW if config.smoke else TRUTH, perf_counter(), None
-    parameters: dict[str, dict[str, Any]] = {}
-    try:
-        recordings = [
-            case.recording(order, one, config.seed + 10 * k)
-            for k, (order, one) in enumerate(zip(case.orders(config.smoke), made))
-        ]
-        found = explain(
-            stated(recordings, truth), rtol=config.rtol, workers=config.workers, checkpoint=runs,
-            progress=not config.smoke,
-        )  # fmt: skip
-        parameters, chi2, notices = judged(found, truth), found.chi2, list(found.notices)
-    except (Unreachable, ValueError) as error:
-        notices = [str(error)]
-    named = any(word.lower() in text.lower() for word in case.words for text in notices)
-    if parameters and all(row["inside"] is not False for row in parameters.values()):
-        verdict = "holds"
-    else:
-        verdict = "cause named" if named else "warned, cause not named" if notices else "silent"
-    return {
-        "name": case.name, "parameters": parameters, "chi2": chi2, "warnings": notices,
-        "verdict": verdict, "fastest_slip": max(one.slip for one in made),
-        "wall_s": perf_counter() - start,
-    }  # fmt: skip
-
-
-def table(cases: Sequence[Mapping[str, Any]]) -> Table:
-    """Errors in percent, those outside of their interval in bold, and what is reported."""
-    rows = []
-    for one in cases:
-        errors = [
-            "-" if row["error"] is None else f"{100 * row['error']:+.2g}" if row["inside"]
-            else f"**{100 * row['error']:+.2g}**"
-            for row in one["parameters"].values()
-        ]  # fmt: skip
-        warnings = "; ".join(textwrap.shorten(text, 110) for text in one["warnings"])
-        chi2 = "-" if one["chi2"] is None else f"{one['chi2']:.3f}"
-        rows.append((
-            one["name"], " ".join(errors), chi2, one["verdict"], f"{one['wall_s']:.0f}",
-            warnings.replace("|", "/") or "-",
-        ))  # fmt: skip
-    head = ("what differs", "errors of the parameters [%]", "chi2", "verdict", "wall [s]",
-            "warnings")  # fmt: skip
-    return Table(head, rows)
+    seeds: int = 1
+    first: int = 7
 
 
 def main(config: Config) -> None:
     cases = chosen(CASES, config.only or (SMOKE if config.smoke else ()))
     if config.smoke:
-        config = replace(config, workers=1, step=5e-5)
-        cases = [replace(case, motions=("pressing", "shaking")) for case in cases]
-    every = [order for case in cases for order in case.orders(config.smoke)]
-    made, found = make_all(every, config.step, config.workers), []
-    for case in cases:
-        found.append(study(case, [made[order] for order in case.orders(config.smoke)], config))
-        print(f"\n{case.name}: {found[-1]['verdict']}", *found[-1]["warnings"], sep="\n  ")
-        content = {"verdicts": Counter(one["verdict"] for one in found), "cases": found}
-        write(config, content, {"cases": table(found)})
-    for folder in config.out.glob("runs-*"):
-        forget(folder)
+        cases = [replace(case, motions=("shaking",), unknowns=tuple(FEW)) for case in cases]
+        config = replace(config, workers=1, rtol=1e-4, step=5e-5)
+    suspects.study(cases, config, "cases")
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ the judge's own uncertainty. No gradient is looked at to choose the step.
 
 Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms with mu_s = 0.3, mu_k
 = 0.2, v_s = 50 mm/s), `make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20
-um above touching) and `full` (the 30 s manipulation). How far gradients depend on the step, and their
-cost, is in `step_accuracy.py`.
+um above touching) and `full` (the 30 s manipulation). The step that a
+gradient needs, and its cost, are in `step_accuracy.py`.
 
 Command: .venv/bin/python -m experiments.validation.gradient_accuracy [--smoke]
 Expected, largest error among parameters whose central difference is itself known to 1e-6: 6e-7 in

@@ -20,8 +20,9 @@ deviations in a repetition that is not covered, no false cause, and no notice wh
 wrong. About two hours on two cores for `CASES`, and six for `DEPARTURES`.
 """
 
+import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -30,7 +31,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from experiments.frame import Table, options, repeated, timed, write
-from experiments.identify_contact import LAW, RUBBER, SENSORS, TRUTH
+from experiments.identify_contact import LAW, MU_K, MU_S, RUBBER, SENSORS, TRUTH
 from experiments.validation.foreign_recordings import (
     KEPT,
     Alter,
@@ -39,19 +40,15 @@ from experiments.validation.foreign_recordings import (
     Sensing,
     chosen,
     make_all,
-    stated,
 )
-from torchsoft.sysid import IdentificationResult, Recording, explain, identify
+from torchsoft.sysid import IdentificationResult, Recording, Unreachable, explain, identify
 from torchsoft.sysid.assumptions import delayed
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import forget
 from torchsoft.sysid.suspects import LIKELY
 
-SIX = tuple(f"{LAW}.{name}" for name in ("K_n", "K_t", "friction.mu_s", "friction.mu_k")) + (
-    f"{RUBBER}.E",
-    f"{RUBBER}.tau",
-)
-KNOWN = {name: value for name, value in TRUTH.items() if name not in SIX}
+SIX = (f"{LAW}.K_n", f"{LAW}.K_t", MU_S, MU_K, f"{RUBBER}.E", f"{RUBBER}.tau")
+"""Unknowns; the laboratory knows the others."""
 
 OFF = 3.0
 """Standard deviations by which an estimate is off."""
@@ -142,8 +139,8 @@ def gaps(part: float) -> Alter:
 def named(
     name: str, suspects: tuple[str, ...] = (), motion: str = "long shaking", **how: Any
 ) -> Case:
-    """A case of one motion, of which a laboratory knows all but six parameters."""
-    return Case(name, suspects, noted=KNOWN, motions=(motion,), **how)
+    """A case of one motion and six unknowns."""
+    return Case(name, suspects, unknowns=SIX, motions=(motion,), **how)
 
 
 CASES = (
@@ -242,17 +239,23 @@ SMOKE = ("inertia +5 %", "pads 0.5 % thicker")
 
 
 @dataclass(frozen=True)
-class Config:
+class Settings:
+    """What studies of independent recordings have in common."""
+
     out: Path = Path("out/suspects")
-    table: Literal["suspects", "departures", "all"] = "suspects"
     seeds: int = 5
     first: int = 0  # the first seed
     rtol: float = 1e-5  # of the fits' last stage
-    step: float = 20e-6  # of the independent simulator [s]
+    step: float = 20e-6  # of the independent simulator [s]; half of it has to divide 1 ms
     workers: int = 2  # repetitions at a time
     explain: bool = True  # where `identify` says so
     only: tuple[str, ...] = ()  # names of cases, of any table; those of the table by default
-    smoke: bool = False  # two cases, one seed, a looser tolerance
+    smoke: bool = False  # few cases, one seed, a looser tolerance
+
+
+@dataclass(frozen=True)
+class Config(Settings):
+    table: Literal["suspects", "departures", "all"] = "suspects"
 
 
 # repetitions
@@ -334,25 +337,27 @@ def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
-    recording = case.recording(case.orders()[0], made, seed)
-    one = stated([recording], {name: TRUTH[name] for name in SIX})
-    folder = config.out / f"runs-{EVERY.index(case)}-{seed}"
-    options: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
-    result, identify_s = timed(lambda: identify(one, **options))
+def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Repetition:
+    """Identify a case from its recordings with one seed of the noise."""
+    folder = config.out / f"runs-{re.sub(r'[^\w.+-]+', '-', case.name)}-{seed}"
+    how: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
     explain_s = None
-    if config.explain and result.made_by["candidates"]:
-        result, explain_s = timed(lambda: explain(one, **options))
+    try:
+        one = case.problem(made, seed)
+        result, identify_s = timed(lambda: identify(one, **how))
+        if config.explain and result.made_by["candidates"]:
+            result, explain_s = timed(lambda: explain(one, **how))
+    except (Unreachable, ValueError) as error:
+        return Repetition({}, {}, [], "rejected", [str(error)], [], 0.0, None)
     forget(folder)
     off = {
         e.name: float(np.log(e.value / TRUTH[e.name]) / e.relative_sd)
         for e in result.estimates if e.value is not None
     }  # fmt: skip
     named = {one.name: one.odds for one in result.assumptions if one.odds > LIKELY}
-    unseen = list(getattr(result, "unseen", []))
     return Repetition(
-        off, named, false_causes(case, result), result.verdict, result.notices, unseen,
-        identify_s, explain_s,
+        off, named, false_causes(case, result), result.verdict, result.notices,
+        list(result.unseen), identify_s, explain_s,
     )  # fmt: skip
 
 
@@ -377,20 +382,24 @@ def table(cases: list[dict[str, Any]]) -> Table:
     return Table(head, rows)
 
 
+def study(cases: Sequence[Case], config: Settings, name: str) -> None:
+    """Make the recordings of all cases, identify them from every seed, and write their table."""
+    made = make_all((o for case in cases for o in case.orders), config.step, config.workers)
+    done = list[dict[str, Any]]()
+    for case in cases:
+        runs = [made[order] for order in case.orders]
+        one = lambda seed, case=case, runs=runs: repeat(case, runs, config.first + seed, config)
+        done.append(summed(case, repeated(one, config.seeds, config.workers, case.name)))
+        totals = {what: sum(row[what] for row in done) for what in ("silent", "false")}
+        write(config, {**totals, "cases": done}, {name: table(done)})
+
+
 def main(config: Config) -> None:
     some = TABLES[config.table] if not config.only else EVERY
     cases = chosen(some, config.only) if not config.smoke else chosen(EVERY, config.only or SMOKE)
     if config.smoke:
         config = replace(config, seeds=1, workers=1, rtol=1e-4, step=5e-5)
-    orders = {case.name: case.orders()[0] for case in cases}
-    made = make_all(orders.values(), config.step, config.workers)
-    done = list[dict[str, Any]]()
-    for case in cases:
-        run = made[orders[case.name]]
-        one = lambda seed, case=case, run=run: repeat(case, run, config.first + seed, config)
-        done.append(summed(case, repeated(one, config.seeds, config.workers, case.name)))
-        totals = {what: sum(row[what] for row in done) for what in ("silent", "false")}
-        write(config, {**totals, "cases": done}, {config.table: table(done)})
+    study(cases, config, config.table)
 
 
 if __name__ == "__main__":
