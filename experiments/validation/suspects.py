@@ -246,7 +246,7 @@ class Settings:
     seeds: int = 5
     first: int = 0  # the first seed
     rtol: float = 1e-5  # of the fits' last stage
-    step: float = 20e-6  # of the independent simulator [s]; half of it has to divide 1 ms
+    step: float = 20e-6  # of the simulator [s]; 1 ms is a multiple of twice as much
     workers: int = 2  # repetitions at a time
     explain: bool = True  # where `identify` says so
     only: tuple[str, ...] = ()  # names of cases, of any table; those of the table by default
@@ -339,7 +339,8 @@ def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
 
 def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Repetition:
     """Identify a case from its recordings with one seed of the noise."""
-    folder = config.out / f"runs-{re.sub(r'[^\w.+-]+', '-', case.name)}-{seed}"
+    name = re.sub(r"[^\w.+-]+", "-", case.name)
+    folder = config.out / f"runs-{name}-{seed}"
     how: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
     explain_s = None
     try:
