@@ -84,10 +84,9 @@ def benchmark(found):
 
 @pytest.mark.slow
 def test_other_integrators_reach_the_solution_of_the_stepper():
-    pytest.importorskip("diffrax")
     module = program("benchmark")
     rows = module.peers(module.Config(window=5e-3, repeats=1))
-    assert len(rows) == 12
+    assert len(rows) == 9
     assert all(rows.values())
 
 

@@ -5,8 +5,8 @@ All in one process, medians of timings in turns, so that the ratios hold on a no
 
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
 - growth with the surface nodes, with a fitted exponent;
-- with `--peers` the same equations under scipy's, torchdiffeq's and diffrax's integrators over a
-  window in mid-roll. All call the compiled right-hand side (`torchsoft.solve.system`). Every method
+- with `--peers` the same equations under scipy's and torchdiffeq's integrators over a window in
+  mid-roll. All call the compiled right-hand side (`torchsoft.solve.system`). Every method
   is run by a series of tolerances, from loose to tight, until it is as exact as the stepper, in the
   disc's place and in the nodal forces; that run is timed, without compiling.
 
@@ -17,7 +17,6 @@ Expected: time grows with the nodes to the power 1.3; the fastest of the other i
 seven times as long. About three minutes, three more with `--peers`.
 """
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -55,7 +54,7 @@ class Config:
     short_runs: int = 1000
     short: float = 0.3  # simulated time of each of them [s]
     elements_x: tuple[int, ...] = (60, 120, 240, 480)  # meshes, a thirtieth of that through the pad
-    peers: bool = False  # other integrators too; needs `pip install torchsoft[peers]`
+    peers: bool = False  # other integrators too
     goal: float = 1e-4  # relative tolerance of the stepper that others are to be as exact as
     window: float = 0.1  # simulated time that they get, in mid-roll [s]
     smoke: bool = False  # a size that takes seconds
@@ -118,16 +117,8 @@ Solver = Callable[[float], Array]
 
 
 def solvers(f: Rates, y0: Array, t: Array, size: Array) -> dict[str, Solver]:
-    """scipy's methods, which difference the Jacobian themselves, and explicit ones of torchdiffeq
-    and diffrax; absolute tolerances are those of the `size` of each state."""
-    os.environ.setdefault(
-        "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    )
-    import diffrax  # pyright: ignore[reportMissingImports]
-    import jax  # pyright: ignore[reportMissingImports]
-
-    jax.config.update("jax_enable_x64", True)
-    shape = jax.ShapeDtypeStruct(size.shape, np.float64)
+    """scipy's methods, which difference the Jacobian themselves, and explicit ones of torchdiffeq;
+    absolute tolerances are those of the `size` of each state."""
 
     def by_scipy(method: str, rtol: float) -> Array:
         how: dict[str, Any] = {"method": method, "t_eval": t, "rtol": rtol, "atol": rtol * size}
@@ -140,27 +131,9 @@ def solvers(f: Rates, y0: Array, t: Array, size: Array) -> dict[str, Solver]:
         out: Any = odeint(rates, start, times, rtol=rtol, atol=atol, method=method)
         return out.numpy()
 
-    def rates(t: Any, y: Any, _: Any) -> Any:
-        call = lambda t, y: f(float(t), np.asarray(y))
-        return jax.pure_callback(call, shape, t, y, vmap_method="sequential")
-
-    @jax.jit
-    def by_diffrax(method: Any, rtol: Any) -> Any:
-        return diffrax.diffeqsolve(
-            diffrax.ODETerm(rates), method, t[0], t[-1], 1e-4, y0, max_steps=100_000,
-            saveat=diffrax.SaveAt(ts=t),
-            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol * size),
-        ).ys  # fmt: skip
-
-    explicit = {"Heun": diffrax.Heun(), "Bosh3": diffrax.Bosh3(), "Tsit5": diffrax.Tsit5()}
-    out: dict[str, Solver] = {}
-    for name in ("LSODA", "BDF", "Radau", "RK23", "RK45"):
-        out[f"scipy {name}"] = partial(by_scipy, name)
-    for name in ("adaptive_heun", "bosh3", "dopri5"):
-        out[f"torchdiffeq {name}"] = partial(by_torchdiffeq, name)
-    for name, method in explicit.items():
-        out[f"diffrax {name}"] = lambda rtol, method=method: np.asarray(by_diffrax(method, rtol))
-    return out
+    scipys, torchs = ("LSODA", "BDF", "Radau", "RK23", "RK45"), ("adaptive_heun", "bosh3", "dopri5")
+    out: dict[str, Solver] = {f"scipy {name}": partial(by_scipy, name) for name in scipys}
+    return out | {f"torchdiffeq {name}": partial(by_torchdiffeq, name) for name in torchs}
 
 
 def peers(config: Config) -> dict[str, dict[str, float]]:

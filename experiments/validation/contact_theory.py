@@ -10,33 +10,29 @@ Expected: sliding, stops and spin within 0.1 % at every mass and size; Hertz wit
 rolled to both sides. A minute of a core.
 """
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from experiments.frame import Table, numbers, options, write
-from experiments.validation import half_plane
+from experiments.frame import numbers, options, write
 from experiments.validation.half_plane import (
-    CORNER,
-    DEPTH,
     PEAK,
     STIFF,
     WAY,
     A,
     HalfPlane,
+    carter,
     cattaneo,
     hertz,
     punch,
-    root,
 )
 from experiments.validation.sliding import MU, Sliding
 from torchsoft import SmoothSlip
-from torchsoft.physics.mesh import Array
 
 
 @dataclass(frozen=True)
@@ -58,14 +54,18 @@ class Config:
 Rows = dict[str, dict[str, float]]
 
 
+Curve = Sequence[Any]
+"""Two rows of numbers, x and y."""
+
+
 class Panel(NamedTuple):
     """One part of the figure: title and labels, lines of theory, and what was found, by label."""
 
     title: str
     x: str
     y: str
-    theory: list[tuple[Array, Array]]
-    found: dict[str, tuple[Array, Array]]
+    theory: list[Curve]
+    found: dict[str, Curve]
 
 
 def sliding(config: Config) -> dict[str, Rows]:
@@ -87,73 +87,51 @@ def pressed(config: Config) -> dict[str, Rows]:
     cases |= {f"springs {k:g} E*/a": replace(usual, springs=k) for k in config.springs}
     layers = {f"layer of {h:g} a": replace(usual, thick=h) for h in config.thick}
     both = {**cases, "40 elements, springs 400 E*/a": STIFF}
-    pressure = {name: hertz(case)[0] | punch(case)[0] for name, case in both.items()}
-    pressure |= {name: hertz(case)[0] for name, case in layers.items()}
+    pressure = {name: hertz(case) | punch(case) for name, case in both.items()}
+    pressure |= {name: hertz(case) for name, case in layers.items()}
     every = tqdm(cases.items(), "partial slip", leave=False, disable=None)
     return {"pressure": pressure, "partial slip": {name: cattaneo(x)[0] for name, x in every}}
 
 
-def rolling(config: Config) -> tuple[Rows, list[Panel]]:
-    """Carter's rolling, and its panels."""
-    rows: Rows = {}
-    found, limit, shear = {}, np.linspace(0, 1, 101), None
+def rolling(config: Config) -> Rows:
+    """Carter's rolling by nu and moment."""
     cases = [(nu, traction) for nu in config.nu for traction in config.tractions]
-    for nu, traction in tqdm(cases, "rolls", leave=False, disable=None):
-        case = HalfPlane(nu, config.rolled_elements, rolled=config.way)
-        row, at = half_plane.carter(case, traction)
-        rows[f"{nu:g}, {traction:g}"] = row
-        found.setdefault(f"nu = {nu:g}", []).append((row["xi R / (mu a)"], row["Q / (mu P)"]))
-        if nu == config.nu[0] and traction == 0.5:
-            near, c, x = abs(at.x) < 1.2 * A, math.sqrt(1 - row["Q / (mu P)"]), axis()
-            theory = root(x, 1.0) - c * root(x - (1 - c), c)
-            points = at.x[near] / A, at.q[near] / (MU * PEAK)
-            shear = Panel("rolling, Q = mu P / 2", "x / a", "q / (mu p_0)", [(x, theory)],
-                          {"": points})  # fmt: skip
-    points = {name: tuple(np.array(pairs).T) for name, pairs in found.items()}
-    creep = Panel("rolling (Carter)", "xi R / (mu a)", "Q / (mu P)",
-                  [(limit, 1 - (1 - limit) ** 2)], points)  # fmt: skip
-    return rows, [creep] if shear is None else [creep, shear]
+    return {
+        f"{nu:g}, {traction:g}": carter(
+            HalfPlane(nu, config.rolled_elements, rolled=config.way), traction
+        )
+        for nu, traction in tqdm(cases, "rolls", leave=False, disable=None)
+    }
 
 
-def axis() -> Array:
-    return np.linspace(-1.2, 1.2, 481)
-
-
-def panels() -> list[Panel]:
-    """Hertz, punch, partial slip and spin."""
-    case, x, inner = HalfPlane(), axis(), np.linspace(-0.995, 0.995, 400)
-    _, circle = hertz(case)
-    off, box = punch(STIFF)
-    own = (1 + off["punch: a"]) * (1 - CORNER)
-    pressure = box.p * math.pi * own * A * DEPTH / case.load
-    _, slid = cattaneo(case)
+def panels(rolls: Rows) -> list[Panel]:
+    """Partial slip, creepage of rolls and spin."""
+    _, slid = cattaneo(HalfPlane())
     shears = {name: (at.x / A, at.q / (MU * PEAK)) for name, (at, _) in slid.items()}
-    t, spin = Sliding().spun()
+    creep = [[row[name] for row in rolls.values()] for name in ("xi R / (mu a)", "Q / (mu P)")]
+    limit, (t, spin) = np.linspace(0, 1, 101), Sliding().spun()
     return [
-        Panel("circle (Hertz)", "x / a", "p / p_0", [(x, root(x, 1.0))],
-              {"": (circle.x / A, circle.p / PEAK)}),
-        Panel("flat punch", "x / a", "p pi a / P", [(inner, 1 / np.sqrt(1 - inner**2))],
-              {"": (box.x / A / own, pressure)}),
         Panel("partial slip (Cattaneo, Mindlin)", "x / a", "q / (mu p_0)",
               [(at.x / A, theory) for at, theory in slid.values()], shears),
+        Panel("rolling (Carter)", "xi R / (mu a)", "Q / (mu P)",
+              [(limit, 1 - (1 - limit) ** 2)], {"found": creep}),
         Panel("spinning disc set down", "3 mu g t / (omega_0 r)", "omega / omega_0",
-              [(np.array([0, 1, 1.5]), np.array([1, 1 / 3, 1 / 3]))], {"": (t[::4], spin[::4])}),
+              [([0, 1, 1.5], [1, 1 / 3, 1 / 3])], {"found": (t[::4], spin[::4])}),
     ]  # fmt: skip
 
 
 def figure(every: list[Panel]) -> Figure:
     """Circles are found, lines are theory."""
-    made = Figure(figsize=(10, 6.4), layout="constrained")
-    for axes, panel in zip(made.subplots(2, 3).flat, every):
+    made = Figure(figsize=(10, 3.4), layout="constrained")
+    for axes, panel in zip(made.subplots(1, 3), every):
         for x, y in panel.theory:
             axes.plot(x, y, color="k", lw=1)
         for name, (x, y) in panel.found.items():
             axes.plot(x, y, "o", ms=3, mfc="none", label=name)
         axes.set(title=panel.title, xlabel=panel.x, ylabel=panel.y)
+        axes.legend(fontsize=7)
         if panel.x == "x / a":
-            axes.set(xlim=(-1.2, 1.2))
-        if "" not in panel.found:
-            axes.legend(fontsize=7)
+            axes.set_xlim(-1.2, 1.2)
     return made
 
 
@@ -164,16 +142,15 @@ def main(config: Config) -> None:
             elements=(10, 20), springs=(), thick=(30.0,), tractions=(0.5,), nu=(0.49,),
             way=3.0, rolled_elements=10, smoke=True,
         )  # fmt: skip
-    rolls, rolled = rolling(config)
-    found = {**sliding(config), **pressed(config), "rolling": rolls}
-    tables: dict[str, Table] = {
+    found = {**sliding(config), **pressed(config), "rolling": rolling(config)}
+    tables = {
         "slopes": numbers("slope [deg]", found["slopes"]),
         "sizes": numbers("mass, height of the pad", found["sizes"], "+.2%"),
         "pressure": numbers("case", found["pressure"], "+.2%"),
         "partial slip": numbers("case", found["partial slip"], "+.2%"),
-        "rolling": numbers("nu, moment over mu P R", rolls),
+        "rolling": numbers("nu, moment over mu P R", found["rolling"]),
     }
-    write(config, found, tables, {"contact_theory": figure([*panels(), *rolled])})
+    write(config, found, tables, {"contact_theory": figure(panels(found["rolling"]))})
 
 
 if __name__ == "__main__":

@@ -131,7 +131,7 @@ def run(order: Order, step: float) -> Made:
     """A run of the independent simulator on steps of `step` [s]."""
     file = planned(order.motion)
     count = round((file.outputs.duration + SETTLE) / step)
-    t = step * (np.arange(count + 1) - round(SETTLE / step))
+    t: Array = (step * (np.arange(count + 1) - round(SETTLE / step))).astype(np.float64)
     signals = file.build().rig.reference(torch.from_numpy(t), SIGNALS).detach().numpy()
     made = simulate(numbers(file, dict(order.differs)), t, signals, round(KEPT / step))
     return Made(order.motion, made.t, made.channels)

@@ -3,7 +3,7 @@ Cattaneo and Mindlin, and Carter. Lengths are in units of the contact's half-wid
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -170,14 +170,14 @@ def still(rig: Rig, top: float) -> Tractions:
     return tractions(rig, np.stack((F_N, 0 * F_N), -1))
 
 
-def hertz(case: HalfPlane) -> tuple[dict[str, float], Tractions]:
+def hertz(case: HalfPlane) -> dict[str, float]:
     """Half-width and peak pressure of a circle over Hertz's, less one."""
     at = still(case.rig(Circle(RADIUS)), RADIUS)
     a, top = ellipse(at.x, at.p, 0.9 * A)
-    return {"Hertz: a": a / A - 1, "Hertz: p_0": top / PEAK - 1}, at
+    return {"Hertz: a": a / A - 1, "Hertz: p_0": top / PEAK - 1}
 
 
-def punch(case: HalfPlane) -> tuple[dict[str, float], Tractions]:
+def punch(case: HalfPlane) -> dict[str, float]:
     """A flat punch: the half-width that its pressure has over that of its flat side, less one; the
     largest error of the pressure in the inner 70 %, by that half-width and by the flat side's."""
     at = still(case.rig(RoundedBox(A, 0.5 * A, radius=CORNER * A)), 0.5 * A)
@@ -186,7 +186,7 @@ def punch(case: HalfPlane) -> tuple[dict[str, float], Tractions]:
     flat, own = (1 - CORNER) * A, math.sqrt(-top / slope)
     pressure = lambda a: case.load / DEPTH / (math.pi * np.sqrt(a**2 - at.x[k] ** 2))
     off = [float(abs(at.p[k] / pressure(a) - 1).max()) for a in (own, flat)]
-    return {"punch: a": own / flat - 1, "punch: p": off[0], "punch: p, a of the flat": off[1]}, at
+    return {"punch: a": own / flat - 1, "punch: p": off[0], "punch: p, a of the flat": off[1]}
 
 
 def sheared(x: Array, Q: float, most: float | None = None) -> Array:
@@ -225,9 +225,8 @@ def cattaneo(case: HalfPlane) -> tuple[dict[str, float], dict[str, tuple[Tractio
     return found, shown
 
 
-def rolled(case: HalfPlane, traction: float) -> tuple[float, float, Tractions]:
-    """Creepage over mu a / R and Q over mu P, steady, of a roll with a moment Q R; and the
-    tractions about the disc's centre."""
+def rolled(case: HalfPlane, traction: float) -> tuple[float, float]:
+    """Creepage over mu a / R and Q over mu P, steady, of a roll with a moment Q R."""
     v, moment, way = A, traction * MU * case.load * RADIUS, case.rolled
     reference = Reference(**{
         "body.x": Sampled([0.0, way], [0.0, way * v], [v, v]),
@@ -240,19 +239,17 @@ def rolled(case: HalfPlane, traction: float) -> tuple[float, float, Tractions]:
     run = simulate(rig, t, y0=y0, rtol=RTOL)
     late = t > way - 1
     angle, passed = (torch.diff(run[x][late][[0, -1]]).item() for x in ("theta_body", "x_body"))
-    every = along(rig, run)
-    Q = float(np.mean([at.friction for at, steady in zip(every, late) if steady]))
-    creepage = (1 + angle * RADIUS / passed) / (MU * A / RADIUS)
-    return creepage, Q, every[-1]._replace(x=every[-1].x - way * A)
+    Q = np.mean([at.friction for at, steady in zip(along(rig, run), late) if steady])
+    return (1 + angle * RADIUS / passed) / (MU * A / RADIUS), float(Q)
 
 
-def carter(case: HalfPlane, traction: float) -> tuple[dict[str, Any], Tractions]:
+def carter(case: HalfPlane, traction: float) -> dict[str, float]:
     """Rolls with a traction to both sides: half of the difference of their creepages and tractions,
     and what the traction is off Carter's for that creepage, over the limit; half of the sum."""
-    (one, Q, at), (other, P, _) = (rolled(case, sign * traction) for sign in (1, -1))
+    (one, Q), (other, P) = (rolled(case, sign * traction) for sign in (1, -1))
     xi, Q = 0.5 * (one - other), 0.5 * (Q - P)
     by_theory = lambda creepage: 1 - (1 - min(1.0, creepage)) ** 2
     return {
-        "nu": case.nu, "xi R / (mu a)": xi, "Q / (mu P)": Q, "off": Q - by_theory(xi),
+        "xi R / (mu a)": xi, "Q / (mu P)": Q, "off": Q - by_theory(xi),
         "off, one side alone": Q - by_theory(one), "free rolling": 0.5 * (one + other),
-    }, at  # fmt: skip
+    }  # fmt: skip

@@ -75,14 +75,15 @@ def study(built: BuiltRig, config: Config) -> dict[str, dict[str, Any]]:
     ways |= {f"step = {h:g} ms": {"step": 1e-3 * h} for h in config.steps_ms}
     out = {}
     for way, steps in ways.items():
+        forward = {"gradient": "forward", "wrt": EIGHT, "rigid": True, **steps}
+        run, got = built.run(**steps), gradient(built, **steps)
         tasks = (
             lambda steps=steps: built.run(**steps),
             lambda steps=steps: gradient(built, **steps),
-            lambda steps=steps: built.run(gradient="forward", wrt=EIGHT, rigid=True, **steps),
+            lambda how=forward: built.run(**how),
         )
-        turns = [[timed(task) for task in tasks] for _ in range(config.repeats)]
-        run, got, _ = (result for result, _ in turns[0])
-        alone, adjoint, forward = (min(wall for _, wall in task) for task in zip(*turns))
+        turns = [[timed(task)[1] for task in tasks] for _ in range(config.repeats)]
+        alone, adjoint, jacobian = (min(walls) for walls in zip(*turns))
         off = ((got - wanted) / wanted).abs()
         errors = {
             name: (run[name] - exact[name]).abs().max() / (exact[name].max() - exact[name].min())
@@ -90,7 +91,7 @@ def study(built: BuiltRig, config: Config) -> dict[str, dict[str, Any]]:
         }
         out[way] = {
             "steps": run.stats.steps, "refused": run.stats.refused_steps, "run [s]": alone,
-            "gradient / run": adjoint / alone, "Jacobian / run": forward / alone,
+            "gradient / run": adjoint / alone, "Jacobian / run": jacobian / alone,
             **{name: error.item() for name, error in errors.items()},
             "energy residual": run.energy_residual_rel, "gradient": off.max().item(),
             "gradients": dict(zip(EIGHT, off.tolist())),
