@@ -10,7 +10,7 @@ Expected: sliding, stops and spin within 0.1 % at every mass and size; Hertz wit
 rolled to both sides. A minute of a core.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,7 +65,7 @@ class Panel(NamedTuple):
     x: str
     y: str
     theory: list[Curve]
-    found: dict[str, Curve]
+    found: Mapping[str, Curve]
 
 
 def sliding(config: Config) -> dict[str, Rows]:

@@ -174,7 +174,8 @@ class Case:
     of the rig file, and set-points.
 
     A name with one of `suspects` in it is that of a true suspect; a notice with one of the `words`
-    names it. Both are empty where nothing is wrong.
+    names it. Both are empty where nothing is wrong. A case that is `rejected` may end with an error
+    in place of estimates; any other may not.
     """
 
     name: str
@@ -186,6 +187,7 @@ class Case:
     alter: Alter | None = None
     noted: Mapping[str, Any] = field(default_factory=dict)
     setpoints: Noting | None = None
+    rejected: bool = False
     unknowns: tuple[str, ...] = tuple(TRUTH)
     motions: tuple[str, ...] = GENTLE
 

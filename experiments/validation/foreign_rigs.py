@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from experiments.frame import options
-from experiments.identify_contact import FEW
+from experiments.identify_contact import LAW, MU_S, RUBBER
 from experiments.validation import suspects
 from experiments.validation.foreign_recordings import RATE, SIGNALS, Case, Sensing, chosen
 from torchsoft import Reference
@@ -69,14 +69,17 @@ CASES = (
     Case("set-points at 200 Hz", words=("set-point", "setpoint"), setpoints=at_samples),
     Case("F_ff left out", words=("F_ff", "fed forward", "feed-forward"),
          setpoints=without_feed_forward),
-    Case("loop convention wrong", words=("senses", "x_d"), noted={"control.senses": "disc.x"}),
-    Case("sign of F_x flipped", words=("sign",), sensed=lambda channels: {"F_x": -channels["F_x"]}),
+    Case("loop convention wrong", words=("senses", "x_d"), noted={"control.senses": "disc.x"},
+         rejected=True),
+    Case("sign of F_x flipped", words=("sign",), rejected=True,
+         sensed=lambda channels: {"F_x": -channels["F_x"]}),
     Case("AR(1) noise of 0.9", words=("colour", "white", "AR(", "autocorrel"), colour=0.9),
     Case("camera 2 ms late", words=("delay", "late"), sensed=late(2)),
     Case("radius off by 0.5 %", words=("radius",), differs={"radius": 1.005 * 19.37e-3}),
 )  # fmt: skip
 
 SMOKE = ("same assumptions, gentle", "sign of F_x flipped")
+SMOKE_UNKNOWNS = (MU_S, f"{LAW}.K_n", f"{RUBBER}.E", f"{RUBBER}.tau")
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class Config(suspects.Settings):
 def main(config: Config) -> None:
     cases = chosen(CASES, config.only or (SMOKE if config.smoke else ()))
     if config.smoke:
-        cases = [replace(case, motions=("shaking",), unknowns=tuple(FEW)) for case in cases]
+        cases = [replace(case, motions=("shaking",), unknowns=SMOKE_UNKNOWNS) for case in cases]
         config = replace(config, workers=1, rtol=1e-4, step=5e-5)
     suspects.study(cases, config, "cases")
 

@@ -349,6 +349,8 @@ def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Rep
         if config.explain and result.made_by["candidates"]:
             result, explain_s = timed(lambda: explain(one, **how))
     except (Unreachable, ValueError) as error:
+        if not case.rejected:
+            raise
         return Repetition({}, {}, [], "rejected", [str(error)], [], 0.0, None)
     forget(folder)
     off = {
