@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
@@ -39,6 +40,7 @@ def options(config: type[C], description: str | None) -> C:
     Ends with status 2 and an error for a number that no program can use.
     """
     torch.set_num_threads(1)
+    commit()  # that of the code which runs, even if files change while it does
     given: Any = tyro.cli(config, description=description)
     for name, value in asdict(given).items():
         low, high = STEPS if name == "step" else (SMALLEST, LARGEST)
@@ -93,8 +95,10 @@ def numbers(title: str, rows: Mapping[str, Mapping[str, float]], form: str = ".4
     return Table((title, *names), cells)
 
 
+@cache
 def commit() -> str:
-    """The commit of the checkout, ending in "-dirty" where files differ; "unknown" without git."""
+    """The commit of the checkout when it was first asked for, ending in "-dirty" where files
+    differ; "unknown" without git."""
     command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
     done = subprocess.run(
         command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
