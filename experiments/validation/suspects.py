@@ -15,9 +15,9 @@ something that is right.
 
 Command: .venv/bin/python -m experiments.validation.suspects [--seeds 5] [--first 0]
 [--table departures] [--only "tilt of 2 mrad"] [--smoke]
-Expected: no estimate is off by three
-deviations in a repetition that is not covered, no false cause, and no notice where nothing is
-wrong. About two hours on two cores for `CASES`, and six for `DEPARTURES`.
+Expected: no estimate is off by three deviations in a repetition that is not covered, no false
+cause, and no notice where nothing is wrong. About two hours on two cores for `CASES`, and six for
+`DEPARTURES`.
 """
 
 import re
