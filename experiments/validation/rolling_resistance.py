@@ -16,7 +16,7 @@ for.
 
 Command: .venv/bin/python -m experiments.validation.rolling_resistance [--smoke]
 Expected: force and power agree to 6e-3 at every speed. At 20 N, where the disc sinks in by 7 % of
-the pad's height, the resistance is 1.4 % below to 3.7 % above theory's; at 5 N, near the peak, it
+the pad's height, the resistance is 1.2 % below to 3.7 % above theory's; at 5 N, near the peak, it
 is theory's to 0.2 %. Under a held load Kelvin-Voigt has a peak, too: at high speed the contact
 stiffens and shrinks. A minute on an idle core.
 """
