@@ -129,6 +129,8 @@ PUBLISHED = {
     "y_Br from 0.5 s on, lowest [mm]": "48.6", "y_Br from 0.5 s on, highest [mm]": "48.6",
     "peak speed of the disc [mm/s]": "4.375 (desired)",
     "direction of rolling out": "anticlockwise", "grasping force fed forward [N]": "not given",
+    "energy residual / injected": "-", "steps": "-", "Newton iterations a step": "-",
+    "wall time of the stepping [s]": "-",
 }  # fmt: skip
 """Numbers that the paper prints; of others it has curves only."""
 
@@ -173,7 +175,9 @@ def table(default: Mapping[str, Any], paper_like: Mapping[str, Any]) -> Table:
     """The published values beside those of both runs."""
 
     def cell(value: float | str | None) -> str:
-        return "-" if value is None else value if isinstance(value, str) else f"{value:.5g}"
+        if value is None:
+            return "-"
+        return f"{value:#.5g}" if isinstance(value, float) else str(value)
 
     rows = [
         (name, PUBLISHED.get(name, "curve only"), cell(value), cell(paper_like[name]))
