@@ -36,9 +36,9 @@ from threadpoolctl import threadpool_limits
 from torch import nn
 
 from experiments.frame import COARSE, Table, grid, numbers, options, write
-from experiments.slip import at_the_points
-from torchsoft import Profile, Reference, Rig, RigFile, Trajectory, excite, hold, simulate
+from torchsoft import Profile, Reference, Rig, RigFile, excite, hold, simulate
 from torchsoft.files import finite
+from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Waves, wave
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
@@ -81,12 +81,6 @@ class Config:
     other_times: tuple[float, ...] = (0.15, 0.1, 0.055, 0.045, 0.035, 0.03, 0.025, 0.02)
     speeds: tuple[float, ...] = (0.005, 0.01, 0.02)  # that tanh(s' / speed) is tried with [m/s]
     smoke: bool = False  # a size that takes seconds
-
-
-def slipping(model: Rig, run: Trajectory) -> float:
-    """Part of the touching nodes of the upper pad that slip faster than 1 mm/s, over time."""
-    depth, speed = at_the_points(model, run.t[::20], run.y[::20])["U"]
-    return float(((depth > 0) & (speed > 1e-3)).sum() / (depth > 0).sum())
 
 
 def refit(
@@ -234,7 +228,7 @@ class Stroke(NamedTuple):
     wall_s: float
 
 
-def strokes(config: Config, travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
+def strokes(travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
     """Strokes there and back from a light grasp with the horizontal loop on the bracket."""
     roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
     e = Excitation(roll, duration=0.5 + 4 * stroke_time + 0.01, depth=depth)
@@ -243,7 +237,9 @@ def strokes(config: Config, travel: float, stroke_time: float, depth: float = DE
     run = built.run(t[: start + 1], step=5e-4)
     rest = built.run(t[start:], y0=run.y[-1], step=5e-4)
     peak = float(np.abs(np.gradient(rest["v_x_Br"].numpy(), 5e-4)).max())
-    return Stroke(record(rest), peak, slipping(built.rig, rest), rest.stats.wall_s)
+    states = rest.contact_state["U"]
+    slipping = float((states == SLIPPING).sum() / (states > 0).sum())
+    return Stroke(record(rest), peak, slipping, rest.stats.wall_s)
 
 
 def sticking(model: ReducedModel) -> ReducedModel:
@@ -262,8 +258,8 @@ def sticking(model: ReducedModel) -> ReducedModel:
 
 
 def study_slip(config: Config) -> dict[str, Any]:
-    train = [strokes(config, -20e-3, T).record for T in config.stroke_times]
-    other = {T: strokes(config, 15e-3, T) for T in (*config.checking_times, *config.other_times)}
+    train = [strokes(-20e-3, T).record for T in config.stroke_times]
+    other = {T: strokes(15e-3, T) for T in (*config.checking_times, *config.other_times)}
     r = rolling_radius([train[int(np.argmax(config.stroke_times))]])
     recipe = Recipe(width=0.004, window=min(config.stroke_times) * 4)
     checks = [other[T].record for T in config.checking_times]
@@ -284,7 +280,7 @@ def study_slip(config: Config) -> dict[str, Any]:
         }
         for T, one in sorted(other.items(), reverse=True)
     ]  # fmt: skip
-    deep = strokes(config, 15e-3, 0.04, depth=2 * DEPTH)
+    deep = strokes(15e-3, 0.04, depth=2 * DEPTH)
     return {
         "terms": len(model.terms),
         "heldout_nrmse": float(np.mean([one["nrmse"] for one in by_stroke if one["held_out"]])),

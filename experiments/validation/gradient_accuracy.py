@@ -31,9 +31,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from experiments.frame import COARSE, Table, grid, options, write
-from experiments.slip import at_the_points
-from torchsoft import Rig, RigFile, simulate
-from torchsoft.physics.channels import Seen, read
+from torchsoft import Rig, RigFile, Trajectory, simulate
+from torchsoft.physics.energy import SLIPPING
 
 NEWTON = 1e-10
 """Newton's tolerance of every run here [N]."""
@@ -72,16 +71,10 @@ class Window:
     t: Tensor
     step: float
 
-    def states(self) -> Tensor:
-        """The run (T, size), differentiable if gradients are on."""
+    def run(self) -> Trajectory:
+        """The run, differentiable if gradients are on."""
         how: dict[str, Any] = {"step": self.step, "tolerance": NEWTON, "gradient": "discrete"}
-        return simulate(self.model, self.t, y0=self.y0, **how).y
-
-    def signals(self, y: Tensor) -> Tensor:
-        """`SIGNALS` in the states y, (T, signals)."""
-        follow = self.model.follow(self.t)
-        values = read(Seen(self.model, self.model.unpack(y, follow), follow))
-        return torch.stack([values[name] for name in SIGNALS], -1)
+        return simulate(self.model, self.t, y0=self.y0, **how)
 
     def parameters(self, few: bool) -> dict[str, Tensor]:
         """The trained scalar parameters, called as in the rig file."""
@@ -89,33 +82,30 @@ class Window:
         every = {name: self.model.parameter(name) for name in names}
         return {name: p for name, p in every.items() if p.requires_grad}
 
-    @torch.no_grad()
-    def events(self, y: Tensor) -> dict[str, int]:
-        """Nodes that touch, leave and start to slip between the outputs."""
-        touching, slipping = [], []
-        for rows in torch.arange(len(y)).split(200):
-            contacts = at_the_points(self.model, self.t[rows], y[rows]).values()
-            depth, speed = (torch.cat(one, -1) for one in zip(*contacts))
-            touching.append(depth > 0)
-            slipping.append((speed > 0) & (depth > 0))
-        on, slips = torch.cat(touching), torch.cat(slipping)
-        starts = lambda now, before: int((now & ~before).sum())
-        return {
-            "touch": starts(on[1:], on[:-1]), "leave": starts(on[:-1], on[1:]),
-            "slip_onsets": starts(slips[1:], slips[:-1]),
-        }  # fmt: skip
+
+def events(run: Trajectory) -> dict[str, int]:
+    """Points that touch, leave and start to slip between the outputs."""
+    states = torch.cat(list(run.contact_state.values()), -1)
+    on, slips = states > 0, states == SLIPPING
+    starts = lambda now: int((now[1:] & ~now[:-1]).sum())
+    return {"touch": starts(on), "leave": starts(~on), "slip_onsets": starts(slips)}
+
+
+def signals(run: Trajectory) -> Tensor:
+    """`SIGNALS` of a run, (T, signals)."""
+    return torch.stack([run[name] for name in SIGNALS], -1)
 
 
 @torch.no_grad()
-def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
-    """The loss of the docstring as a function of the states, its constants from the nominal run."""
-    t, nominal = window.t, window.signals(window.states())
+def make_loss(window: Window) -> Callable[[Trajectory], Tensor]:
+    """The loss of the docstring as a function of a run, its constants from the nominal one."""
+    t, nominal = window.t, signals(window.run())
     floor = torch.tensor(list(SIGNALS.values()), dtype=torch.float64)
     centre, scale = nominal.mean(0), torch.maximum(nominal.std(0), floor)
     weight = (0.5 + (t - t[0]) / (t[-1] - t[0]))[:, None]
 
-    def loss(y: Tensor) -> Tensor:
-        z = (window.signals(y) - centre) / scale
+    def loss(run: Trajectory) -> Tensor:
+        z = (signals(run) - centre) / scale
         return (weight * (z + 0.5 * z**2)).mean()
 
     return loss
@@ -137,7 +127,7 @@ def richardson(values: list[float], steps: tuple[float, ...]) -> tuple[float, fl
 
 @torch.no_grad()
 def central_difference(
-    window: Window, loss: Callable[[Tensor], Tensor], p: Tensor, steps: tuple[float, ...]
+    window: Window, loss: Callable[[Trajectory], Tensor], p: Tensor, steps: tuple[float, ...]
 ) -> tuple[float, float]:
     """dL/dp by central differences, and the judge's uncertainty over it."""
     nominal, values = p.clone(), []
@@ -145,7 +135,7 @@ def central_difference(
         ends, losses = [nominal * (1 + sign * relative) for sign in (1, -1)], []
         for end in ends:
             p.copy_(end)
-            losses.append(loss(window.states()).item())
+            losses.append(loss(window.run()).item())
         values.append((losses[0] - losses[1]) / (ends[0] - ends[1]).item())
     p.copy_(nominal)
     value, spread = richardson(values, steps)
@@ -174,7 +164,7 @@ def windows(config: Config) -> list[Window]:
     )
     model, y0, _ = file.build()
     with torch.no_grad():
-        path = Window("path", model, y0, grid(roll, 0.01), 2e-3).states()
+        path = Window("path", model, y0, grid(roll, 0.01), 2e-3).run().y
     above = float(model.unpack(y0).pose["bracket"][1]) + 2e-5
     lowered, y_above, _ = file.override({"bodies.bracket.start.y": above}).build()
     return [
@@ -189,8 +179,9 @@ def windows(config: Config) -> list[Window]:
 def judge(window: Window, config: Config) -> dict[str, Any]:
     """Errors of the adjoint over one window."""
     loss, parameters = make_loss(window), window.parameters(few=config.smoke)
-    y = window.states()
-    gradient = torch.autograd.grad(loss(y), list(parameters.values()), materialize_grads=True)
+    run = window.run()
+    changes = events(run)
+    gradient = torch.autograd.grad(loss(run), list(parameters.values()), materialize_grads=True)
     steps = config.full_steps if window.name == "full" else config.steps
     errors, unsure = {}, {}
     for (name, p), found in zip(parameters.items(), gradient):
@@ -198,8 +189,7 @@ def judge(window: Window, config: Config) -> dict[str, Any]:
         value, unsure[name] = central_difference(window, loss, p, finer)
         off = abs(found.item() - value)
         errors[name] = off / abs(value) if value else float("inf") if off else 0.0
-    events = window.events(y.detach())
-    return {"events": events, "relative_error": errors, "judge_uncertainty": unsure}
+    return {"events": changes, "relative_error": errors, "judge_uncertainty": unsure}
 
 
 def table(found: dict[str, dict[str, Any]]) -> Table:
