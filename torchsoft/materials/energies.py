@@ -8,6 +8,7 @@ the others are solved for (variable projection).
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,42 @@ class EnergyFit:
     def measured(self) -> Pull:
         """The first table."""
         return self.pulls[0]
+
+    @property
+    def test(self) -> str:
+        """Kinds of tests."""
+        return " and ".join(dict.fromkeys(pull.test for pull in self.pulls))
+
+    @property
+    def described(self) -> str:
+        """What was fitted, and how well."""
+        return f"{self.kind}, residual {self.rms:.2%} of the largest"
+
+    def method(self) -> dict[str, Any]:
+        """How the coefficients were found, and how well they fit, for a summary in JSON."""
+        own: dict[str, Any] = {
+            "method": "least squares of the nominal stress of an incompressible specimen",
+            "tables": [
+                {
+                    "file": pull.path.name,
+                    "test": pull.test,
+                    "rows": len(pull.strain),
+                    "strains": list(pull.strains),
+                }
+                for pull in self.pulls
+            ],
+            "residual_rms": self.rms,
+            "residual_of": "of the largest",
+        }
+        if self.relaxation is None:
+            return own
+        return own | {
+            "relaxation": {
+                "file": self.relaxation.measured.path.name,
+                "sha256": sha256(self.relaxation.measured.path.read_bytes()).hexdigest(),
+                **self.relaxation.method(),
+            }
+        }
 
     @property
     def rms(self) -> float:

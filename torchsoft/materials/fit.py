@@ -77,6 +77,11 @@ class Fit:
     notices: tuple[str, ...]
 
     @property
+    def test(self) -> str:
+        """Kind of test."""
+        return self.measured.test
+
+    @property
     def kind(self) -> str:
         """Kind of the material in files."""
         return "generalised_kelvin" if self.measured.test == "creep" else "prony"
@@ -107,9 +112,25 @@ class Fit:
         return float(np.sqrt(np.mean((self.residual / self.measured.size) ** 2)))
 
     @property
-    def residual_of(self) -> str:
-        """The response that `rms` is a part of."""
-        return "of each row" if self.measured.relative else "of the largest"
+    def described(self) -> str:
+        """What was fitted, and how well."""
+        part = "of each row" if self.measured.relative else "of the largest"
+        return f"{self.kind} of {self.terms} terms, residual {self.rms:.2%} {part}"
+
+    def method(self) -> dict[str, Any]:
+        """How the coefficients were found, and how well they fit, for a summary in JSON."""
+        return {
+            "method": "nonnegative least squares on a logarithmic grid of times, then least "
+            "squares in strengths and times together; the number of terms by Schwarz's criterion "
+            "(BIC)",
+            "rows": len(self.measured.t),
+            "resolved_s": list(self.measured.window),
+            "largest_strain": self.measured.largest_strain,
+            "criterion": {str(count): score for count, score in self.scores.items()},
+            "residual_rms": self.rms,
+            "residual_of": "of each row" if self.measured.relative else "of the largest",
+            "residual_correlation": self.correlation,
+        }
 
     def table(self) -> dict[str, Any]:
         """The arguments of the material's constructor that the test tells, and tau_instant."""
