@@ -272,6 +272,12 @@ def test_energies_are_found_again_from_three_kinds_of_tests(kind, tmp_path):
         assert nominal_stress(made, test, x) == pytest.approx(expected, rel=1e-5, abs=10)
 
 
+def test_an_exponent_may_pass_zero(tmp_path):
+    """In the search for the one term of a material that has two of opposite signs."""
+    found = fit_energy(pulls(tmp_path, TRUE["ogden"], "tension", "shear"), "ogden", nu=0.49)
+    assert found.rms < 0.02
+
+
 def test_noise_shows_in_the_standard_deviation(tmp_path):
     found = fit_energy(
         pulls(tmp_path, TRUE["neo_hookean"], "tension", noise=0.02), "neo_hookean", nu=0.49

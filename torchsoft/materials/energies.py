@@ -209,6 +209,7 @@ def fit_energy(
 
     def columns(exponents: Array) -> Array:
         """Stresses per coefficient in which they are linear, over `sizes`: (rows, coefficients)."""
+        exponents = np.where(abs(exponents) < STEP, STEP, exponents)  # zero is no exponent
         units = [(1.0, alpha) for alpha in exponents] if kind == "ogden" else np.eye(count).tolist()
         return np.stack([column(*one) for one in units], 1)
 
@@ -227,6 +228,7 @@ def fit_energy(
         starts = [np.roll(EXPONENTS, -k)[: terms or 1] for k in range(len(EXPONENTS))]
         found = [least_squares(residuals, start, bounds=bounds, max_nfev=100) for start in starts]
         exponents = min(found, key=lambda one: (solved(columns(one.x)).sum() <= 0, one.cost)).x
+        exponents = np.where(abs(exponents) < STEP, STEP, exponents)
     A = columns(exponents)
     linear = solved(A)
     best = [*linear.tolist(), *exponents.tolist()]
