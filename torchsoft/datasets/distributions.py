@@ -31,6 +31,11 @@ class Related(Table):
 
     ratio_to: str | None = None
 
+    @property
+    def related(self) -> str:
+        """The parameter that it multiplies, in words."""
+        return f", times `{self.ratio_to}`" if self.ratio_to else ""
+
     @model_serializer(mode="wrap")
     def _only_what_is_said(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         unsaid = {"ratio_to": None, "either_sign": False}
@@ -53,6 +58,13 @@ class Uniform(Related):
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"a logarithmic range needs low > 0, but low = {self.low}")
         return self
+
+    @property
+    def words(self) -> str:
+        """The distribution in words."""
+        scale = ", logarithmic" if self.scale == "log" else ""
+        sign = ", of either sign" if self.either_sign else ""
+        return f"{self.low:g} to {self.high:g}{scale}{sign}{self.related}"
 
     def at(self, u: float) -> float:
         """The value at u in [0, 1]."""
@@ -108,6 +120,12 @@ class Normal(Related):
         return self
 
     @property
+    def words(self) -> str:
+        """The distribution in words."""
+        spread = f"normal, mean {self.mean:g}, standard deviation {self.sd:g}"
+        return f"{spread}, {self.low:g} to {self.high:g}{self.related}"
+
+    @property
     def _tails(self) -> tuple[float, float]:
         """Cumulative probabilities of the untruncated distribution at both bounds."""
         ends = (self.low - self.mean) / self.sd, (self.high - self.mean) / self.sd
@@ -133,6 +151,11 @@ class Choice(Related):
 
     choices: Annotated[tuple[float, ...], LISTED] = Field(min_length=1, max_length=10_000)
     scale: ClassVar[Literal["linear"]] = "linear"
+
+    @property
+    def words(self) -> str:
+        """The distribution in words."""
+        return f"one of {', '.join(f'{x:g}' for x in self.choices)}{self.related}"
 
     @property
     def low(self) -> float:
