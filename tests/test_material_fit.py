@@ -483,19 +483,6 @@ def test_a_torn_specimen_is_read_up_to_where_it_tore(tmp_path):
     assert any("6 rows from row 35 to row 40: strains above 1.6" in x for x in found.notices)
 
 
-def test_headings_of_another_language_are_told_or_left_out(tmp_path):
-    names = {"t [s]": "Zeit [s]", "strain [1]": "Dehnung [1]", "stress [Pa]": "Kraft [Pa]"}
-    made = {names[name]: x for name, x in HELD.items()} | {"Kanal 4 [1]": COUNT}
-    path = table(tmp_path / "test.csv", made)
-    headings = {"Zeit": "t", "Dehnung": "strain", "Kraft": "stress"}
-    with pytest.raises(ValueError, match="column `Kanal 4` is not known"):
-        read(path, headings=headings)
-    with pytest.raises(ValueError, match="the column 'Kraft' stands for `forse`"):
-        read(path, headings=headings | {"Kraft": "forse"}, ignore=["Kanal 4"])
-    found: Any = read(path, headings=headings, ignore=["Kanal 4"])
-    assert np.array_equal(found.t, COUNT)
-
-
 OPTIONS = [
     (["--column", "strain"], "--column must be NAME=HEADING"),
     ([*FITTED[:2], "--range", "0", "1", "--also", "shear=x.csv"], "--also is of"),
