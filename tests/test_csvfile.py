@@ -99,7 +99,10 @@ def test_other_headings_and_columns_to_ignore(tmp_path):
     table = read(path, headings=headings, ignore=["Temp"])
     assert table.ignored == ("Temp",)
     assert np.allclose(table.values["x"], X)
-    for wrong, message in (({}, "`Temp` is not known"), ({"Kraft": "forse"}, "stands for `forse`")):
+    for wrong, message in (
+        ({}, "`Temp` is not known"),
+        ({"Kraft": "forse"}, "is given as `forse`"),
+    ):
         with pytest.raises(ValueError, match=message):
             read(path, headings=headings | wrong)
     assert read(path, headings={"Zeit": "t"}, ignore=None).ignored == ("Kraft", "Temp", "Weg")

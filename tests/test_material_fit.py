@@ -1,5 +1,5 @@
 """Materials fitted to tests of laboratories: series, moduli and energies that are found again from
-tables that they made, what tables do not tell, presets, and the command."""
+tables that they made, what tables do not determine, presets, and the command."""
 
 import json
 import re
@@ -333,7 +333,7 @@ def test_what_one_test_does_not_tell_is_reported(tmp_path):
     rows = pulls(tmp_path, TRUE["yeoh"], "tension")
     notices = " ".join(fit_energy(rows, "mooney_rivlin", nu=0.49).notices)
     assert "stretches from 1.01 to 2" in notices
-    assert "one kind of test does not tell" in notices
+    assert "one kind of test does not determine" in notices
     falling = pulls(tmp_path, Yeoh(C10=9e4, C20=-9e3, C30=4e2, **SOFT), "tension")
     assert "not stable" in " ".join(fit_energy(falling, "yeoh", nu=0.49).notices)
     for kind, terms, words in (("yeoh", 2, "those of ogden"), ("ogden", 6, "take fewer terms")):
@@ -401,7 +401,7 @@ WRONG: list[tuple[Mapping[str, Any], dict[str, Any], str]] = [
     ({"stretch [1]": 1 + COUNT, "stress [Pa]": COUNT}, PRESSED, "up to 21, but"),
     ({name: np.r_[x, 2 * x] for name, x in TRIANGLE.items()}, PULLED, "keep the rows of one load"),
     (SWEEP, {}, "the storage modulus falls from 1000 Pa"),
-    ({"frequency [Hz]": OMEGA, "storage_modulus [Pa]": OMEGA}, {}, "may stand for the second; but"),
+    ({"frequency [Hz]": OMEGA, "storage_modulus [Pa]": OMEGA}, {}, "may replace the second; but"),
     (SAME[6][0], {}, "need Poisson's"),
     (SWEEP, {"test": "creep"}, "`frequency` is of a sweep, not of a creep test"),
 ]  # fmt: skip

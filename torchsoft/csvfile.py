@@ -108,7 +108,7 @@ def read(
     for written, name in headings.items():
         if name not in known:
             raise ValueError(
-                f"{path}: the column {shown(written)} stands for `{line(name, 80)}`, which is not "
+                f"{path}: the column {shown(written)} is given as `{line(name, 80)}`, which is not "
                 f"known{hint(written, 2)}"
             )
     names = {name: name for name in known.keys() - headings.values()} | dict(headings)

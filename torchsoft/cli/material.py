@@ -25,8 +25,8 @@ the strain energy that it is to have, with --also for further tables and --relax
 branches. The whole history counts: ramps need not be cut off.
 
 A relaxation test and a sweep give a relaxation series (prony), a creep test a generalised Kelvin
-chain, a pull a modulus (kelvin_voigt). Says what the rows do not tell. Writes material.toml, with
-the names of the constructor's arguments, summary.json and fit.png."""
+chain, a pull a modulus (kelvin_voigt). Reports what the rows do not determine. Writes
+material.toml, with the names of the constructor's arguments, summary.json and fit.png."""
 
 PRESETS = """\
 Rubbers from the literature, every coefficient marked `published`, with where, `fitted` to published
@@ -98,12 +98,12 @@ SIZES = {
     "area": "cross-section before the test [m2], which `force` is divided by",
 }
 ASSUMED = {
-    "nu": (0.45, "Poisson's ratio [1], which no test in one dimension tells"),
-    "rho": (1100.0, "density [kg/m3], which no test tells"),
+    "nu": (0.45, "Poisson's ratio [1], which no test in one dimension determines"),
+    "rho": (1100.0, "density [kg/m3], which no test determines"),
     "depth": (44e-3, "depth of the pads [m]"),
-    "tau": (10e-3, "retardation time [s], which a pull does not tell"),
+    "tau": (10e-3, "retardation time [s], which a pull does not determine"),
 }
-"""Numbers that a test may not tell: assumed values and meanings."""
+"""Values that a test may not determine: assumed values and meanings."""
 
 
 def fit_material(options: argparse.Namespace) -> int:
@@ -128,17 +128,17 @@ def fit_material(options: argparse.Namespace) -> int:
     }
     for name, value in given.items():
         if value is not None and name not in assumed:
-            raise ValueError(f"{options.file}: it tells {name} itself: leave --{name} out")
+            raise ValueError(f"{options.file}: the test determines {name}: leave --{name} out")
     try_folder(options.out, options.force)
-    told = {name: x for name, x in vars(options).items() if name in OPTIONS}
-    write(found, options.out, assumed, told)
+    stated = {name: x for name, x in vars(options).items() if name in OPTIONS}
+    write(found, options.out, assumed, stated)
     say(printed(found))
     say(f"written to {', '.join(str(options.out / name) for name in FILES)}")
     return 0
 
 
 TIMELESS = ("kelvin_voigt", *ENERGIES)
-"""Kinds of materials whose tests tell no time."""
+"""Kinds of materials whose tests determine no time."""
 
 OPTIONS = (
     "test", "energy", "also", "relaxation", "fast", "true", "terms", *SIZES, "range", "column",

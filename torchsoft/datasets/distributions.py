@@ -108,7 +108,7 @@ class Normal(Related):
     def _is_ordered(self) -> Self:
         if not self.low < self.high:
             raise ValueError(
-                f"low = {self.low} should be below high = {self.high}; without bounds of your own "
+                f"low = {self.low} should be below high = {self.high}; without stated bounds "
                 f"they are {WIDTH:g} times sd = {self.sd} from mean = {self.mean}"
             )
         below, above = self._tails
@@ -200,4 +200,4 @@ class Kind(Table):
     fixed: dict[str, Any] = Field(default_factory=dict)
     """values in it, or whole tables such as a motion, by the names of the rig file's tables"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
-    """distributions of its own, besides those of all kinds or in their place"""
+    """distributions of its own, added to those of all kinds, or in their place"""

@@ -49,7 +49,7 @@ VANISHED = 1e-6
 """Strength over the sum of all below which a term is none."""
 
 FLOW = 100.0
-"""Longest time of a chain that stands for a flow, over that of the test."""
+"""Longest time of a chain that represents a flow, over that of the test."""
 
 ROUNDING = 1e-12
 """Residual over the largest answer below which a fit is exact."""
@@ -133,7 +133,7 @@ class Fit:
         }
 
     def table(self) -> dict[str, Any]:
-        """The arguments of the material's constructor that the test tells, and tau_instant."""
+        """The arguments of the material's constructor that the test determines, and tau_instant."""
         symbol, argument = ("E", "moduli") if self.kind == "prony" else ("J", "J")
         numbers = range(1, self.terms + 1)
         tau = [self.values[f"tau_{k}"] for k in numbers]
@@ -168,7 +168,7 @@ class Trial(NamedTuple):
 def fit(measured: Measured | Spectrum, *, terms: int | None = None) -> Fit:
     """The series with the least criterion among those whose every strength the rows determine, if
     there is one, or with as many `terms` as asked for. Raises `ValueError` where the rows are too
-    few for these, or tell no modulus that remains."""
+    few for these, or determine no relaxed modulus."""
     shortest, longest = measured.window
     most = min(MOST, 2 + int(math.log10(longest / shortest)), (len(measured.answer) - 2) // 2)
     if terms is not None and not 1 <= terms <= most:
@@ -194,12 +194,14 @@ def fit(measured: Measured | Spectrum, *, terms: int | None = None) -> Fit:
         )
     scores = {count: trial.score for count, trial in tried.items()}
     fits = [concluded(measured, tried[k], scores) for k in sorted(tried, key=scores.__getitem__)]
-    told = [one for one in fits if not one.undetermined]
-    if terms is not None or not told or told[0] is fits[0]:
+    determined = [one for one in fits if not one.undetermined]
+    if terms is not None or not determined or determined[0] is fits[0]:
         return fits[0]
-    left = f"{fits[0].terms} terms fit better, but {told[0].terms} are taken: the rows do not "
+    left = (
+        f"{fits[0].terms} terms fit better, but {determined[0].terms} are taken: the rows do not "
+    )
     left += f"determine {', '.join(fits[0].undetermined)} of the others"
-    return replace(told[0], notices=(*told[0].notices, left))
+    return replace(determined[0], notices=(*determined[0].notices, left))
 
 
 def beginnings(measured: Measured | Spectrum, count: int) -> list[Array]:
@@ -313,7 +315,7 @@ def notices(
     (shortest, longest), terms = measured.window, (len(values) - 1) // 2
     verb = "creeps" if measured.test == "creep" else "relaxes"
     sentences = [
-        f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not tell what "
+        f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not show what "
         f"{verb} faster, and what {verb} slower counts to the relaxed modulus E, which may be "
         "lower still"
     ]
@@ -336,7 +338,7 @@ def notices(
     if measured.flows:
         sentences.append(
             "the creep flows: under a held stress the strain still grows in proportion to time at "
-            "the end, so that no E remains; the slowest term stands for a dashpot, and holds up to "
+            "the end, so that no E remains; the slowest term represents a dashpot, and holds up to "
             "the end of the test only"
         )
     if correlation > COLOURED:

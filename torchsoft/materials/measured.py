@@ -102,7 +102,7 @@ class Measured:
 
     @property
     def largest_strain(self) -> float | None:
-        """Largest strain [1]; None where the table does not tell it."""
+        """Largest strain [1]; None where the table does not state it."""
         return None if self.per_load else float(np.abs(self.strain).max())
 
     @property
@@ -157,7 +157,7 @@ class Spectrum:
 
     @property
     def t(self) -> Array:
-        """Times (n,) [s] that the frequencies stand for."""
+        """Times (n,) [s] that the frequencies correspond to."""
         return 1.0 / self.omega
 
     @property
@@ -324,7 +324,7 @@ def sweep(path: Path, table: csvfile.Numbers, nu: float | None) -> Spectrum:
     if there not in ways:
         raise ValueError(
             f"{path}: beside `frequency` stand storage_modulus and loss_modulus, of tension, or "
-            "storage_shear_modulus and loss_shear_modulus; tan_delta may stand for the second; but "
+            "storage_shear_modulus and loss_shear_modulus; tan_delta may replace the second; but "
             f"there is {', '.join(sorted(there)) or 'none'}"
         )
     one = ways[there]
@@ -446,7 +446,7 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
         if name in POSITIVE and bad.any():
             unit = next(unit for unit, size in KNOWN[name].items() if size == 1)
             raise ValueError(
-                f"{path}, row {table.rows[bad.argmax()]}, column `{name}`: "
+                f"{path}, row {table.rows[int(bad.argmax())]}, column `{name}`: "
                 f"{column[bad.argmax()]:.4g} {unit} is not above zero: look at the signs and the "
                 "offsets of the sensors, and leave out rows of noise alone"
             )
@@ -470,8 +470,8 @@ def hint(name: str, columns: int) -> str:
     known = "; ".join(f"{column} [{', '.join(units)}]" for column, units in KNOWN.items())
     return (
         f"{'; separate columns with commas, semicolons or tabs' if columns == 1 else ''}; columns "
-        f"and their units are {known}; one of another name is told by --column NAME={name or 'ITS'}"
-        f", others are left out by --ignore"
+        f"and their units are {known}; give one of another name by --column NAME={name or 'ITS'}"
+        f"; leave others out by --ignore"
     )
 
 

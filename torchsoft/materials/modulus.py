@@ -55,7 +55,7 @@ class Modulus:
         }
 
     def table(self) -> dict[str, Any]:
-        """The argument of the material's constructor that the test tells."""
+        """The argument of the material's constructor that the test determines."""
         return dict(self.values)
 
     def material(self, *, nu: float, rho: float, depth: float, tau: float) -> KelvinVoigt:
