@@ -34,6 +34,26 @@ RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
 
+IDENTIFIED = """
+rig = "paper"
+[settings]
+laws.steel_on_rubber.friction.v_s = 0.05
+actuators.x.measures = "bracket.x"
+bodies.disc.start.x = 60.3e-3
+bodies.bracket.start.x = 60.3e-3
+[unknowns."laws.steel_on_rubber.K_n"]
+nominal = 1e5
+[unknowns."materials.rubber.E"]
+nominal = 0.7e6
+[sensors]
+x_C.noise = 10e-6
+y_Br.noise = 10e-6
+F_y.noise = 0.1
+[fit]
+rtol = 1e-3
+"""
+"""Configuration of the identification in examples/identify, with two unknowns."""
+
 PAPER = RigFile.ready("paper")
 RIG = good_sensors(PAPER.assemble())
 """Sensors of the paper's rig."""

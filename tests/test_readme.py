@@ -41,7 +41,9 @@ ELSEWHERE = {
     "rehearse fit.toml": "test_sysid_rigs.py",
     "tcp://head": "test_datasets.py",
     "dask_jobqueue": "a cluster",
-    "dataset slurm": "test_datasets_sharing.py",
+    "dataset slurm": "test_datasets.py",
+    "LeRobotDataset": "a package",
+    "out/the_well": "a package",
     "sbatch": "a cluster",
 }
 """Parts of blocks that need more than a test has, and where they are tried instead."""

@@ -47,25 +47,6 @@ fixed."motion.x_d" = { kind = "chirp", since = 0.1, amplitude = 1e-3, first = 2.
 parameters."motion.x_d.amplitude" = { low = 2e-4, high = 4e-4 }
 """
 
-IDENTIFICATION = """
-rig = "paper"
-[settings]
-laws.steel_on_rubber.friction.v_s = 0.05
-actuators.x.measures = "bracket.x"
-bodies.disc.start.x = 60.3e-3
-bodies.bracket.start.x = 60.3e-3
-[unknowns."laws.steel_on_rubber.K_n"]
-nominal = 1e5
-[unknowns."materials.rubber.E"]
-nominal = 0.7e6
-[sensors]
-x_C.noise = 10e-6
-y_Br.noise = 10e-6
-F_y.noise = 0.1
-[fit]
-rtol = 1e-3
-"""
-
 ROLLING = """
 import json, threading, torch
 from torchsoft import RigFile

@@ -3,6 +3,7 @@ are those that were written."""
 
 from collections.abc import Callable
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,7 +29,7 @@ from hostile.trial import LIMIT, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
 from torchsoft.datasets.files import StoreError
-from torchsoft.files import sealed
+from torchsoft.files import SEAL
 from torchsoft.rigs import RigFile
 from torchsoft.solve.formats import load
 from torchsoft.sysid import IdentificationResult, Problem, identify
@@ -171,7 +172,7 @@ def trajectory(tmp_path_factory):
     truth = load(sound / "run.nc")
     assert set(read_table(sound / "run.nc", (), KNOWN).values) >= {"t", "x_d", "x_C", "effort_y"}
     wrong = lambda path, kind: misread_table(path, truth)
-    seal = lambda path, content: sealed(content)
+    seal = lambda path, content: content + sha256(content).hexdigest().encode() + SEAL
     return Specimen(sound, wrong, seal, PLANTED | SPECIAL)
 
 

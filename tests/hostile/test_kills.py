@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from conftest import IDENTIFIED
 
 from hostile.processes import (
     DIED,
@@ -28,7 +29,7 @@ from hostile.processes import (
     restore,
     tree,
 )
-from hostile.specimens import IDENTIFICATION, cells, csv_text, dataset, make, run
+from hostile.specimens import cells, csv_text, dataset, make, run
 from hostile.trial import Tally, count, random
 from torchsoft.cli import main
 
@@ -119,7 +120,7 @@ def generation(folder: Path, workers: int = 0) -> Work:
 def identification(folder: Path, workers: int) -> Work:
     for name, rows in (("data", 42), ("more", 32)):
         (folder / f"{name}.csv").write_text(csv_text(cells(rows)), encoding="utf-8")
-    (folder / "rig.toml").write_text(IDENTIFICATION, encoding="utf-8")
+    (folder / "rig.toml").write_text(IDENTIFIED, encoding="utf-8")
     files = [str(folder / name) for name in ("data.csv", "more.csv", "rig.toml")]
     how = ["--workers", str(workers), "--no-progress"]
 

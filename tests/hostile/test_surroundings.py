@@ -13,9 +13,10 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from conftest import IDENTIFIED
 
 from hostile.processes import ROOT, USER, start
-from hostile.specimens import IDENTIFICATION, ROLL, ROLLING, cells, csv_text
+from hostile.specimens import ROLL, ROLLING, cells, csv_text
 from hostile.trial import Tally, count
 from torchsoft.solve.kernel import objects
 
@@ -137,13 +138,13 @@ def test_commands_say_why_in_any_locale(tmp_path, locale, tally):
     command = *identify, str(data), str(config), "--out", str(tmp_path / "ö"), "--no-progress"
     for wrong, word in (
         (b"title = '\xff'\n", "not a TOML file"), (b"a = " + b"[" * 20_000, "nested too deeply"),
-        ((IDENTIFICATION + "[unknowns.'pad.µ']\n").encode(), "pad"),
-        ((IDENTIFICATION + "starts = 1000000\n").encode(), "--yes"),
+        ((IDENTIFIED + "[unknowns.'pad.µ']\n").encode(), "pad"),
+        ((IDENTIFIED + "starts = 1000000\n").encode(), "--yes"),
     ):  # fmt: skip
         config.write_bytes(wrong)
         told = f"(.*\n)?[^\n]*{word}[^\n]*\n"
         expect(line, *command, status=2, out=".*", err=told, **locale)
-    config.write_text("# Reibung µ, Größe θ\n" + IDENTIFICATION, encoding="utf-8")
+    config.write_text("# Reibung µ, Größe θ\n" + IDENTIFIED, encoding="utf-8")
     expect(line, *command, err=".*", **locale)
     written = json.loads((tmp_path / "ö" / "answer.json").read_text(encoding="utf-8"))
     line.held("größe µ" in str(written), "the name is lost")
