@@ -122,7 +122,8 @@ def test_force_curves_are_those_of_the_snapshots(rig, run, tmp_path):
     drawn, rows = json.loads(done.stdout), frame_rows(shown, 10)
     compared, reversed_ = 0, 0
     for f, instant in enumerate(instants(shown, shown.t[rows].tolist())):
-        scene = Scene(Figure().subplots(), shown.setup, curves=(drawn["scale"], 1.0))
+        scene = Scene(Figure().subplots(), shown.setup, [instant])
+        scene.force_scale = drawn["scale"]
         scene.show(instant)
         for name in shown.setup.contacts:
             for j, areas in enumerate((scene.normal, scene.friction)):

@@ -37,8 +37,9 @@ def add_commands(commands: Any) -> None:
 def plot(options: argparse.Namespace) -> int:
     """Draw a saved run."""
     from torchsoft.plot.animation import player
-    from torchsoft.plot.dashboard import dashboard, named
+    from torchsoft.plot.dashboard import dashboard, panels
     from torchsoft.plot.figures import SIZES, save
+    from torchsoft.plot.scene import instants
     from torchsoft.solve.trajectory import Trajectory
 
     run, title = Trajectory.load(options.file), options.title or options.file.stem
@@ -53,9 +54,10 @@ def plot(options: argparse.Namespace) -> int:
         figure = dashboard(run, look=options.width, **common)
         tall, most = figure.get_figheight(), SIZES[options.width].height
         if tall > most + 1e-6:
+            names = panels(run, *instants(run, [float(run.t[0])]))
             say(
                 f"the figure is {25.4 * tall:.0f} mm tall, a page {25.4 * most:.0f}: choose panels "
-                f"with --only, of {', '.join(named(run))}"
+                f"with --only, of {', '.join(names)}"
             )
         save(figure, written[-1])
     if options.vtk:

@@ -30,7 +30,7 @@ from torchsoft.envs.dynamics import (
 )
 from torchsoft.parallel import cores, executor, parallel_map
 from torchsoft.physics.arguments import number, whole
-from torchsoft.plot.scene import Instant, Scene, force_scale, instants
+from torchsoft.plot.scene import Instant, Scene, instants, limits
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.diagnostics import doubts
@@ -362,8 +362,7 @@ def scene_of(run: Trajectory, first: Instant) -> Scene:
     """Axes for the pictures of an episode, with room around the first of them."""
     figure = Figure(figsize=(6.0, 4.8), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    scene = Scene(figure.subplots(), run.setup, curves=force_scale(run.setup, [first]))
-    sides = [np.array(x) for x in scene.limits([first])]
-    x, y = (side + ROOM * np.diff(side) * [-1, 1] for side in sides)
-    scene.axes.set(xlim=x, ylim=y, xlabel="x [mm]", ylabel="y [mm]")
+    scene = Scene(figure.subplots(), run.setup, [first], stressed=False)
+    x, y = (side + ROOM * np.diff(side) * [-1, 1] for side in limits(run.setup, [first]))
+    scene.axes.set(xlim=x, ylim=y)
     return scene

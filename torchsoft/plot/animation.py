@@ -31,7 +31,7 @@ from torchsoft.plot.dashboard import (
     ripples,
     sums,
 )
-from torchsoft.plot.figures import ACTUAL, COLOURS, SIZES, STYLE, finish_time_axis, stress_bar
+from torchsoft.plot.figures import ACTUAL, COLOURS, STYLE, finish_time_axis, stress_bar
 from torchsoft.plot.scene import (
     DISC,
     FRICTION,
@@ -42,12 +42,12 @@ from torchsoft.plot.scene import (
     PAD,
     STEEL,
     Scene,
-    along_surface,
     foot,
     force_scale,
+    friction_sign,
     instants,
     keys,
-    largest_stress,
+    limits,
     own_axes,
     own_places,
     plates,
@@ -80,20 +80,16 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) ->
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and below it a coordinate over
     time. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
-    scale = force_scale(setup, shown)
-    x_limits, y_limits = Scene(Figure().subplots(), setup, curves=scale).limits(shown)
-    tall = (y_limits[1] - y_limits[0]) / (x_limits[1] - x_limits[0])
     with rc_context(STYLE):
+        tall = float(np.divide(*map(np.ptp, reversed(limits(setup, shown)))))
         height = 2 * round(0.5 * dpi * min(max(5.8, 7.0 * tall + 2.2), 8.6)) / dpi  # H.264: even
         figure = Figure(figsize=(8.0, height), dpi=dpi, layout="constrained")
         canvas = FigureCanvasAgg(figure)
-        whole, strip = figure.subplots(2, 1, height_ratios=(figure.get_figheight() - 1.26, 1.26))
-        stress = largest_stress(shown)
-        scene = Scene(whole, setup, curves=scale, stress=stress)
-        stress_bar(figure, whole, stress, SIZES["screen"])
-        whole.set(xlim=x_limits, ylim=y_limits, xlabel="x [mm]", ylabel="y [mm]", title=title)
-        scene.scale_bar(whole)
-        whole.grid(False)
+        whole, strip = figure.subplots(2, 1, height_ratios=(height - 1.26, 1.26))
+        scene = Scene(whole, setup, shown)
+        scene.scale_bar()
+        stress_bar(figure, whole, scene.stress)
+        whole.set_title(title)
         figure.legend(handles=keys(setup, shown), loc="outside lower center", ncols=5)
         motion(strip, run, curve)
         finish_time_axis(strip)
@@ -247,10 +243,8 @@ def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
         u = run.displacement[contact.pad][rows].detach().numpy()
         still = np.zeros(3)
         first = still if pad.base is None else run.state.pose[pad.base][rows[0]].detach().numpy()
-        _, (x, y) = own_axes(pad, first)  # as snapshots have it: friction is positive to the right
-        turn = float(np.sign(along_surface(pad, first) @ np.array([y, -x])))
         direction, up = own_axes(pad, still)
-        force = run.force[name][rows].detach().numpy() * [1.0, turn]
+        force = run.force[name][rows].detach().numpy() * [1.0, friction_sign(pad, first)]
         out[name] = {
             "pad": contact.pad, "body": contact.body, "mu": contact.friction.get("mu_s"),
             "along": direction.tolist(), "up": up.tolist(),
@@ -328,7 +322,7 @@ def player(
             for name, body in run.setup.bodies.items()
         },
         "pads": pads(run, rows), "contacts": contacts(run, rows),
-        "scale": force_scale(run.setup, shown)[0], "t": first["t"], "charts": curves_,
+        "scale": force_scale(run.setup, shown), "t": first["t"], "charts": curves_,
         "note": RIPPLE if ripples(run) else "",
         "made": {k: str(v) for k, v in run.made_by.items() if isinstance(v, str)},
     }  # fmt: skip

@@ -25,7 +25,9 @@ from torchsoft.plot.figures import (
     ACTUAL,
     COLOURS,
     DESIRED,
+    SIZES,
     Look,
+    Size,
     finish_time_axis,
     legend_above,
     letter,
@@ -43,10 +45,9 @@ from torchsoft.plot.scene import (
     Instant,
     Scene,
     along_surface,
-    force_scale,
     instants,
     keys,
-    largest_stress,
+    limits,
 )
 from torchsoft.solve.trajectory import Trajectory
 
@@ -275,16 +276,39 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
         beside.set_ylabel("traction [kPa]")
 
 
-def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
-    """Functions that draw the panels over time, by title."""
-    moving = [one for one in curves(run) if np.ptp(one.values) > STILL] or list(curves(run))[:1]
-    out: dict[str, Callable[[Axes], None]] = {
-        curve.name: partial(motion, run=run, curve=curve) for curve in moving
-    }
+def scene(axes: Axes, run: Trajectory, instant: Instant) -> None:
+    """Draw bodies, pads and contact forces, with the colour bar of the stress and a legend."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    one = Scene(axes, run.setup, [instant], size=0.1 * rcParams["font.size"])
+    one.show(instant)
+    one.scale_bar()
+    axes.set_anchor("W")
+    stress_bar(figure, [axes], one.stress)
+    columns = 5 if figure.get_figwidth() > SIZES["column"].width else 2
+    handles = keys(run.setup, [instant])
+    figure.legend(handles=handles, loc="outside upper right", ncols=columns)
+
+
+def most_loaded(run: Trajectory) -> float:
+    """The time [s] of the largest normal force."""
+    forces = (force[..., 0].sum(-1) for force in run.force.values())
+    return float(run.t[int(sum(forces, torch.zeros_like(run.t)).argmax())])
+
+
+def panels(run: Trajectory, instant: Instant) -> dict[str, Callable[[Axes], None]]:
+    """Functions that draw the panels of a run by name: the scene and the contacts at an instant,
+    then all that changes over time."""
+    out: dict[str, Callable[[Axes], None]] = {"scene": partial(scene, run=run, instant=instant)}
+    for contact in reversed(run.setup.contacts):
+        out[f"contact {contact}"] = partial(cones, run=run, instant=instant, contact=contact)
+    every = list(curves(run))
+    for curve in [one for one in every if np.ptp(one.values) > STILL] or every[:1]:
+        out[curve.name] = partial(motion, run=run, curve=curve)
     if run.force:
-        every = sums(run)
-        touching, slipping = every.pop("points in contact")[1], every.pop("slipping")[1]
-        for kind, (unit, series) in every.items():
+        totals = sums(run)
+        touching, slipping = totals.pop("points in contact")[1], totals.pop("slipping")[1]
+        for kind, (unit, series) in totals.items():
             out[kind] = partial(contact_sums, run=run, kind=kind, unit=unit, series=series)
         out["points in contact"] = lambda axes: points(axes, run, touching, slipping)
     for one in run.setup.actuators.values():
@@ -307,16 +331,44 @@ def ripples(run: Trajectory) -> bool:
 
 
 def chosen(only: Sequence[str], names: list[str]) -> list[str]:
-    """The panels in `only`, or all of `names`. Raises `ValueError` for an unknown one."""
+    """The panels in `only`, or all of `names`; the scene first. Raises `ValueError` for an unknown
+    one."""
     for name in only:
         if name not in names:
             raise ValueError(f"there is no panel `{name}`; {suggestion(name, names, 'there are')}")
-    return list(dict.fromkeys(only)) or names
+    return sorted(dict.fromkeys(only or names), key=lambda name: name != "scene")
 
 
-def named(run: Trajectory) -> list[str]:
-    """Names of the panels that a dashboard of the run has."""
-    return ["scene", *(f"contact {key}" for key in list(run.setup.contacts)[::-1]), *panels(run)]
+def arranged(
+    names: Sequence[str], shape: float, title: str, size: Size
+) -> tuple[Figure, dict[str, Axes]]:
+    """An empty figure and the axes of its panels. The scene, `shape` times as high as wide, is in
+    the upper left, with contacts to its right; all else follows below, row by row."""
+    others = [name for name in names if name != "scene"]
+    pictured, columns = "scene" in names, size.columns
+    if not pictured:
+        columns = min(columns, len(others))
+    width = size.width / size.columns
+    each, legend, tall, beside = 0.5 * width + 0.03 * size.font, 0.06 * size.font, 0.0, 0
+    if pictured:
+        share, span = (0.86, columns - 1) if columns > 1 else (0.73, 1)
+        tall = min(shape, 1.1) * share * width * span + 0.5
+        contacts = sum(name.startswith("contact ") for name in names)
+        beside = min(contacts, round(tall / each)) if columns > 1 else 0
+    top = [["scene"]] * pictured
+    if pictured and columns > 1:
+        top = [["scene"] * (columns - 1) + [name] for name in others[:beside] or ["."]]
+    below = others[beside:]
+    below += below[-1:] * (-len(below) % columns)  # the last takes what is left
+    rows = [below[i : i + columns] for i in range(0, len(below), columns)]
+    room = (size.height - tall - legend) / max(len(rows), 1)
+    each = room if FLATTEST * each <= room < each else each
+    figure = new_figure(title, width * columns, tall + len(rows) * each + legend)
+    mosaic: Any = top + rows
+    ratios = [tall] * len(top) + [each] * len(rows)
+    if columns > 1 and top and rows:  # the colour bar of the scene moves its own rows only
+        mosaic, ratios = [[top], [rows]], [tall, each * len(rows)]
+    return figure, figure.subplot_mosaic(mosaic, height_ratios=ratios)
 
 
 def dashboard(
@@ -331,67 +383,22 @@ def dashboard(
     two contacts and the friction by default. Raises `ValueError` for another one, and for a panel
     that is not there.
     """
-    if time is None:
-        total = sum(
-            (force[..., 0].sum(-1) for force in run.force.values()), torch.zeros_like(run.t)
-        )
-        time = float(run.t[int(total.argmax())])
-    (instant,) = instants(run, [time])
-    contacts = {
-        f"contact {key}": partial(cones, run=run, instant=instant, contact=key)
-        for key in list(run.setup.contacts)[::-1]
-    }
-    drawn = contacts | panels(run)
+    (instant,) = instants(run, [most_loaded(run) if time is None else time])
+    drawn = panels(run, instant)
     if look == "column" and not only:
-        only = ("scene", *list(contacts)[:2], *(["friction"] if run.force else []))
-    selected = chosen(only, ["scene", *drawn])
-    pictured = "scene" in selected
-    selected = [name for name in selected if name != "scene"]
+        contacts = [name for name in drawn if name.startswith("contact ")]
+        only = ("scene", *contacts[:2], *(["friction"] if run.force else []))
+    names = chosen(only, list(drawn))
     with looking(look) as size:
-        columns = min(size.columns, max(1, len(selected))) if not pictured else size.columns
-        width = size.width / size.columns
-        each, span, tall, beside = 0.5 * width + 0.03 * size.font, max(1, columns - 1), 0.0, 0
-        curves_, stress = force_scale(run.setup, [instant]), largest_stress([instant])
-        (left, right), (low, high) = Scene(Figure().subplots(), run.setup, curves=curves_).limits(
-            [instant]
-        )
-        if pictured:
-            share = 0.86 if columns > 1 else 0.73
-            tall = min((high - low) / (right - left), 1.1) * share * width * span + 0.5
-            beside = min(len(contacts), len(selected), round(tall / each)) if columns > 1 else 0
-        at_right, below = selected[:beside] or ["."], selected[beside:]
-        top = [["scene"] * span + [name][: columns - span] for name in at_right] * pictured
-        below += below[-1:] * (-len(below) % columns)  # the last takes what is left
-        rows = [below[i : i + columns] for i in range(0, len(below), columns)]
+        x, y = limits(run.setup, [instant])
         heading = (title or "Run") if size.titled else ""
-        room = (size.height - tall - 0.06 * size.font) / max(len(rows), 1)
-        each = room if FLATTEST * each <= room < each else each
-        figure = new_figure(heading, width * columns, tall + len(rows) * each + 0.06 * size.font)
-        mosaic: Any = top + rows
-        ratios = [tall] * len(top) + [each] * len(rows)
-        if columns > 1 and top and rows:  # the colour bar of the scene moves its own rows only
-            mosaic, ratios = [[top], [rows]], [tall, each * len(rows)]
-        axes = figure.subplot_mosaic(mosaic, height_ratios=ratios)
-        if pictured:
-            whole = axes["scene"]
-            scene = Scene(whole, run.setup, curves=curves_, stress=stress, size=0.1 * size.font)
-            scene.show(instant)
-            whole.set(
-                xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]",
-                title=f"a) t = {instant.time:g} s",
-            )  # fmt: skip
-            whole.grid(False)
-            whole.set_anchor("W")
-            if contacts:
-                scene.scale_bar(whole)
-            stress_bar(figure, [whole], stress, size)
-            handles = keys(run.setup, [instant])
-            figure.legend(handles=handles, loc="outside upper right", ncols=5 if columns > 1 else 2)
+        figure, axes = arranged(names, float(np.ptp(y) / np.ptp(x)), heading, size)
         if size.titled and not only and ripples(run):
             figure.supxlabel(RIPPLE, fontsize="small", color="#666666")
-        for i, name in enumerate(selected):
+        for i, name in enumerate(names):
             drawn[name](axes[name])
-            axes[name].set_title(f"{letter(i + pictured)} {name}")
+            about = f"t = {instant.time:g} s" if name == "scene" else name
+            axes[name].set_title(f"{letter(i)} {about}")
             if not axes[name].get_xlabel():
                 finish_time_axis(axes[name])
     return figure

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import rc_context, rcParams
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -24,10 +24,10 @@ from torchsoft.files import replacing
 from torchsoft.plot.scene import (
     STRESS,
     Scene,
-    force_scale,
     instants,
     keys,
     largest_stress,
+    limits,
 )
 from torchsoft.solve.trajectory import Trajectory
 
@@ -190,12 +190,12 @@ def letter(i: int) -> str:
     return f"{'abcdefghijklmnopqrstuvwxyz'[i % 26]})"
 
 
-def stress_bar(figure: Figure, axes: Any, largest: float, size: Size) -> None:
+def stress_bar(figure: Figure, axes: Any, largest: float) -> None:
     """Add the colour bar of the von Mises stress."""
     if largest > 0:
         colours = ScalarMappable(Normalize(0.0, largest), STRESS)
         bar = figure.colorbar(colours, ax=axes, shrink=0.6, pad=0.01, aspect=30)
-        bar.set_label("von Mises' stress [kPa], elastic part", fontsize=0.9 * size.font)
+        bar.set_label("von Mises' stress [kPa], elastic part", fontsize=rcParams["legend.fontsize"])
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 
@@ -205,41 +205,32 @@ def snapshots(
     """Bodies, deformed pads with their stress, contact points by their state, and contact forces at
     `times` [s], by default at six over the whole run."""
     setup = run.setup
-    shown = instants(
-        run, times or np.linspace(float(run.t[0]), float(run.t[-1]), SNAPSHOTS).tolist()
-    )
+    times = times or np.linspace(float(run.t[0]), float(run.t[-1]), SNAPSHOTS).tolist()
+    shown = instants(run, times)
     with looking(look) as size:
-        curves, stress = force_scale(setup, shown), largest_stress(shown)
-        scene = Scene(Figure().subplots(), setup, curves=curves)
-        (left, right), (low, high) = scene.limits(shown)
-        tall = min(max((high - low) / (right - left), 0.3), 1.5)
+        x, y = limits(setup, shown)
+        tall = float(np.clip(np.ptp(y) / np.ptp(x), 0.3, 1.5))
         columns = min(size.columns, len(shown))
         rows = -(-len(shown) // columns)
         width = min(size.width, 4.8 * columns)
         heading = (title or "Bodies, pads and contact forces") if size.titled else ""
         figure = new_figure(heading, width, (0.93 * width / columns * tall + 0.35) * rows + 0.8)
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        markers = 0.1 * size.font * min(1.0, width / columns / 4.0)
         for i, (axes, instant) in enumerate(zip(grid.flat, shown)):
-            scene = Scene(
-                axes, setup, curves=curves, stress=stress,
-                size=0.1 * size.font * min(1.0, width / columns / 4.0),
-            )  # fmt: skip
+            scene = Scene(axes, setup, shown, size=markers)
             scene.show(instant)
-            axes.set(
-                xlim=(left, right), ylim=(low, high), title=f"{letter(i)} t = {instant.time:g} s"
-            )
-            if curves != (1.0, 1.0):
-                scene.scale_bar(axes)
-            axes.grid(False)
+            scene.scale_bar()
+            axes.set_title(f"{letter(i)} t = {instant.time:g} s")
+            if i + columns < len(shown):
+                axes.set_xlabel("")
+            else:
+                axes.tick_params(labelbottom=True)
+        for axes in grid[:, 1:].flat:
+            axes.set_ylabel("")
         for axes in grid.flat[len(shown) :]:
             axes.set_visible(False)
-        for axes in grid.flat[max(0, len(shown) - columns) : len(shown)]:
-            axes.set_xlabel("x [mm]")
-            axes.tick_params(labelbottom=True)
-        for axes in grid[:, 0]:
-            axes.set_ylabel("y [mm]")
-        stress_bar(figure, list(grid.flat), stress, size)
-        figure.legend(
-            handles=keys(setup, shown), loc="outside lower center", ncols=min(5, 2 * columns)
-        )
+        stress_bar(figure, list(grid.flat), largest_stress(shown))
+        legend: Any = {"loc": "outside lower center", "ncols": min(5, 2 * columns)}
+        figure.legend(handles=keys(setup, shown), **legend)
     return figure

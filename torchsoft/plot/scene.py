@@ -4,7 +4,7 @@ points by their state, and contact forces as curves.
 Figures and animation share it. Everything on axes is in millimetres and newtons.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +37,8 @@ STATES = {
     -1: ("touches", "s", "#666666"),
 }
 """Word, marker and colour of the states of contact points; -1 is contact without a known state."""
+
+MARKER_SIZES = {STICKING: 2.8, SLIPPING: 3.6, SEPARATED: 2.0, -1: 2.8}
 
 MM = 1e3
 
@@ -106,10 +108,8 @@ def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
         for key, contact in setup.contacts.items():
             pad, own = setup.pads[contact.pad], base[contact.pad]
             points[key] = in_world(MM * pad.surface_points(u[contact.pad][i]), own)
-            direction, (_, y) = along_surface(pad, own), own_axes(pad, own)
-            t = np.array([y[1], -y[0]])  # of the moving frame, whose normal points into the pad
-            force[key] = run.force[key][row].detach().numpy() * [1.0, np.sign(direction @ t)]
-            along[key] = points[key] @ direction
+            force[key] = run.force[key][row].detach().numpy() * [1.0, friction_sign(pad, own)]
+            along[key] = points[key] @ along_surface(pad, own)
         mesh = {name: in_world(meshes[name][i], base[name]) for name in meshes}
         stress = {name: stresses[name][i] for name in stresses}
         state = {key: run.contact_state[key][row].numpy() for key in setup.contacts}
@@ -129,6 +129,13 @@ def along_surface(pad: PadSetup, base: Array) -> Array:
     same way while a finger leans."""
     x = own_axes(pad, base)[0]
     return x if x[int(abs(x[0]) < STEEP)] > 0 else -x
+
+
+def friction_sign(pad: PadSetup, base: Array) -> float:
+    """1 where the recorded friction is positive along `along_surface`, else -1. Records use the
+    frame whose normal points into the pad, for mirrored pads too."""
+    x, y = own_axes(pad, base)[1]
+    return float(np.sign(along_surface(pad, base) @ np.array([y, -x])))
 
 
 def outwards(setup: Setup, instant: Instant) -> str:
@@ -160,19 +167,15 @@ def foot(setup: Setup, thickness: float) -> Array:
     return np.array([0.0, -thickness - 5.0 * unit(setup)])
 
 
-def force_scale(setup: Setup, shown: Sequence[Instant]) -> tuple[float, float]:
-    """Scale of the force curves [mm/N], at which the largest force has `curve_height`, and a round
-    force [N] for the scale bar."""
-    largest = max(
-        (float(np.abs(force).max()) for instant in shown for force in instant.force.values()),
-        default=0.0,
-    )
-    if largest == 0:
-        return 1.0, 1.0
-    decade = 10.0 ** np.floor(np.log10(largest))
-    return curve_height(setup) / largest, float(
-        max(m * decade for m in (1, 2, 5) if m * decade <= largest)
-    )
+def largest_force(shown: Sequence[Instant]) -> float:
+    """Largest force [N] at a contact point in some instants."""
+    return max((float(np.abs(x).max()) for at in shown for x in at.force.values()), default=0.0)
+
+
+def force_scale(setup: Setup, shown: Sequence[Instant]) -> float:
+    """Scale of the force curves [mm/N], at which the largest force has `curve_height`; 1 where
+    there is no force."""
+    return curve_height(setup) / (largest_force(shown) or curve_height(setup))
 
 
 def plates(setup: Setup) -> dict[str, float]:
@@ -182,32 +185,56 @@ def plates(setup: Setup) -> dict[str, float]:
     out = {}
     for name, pad in setup.pads.items():
         if pad.base is not None:
-            behind = (
-                2 * MM * float((pad.placed(np.zeros(2)) @ pad.axes)[1])
-            )  # height of the face over the base's centre
+            height = MM * float((pad.placed(np.zeros(2)) @ pad.axes)[1])  # of face over centre
             if setup.bodies[pad.base].outline is not None:
                 out[name] = 0.0
-            elif behind > 1e-6:
-                out[name] = behind
+            elif height > 5e-7:
+                out[name] = 2 * height
     thickest = max(out.values(), default=0.0) or 4 * unit(setup)
     return {name: out.get(name, thickest) for name in setup.pads}
 
 
-class Scene:
-    """The artists of one picture on `axes`; `show` moves the artists in `moving`, which are in
-    drawing order, to another instant.
+def behind(setup: Setup, instant: Instant, name: str, depth: float, *, wider: float = 0.0) -> Array:
+    """Corners (4, 2) [mm] of the rectangle of a `depth` behind a pad's bonded face, `wider` [mm]
+    than the face on each side."""
+    (left, face), (right, _) = MM * setup.pads[name].mesh.base + [[-wider, 0.0], [wider, 0.0]]
+    corners = np.array([[left, face - depth], [right, face - depth], [right, face], [left, face]])
+    return own_places(setup.pads[name], instant.base[name], corners)
 
-    The mesh is the real one, in finer lines where it is dense. `curves` = (mm per N, scale bar in
-    N) draws the contact forces behind the pads, normal force red, friction blue. `stress` [kPa] is
-    the value of the darkest colour; pads are plain without it. `size` scales markers and lines.
+
+def limits(setup: Setup, shown: Sequence[Instant]) -> tuple[Array, Array]:
+    """Limits (2,) of x and of y [mm] for all instants, force curves included."""
+    margin, thickness, rows = unit(setup), plates(setup), []
+    for instant in shown:
+        for name, body in setup.bodies.items():
+            if body.outline is not None:
+                around = in_world(MM * body.outline, instant.pose[name])
+                rows += [around - 2.0 * margin, around + 2.0 * margin]
+        for name, mesh in instant.mesh.items():
+            depth = thickness[name] + curve_height(setup) + 7.0 * margin
+            rows += [mesh, behind(setup, instant, name, depth, wider=4.0 * margin)]
+    every = np.concatenate(rows)
+    x, y = np.stack((every.min(0), every.max(0)), -1)
+    return x, y
+
+
+class Scene:
+    """The artists of one picture on `axes`, whose limits and scales fit the instants in `shown`.
+    `show` moves the artists in `moving`, which are in drawing order, to an instant.
+
+    The mesh is the real one, in finer lines where it is dense. Contact forces stand as curves
+    behind the pads, normal force red, friction blue. Pads show their von Mises stress, or are plain
+    unless `stressed`. `size` scales markers and lines.
     """
 
     def __init__(
-        self, axes: Axes, setup: Setup, *, curves: tuple[float, float] | None = None,
-        stress: float | None = None, size: float = 1.0,
+        self, axes: Axes, setup: Setup, shown: Sequence[Instant], *, stressed: bool = True,
+        size: float = 1.0,
     ) -> None:  # fmt: skip
-        self.axes, self.setup, self.curves = axes, setup, curves
+        self.axes, self.setup = axes, setup
         self.thickness = plates(setup)
+        self.force_scale, self.largest_force = force_scale(setup, shown), largest_force(shown)
+        self.stress = largest_stress(shown) if stressed else 0.0
         self.shapes = {
             name: MM * body.outline
             for name, body in setup.bodies.items()
@@ -215,131 +242,99 @@ class Scene:
         }
 
         def polygons(
-            names: Sequence[str], face: str, edge: str, width: float
+            names: Iterable[str], face: str, edge: str, width: float
         ) -> dict[str, Polygon]:
-            out = {
-                k: Polygon(np.zeros((3, 2)), fc=face, ec=edge, lw=size * width, joinstyle="round")
-                for k in names
+            nowhere, style = np.zeros((3, 2)), {"lw": size * width, "joinstyle": "round"}
+            return {
+                name: axes.add_patch(Polygon(nowhere, fc=face, ec=edge, **style)) for name in names
             }
-            for polygon in out.values():
-                axes.add_patch(polygon)
-            return out
 
-        self.plates = polygons(
-            [name for name, thick in self.thickness.items() if thick], STEEL, INK, 0.6
-        )
+        with_plate = [name for name, thickness in self.thickness.items() if thickness]
+        self.plates = polygons(with_plate, STEEL, INK, 0.6)
         self.fields, self.layers = {}, {}
-        for k, pad in setup.pads.items():
-            colours: dict[str, Any] = {"facecolors": PAD}
-            if stress:
-                colours = {"cmap": STRESS, "norm": Normalize(0.0, stress)}
-            self.fields[k] = PolyCollection([], lw=0.3, edgecolors="face", **colours)
+        colours: dict[str, Any] = {"facecolors": PAD}
+        if self.stress:
+            colours = {"cmap": STRESS, "norm": Normalize(0.0, self.stress)}
+        for name, pad in setup.pads.items():
             side = MM * float(np.median(np.ptp(pad.mesh.nodes[pad.mesh.sides], 1).max(-1)))
             width = 0.35 * size * min(1.0, side / unit(setup))
-            self.layers[k] = LineCollection([], colors=LAYER, linewidths=width, alpha=0.6)
-            for collection in (self.fields[k], self.layers[k]):
-                axes.add_collection(collection, autolim=False)
-        self.outlines = polygons(list(setup.pads), "none", LAYER, 0.9)
-        self.bodies = polygons(list(self.shapes), DISC, INK, 1.0)
-        self.spokes, self.hubs, self.friction, self.normal = {}, {}, {}, {}
-        for k in self.shapes:
-            (self.spokes[k],) = axes.plot([], [], color=INK, lw=1.6 * size, solid_capstyle="butt")
-            (self.hubs[k],) = axes.plot([], [], "o", color=INK, ms=3 * size)
-        self.states: dict[tuple[str, int], Line2D] = {}
-        for k in setup.contacts:
+            self.fields[name] = PolyCollection([], lw=0.3, edgecolors="face", **colours)
+            self.layers[name] = LineCollection([], colors=LAYER, linewidths=width, alpha=0.6)
+            axes.add_collection(self.fields[name], autolim=False)
+            axes.add_collection(self.layers[name], autolim=False)
+        self.outlines = polygons(setup.pads, "none", LAYER, 0.9)
+        self.bodies = polygons(self.shapes, DISC, INK, 1.0)
+        self.spokes, self.hubs, self.states = {}, {}, {}
+        for name in self.shapes:
+            style: dict[str, Any] = {"lw": 1.6 * size, "solid_capstyle": "butt"}
+            (self.spokes[name],) = axes.plot([], [], color=INK, **style)
+            (self.hubs[name],) = axes.plot([], [], "o", color=INK, ms=3 * size)
+        for name in setup.contacts:
             for state, (_, marker, colour) in STATES.items():
-                ms = size * (2.0 if state == SEPARATED else 3.6 if state == SLIPPING else 2.8)
-                (self.states[k, state],) = axes.plot([], [], marker, color=colour, ms=ms, mew=0)
-        for k in setup.contacts if curves else ():
-            self.friction[k] = Polygon(
-                np.zeros((3, 2)), facecolor=FRICTION, edgecolor=FRICTION, alpha=0.75, lw=0.8 * size
-            )
-            self.normal[k] = Polygon(
-                np.zeros((3, 2)), facecolor=f"{NORMAL}33", edgecolor=NORMAL, lw=1.2 * size
-            )
-            axes.add_patch(self.normal[k])
-            axes.add_patch(self.friction[k])
+                style = {"color": colour, "ms": size * MARKER_SIZES[state], "mew": 0}
+                (self.states[name, state],) = axes.plot([], [], marker, **style)
+        self.normal = polygons(setup.contacts, f"{NORMAL}33", NORMAL, 1.2)
+        self.friction = polygons(setup.contacts, f"{FRICTION}bf", f"{FRICTION}bf", 0.8)
         groups = (
             self.plates, self.fields, self.layers, self.outlines, self.bodies, self.spokes,
             self.hubs, self.normal, self.friction, self.states,
         )  # fmt: skip
         self.moving: list[Artist] = [artist for group in groups for artist in group.values()]
-        axes.set_aspect("equal")
+        x, y = limits(setup, shown)
+        axes.set(xlim=x, ylim=y, xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+        axes.grid(False)
 
     def show(self, instant: Instant) -> None:
         """Move all artists to `instant`."""
-        for k, nodes in instant.mesh.items():
-            mesh = self.setup.pads[k].mesh
-            self.outlines[k].set_xy(nodes[mesh.outline])
-            self.layers[k].set_segments(nodes[mesh.sides])
-            self.fields[k].set_verts(nodes[mesh.elements])
-            if self.fields[k].norm.scaled():
-                self.fields[k].set_array(instant.stress[k])
-        for k, plate in self.plates.items():
-            plate.set_xy(self.behind(instant, k, 0.0, self.thickness[k]))
-        for k, outline in self.shapes.items():
-            pose = instant.pose[k]
-            self.bodies[k].set_xy(in_world(outline, pose))
-            self.spokes[k].set_data(*np.stack((pose[:2], in_world(straight_up(outline), pose)), -1))
-            self.hubs[k].set_data(*pose[:2, None])
-        for (k, state), line in self.states.items():
-            rows = instant.near(k, 8)
-            line.set_data(*instant.points[k][rows[instant.state[k][rows] == state]].T)
-        for k in self.normal:
-            name, rows = self.setup.contacts[k].pad, instant.near(k)
-            pad, base, force = self.setup.pads[name], instant.base[name], instant.force[k][rows]
-            x = (instant.points[k][rows] - own_places(pad, base, np.zeros(2))) @ own_axes(
-                pad, base
-            )[0]
-            _, low = foot(self.setup, self.thickness[name])
-            for area, values in ((self.normal[k], force[:, 0]), (self.friction[k], force[:, 1])):
-                assert self.curves
-                row = np.stack((x, low - self.curves[0] * values), -1)
-                ends = np.stack((x, np.full_like(x, low)), -1)[[0, -1]] if len(x) else row
-                around = np.concatenate((ends[:1], row, ends[1:]))
-                area.set_xy(own_places(pad, base, around) if len(x) else np.zeros((1, 2)))
+        setup = self.setup
+        for name, nodes in instant.mesh.items():
+            mesh = setup.pads[name].mesh
+            self.outlines[name].set_xy(nodes[mesh.outline])
+            self.layers[name].set_segments(nodes[mesh.sides])
+            self.fields[name].set_verts(nodes[mesh.elements])
+            if self.stress:
+                self.fields[name].set_array(instant.stress[name])
+        for name, plate in self.plates.items():
+            plate.set_xy(behind(setup, instant, name, self.thickness[name]))
+        for name, outline in self.shapes.items():
+            pose = instant.pose[name]
+            top = in_world(straight_up(outline), pose)
+            self.bodies[name].set_xy(in_world(outline, pose))
+            self.spokes[name].set_data(*np.stack((pose[:2], top), -1))
+            self.hubs[name].set_data(*pose[:2, None])
+        for (name, state), line in self.states.items():
+            rows = instant.near(name, 8)
+            line.set_data(*instant.points[name][rows[instant.state[name][rows] == state]].T)
+        for name in setup.contacts:
+            for area, kind in ((self.normal[name], 0), (self.friction[name], 1)):
+                area.set_xy(self.force_curve(instant, name, kind))
 
-    def behind(self, instant: Instant, name: str, side: float, depth: float) -> Array:
-        """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider by `side` [mm] on
-        each side."""
-        pad = self.setup.pads[name]
-        (left, face), (right, _) = MM * pad.mesh.base + [[-side, 0.0], [side, 0.0]]
-        corners = np.array(
-            [[left, face - depth], [right, face - depth], [right, face], [left, face]]
-        )
-        return own_places(pad, instant.base[name], corners)
+    def force_curve(self, instant: Instant, contact: str, kind: int) -> Array:
+        """Corners (points + 2, 2) [mm] of the area under the curve of the normal force (`kind` 0)
+        or the friction (1) of a contact; one point without a force."""
+        name, near = self.setup.contacts[contact].pad, instant.near(contact)
+        if not len(near):
+            return np.zeros((1, 2))
+        pad, base = self.setup.pads[name], instant.base[name]
+        origin = own_places(pad, base, np.zeros(2))
+        x = (instant.points[contact][near] - origin) @ own_axes(pad, base)[0]
+        _, low = foot(self.setup, self.thickness[name])
+        curve = np.stack((x, low - self.force_scale * instant.force[contact][near, kind]), -1)
+        return own_places(pad, base, np.concatenate(([[x[0], low]], curve, [[x[-1], low]])))
 
-    def limits(self, shown: Sequence[Instant]) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Limits of x and y [mm] for all instants, force curves included."""
-        step, rows = unit(self.setup), []
-        for instant in shown:
-            for k, outline in self.shapes.items():
-                around = in_world(outline, instant.pose[k])
-                rows += [around - 2.0 * step, around + 2.0 * step]
-            for k, mesh in instant.mesh.items():
-                depth = self.thickness[k] + (
-                    curve_height(self.setup) + 7.0 * step if self.curves else 4.0 * step
-                )
-                rows += [mesh.reshape(-1, 2), self.behind(instant, k, 4.0 * step, depth)]
-        every = np.concatenate(rows)
-        (left, low), (right, high) = every.min(0), every.max(0)
-        return (float(left), float(right)), (float(low), float(high))
-
-    def scale_bar(self, axes: Axes) -> None:
-        """Draw a vertical bar in the upper right corner, with the length of the scale's force."""
-        assert self.curves
-        millimetres, force = self.curves
-        step, (_, right), (_, high) = unit(self.setup), axes.get_xlim(), axes.get_ylim()
-        x, y = right - 6.0 * step, high - curve_height(self.setup) - 2.0 * step
-        axes.plot([x, x], [y, y + millimetres * force], color=INK, lw=1.5, solid_capstyle="butt")
-        axes.text(
-            x - 2.0 * step,
-            y + 0.5 * millimetres * force,
-            f"{force:g} N",
-            ha="right",
-            va="center",
-            fontsize="small",
-        )
+    def scale_bar(self) -> None:
+        """Draw a vertical bar in the upper right corner, with the length of a round force; none
+        where there is no force."""
+        if not self.largest_force:
+            return
+        decade, step = 10.0 ** np.floor(np.log10(self.largest_force)), unit(self.setup)
+        force = float(max(m * decade for m in (1, 2, 5) if m * decade <= self.largest_force))
+        x = self.axes.get_xlim()[1] - 6.0 * step
+        y = self.axes.get_ylim()[1] - curve_height(self.setup) - 2.0 * step
+        top = y + self.force_scale * force
+        self.axes.plot([x, x], [y, top], color=INK, lw=1.5, solid_capstyle="butt")
+        label = {"ha": "right", "va": "center", "fontsize": "small"}
+        self.axes.text(x - 2.0 * step, y + 0.5 * step, f"{force:g} N", **label)
 
 
 def largest_stress(shown: Sequence[Instant]) -> float:
