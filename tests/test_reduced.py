@@ -29,7 +29,7 @@ from torchsoft.reduced import (
     score,
 )
 from torchsoft.reduced.fit import contradictions
-from torchsoft.reduced.ode import BEYOND, Factor, Held, Term
+from torchsoft.reduced.ode import BEYOND, Held, Term
 from torchsoft.reduced.records import KINEMATICS, STATES
 from torchsoft.reduced.terms import variable
 from torchsoft.rigs import RigFile
@@ -207,8 +207,7 @@ def test_terms_that_depend_on_each_other_or_on_nothing_are_rejected(motions):
 @pytest.mark.parametrize("nonlinear", [False, True])
 def test_all_routes_are_one(nonlinear):
     """Rollout, torchdiffeq and scipy through the same terms."""
-    product = Term("x_C |v_C|", "m m/s", (Factor({"x_C": 1.0}), Factor({"v_C": 1.0}, "abs")))
-    extra = ((friction(R, 0.01)["v_C"][1], 5.0), (product, -1e6)) if nonlinear else ()
+    extra = ((friction(R, 0.01)["v_C"][1], 5.0),) if nonlinear else ()
     model, one = truth(*extra), motion(truth(*extra), 7, duration=0.005)
     assert model.linear is not nonlinear
     t, u, y0 = one.t, 20 * one.columns(("x_d", "x_d_dot")), 20 * one.columns(STATES)[0]
@@ -247,12 +246,12 @@ def test_gradients_through_torchdiffeq_are_those_of_the_rollout():
 
 @pytest.mark.parametrize("nonlinear", [False, True])
 def test_divergence_is_reported_with_its_time(nonlinear):
-    """v' = a v from v = 1 leaves 100 times its scale at ln(100) / a; v' = v^2 blows up at t = 1."""
-    term, value, when = variable("v_C"), 5.0, np.log(BEYOND) / 5
-    if nonlinear:
-        square = Term("v_C v_C", "m2/s2", (Factor({"v_C": 1.0}), Factor({"v_C": 1.0})))
-        term, value, when = square, 1.0, 1 - 1 / BEYOND
-    model = ReducedModel(("v_C",), (), {}, {"v_C": [(term, value)]})
+    """v' = 5 v from v = 1 leaves 100 times its scale at ln(100) / 5; a constant 5 tanh(v / 1e-3)
+    adds ln(1 / 2) to the logarithm."""
+    pairs, constant = [(variable("v_C"), 5.0)], Term("tanh", "1", {"v_C": 1.0}, 1e-3)
+    pairs += [(constant, 5.0)] * nonlinear
+    when = np.log((BEYOND + nonlinear) / (1 + nonlinear)) / 5
+    model = ReducedModel(("v_C",), (), {}, {"v_C": pairs})
     out = model.rollout(np.linspace(0, 2, 2001), np.array([1.0]), np.empty((2001, 0)))
     assert out.diverged_at == pytest.approx(when, abs=2e-3)
     finite = np.isfinite(out.y[:, 0])

@@ -78,7 +78,7 @@ class Record(Shown):
             raise ValueError(
                 f"the record has no series {', '.join(lacking)}; it has {', '.join(self.series)}"
             )
-        return np.column_stack([self.series[name] for name in names])
+        return np.array([self.series[name] for name in names]).reshape(len(names), len(self.t)).T
 
 
 def record(
