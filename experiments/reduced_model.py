@@ -41,7 +41,7 @@ from torchsoft.files import finite
 from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Waves, wave
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, rollout_of, score
-from torchsoft.reduced.ode import ReducedModel, Term
+from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics
 from torchsoft.rigs.excite import Excitation
@@ -242,17 +242,10 @@ def strokes(travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
     return Stroke(record(rest), peak, slipping, rest.stats.wall_s)
 
 
-def without_saturation(term: Term) -> Term:
-    """The limit of a term for small slip: tanh(s' / speed) is s' / speed."""
-    scale = term.saturation or 1.0
-    form = {name: weight / scale for name, weight in term.form.items()}
-    return replace(term, form=form, saturation=None)
-
-
 def sticking(model: ReducedModel) -> ReducedModel:
     """The model's limit for small slip: every tanh(s' / speed) is s' / speed."""
     equations = {
-        name: [(without_saturation(term), x) for term, x in pairs]
+        name: [(replace(term, form=term.slope, saturation=None), x) for term, x in pairs]
         for name, pairs in model.equations().items()
     }
     return ReducedModel(

@@ -72,6 +72,12 @@ class Term:
     def linear(self) -> bool:
         return self.saturation is None
 
+    @property
+    def slope(self) -> dict[str, float]:
+        """The form over the saturation: the term itself where its value is small."""
+        scale = 1.0 if self.saturation is None else self.saturation
+        return {name: weight / scale for name, weight in self.form.items()}
+
 
 class Table(NamedTuple):
     """Terms as tensors: forms (terms, variables) in units of the saturations, and which terms
@@ -85,13 +91,13 @@ class Table(NamedTuple):
         """Raises `ValueError` for a term of a variable that is not among `variables`."""
         forms = torch.zeros(len(terms), len(variables), dtype=torch.float64)
         for i, term in enumerate(terms):
-            for name, weight in term.form.items():
+            for name, weight in term.slope.items():
                 if name not in variables:
                     known = ", ".join(variables)
                     raise ValueError(
                         f"term `{term.text}` needs the variable {name!r}; known: {known}"
                     )
-                forms[i, variables.index(name)] = weight / (term.saturation or 1.0)
+                forms[i, variables.index(name)] = weight
         return cls(forms, torch.tensor([not term.linear for term in terms], dtype=torch.bool))
 
     def values(self, variables: Tensor) -> Tensor:

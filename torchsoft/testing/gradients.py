@@ -2,9 +2,10 @@
 central differences along the same steps."""
 
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -24,7 +25,10 @@ from torchsoft.solve.trajectory import Touch, Trajectory
 from torchsoft.testing.energy import conclude
 
 Value = Callable[[Trajectory], Tensor]
+Values = Callable[[Trajectory], dict[str, Tensor]]
 Leaves = dict[str, Tensor]
+Slopes = dict[str, dict[str, float]]
+"""Derivatives of every value by every leaf, along the leaf's way."""
 
 NEWTON = 1e-10
 """Newton's tolerance of the runs [N]: differences are as good as steps are solved."""
@@ -126,11 +130,9 @@ class GradientCheck(Shown):
 
     def _throughout(self, holds: Callable[[Derivative], bool]) -> tuple[str, ...]:
         """Parameters of which something holds for the derivatives of all values."""
-        found = {one.by: True for one in self.derivatives if one.by != TOGETHER}
-        for one in self.derivatives:
-            if one.by in found:
-                found[one.by] = found[one.by] and holds(one)
-        return tuple(name for name, holding in found.items() if holding)
+        names = dict.fromkeys(one.by for one in self.derivatives if one.by != TOGETHER)
+        broken = {one.by for one in self.derivatives if not holds(one)}
+        return tuple(name for name in names if name not in broken)
 
     @property
     def without_effect(self) -> tuple[str, ...]:
@@ -143,35 +145,37 @@ class GradientCheck(Shown):
         vague = self._throughout(lambda one: one.zero or not one.clear)
         return tuple(name for name in vague if name not in self.without_effect)
 
-    def _regime(self) -> tuple[dict[str, float], dict[str, int]]:
+    @cached_property
+    def contact_regimes(self) -> dict[str, float]:
         """Shares of the contact points' time in every state, and how often they touch down and
-        leave."""
+        leave; empty for a rig without contacts."""
+        if not self.run.contact_state:
+            return {}
         states = torch.cat([x.flatten(1) for x in self.run.contact_state.values()], 1)
         kinds = {"stick": 1, "slip": 2, "out of contact": 0}
         shares = {name: float((states == kind).double().mean()) for name, kind in kinds.items()}
         on = states > 0
-        touched, left = (int(x.sum()) for x in (on[1:] & ~on[:-1], on[:-1] & ~on[1:]))
-        return shares, {"touch down": touched, "leave": left}
+        changes = {"touch down": on[1:] & ~on[:-1], "leave": on[:-1] & ~on[1:]}
+        return shares | {name: int(x.sum()) for name, x in changes.items()}
 
     @property
     def regime(self) -> str:
         """What the contact points did in the run."""
-        shares, changes = self._regime()
-        parts = ", ".join(f"{share:.0%} {name}" for name, share in shares.items())
-        return f"{parts}; {', '.join(f'{count} {name}' for name, count in changes.items())}"
+        texts = [
+            f"{much} {name}" if isinstance(much, int) else f"{much:.0%} {name}"
+            for name, much in self.contact_regimes.items()
+        ]
+        return f"{', '.join(texts[:3])}; {', '.join(texts[3:])}"
 
     @property
     def absent(self) -> tuple[str, ...]:
         """What the contact points never did in the run; empty for a rig without contacts."""
-        if not self.run.contact_state:
-            return ()
-        shares, changes = self._regime()
-        if shares["out of contact"] == 1.0:
+        if self.contact_regimes.get("out of contact") == 1.0:
             return ("touch",)
-        return tuple(name for name, much in (shares | changes).items() if not much)
+        return tuple(name for name, much in self.contact_regimes.items() if not much)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
-        rows = [("contact points", self.regime)] if self.run.contact_state else []
+        rows = [("contact points", self.regime)] if self.contact_regimes else []
         for label, names in (("without effect", self.without_effect), ("unclear", self.unchecked)):
             rows += [(label, ", ".join(names))] if names else []
         for one in self.derivatives:
@@ -216,9 +220,11 @@ def check_gradients(
 
     Raises `CheckFailed` with a message on every fault, `ValueError` for names that are not known.
     """
-    start = _start(rig, t, y0, rtol)
-    with _leaves(rig, start, wrt) as leaves:
-        check = _checked(rig, start, leaves, of, rtol, bound, dy0, each, step_error, centres)
+    steps = _steps(rig, t, y0, rtol)
+    direction = _direction(rig, steps) if dy0 is None else tensor("dy0", dy0).detach()
+    with _leaves(rig, wrt) as leaves:
+        probe = Probe(rig, steps, leaves, direction, _values(rig, steps, of, centres))
+        check = probe.compared(rtol, bound, each, step_error)
     faults, idle = _faults(check, bound), check.without_effect
     if idle and (wrt is not None or len(idle) == len(leaves)):
         faults.append(_unchecked(check, idle))
@@ -235,35 +241,28 @@ def check_gradients(
     return check
 
 
-class Start(NamedTuple):
-    """Times (T,), the initial state, as a function of the rig, and a run from it: its states
-    (T, size) and its steps."""
+class Steps(NamedTuple):
+    """The steps along which all runs are compared: times (T,), the initial state as a function of
+    the rig, knots, and the states (T, size) at the times."""
 
     t: Tensor
     begin: Begin
-    y: Tensor
     knots: Tensor
-
-    @property
-    def y0(self) -> Tensor:
-        """The initial state (size,) of the run."""
-        return self.y[0]
+    y: Tensor
 
 
-def constant(state: Tensor) -> Begin:
-    """The start at a state (size,), whatever the rig's parameters are."""
-    return lambda rig: Initial(state, rig.reference)
-
-
-def _start(rig: Rig, t: Numbers, y0: Numbers | Begin, rtol: float) -> Start:
+def _steps(rig: Rig, t: Numbers, y0: Numbers | Begin, rtol: float) -> Steps:
+    begin = y0
+    if not callable(begin):
+        state = tensor("y0", begin).detach()
+        begin = lambda rig: Initial(state, rig.reference)
     run = simulate(rig, t, y0=y0, rtol=rtol, tolerance=NEWTON)
-    first = y0 if callable(y0) else constant(tensor("y0", y0).detach())
     # rounding may keep Newton from solving a step where a law bends, which is then halved
     for _ in range(REPEATS):
-        run = _along(rig, run.t, run.knots, y0=first)
+        run = _along(rig, run.t, run.knots, y0=begin)
         if run.stats.failed_steps == 0:
             break
-    return Start(run.t, first, run.y.detach(), run.knots)
+    return Steps(run.t, begin, run.knots, run.y.detach())
 
 
 def _along(rig: Rig, t: Tensor, knots: Tensor, **how: Any) -> Trajectory:
@@ -274,7 +273,7 @@ def _along(rig: Rig, t: Tensor, knots: Tensor, **how: Any) -> Trajectory:
 
 
 @contextmanager
-def _leaves(rig: Rig, start: Start, wrt: Sequence[str] | None) -> Iterator[Leaves]:
+def _leaves(rig: Rig, wrt: Sequence[str] | None) -> Iterator[Leaves]:
     """The tensors that are to be moved, which require a gradient meanwhile; the start's is a number
     that moves it along its direction."""
     kick = {"start": torch.zeros((), dtype=torch.float64)}
@@ -289,156 +288,198 @@ def _leaves(rig: Rig, start: Start, wrt: Sequence[str] | None) -> Iterator[Leave
     if wrt is not None:
         known = kick | knots
         leaves = {name: known[name] if name in known else rig.parameter(name) for name in wrt}
-    asked = {name: p.requires_grad for name, p in leaves.items()}
+    before = [(p, p.requires_grad) for p in leaves.values()]
     for p in leaves.values():
         p.requires_grad_()
     try:
         yield leaves
     finally:
-        for name, p in leaves.items():
-            p.requires_grad_(asked[name])
+        for p, required in before:
+            p.requires_grad_(required)
 
 
-def _values(
-    rig: Rig, start: Start, of: Value | Sequence[str] | None, centres: bool
-) -> tuple[Callable[[Trajectory], dict[str, Tensor]], Callable[..., dict[str, Tensor]] | None]:
-    """What is differentiated, by name, and how it is made of forward sensitivities (T, size, n) and
-    those of touch (T, channels, n)."""
-    if of is not None:
-        if isinstance(of, str) or not (callable(of) or isinstance(of, Sequence)):
-            raise ValueError(f"`of` must be a list of channels or a function, but is {of!r}")
-        if callable(of):
-            return lambda run: {"value": of(run)}, None
-        return lambda run: {name: run[name][-1] for name in of}, None
-    generator = torch.Generator().manual_seed(0)
-    weights = torch.randn(
-        len(start.t) - 1, rig.layout.size, generator=generator, dtype=torch.float64
-    )
-    for (part, _), where in rig.layout.slices.items():
-        weights[:, where] *= {"pose": 1e3, "velocity": 10.0}.get(part, 0.0)  # [1/m, s/m]
-    felt = felt_channels(rig, centres)
-    pulls = torch.randn(len(start.t), len(felt), generator=generator, dtype=torch.float64)
-    touch = Touch(rig)
-    units = [{"N": 1.0, "N.m": 50.0, "m": 1e3}[touch.unit(name)] for name in felt]
-    pulls *= torch.tensor(units, dtype=torch.float64)
+class RandomSums:
+    """The values that are differentiated by default: a random sum of the bodies' motion, and one of
+    the channels of touch `felt`; also of forward sensitivities."""
 
-    def values(run: Trajectory) -> dict[str, Tensor]:
-        motion = (weights * (run.y[1:] - start.y0)).sum()
-        return {"motion": motion} | (
-            {"forces": (pulls * run.together(*felt)).sum()} if felt else {}
-        )
+    def __init__(self, rig: Rig, steps: Steps, centres: bool) -> None:
+        generator = torch.Generator().manual_seed(0)
+        draw = lambda *shape: torch.randn(shape, generator=generator, dtype=torch.float64)
+        self.y0, self.weights = steps.y[0], draw(len(steps.t) - 1, rig.layout.size)
+        for (part, _), where in rig.layout.slices.items():
+            self.weights[:, where] *= {"pose": 1e3, "velocity": 10.0}.get(part, 0.0)  # [1/m, s/m]
+        touch = Touch(rig)
+        # centres of pressure bend sharply at light forces
+        self.felt = [name for name in touch if centres or "centre" not in name]
+        units = [{"N": 1.0, "N.m": 50.0, "m": 1e3}[touch.unit(name)] for name in self.felt]
+        self.pulls = draw(len(steps.t), len(self.felt)) * torch.tensor(units, dtype=torch.float64)
 
-    def forward(of_states: Tensor, of_forces: Tensor | None) -> dict[str, Tensor]:
-        motion = torch.einsum("ti,tin->n", weights, of_states[1:])
-        if of_forces is None:
-            return {"motion": motion}
-        return {"motion": motion, "forces": torch.einsum("ti,tin->n", pulls, of_forces)}
+    def __call__(self, run: Trajectory) -> dict[str, Tensor]:
+        motion = {"motion": (self.weights * (run.y[1:] - self.y0)).sum()}
+        if not self.felt:
+            return motion
+        return motion | {"forces": (self.pulls * run.together(*self.felt)).sum()}
 
-    return values, forward
+    def forward(self, run: Trajectory) -> dict[str, Tensor]:
+        """Derivatives (n,) of the values by the forward sensitivities of a run."""
+        assert run.sensitivities is not None
+        motion = {"motion": torch.einsum("ti,tin->n", self.weights, run.sensitivities[1:])}
+        if not self.felt:
+            return motion
+        touch = torch.stack([run.touch_sensitivities[name] for name in self.felt], 1)
+        return motion | {"forces": torch.einsum("ti,tin->n", self.pulls, touch)}
 
 
-def felt_channels(rig: Rig, centres: bool) -> list[str]:
-    """Channels of touch; centres of pressure, which bend sharply at light forces, if wanted."""
-    return [name for name in Touch(rig) if centres or "centre" not in name]
+def _values(rig: Rig, steps: Steps, of: Value | Sequence[str] | None, centres: bool) -> Values:
+    if of is None:
+        return RandomSums(rig, steps, centres)
+    if isinstance(of, str) or not (callable(of) or isinstance(of, Sequence)):
+        raise ValueError(f"`of` must be a list of channels or a function, but is {of!r}")
+    if callable(of):
+        return lambda run: {"value": of(run)}
+    return lambda run: {name: run[name][-1] for name in of}
 
 
-def _checked(
-    rig: Rig, start: Start, leaves: Leaves, of: Any, rtol: float, bound: float,
-    dy0: Numbers | None, each: bool, step_error: bool, centres: bool,
-) -> GradientCheck:  # fmt: skip
-    values, by_forward = _values(rig, start, of, centres)
-    kick, generator = leaves.get("start"), torch.Generator().manual_seed(1)
-    shake = _direction(rig, start) if dy0 is None else tensor("dy0", dy0).detach()
+@dataclass(frozen=True)
+class Probe:
+    """A rig whose leaves are moved: parameters, knots, and the start, along its direction (size,).
+    Its runs take given steps, and `values` are differentiated."""
 
-    def begin(rig: Rig) -> Initial:
-        initial = start.begin(rig)
-        return initial if kick is None else initial._replace(y0=initial.y0 + kick * shake)
+    rig: Rig
+    steps: Steps
+    leaves: Leaves
+    direction: Tensor
+    values: Values
 
-    ways: Leaves = {}
-    for name, p in leaves.items():
-        sign = torch.randn(p.shape, generator=generator, dtype=torch.float64).sign()
-        ways[name] = sign if p.ndim else torch.ones(())
-        ways[name] = ways[name] * (
-            1.0 if name == "start" else float(p.detach().abs().mean()) or 1e-6
-        )
+    def begin(self, rig: Rig) -> Initial:
+        """The initial state, moved along the direction."""
+        initial = self.steps.begin(rig)
+        if "start" not in self.leaves:
+            return initial
+        return initial._replace(y0=initial.y0 + self.leaves["start"] * self.direction)
 
-    def shares(made: Trajectory) -> dict[str, dict[str, float]]:
+    @cached_property
+    def ways(self) -> Leaves:
+        """The change of every leaf along which it is differentiated: its own size, with random
+        signs where it has several entries."""
+        generator, out = torch.Generator().manual_seed(1), {}
+        for name, p in self.leaves.items():
+            signs = torch.randn(p.shape, generator=generator, dtype=torch.float64).sign()
+            size = 1.0 if name == "start" else float(p.detach().abs().mean()) or 1e-6
+            out[name] = size * (signs if p.ndim else torch.ones(()))
+        return out
+
+    def run(self, **how: Any) -> Trajectory:
+        return _along(self.rig, self.steps.t, self.steps.knots, **{"y0": self.begin} | how)
+
+    def adjoints(self, run: Trajectory) -> Slopes:
         """Derivatives of every value along the way of every leaf."""
-        found = {}
-        for kind, value in values(made).items():
-            slopes = torch.autograd.grad(
-                value, list(leaves.values()), retain_graph=True, materialize_grads=True,
-                allow_unused=True,
-            )  # fmt: skip
-            pairs = zip(leaves, slopes)
-            found[kind] = {name: float((slope * ways[name]).sum()) for name, slope in pairs}
+        found, leaves = {}, list(self.leaves.values())
+        how: dict[str, Any] = {"retain_graph": True, "materialize_grads": True}
+        for kind, value in self.values(run).items():
+            slopes = torch.autograd.grad(value, leaves, allow_unused=True, **how)
+            pairs = zip(self.ways.items(), slopes)
+            found[kind] = {name: float((slope * way).sum()) for (name, way), slope in pairs}
         return found
 
-    made = _along(rig, start.t, start.knots, y0=begin, gradient="discrete")
-    own = shares(made)
-    finer = {}
-    if step_error:
+    def finer_adjoints(self, rtol: float) -> Slopes:
+        """Derivatives of a run at a tenth of the tolerance; empty, with a warning, if it fails."""
+        how: dict[str, Any] = {"tolerance": NEWTON, "gradient": "discrete"}
         try:
-            finer = shares(
-                simulate(
-                    rig, start.t, y0=begin, rtol=0.1 * rtol, tolerance=NEWTON, gradient="discrete"
-                )
-            )
+            run = simulate(self.rig, self.steps.t, y0=self.begin, rtol=0.1 * rtol, **how)
         except SimulationFailed as failed:
             warn(
                 f"the error of the steps is not known, since a run at a tenth of rtol = {rtol:g} "
                 f"failed: {failed}",
             )
-    ahead = _forward(rig, start, leaves, shake, ways, by_forward, centres)
+            return {}
+        return self.adjoints(run)
 
-    largest = {kind: max(map(abs, found.values()), default=0.0) for kind, found in own.items()}
-    sizes = {kind: abs(float(value.detach())) for kind, value in values(made).items()}
+    def forwards(self) -> Slopes:
+        """Derivatives by forward sensitivities, by the start and the scalars; empty for custom
+        values."""
+        numbers = [
+            name
+            for name, p in self.leaves.items()
+            if p.ndim == 0 and name != "start" and not name.startswith("reference.")
+        ]
+        names = [*numbers, *(["start"] if "start" in self.leaves else [])]
+        if not names or not isinstance(self.values, RandomSums):
+            return {}
+        initial = started(self.rig, self.steps.begin, "forward")
+        dy0 = directions(initial.y0, [*map(self.rig.parameter, numbers)])
+        run = self.run(
+            y0=initial, gradient="forward", wrt=numbers, touch=self.values.felt,
+            dy0=torch.cat((torch.from_numpy(dy0), self.direction[:, None]), -1),
+        )  # fmt: skip
+        if run.stats.failed_steps or run.sensitivities is None:
+            return {}
+        return {
+            kind: {name: float(slope * self.ways[name]) for name, slope in zip(names, slopes)}
+            for kind, slopes in self.values.forward(run).items()
+        }
 
-    def differenced(by: float, along: Leaves) -> dict[str, float]:
+    def differences(self, along: Leaves, h: float) -> dict[str, float]:
         """Central differences of all values; not a number where a step was halved."""
         ends = []
-        for h in (by, -by):
-            moved = {name: h * way for name, way in along.items()}
-            with _moved(leaves, moved):
-                ended = _along(rig, start.t, start.knots, y0=begin)
-            failed = ended.stats.failed_steps > 0
-            ends.append({k: np.nan if failed else float(v) for k, v in values(ended).items()})
-        return {kind: (ends[0][kind] - ends[1][kind]) / (2 * by) for kind in ends[0]}
+        for by in (h, -h):
+            with _moved(self.leaves, {name: by * way for name, way in along.items()}):
+                run = self.run()
+            failed = run.stats.failed_steps > 0
+            ends.append({k: np.nan if failed else float(v) for k, v in self.values(run).items()})
+        return {kind: (ends[0][kind] - ends[1][kind]) / (2 * h) for kind in ends[0]}
 
-    def factor(name: str, kinds: Collection[str]) -> float:
-        """How much further a leaf is moved that matters less than the others. Lengths decide when
-        points touch, and are hardly changed."""
-        weight = max(abs(own[kind][name]) / (largest[kind] + 1e-300) for kind in kinds)
-        most = 0.1 * WEAK if "shape" in name or "reference" in name else WEAK
-        return min(1 / max(weight, 1e-300), most)
-
-    derivatives = []
-    for name in leaves:
-        judged: Mapping[str, tuple[float | None, float | None]] = dict.fromkeys(own, (None, None))
-        if each:
-            much = factor(name, own)
+    def compared(self, rtol: float, bound: float, each: bool, step_error: bool) -> GradientCheck:
+        """Derivatives by all ways. Without `each` a difference is taken of all leaves together."""
+        run = self.run(gradient="discrete")
+        own = self.adjoints(run)
+        finer = self.finer_adjoints(rtol) if step_error else {}
+        ahead = self.forwards()
+        sizes = {kind: abs(float(value.detach())) for kind, value in self.values(run).items()}
+        largest = {kind: max(map(abs, found.values()), default=0.0) for kind, found in own.items()}
+        weights = {
+            kind: {name: abs(x) / (largest[kind] + 1e-300) for name, x in found.items()}
+            for kind, found in own.items()
+        }
+        derivatives = []
+        for name in self.leaves:
             expected = {kind: found[name] for kind, found in own.items()}
-            judged = _judged(
-                lambda h, name=name, much=much: differenced(h * much, {name: ways[name]}), expected,
-                {kind: max(abs(x), largest[kind] / WEAK) for kind, x in expected.items()}, bound,
-            )  # fmt: skip
-        for kind, found in own.items():
-            change = REST * abs(finer[kind][name] - found[name]) if finer else None
-            forward = ahead.get(kind, {}).get(name)
-            one = Derivative(kind, name, found[name], forward, *judged[kind], change, 0.0)
-            derivatives.append(one)
-            sizes[kind] = max(sizes[kind], one.size - (one.uncertainty or 0.0), abs(one.adjoint))
-    derivatives = [one._replace(scale=sizes[one.value]) for one in derivatives]
-    for kind, found in {} if each else own.items():
-        factors = {name: factor(name, [kind]) for name in leaves}
-        along = {name: much * ways[name] for name, much in factors.items()}
-        parts = {name: much * found[name] for name, much in factors.items()}
-        scale = {kind: sum(map(abs, parts.values()))}
-        whole = sum(parts.values())
-        judged = _judged(lambda h, along=along: differenced(h, along), {kind: whole}, scale, bound)
-        one = Derivative(kind, TOGETHER, whole, None, *judged[kind], None, scale[kind])
-        derivatives.append(one)
-    return GradientCheck(tuple(derivatives), made, rtol)
+            judged: dict[str, Any] = dict.fromkeys(own, (None, None))
+            if each:
+                reach = _reach(name, max(weights[kind][name] for kind in own))
+                scale = {kind: max(abs(x), largest[kind] / WEAK) for kind, x in expected.items()}
+                way = {name: self.ways[name]}
+                differenced = lambda h, way=way, reach=reach: self.differences(way, reach * h)
+                judged = _judged(differenced, expected, scale, bound)
+            for kind, adjoint in expected.items():
+                change = REST * abs(finer[kind][name] - adjoint) if finer else None
+                forward = ahead.get(kind, {}).get(name)
+                one = Derivative(kind, name, adjoint, forward, *judged[kind], change, 0.0)
+                sizes[kind] = max(sizes[kind], one.size - (one.uncertainty or 0.0), abs(adjoint))
+                derivatives.append(one)
+        derivatives = [one._replace(scale=sizes[one.value]) for one in derivatives]
+        if not each:
+            derivatives += [self._together(kind, own[kind], weights[kind], bound) for kind in own]
+        return GradientCheck(tuple(derivatives), run, rtol)
+
+    def _together(
+        self, kind: str, adjoints: Mapping[str, float], weights: Mapping[str, float], bound: float
+    ) -> Derivative:
+        """The derivative of one value along all ways at once, each as far as its leaf reaches."""
+        reach = {name: _reach(name, weights[name]) for name in self.leaves}
+        along = {name: reach[name] * way for name, way in self.ways.items()}
+        parts = [reach[name] * adjoint for name, adjoint in adjoints.items()]
+        whole, scale = sum(parts), sum(map(abs, parts))
+        differenced = partial(self.differences, along)
+        judged = _judged(differenced, {kind: whole}, {kind: scale}, bound)[kind]
+        return Derivative(kind, TOGETHER, whole, None, *judged, None, scale)
+
+
+def _reach(name: str, weight: float) -> float:
+    """How much further a leaf is moved whose derivative is the part `weight` of the largest.
+    Lengths decide when points touch, and are hardly changed."""
+    most = 0.1 * WEAK if "shape" in name or "reference" in name else WEAK
+    return min(1 / max(weight, 1e-300), most)
 
 
 def _judged(
@@ -508,14 +549,14 @@ def _unchecked(check: GradientCheck, names: Sequence[str]) -> str:
     )
 
 
-def _direction(rig: Rig, start: Start) -> Tensor:
+def _direction(rig: Rig, steps: Steps) -> Tensor:
     """A random direction of the start, every part of the state as large as it changed in the
     run."""
     generator = torch.Generator().manual_seed(2)
     way = torch.randn(rig.layout.size, generator=generator, dtype=torch.float64)
     for where in rig.layout.slices.values():
         if where.start < where.stop:
-            way[where] *= (start.y[:, where] - start.y0[where]).abs().max()
+            way[where] *= (steps.y[:, where] - steps.y[0, where]).abs().max()
     return way
 
 
@@ -530,33 +571,3 @@ def _moved(leaves: Leaves, by: Leaves) -> Iterator[None]:
         finally:
             for name, value in kept.items():
                 leaves[name].copy_(value)
-
-
-def _forward(
-    rig: Rig, start: Start, leaves: Leaves, shake: Tensor, ways: Leaves,
-    by_forward: Callable[..., dict[str, Tensor]] | None, centres: bool,
-) -> dict[str, dict[str, float]]:  # fmt: skip
-    """Forward sensitivities of every value along the ways of the start and of the scalars."""
-    wanted = [
-        name
-        for name, p in leaves.items()
-        if p.ndim == 0 and name != "start" and not name.startswith("reference.")
-    ]
-    kicked = "start" in leaves
-    if by_forward is None or not (wanted or kicked):
-        return {}
-    initial = started(rig, start.begin, "forward")
-    dy0 = torch.from_numpy(directions(initial.y0, [*map(rig.parameter, wanted)]))
-    felt = felt_channels(rig, centres)
-    run = _along(
-        rig, start.t, start.knots, y0=initial, gradient="forward", wrt=wanted, touch=felt,
-        dy0=torch.cat((dy0, shake[:, None]), -1),
-    )  # fmt: skip
-    if run.stats.failed_steps or run.sensitivities is None:
-        return {}
-    of_forces = torch.stack([run.touch_sensitivities[name] for name in felt], 1) if felt else None
-    names = [*wanted, "start"] if kicked else wanted
-    return {
-        kind: {name: float(slope * ways[name]) for name, slope in zip(names, slopes)}
-        for kind, slopes in by_forward(run.sensitivities, of_forces).items()
-    }
