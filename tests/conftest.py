@@ -17,6 +17,7 @@ from torchsoft import (
     RigFile,
     SmoothSlip,
     SoftContact,
+    Trajectory,
     excite,
     hold,
     register_method,
@@ -172,6 +173,15 @@ def nested(name: str, value: Any) -> dict[str, Any]:
 def dry(**how: Any) -> SoftContact:
     """A contact with smooth slip."""
     return SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05), **how)
+
+
+def fingers() -> tuple[Rig, Trajectory]:
+    """A disc on a table between two pads that stand upright, on fingers that lean."""
+    lean = {"kind": "profile", "times": [0.0, 0.4], "values": [0.0, 0.08]}
+    tips = {name: {"elements_x": 18} for name in ("left_tip", "right_tip")}
+    pads = {"table": {"elements_x": 25}, **tips}
+    built = RigFile.ready("two_fingers").override(pads=pads, motion={"lean": lean}).build()
+    return built.rig, built.run(times(0.5, 6), rtol=1e-3)
 
 
 def times(end: float, n: int) -> Tensor:
