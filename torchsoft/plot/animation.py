@@ -81,8 +81,9 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) ->
     time. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
     with rc_context(STYLE):
-        tall = float(np.divide(*map(np.ptp, reversed(limits(setup, shown)))))
-        height = 2 * round(0.5 * dpi * min(max(5.8, 7.0 * tall + 2.2), 8.6)) / dpi  # H.264: even
+        x, y = limits(setup, shown)
+        tall = 7.0 * float(np.ptp(y) / np.ptp(x)) + 2.2
+        height = 2 * round(0.5 * dpi * min(max(5.8, tall), 8.6)) / dpi  # H.264: even
         figure = Figure(figsize=(8.0, height), dpi=dpi, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         whole, strip = figure.subplots(2, 1, height_ratios=(height - 1.26, 1.26))

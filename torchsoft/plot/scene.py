@@ -244,10 +244,15 @@ class Scene:
         def polygons(
             names: Iterable[str], face: str, edge: str, width: float
         ) -> dict[str, Polygon]:
-            nowhere, style = np.zeros((3, 2)), {"lw": size * width, "joinstyle": "round"}
-            return {
-                name: axes.add_patch(Polygon(nowhere, fc=face, ec=edge, **style)) for name in names
+            out = {
+                name: Polygon(
+                    np.zeros((3, 2)), fc=face, ec=edge, lw=size * width, joinstyle="round"
+                )
+                for name in names
             }
+            for polygon in out.values():
+                axes.add_patch(polygon)
+            return out
 
         with_plate = [name for name, thickness in self.thickness.items() if thickness]
         self.plates = polygons(with_plate, STEEL, INK, 0.6)
@@ -333,7 +338,7 @@ class Scene:
         y = self.axes.get_ylim()[1] - curve_height(self.setup) - 2.0 * step
         top = y + self.force_scale * force
         self.axes.plot([x, x], [y, top], color=INK, lw=1.5, solid_capstyle="butt")
-        label = {"ha": "right", "va": "center", "fontsize": "small"}
+        label: Any = {"ha": "right", "va": "center", "fontsize": "small"}
         self.axes.text(x - 2.0 * step, y + 0.5 * step, f"{force:g} N", **label)
 
 

@@ -273,9 +273,9 @@ def score(model: ReducedModel, on: Record) -> Score:
     out, exact = rollout_of(model, on), on.columns(model.states)
     error = np.sqrt(((out.y - exact) ** 2).mean(0))
     error = np.where(np.isfinite(error), error, np.inf)
-    over_range, over_deviation = error / np.ptp(exact, axis=0), error / exact.std(0)
-    by_state = [dict(zip(model.states, one.tolist())) for one in (over_range, over_deviation)]
-    return Score(*by_state, out)
+    over_range = dict(zip(model.states, (error / np.ptp(exact, axis=0)).tolist()))
+    over_deviation = dict(zip(model.states, (error / exact.std(0)).tolist()))
+    return Score(over_range, over_deviation, out)
 
 
 def _warn_of_misses(

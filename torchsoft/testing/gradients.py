@@ -27,6 +27,7 @@ from torchsoft.testing.energy import conclude
 Value = Callable[[Trajectory], Tensor]
 Values = Callable[[Trajectory], dict[str, Tensor]]
 Leaves = dict[str, Tensor]
+Pair = tuple[float | None, float | None]
 Slopes = dict[str, dict[str, float]]
 """Derivatives of every value by every leaf, along the leaf's way."""
 
@@ -444,7 +445,7 @@ class Probe:
         derivatives = []
         for name in self.leaves:
             expected = {kind: found[name] for kind, found in own.items()}
-            judged: dict[str, Any] = dict.fromkeys(own, (None, None))
+            judged: Mapping[str, Pair] = dict.fromkeys(own, (None, None))
             if each:
                 reach = _reach(name, max(weights[kind][name] for kind in own))
                 scale = {kind: max(abs(x), largest[kind] / WEAK) for kind, x in expected.items()}
