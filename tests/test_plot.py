@@ -261,7 +261,7 @@ def test_diagram_places_every_node_of_the_graph_by_itself(held, inertial):
 
 
 def test_animation_moves(done, tmp_path):
-    animate(done[1], tmp_path / "run.gif", frames=4, dpi=40)
+    animate(done[1], tmp_path / "run.gif", frames=4)
     assert [path.name for path in tmp_path.iterdir()] == ["run.gif"]
     with Image.open(tmp_path / "run.gif") as gif:
         assert (gif.n_frames, gif.info["duration"]) == (4, 80)

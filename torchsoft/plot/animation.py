@@ -42,6 +42,7 @@ from torchsoft.plot.scene import (
     PAD,
     STEEL,
     Scene,
+    behind,
     foot,
     force_scale,
     friction_sign,
@@ -57,6 +58,8 @@ from torchsoft.solve.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12.5
 """Frame rate; the delay of a GIF's frame is a multiple of 10 ms."""
+
+DPI = 110
 
 Picture = NDArray[np.uint8]
 
@@ -76,15 +79,15 @@ def pace(speed: float) -> str:
     return f"\n{times:g} times {'as fast' if speed > 1 else 'slower'}"
 
 
-def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) -> Iterator[Picture]:
+def render(run: Trajectory, times: Array, title: str, curve: Curve) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and below it a coordinate over
     time. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
     with rc_context(STYLE):
         x, y = limits(setup, shown)
         tall = 7.0 * float(np.ptp(y) / np.ptp(x)) + 2.2
-        height = 2 * round(0.5 * dpi * min(max(5.8, tall), 8.6)) / dpi  # H.264: even
-        figure = Figure(figsize=(8.0, height), dpi=dpi, layout="constrained")
+        height = 2 * round(0.5 * DPI * min(max(5.8, tall), 8.6)) / DPI  # H.264: even
+        figure = Figure(figsize=(8.0, height), dpi=DPI, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         whole, strip = figure.subplots(2, 1, height_ratios=(height - 1.26, 1.26))
         scene = Scene(whole, setup, shown)
@@ -116,7 +119,7 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) ->
 
 
 def animate(
-    run: Trajectory, path: Path, *, frames: int = 150, dpi: int = 110, progress: bool = False,
+    run: Trajectory, path: Path, *, frames: int = 150, progress: bool = False,
     title: str = "", follow: str = "", slow: float = 0.0,
 ) -> None:  # fmt: skip
     """Write `frames` pictures of the whole run as .gif, or as .mp4 where imageio-ffmpeg is
@@ -139,7 +142,7 @@ def animate(
             f"{suggestion(followed, known, 'there are')}"
         )
     bar = tqdm(
-        render(run, times, dpi, title, known[followed]),
+        render(run, times, title, known[followed]),
         "animation",
         len(times),
         unit="frame",
@@ -209,11 +212,11 @@ def encoded(values: NDArray[Any]) -> str:
 def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
     """Meshes, node positions in the frame of the base [mm] and stresses of the elements [kPa], by
     pad."""
-    out = {}
+    out, thickness = {}, plates(run.setup)
     for name, pad in run.setup.pads.items():
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
         stress = 1e-3 * pad.stress(whole)
-        direct = {
+        fields = {
             "von Mises stress": von_mises(stress),
             "pressure": -stress[..., :3].mean(-1),
             "shear stress": stress[..., 3],
@@ -223,14 +226,11 @@ def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
             "still": (MM * pad.placed(pad.mesh.nodes)).round(6).ravel().tolist(),
             "elements": pad.mesh.elements.ravel().tolist(),
             "outline": pad.mesh.outline.tolist(),
-            "fields": {key: packed(values) for key, values in direct.items()},
+            "fields": {key: packed(values) for key, values in fields.items()},
         }  # fmt: skip
-        left, right = MM * pad.mesh.base
-        thickness = plates(run.setup)[name]
-        if thickness:
-            corners = np.array([left, [right[0], left[1]], [right[0], left[1] - thickness],
-                                [left[0], left[1] - thickness]])  # fmt: skip
-            out[name]["plate"] = (MM * pad.placed(corners / MM)).ravel().tolist()
+        if thickness[name]:
+            corners = behind(pad, np.zeros(3), thickness[name])[[3, 2, 1, 0]]
+            out[name]["plate"] = corners.ravel().tolist()
     return out
 
 
@@ -299,9 +299,7 @@ def charts(run: Trajectory) -> list[dict[str, Any]]:
     return [{"t": t}, *out]
 
 
-def player(
-    run: Trajectory, path: Path, *, frames: int = 300, title: str = "", progress: bool = False
-) -> None:
+def player(run: Trajectory, path: Path, *, frames: int = 300, title: str = "") -> None:
     """Write the player with `frames` frames, a megabyte a hundred for pads like the paper's. The
     file appears whole or not at all. Raises `ValueError` for less than two frames."""
     if frames < 2:

@@ -244,10 +244,12 @@ def energies(axes: Axes, run: Trajectory) -> None:
 def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
     """Draw normal force and friction [N] at the points of one contact over their place along the
     surface [mm]; friction with its cone where the law has one, and points by their state."""
-    near, setup = instant.near(contact), run.setup
-    x, state = instant.along[contact][near], instant.state[contact][near]
+    near, name = instant.near(contact), run.setup.contacts[contact].pad
+    pad, state = run.setup.pads[name], instant.state[contact][near]
+    along = along_surface(pad, instant.base[name])
+    x = instant.points[contact][near] @ along
     normal, friction = instant.force[contact][near].T
-    mu = setup.contacts[contact].friction.get("mu_s")
+    mu = run.setup.contacts[contact].friction.get("mu_s")
     if mu is not None:
         axes.fill_between(x, -mu * normal, mu * normal, color=FRICTION, alpha=0.14, lw=0)
         axes.plot(x, mu * normal, ":", color=FRICTION, lw=0.8)
@@ -263,10 +265,7 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
     if not len(near):
         axes.set(xticks=[], yticks=[], ylim=(-1, 1), xlabel="no point touches")
         return
-    name = setup.contacts[contact].pad
-    pad = setup.pads[name]
-    level = along_surface(pad, instant.base[name])[0] > 0.999
-    axes.set_xlabel("x [mm]" if level else "along the surface [mm]")
+    axes.set_xlabel("x [mm]" if along[0] > 0.999 else "along the surface [mm]")
     legend_above(axes)
     area = pad.depth * pad.lengths[near]
     if np.ptp(area) < 1e-6 * area[0]:  # else a force is not the same pressure everywhere

@@ -199,21 +199,19 @@ def stress_bar(figure: Figure, axes: Any, largest: float) -> None:
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 
-def snapshots(
-    run: Trajectory, times: Sequence[float] = (), *, title: str = "", look: Look = "screen"
-) -> Figure:
+def snapshots(run: Trajectory, times: Sequence[float] = (), *, title: str = "") -> Figure:
     """Bodies, deformed pads with their stress, contact points by their state, and contact forces at
     `times` [s], by default at six over the whole run."""
     setup = run.setup
     times = times or np.linspace(float(run.t[0]), float(run.t[-1]), SNAPSHOTS).tolist()
     shown = instants(run, times)
-    with looking(look) as size:
+    with looking("screen") as size:
         x, y = limits(setup, shown)
         tall = float(np.clip(np.ptp(y) / np.ptp(x), 0.3, 1.5))
         columns = min(size.columns, len(shown))
         rows = -(-len(shown) // columns)
         width = min(size.width, 4.8 * columns)
-        heading = (title or "Bodies, pads and contact forces") if size.titled else ""
+        heading = title or "Bodies, pads and contact forces"
         figure = new_figure(heading, width, (0.93 * width / columns * tall + 0.35) * rows + 0.8)
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         markers = 0.1 * size.font * min(1.0, width / columns / 4.0)

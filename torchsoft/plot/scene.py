@@ -68,8 +68,7 @@ class Instant(NamedTuple):
 
     mesh: pad -> (mesh nodes, 2); stress: pad -> von Mises' (elements,) [kPa]; points: contact ->
     (points, 2); force: contact -> (points, 2), normal force and friction on the pad, the latter
-    positive along `along_surface`; along: contact -> (points,), how far the points are in that
-    direction; state: contact -> (points,).
+    positive along `along_surface`; state: contact -> (points,).
     """
 
     time: float
@@ -79,7 +78,6 @@ class Instant(NamedTuple):
     stress: dict[str, Array]
     points: dict[str, Array]
     force: dict[str, Array]
-    along: dict[str, Array]
     state: dict[str, NDArray[np.int8]]
 
     def near(self, contact: str, margin: int = 1) -> NDArray[np.int64]:
@@ -104,17 +102,16 @@ def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
             name: np.zeros(3) if pad.base is None else pose[pad.base]
             for name, pad in setup.pads.items()
         }
-        points, force, along = {}, {}, {}
+        points, force = {}, {}
         for key, contact in setup.contacts.items():
             pad, own = setup.pads[contact.pad], base[contact.pad]
             points[key] = in_world(MM * pad.surface_points(u[contact.pad][i]), own)
             force[key] = run.force[key][row].detach().numpy() * [1.0, friction_sign(pad, own)]
-            along[key] = points[key] @ along_surface(pad, own)
         mesh = {name: in_world(meshes[name][i], base[name]) for name in meshes}
         stress = {name: stresses[name][i] for name in stresses}
         state = {key: run.contact_state[key][row].numpy() for key in setup.contacts}
         time = float(run.t[row])
-        shown.append(Instant(time, pose, base, mesh, stress, points, force, along, state))
+        shown.append(Instant(time, pose, base, mesh, stress, points, force, state))
     return shown
 
 
@@ -194,12 +191,12 @@ def plates(setup: Setup) -> dict[str, float]:
     return {name: out.get(name, thickest) for name in setup.pads}
 
 
-def behind(setup: Setup, instant: Instant, name: str, depth: float, *, wider: float = 0.0) -> Array:
+def behind(pad: PadSetup, base: Array, depth: float, *, wider: float = 0.0) -> Array:
     """Corners (4, 2) [mm] of the rectangle of a `depth` behind a pad's bonded face, `wider` [mm]
-    than the face on each side."""
-    (left, face), (right, _) = MM * setup.pads[name].mesh.base + [[-wider, 0.0], [wider, 0.0]]
+    than the face on each side; base (3,) is the pose of the pad's base."""
+    (left, face), (right, _) = MM * pad.mesh.base + [[-wider, 0.0], [wider, 0.0]]
     corners = np.array([[left, face - depth], [right, face - depth], [right, face], [left, face]])
-    return own_places(setup.pads[name], instant.base[name], corners)
+    return own_places(pad, base, corners)
 
 
 def limits(setup: Setup, shown: Sequence[Instant]) -> tuple[Array, Array]:
@@ -212,7 +209,7 @@ def limits(setup: Setup, shown: Sequence[Instant]) -> tuple[Array, Array]:
                 rows += [around - 2.0 * margin, around + 2.0 * margin]
         for name, mesh in instant.mesh.items():
             depth = thickness[name] + curve_height(setup) + 7.0 * margin
-            rows += [mesh, behind(setup, instant, name, depth, wider=4.0 * margin)]
+            rows += [mesh, behind(setup.pads[name], instant.base[name], depth, wider=4.0 * margin)]
     every = np.concatenate(rows)
     x, y = np.stack((every.min(0), every.max(0)), -1)
     return x, y
@@ -300,7 +297,7 @@ class Scene:
             if self.stress:
                 self.fields[name].set_array(instant.stress[name])
         for name, plate in self.plates.items():
-            plate.set_xy(behind(setup, instant, name, self.thickness[name]))
+            plate.set_xy(behind(setup.pads[name], instant.base[name], self.thickness[name]))
         for name, outline in self.shapes.items():
             pose = instant.pose[name]
             top = in_world(straight_up(outline), pose)

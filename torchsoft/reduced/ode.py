@@ -8,7 +8,6 @@ step: scipy's stiff solvers call Python at every step and cost more than the ful
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,13 +24,11 @@ from torchsoft.codegen import compile_law
 from torchsoft.display import Shown
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 
-SYMBOLS = {
-    "x_C": ("x_C", "m"), "theta": (r"\theta", "rad"), "x_Br": ("x_{Br}", "m"),
-    "v_C": (r"\dot x_C", "m/s"), "omega": (r"\dot\theta", "rad/s"),
-    "v_Br": (r"\dot x_{Br}", "m/s"), "F_x": ("F_x", "N"), "x_d": ("x_d", "m"),
-    "x_d_dot": (r"\dot x_d", "m/s"),
+UNITS = {
+    "x_C": "m", "theta": "rad", "x_Br": "m", "v_C": "m/s", "omega": "rad/s", "v_Br": "m/s",
+    "F_x": "N", "x_d": "m", "x_d_dot": "m/s",
 }  # fmt: skip
-"""LaTeX and unit of the variables of a reduced model."""
+"""Units of the variables of a reduced model."""
 
 BEYOND = 100.0
 """Largest state of a rollout, over the states' scale; beyond, it has diverged."""
@@ -46,11 +43,6 @@ HALVINGS = 8
 """Most halvings of the step of a rollout."""
 
 
-def symbol(name: str) -> tuple[str, str]:
-    """LaTeX and unit of a variable; the name itself where there is no such channel."""
-    return SYMBOLS.get(name, (name, name))
-
-
 @dataclass(frozen=True)
 class Term:
     """A candidate term with its formula as text and its unit: a linear combination `form` of
@@ -60,13 +52,6 @@ class Term:
     unit: str
     form: Mapping[str, float]
     saturation: float | None = None
-
-    @property
-    def latex(self) -> str:
-        """The formula with the symbols of its variables."""
-        return re.sub(
-            r"tanh|\w+", lambda m: r"\tanh" if m[0] == "tanh" else symbol(m[0])[0], self.text
-        )
 
     @property
     def linear(self) -> bool:
@@ -306,19 +291,12 @@ class ReducedModel(Shown, nn.Module):
         """One equation a line, in SI units."""
         lines = [f"{name}' = {rate}" for name, rate in self.kinematics.items()]
         for target, pairs in self.equations().items():
-            parts = [(value, f"{abs(value):.4g} {_bracketed(term.text)}") for term, value in pairs]
-            lines.append(f"{target}' = {_sum(parts)}")
+            parts = (
+                f"{'+-'[value < 0]} {abs(value):.4g} {_bracketed(term.text)}"
+                for term, value in pairs
+            )
+            lines.append(f"{target}' = {' '.join(parts).removeprefix('+ ') or '0'}")
         return lines
-
-    def latex(self) -> str:
-        """The equations of the velocities as an `aligned` block."""
-        rows = []
-        for target, pairs in self.equations().items():
-            parts = [
-                (value, rf"{_power(abs(value))}\,{_bracketed(term.latex)}") for term, value in pairs
-            ]
-            rows.append(rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {_sum(parts)}")
-        return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def coefficient_table(self) -> list[dict[str, Any]]:
         """Every coefficient with its unit and, from an ensemble, its interval."""
@@ -326,25 +304,14 @@ class ReducedModel(Shown, nn.Module):
         return [
             {
                 "equation": target, "term": term.text, "value": value,
-                "unit": f"{symbol(target)[1]}/s per {term.unit}", "interval": interval,
+                "unit": f"{UNITS.get(target, target)}/s per {term.unit}", "interval": interval,
             }
             for target, term, value, interval in zip(self.targets, self.terms, values, intervals)
         ]  # fmt: skip
 
 
-def _sum(parts: Sequence[tuple[float, str]]) -> str:
-    """Texts joined by the signs of their values; 0 where there are none."""
-    joined = " ".join(f"{'+-'[value < 0]} {text}" for value, text in parts)
-    return joined.removeprefix("+ ") or "0"
-
-
 def _bracketed(text: str) -> str:
     return f"({text})" if " + " in text or " - " in text else text
-
-
-def _power(value: float) -> str:
-    mantissa, _, exponent = f"{value:.4g}".partition("e")
-    return rf"{mantissa}\cdot 10^{{{int(exponent)}}}" if exponent else mantissa
 
 
 def linear_rollout(

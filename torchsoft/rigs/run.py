@@ -178,7 +178,7 @@ def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]
     # matplotlib takes half a second, which `check` does not need
     from torchsoft.plot import figures
     from torchsoft.plot.animation import animate, player
-    from torchsoft.plot.dashboard import dashboard, liveliest
+    from torchsoft.plot.dashboard import dashboard
 
     title, written = plain(file.title), []
     made = {
@@ -196,7 +196,7 @@ def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]
         name = f"video.{file.outputs.video}"
         animate(
             run, out / name, frames=file.outputs.frames, progress=progress, title=title,
-            follow=file.outputs.follow or liveliest(run),
+            follow=file.outputs.follow,
         )  # fmt: skip
         written.append(name)
     return written
