@@ -404,7 +404,7 @@ class Probe:
             for name, p in self.leaves.items()
             if p.ndim == 0 and name != "start" and not name.startswith("reference.")
         ]
-        names = [*numbers, *(["start"] if "start" in self.leaves else [])]
+        names = [*numbers, *{"start"}.intersection(self.leaves)]
         if not names or not isinstance(self.values, RandomSums):
             return {}
         initial = started(self.rig, self.steps.begin, "forward")
@@ -489,30 +489,36 @@ def _judged(
     scale: Mapping[str, float],
     bound: float,
 ) -> dict[str, tuple[float, float]]:
-    """Of every value the difference and its uncertainty, from the two neighbouring lengths that
-    agree best: their distance, or the noise of shorter lengths, which falls with the length, since
-    noise may agree by chance. No further length is tried once the `expected` values are met, to
-    `bound` of their `scale`."""
-    found: dict[float, Mapping[str, float]] = {}
+    """Of every value the difference and its uncertainty. No further length is tried once the
+    `expected` values are met, to `bound` of their `scale`."""
+    found: dict[str, dict[float, float]] = {kind: {} for kind in expected}
     best: dict[str, tuple[float, float]] = {}
     for length in LENGTHS:
-        found[length] = differenced(length)
-        ordered, best = sorted(found), {}
-        for kind in scale:
-            noise = 0.0  # of the value itself, from lengths up to b
-            for a, b in pairwise(ordered):
-                spread, uncertainty = abs(found[a][kind] - found[b][kind]), np.inf
-                if np.isfinite(spread):
-                    noise = max(noise, a * spread)
-                    uncertainty = max(spread, noise / b)
-                if kind not in best or uncertainty < best[kind][1]:
-                    best[kind] = found[b][kind], uncertainty
-        if best and all(
+        differences = differenced(length)
+        for kind, at in found.items():
+            at[length] = differences[kind]
+        best = {kind: _agreed(at) for kind, at in found.items()}
+        if all(
             uncertainty <= 0.1 * bound * scale[kind]
             and abs(value - expected[kind]) <= bound * scale[kind]
             for kind, (value, uncertainty) in best.items()
         ):
             break
+    return best
+
+
+def _agreed(found: Mapping[float, float]) -> tuple[float, float]:
+    """The difference and its uncertainty, from the two neighbouring lengths that agree best: their
+    distance, or the noise of shorter lengths, which falls with the length, since noise may agree by
+    chance."""
+    best, noise = (np.nan, np.inf), 0.0
+    for a, b in pairwise(sorted(found)):
+        spread = abs(found[a] - found[b])
+        if np.isfinite(spread):
+            noise = max(noise, a * spread)
+            uncertainty = max(spread, noise / b)
+            if uncertainty < best[1]:
+                best = found[b], uncertainty
     return best
 
 

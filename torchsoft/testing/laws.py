@@ -111,20 +111,15 @@ def _otherwise(what: str, law: Callable[..., Any], x: Tensor) -> Iterator[str]:
     compiled = compile_law(function, x[0], parameters)
     weights = np.linspace(0.5, 1.7, compiled.outputs)
     found = evaluate(compiled, x, parameters, weights)
-    kept = {name: p.detach().requires_grad_() for name, p in parameters.items()}
     values, slopes, by_parameter = list[Tensor](), list[Tensor](), list[Tensor]()
     for row in x:
-        given = row.clone().requires_grad_()
-        out = function(given, kept)
-        wanted = [given, *kept.values()]
-        nothing = 0.0 * torch.stack([w.sum() for w in wanted]).sum()  # without a graph of its own
-        ask = lambda scalar, wanted=wanted, nothing=nothing: torch.autograd.grad(
-            scalar + nothing, wanted, retain_graph=True
-        )
-        values.append(out.detach())
-        slopes.append(torch.stack([ask(one)[0] for one in out]))
-        bars = ask((out * torch.from_numpy(weights)).sum())[1:]
-        by_parameter.append(torch.cat([torch.zeros(0).double(), *(g.flatten() for g in bars)]))
+        outputs = lambda row, *given: function(row, dict(zip(parameters, given)))
+        given = (row, *(p.detach() for p in parameters.values()))
+        by_row, *by_each = torch.autograd.functional.jacobian(outputs, given)
+        bars = [torch.from_numpy(weights) @ one.reshape(len(weights), -1) for one in by_each]
+        values.append(outputs(*given).detach())
+        slopes.append(by_row)
+        by_parameter.append(torch.cat([torch.zeros(0).double(), *bars]))
     parts = ("values", "derivatives", "derivatives by parameters")
     for part, one, rows in zip(parts, found, (values, slopes, by_parameter)):
         other = torch.stack(rows).numpy()
