@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, press, times
+from conftest import coarse, f64, press, times
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
@@ -30,7 +30,7 @@ from torchsoft.reduced import (
     score,
 )
 from torchsoft.reduced.fit import contradictions
-from torchsoft.reduced.ode import BEYOND, Held, Term
+from torchsoft.reduced.ode import BEYOND, Term
 from torchsoft.reduced.records import KINEMATICS, STATES
 from torchsoft.reduced.terms import variable
 from torchsoft.rigs import RigFile
@@ -218,7 +218,7 @@ def test_all_routes_are_one(nonlinear):
     assert model.linear is not nonlinear
     t, u, y0 = one.t, 20 * one.columns(("x_d", "x_d_dot")), 20 * one.columns(STATES)[0]
     fast = model.rollout(t, y0, u).y
-    model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
+    model.signal = lambda when: f64(*(np.interp(float(when), t, column) for column in u.T))
     start, step = torch.from_numpy(y0), {"step_size": 2e-5}
     with torch.no_grad():
         slow = odeint(model, start, torch.from_numpy(t), method="rk4", options=step).numpy()
@@ -234,7 +234,7 @@ def test_gradients_through_torchdiffeq_are_those_of_the_rollout():
     of the exact rollout."""
     model, one = truth(), motion(truth(), 3, duration=0.02)
     t, u, y0 = one.t, one.columns(model.outer), one.columns(STATES)[0]
-    model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
+    model.signal = lambda when: f64(*(np.interp(float(when), t, column) for column in u.T))
     start = torch.from_numpy(y0).requires_grad_()
     step = {"step_size": 5e-5}
     odeint(model, start, torch.from_numpy(t), method="rk4", options=step)[-1, 0].backward()

@@ -8,7 +8,7 @@ step: scipy's stiff solvers call Python at every step and cost more than the ful
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
@@ -91,24 +91,6 @@ class Table(NamedTuple):
         return torch.where(self.saturates, values.tanh(), values)
 
 
-class Held(nn.Module):
-    """Inputs u (T, inputs) sampled at t (T,) [s], interpolated linearly."""
-
-    t: Tensor
-    u: Tensor
-
-    def __init__(self, t: Tensor, u: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("t", t)
-        self.register_buffer("u", u)
-
-    def forward(self, t: Tensor | float) -> Tensor:
-        when = torch.as_tensor(t, dtype=self.t.dtype)
-        i = torch.searchsorted(self.t, when.detach()).clamp(1, len(self.t) - 1)
-        fraction = (when - self.t[i - 1]) / (self.t[i] - self.t[i - 1])
-        return torch.lerp(self.u[i - 1], self.u[i], fraction.clamp(0.0, 1.0))
-
-
 @dataclass(frozen=True, repr=False)
 class Rollout(Shown):
     """States y (T, states) at t (T,) [s], NaN from the time of divergence `diverged_at` [s] on, and
@@ -177,7 +159,7 @@ class ReducedModel(Shown, nn.Module):
         self.gains = nn.Parameter(double([gain for _, _, gain in laws]))
         self.scale = np.ones(len(states)) if scale is None else np.asarray(scale, dtype=float)
         self.intervals = None if intervals is None else [(float(a), float(b)) for a, b in intervals]
-        self.signal: nn.Module | None = None
+        self.signal: Callable[[Tensor | float], Tensor] | None = None
         self._table = Table.of(self.terms, (*self.states, *self.inputs))
         self._rate_of = selection(self.targets, self.states)
         self._made = selection([name for name, _, _ in laws], self.inputs)
@@ -230,8 +212,7 @@ class ReducedModel(Shown, nn.Module):
         if self.outer:
             if self.signal is None:
                 raise ValueError(
-                    f"set `signal` to a module that gives {', '.join(self.outer)} at t, such as "
-                    "`Held`"
+                    f"set `signal` to a function of t that gives {', '.join(self.outer)} (inputs,)"
                 )
             w = self.signal(t).expand(*y.shape[:-1], -1)
         return self.rates(torch.cat((y, w), -1))
