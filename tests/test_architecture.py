@@ -36,7 +36,7 @@ FLOWS = {
         initial_state recording unknowns noise prediction runs assumptions problem first_samples
         synthetic fit plan prechecks
         residual_tests colour refits assumption_tests new_fits sensitivity suspects estimate
-        result profile posterior identification compare
+        result profile identification compare
         planner columns configuration measured design figures report .
     """,
     "testing": "energy laws gradients .",

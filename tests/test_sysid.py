@@ -23,7 +23,7 @@ from torchsoft.sysid import (
     identify,
     record,
 )
-from torchsoft.sysid.fit import Fit, descend, gauss_newton
+from torchsoft.sysid.fit import Fit, gauss_newton
 from torchsoft.sysid.plan import default_plan, jacobian_error, run_plan, run_stage
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
@@ -80,10 +80,10 @@ def fit(
 
 def check_derivatives(
     problem: Problem, x: np.ndarray, rtol: float, near: float, h: float = 1e-5,
-    adjoint: float = 1e-8, only: Sequence[str] = (), runner: Runner | None = None,
+    only: Sequence[str] = (), runner: Runner | None = None,
 ) -> None:  # fmt: skip
-    """Columns of the Jacobian, or only some of them, against central differences, of `near` [1];
-    the gradient of the adjoint against the Jacobian's. A larger h [1] passes kinks of contact."""
+    """Columns of the Jacobian, or only some of them, against central differences, of `near` [1]. A
+    larger h [1] passes kinks of contact."""
     free, which = problem.coordinates.free, problem.names
     runner = runner or Runner(problem.recordings)
     chosen = problem.residuals(runner, x, which, rtol)
@@ -98,12 +98,6 @@ def check_derivatives(
         )
         slope = (ahead - behind) / (2 * h)
         assert np.linalg.norm(at.J[:, i] - slope) < near * np.linalg.norm(slope), label
-    loss, gradient, failed = problem.misfit(runner, x, which, steps, free)
-    assert not failed
-    assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
-    np.testing.assert_allclose(
-        gradient, at.J.T @ at.r, rtol=adjoint, atol=adjoint * np.abs(gradient).max()
-    )
 
 
 @pytest.mark.parametrize("inertial", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -232,17 +226,6 @@ def test_a_fit_without_headway_ends_early_and_reports_it(level, stalls):
     assert not stalls or "no headway: over 6 evaluations" in end.notices[0]
 
 
-def test_the_adjoint_route_ends_where_gauss_newton_does():
-    bent = ClosedForm(lambda x: [x[0] - 0.5, np.sinh(x[1]) - x[0], 0.1 * x[1]], 2)
-    begin = optimum(bent, 0, 0)
-    newton = gauss_newton(begin)
-    descent = descend(begin._replace(method="lbfgs"), evaluations=40)
-    np.testing.assert_allclose(descent.x, newton.x, atol=2e-3)
-    adam = descend(newton._replace(method="adam"), evaluations=2)
-    assert adam.evaluations == 2
-    assert adam.chi2 <= newton.chi2 + 1e-9
-
-
 @pytest.mark.parametrize(("most", "ends"), [(1.0, (0.0615, 1.0)), (4.0, (-1.0, 2.2))])
 def test_a_coordinate_held_at_its_bound_leaves_the_others_at_their_optimum(most, ends):
     """Two that correlate: the bound of the second moves the first."""
@@ -369,8 +352,6 @@ def test_a_problem_without_unknowns_or_a_plan_that_contradicts_its_options_is_re
     problem = Problem([short], SENSORS, {E: Unknown()})
     with pytest.raises(ValueError, match="`starts` and `rtol` are those of the default plan"):
         identify(problem, starts=3, plan=[])
-    with pytest.raises(ValueError, match="for loss = 'huber' take method = 'gauss_newton'"):
-        identify(problem, loss="huber", method="lbfgs")
 
 
 SAMPLES = np.linspace(0.0, 0.1, 5)

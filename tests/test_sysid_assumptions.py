@@ -13,7 +13,7 @@ from conftest import COARSE, PAPER, RUBBER, dry, excited, stroked
 from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Reference, Rig
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.assumptions import AMOUNTS, assumptions
-from torchsoft.sysid.prediction import Frozen, Prediction, Readout, Signals, Term, lagged, predict
+from torchsoft.sysid.prediction import Prediction, Readout, Signals, Term, lagged, predict
 from torchsoft.sysid.problem import DIFFERENCE
 from torchsoft.sysid.recording import Grid, extended
 from torchsoft.sysid.refits import assuming, begun
@@ -324,28 +324,6 @@ def changed(recording: Recording, name: str, value: float) -> Rig:
     with torch.no_grad():
         rig.parameter(name).fill_(value)
     return rig
-
-
-# Numbers that drift along a recording
-
-
-def test_a_number_that_drifts_changes_along_the_samples():
-    """Before them it is as stated; after them, where all is at rest, that of a softer pad, but for
-    the friction on the way."""
-    held = replace(strokes(), start=strokes().start._replace(followed={}))  # the same set-points
-    whole, grid = run_of(held), held.grid(True)
-    as_stated, pieces, softer, soft = (
-        predict(replace(held, drifts=drifts).begin(), at, grid, (), Frozen(whole.knots)).signals
-        for drifts, at in (
-            ({}, {}), ({E: 0.0}, {}), ({E: -0.1}, {}), ({}, {E: 0.9 * held.parameters[E]})
-        )
-    )  # fmt: skip
-    np.testing.assert_allclose(pieces, as_stated, atol=1e-8)
-    assert (softer[whole.t < 0.0] == as_stated[whole.t < 0.0]).all()
-    y = strokes().channels.index("effort_y")
-    fallen = soft[-1, y] / as_stated[-1, y] - 1
-    assert fallen < -0.05
-    assert softer[-1, y] / as_stated[-1, y] - 1 == pytest.approx(fallen, rel=0.03)
 
 
 @pytest.mark.slow

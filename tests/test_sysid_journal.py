@@ -13,7 +13,7 @@ import pytest
 from hostile.damage import BYTES, PLANTED, Trap, Victim, archive, damage, forged
 
 from torchsoft.sysid import runs
-from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction
+from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction
 from torchsoft.sysid.runs import CHECKPOINT, Job, Journal, Runner, decoded, encoded, forget
 
 ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
@@ -25,7 +25,6 @@ RESULTS = {
     "prediction": PREDICTION,
     "without derivatives": PREDICTION._replace(derivatives=None, knots=None),
     "nothing": Prediction(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 0))),
-    "infinite misfit": Misfit(float("inf"), ODD, -ODD[None]),
     "failed": FailedRun("the disc was lost at t = 0.1 s: µ_s, 'quoted'", float("nan")),
 }
 RUN, OTHER = ("run", 1.0), ("run", 1.0000000000000002)

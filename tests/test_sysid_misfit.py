@@ -10,7 +10,6 @@ from scipy import signal, stats
 from test_sysid_noise import made
 
 from torchsoft.sysid.colour import colour_notices, colours, correlation
-from torchsoft.sysid.fit import Colour
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import (
     LEVEL,
@@ -159,10 +158,10 @@ def test_colour_is_noticed_found_allowed_for_and_named():
     for fit in found.values():
         assert fit.noise.sd >= 1 - 1e-12
         assert 0.5 < correlation(fit.noise) < 0.7
-    (sentence,) = colour_notices(found, Colour())
+    (sentence,) = colour_notices(found)
     words = f"order 1, neighbouring samples correlate by {correlation(found['x_C'].noise):.2f}"
     assert f"x_C ({words})" in sentence
-    assert not colour_notices({}, Colour())
+    assert not colour_notices({})
     assert not residual_notices(Case(3, noise=noise, assumed=found["theta_C"].noise).judged())
 
 

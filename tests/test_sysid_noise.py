@@ -125,7 +125,7 @@ def test_intervals_keep_their_coverage_under_coloured_noise():
     assert inside["ignored"] < 0.7
 
 
-@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy", "arctan"])
+@pytest.mark.parametrize("loss", ["soft_l1", "huber"])
 def test_losses_are_scipys_and_leave_priors_quadratic(loss: Loss):
     rng = np.random.default_rng(0)
     J, y = rng.standard_normal((60, 2)), 3 * rng.standard_normal(60)
@@ -169,7 +169,7 @@ def test_robust_covariance_is_that_of_many_fits(loss: Loss, bad):
 
 def test_robust_covariance_where_no_sample_counts_is_rejected():
     with pytest.raises(ValueError, match="holds on to nothing"):
-        covariance(np.ones((40, 1)), np.full(40, 50.0), "cauchy")
+        covariance(np.ones((40, 1)), np.full(40, 50.0), "huber")
 
 
 def test_a_covariance_has_the_priors_and_the_degrees_of_freedom():

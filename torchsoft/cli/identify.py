@@ -117,7 +117,7 @@ def identify(options: argparse.Namespace) -> int:
                 fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
             )
             problems, heldout = list(case.laws.values()) or [case.problem], case.config.heldout
-            priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
+            priced = (fit.rtol, fit.starts, fit.workers, heldout)
             expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
             if stated is None:

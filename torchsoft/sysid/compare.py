@@ -34,7 +34,7 @@ from scipy.sparse.linalg import spsolve_triangular
 from torchsoft.display import suggestion
 from torchsoft.files import write_json
 from torchsoft.parallel import single_threaded
-from torchsoft.sysid.colour import allow_for_colour, declared_colour
+from torchsoft.sysid.colour import allow_for_colour
 from torchsoft.sysid.fit import Fit, Stage, Unreachable
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
@@ -67,8 +67,8 @@ Outcome = Literal["law", "cannot tell", "none fits"]
 @dataclass(frozen=True)
 class LawFit:
     """Results of one law: the number of its parameters, the log likelihood of the fitted samples in
-    SI units, the reduced chi-squared with its p-value, information criteria, Akaike weight (of
-    AICc), and the log density per sample of held-out recordings, with the p-value of their sum of
+    SI units, the reduced chi-squared with its p-value, the Bayesian information criterion, and the
+    log density per sample of held-out recordings, with the p-value of their sum of
     squares. `numerical` is the change of the log likelihood by a tenth of the tolerance; `left` has
     sentences on deviations of the residuals from the stated noise, by the tests of
     `torchsoft.sysid.residual_tests`, and `patterned` is whether residuals follow the motion."""
@@ -79,10 +79,7 @@ class LawFit:
     log_likelihood: float
     chi2: float
     p: float
-    aic: float
-    aicc: float
     bic: float
-    weight: float
     heldout: float | None
     heldout_p: float | None
     numerical: float
@@ -179,14 +176,13 @@ class Comparison:
 
     def table(self) -> str:
         """A line for each law, with differences from the best."""
-        head = ("law", "k", "log L", "chi2", "dAIC", "dAICc", "dBIC", "weight", "held out")
-        rows = ["{:20s} {:>3s} {:>11s} {:>7s} {:>9s} {:>9s} {:>9s} {:>7s} {:>9s}".format(*head)]
-        least = {key: min(getattr(one, key) for one in self.laws) for key in ("aic", "aicc", "bic")}
+        head = ("law", "k", "log L", "chi2", "dBIC", "held out")
+        rows = ["{:20s} {:>3s} {:>11s} {:>7s} {:>9s} {:>9s}".format(*head)]
+        least = min(one.bic for one in self.laws)
         for one in self.laws:
             own = f"{one.name:20s} {one.parameters:3d} {one.log_likelihood:11.1f} {one.chi2:7.3f}"
-            delta = " ".join(f"{getattr(one, key) - least[key]:9.1f}" for key in least)
             density = "" if one.heldout is None else f" {one.heldout:9.3f}"
-            rows.append(f"{own} {delta} {one.weight:7.3f}{density}")
+            rows.append(f"{own} {one.bic - least:9.1f}{density}")
         return "\n".join(rows)
 
 
@@ -494,7 +490,7 @@ def fitted(name: str, begin: Fit, which: Sequence[str], plan: Sequence[Stage]) -
     fit = run_plan(begin, plan, label=f"{name} ")
     if fit.failure is not None:  # laws are compared by the same tolerance
         raise fit.failure
-    return allow_for_colour(fit, undeclared=False) if declared_colour(fit.problem) else fit
+    return allow_for_colour(fit)
 
 
 def refitted(law: Fit, best: Fit) -> Fit | None:
@@ -537,35 +533,21 @@ def versus(best: Evidence, other: Evidence) -> Versus:
 
 
 def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
-    """Results of every law, with its information criteria."""
-    k = np.array([one.parameters for one in evidence.values()])
-    n, deviance = (
-        len(next(iter(evidence.values())).fitted.r),
-        np.array([-2 * e.fitted.log for e in evidence.values()]),
-    )
-    aic, bic = deviance + 2 * k, deviance + k * np.log(n)
-    aicc = aic + 2 * k * (k + 1) / np.maximum(n - k - 1, 1)
-    weight = np.exp(-0.5 * (aicc - aicc.min()))
+    """Results of every law."""
     out = []
-    for i, (name, one) in enumerate(evidence.items()):
-        square, held, c = (
-            float(one.fitted.r @ one.fitted.r),
-            one.heldout,
-            one.fit.problem.coordinates,
-        )
+    for name, one in evidence.items():
+        square, held = float(one.fitted.r @ one.fitted.r), one.heldout
+        c, k, n = one.fit.problem.coordinates, one.parameters, len(one.fitted.r)
         found = zip(c.all, one.fit.x, one.fit.free)
         out.append(
             LawFit(
                 name,
-                int(k[i]),
+                k,
                 {a.label: a.to_value(x) for a, x, free in found if free},
                 one.fitted.log,
                 square / one.dof,
                 float(stats.chi2.sf(square, one.dof)),
-                float(aic[i]),
-                float(aicc[i]),
-                float(bic[i]),
-                float(weight[i] / weight.sum()),
+                k * float(np.log(n)) - 2 * one.fitted.log,
                 None if held is None else held.log / len(held.r),
                 None if held is None else held.p,
                 one.numerical,

@@ -1,5 +1,5 @@
-"""Least squares on frozen steps: Gauss-Newton with exact sensitivities, descent with the adjoint,
-covariance and robust losses."""
+"""Least squares on frozen steps: Gauss-Newton with exact sensitivities, covariance, and robust
+losses."""
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
@@ -9,9 +9,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, lsq_linear, minimize
+from scipy.optimize import least_squares, lsq_linear
 
-from torchsoft.plan.search import ProjectedAdam
 from torchsoft.sysid.noise import NoiseFit
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
@@ -132,16 +131,17 @@ def rounded(direction: Array, C: Array) -> Array:
 # Robust losses and their covariance
 
 
-Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
+Loss = Literal["linear", "soft_l1", "huber"]
 
 REACH: dict[Loss, float] = {
     "linear": 1.0,
     "soft_l1": 1.287,
     "huber": 1.345,
-    "cauchy": 2.385,
-    "arctan": 2.571,
 }
 """Tuning constant c of every loss, at which it has the `EFFICIENCY` under Gaussian noise."""
+
+ROUNDED = 1e-12
+"""Mean slope of a loss's influence below which it is zero: every residual counts as an outlier."""
 
 EFFICIENCY = 0.95
 """Variance of the least-squares estimate over that of the robust one, under Gaussian noise."""
@@ -161,10 +161,6 @@ def rho(loss: Loss, z: Array) -> Array:
             return np.stack(
                 (np.where(near, z, 2 * root - 1), 1 / root, np.where(near, 0.0, -0.5 / root**3))
             )
-        case "cauchy":
-            return np.stack((np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2))
-        case "arctan":
-            return np.stack((np.arctan(z), 1 / (1 + z**2), -2 * z / (1 + z**2) ** 2))
 
 
 def robust_loss_except_priors(loss: Loss, priors: int) -> Callable[[Array], Array]:
@@ -198,7 +194,7 @@ def covariance(
         float(np.mean(first + 2 * z * second)),
         float(np.sum((first * own) ** 2)) / max(len(own) - n, 1),
     )
-    if slope <= 0:
+    if slope <= ROUNDED:
         raise ValueError(
             f"the loss `{loss}` holds on to nothing: most residuals count as outliers; state more "
             "noise, or take another loss"
@@ -210,8 +206,6 @@ def covariance(
 
 # A fit, from its begin to its end
 
-
-Method = Literal["gauss_newton", "lbfgs", "adam"]
 
 Notify = Callable[[float], None]
 """Called with chi2 after every evaluation."""
@@ -264,17 +258,6 @@ class Stage:
     spread: float = 3.0
 
 
-class Colour(NamedTuple):
-    """Noise of a fit: by channel what was `found`, with the scores of every order, and the fit
-    before, with the noise as `stated`; `refused` is colour that would explain a misfit away that is
-    larger by `worse` [1]."""
-
-    found: Mapping[str, NoiseFit] = MappingProxyType({})
-    stated: "Fit | None" = None
-    refused: Mapping[str, NoiseFit] = MappingProxyType({})
-    worse: float = 1.0
-
-
 NOTHING = Residuals(np.zeros(0), np.zeros((0, 0)), {})
 """Residuals of a fit that has not been evaluated."""
 
@@ -301,9 +284,9 @@ class Fit(NamedTuple):
     the noise.
 
     `stages` are the result's entries on the fits up to this one; `failure` is the error of a stage
-    that could not begin at its end; `colour` is the noise that was estimated from its residuals,
-    `check` that of its steps. `variance` is the factor on the stated variance of the noise;
-    `progress` whether bars are shown.
+    that could not begin at its end; `colour` is declared noise, estimated from its residuals, by
+    channel; `check` is that of its steps. `variance` is the factor on the stated variance of the
+    noise; `progress` whether bars are shown.
     """
 
     problem: Problem
@@ -312,7 +295,6 @@ class Fit(NamedTuple):
     stage: Stage = Stage("", (), (), float("nan"))
     at: Residuals = NOTHING
     loss: Loss = "linear"
-    method: Method = "gauss_newton"
     notify: Notify = silent
     progress: bool = False
     evaluations: int = 0
@@ -320,7 +302,7 @@ class Fit(NamedTuple):
     stalled: bool = False
     stages: tuple[dict[str, Any], ...] = ()
     failure: Unreachable | None = None
-    colour: Colour = Colour()
+    colour: Mapping[str, NoiseFit] = MappingProxyType({})
     check: Check = Check()
     variance: float = 1.0
 
@@ -428,14 +410,6 @@ class Fit(NamedTuple):
             raise Unreachable(at.failed)
         return self._replace(x=x, at=at)
 
-    def misfit(self, x: Array) -> tuple[float, Array, dict[str, FailedRun]]:
-        """|r|^2 / 2 at x (n,) on the fit's steps with its gradient by the fitted coordinates, by
-        the adjoint; infinite where a run fails."""
-        value, gradient, failed = self.problem.misfit(
-            self.runner, x, self.which, self.at.steps, self.free
-        )
-        return value, gradient[self.free], failed
-
     def step_effect(self, x: Array) -> float:
         """Change of |r|^2 at x (n,) by steps chosen there, in place of the fit's; NaN where a run
         fails."""
@@ -493,7 +467,7 @@ class Fit(NamedTuple):
         return out
 
 
-# Gauss-Newton and gradient descent
+# Gauss-Newton
 
 
 class Stalled(Exception):
@@ -582,39 +556,3 @@ def chord(fit: Fit, rounds: int = 5) -> Fit:
         fit = fit._replace(x=trial, at=there._replace(J=fit.at.J))
         fit.notify(fit.chi2)
     return fit._replace(evaluations=count, converged=converged, stalled=False)
-
-
-def descend(fit: Fit, evaluations: int = 100, rate: float = 0.05) -> Fit:
-    """scipy's L-BFGS-B, or Adam (learning `rate`) projected on the bounds, by the fit's `method`,
-    on the misfit on its steps; the best point visited.
-
-    For many unknowns: a gradient costs less than one run more, however many there are. For a
-    handful `gauss_newton` needs far fewer runs. Raises `Unreachable` where the start cannot be
-    simulated.
-    """
-    low, high = fit.bounds
-    samples, best, count = fit.problem.samples(fit.which), (np.inf, fit.x), 0
-
-    def slope(z: Array) -> tuple[float, Array]:
-        nonlocal best, count
-        now = fit.place(z)
-        value, gradient, failed = fit.misfit(now)
-        if failed and count == 0:
-            raise Unreachable(failed)
-        count += 1
-        if value < best[0]:
-            best = value, now
-        fit.notify(2 * value / samples)
-        return min(value / samples, 1e9), np.nan_to_num(gradient) / samples
-
-    start = np.clip(fit.x[fit.free], low, high)
-    if fit.method == "lbfgs":
-        options = {"maxfun": evaluations, "maxcor": 20, "ftol": 1e-12, "gtol": 1e-9}
-        bounds = list(zip(low, high))
-        minimize(slope, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    else:
-        adam = ProjectedAdam(start, lambda z: np.clip(z, low, high), (0.9, 0.999))
-        for _ in range(evaluations):
-            adam.step(slope(adam.z)[1], rate)
-    at = fit.residuals(best[1], jacobian=True)
-    return fit._replace(x=best[1], at=at, evaluations=count, converged=count < evaluations)

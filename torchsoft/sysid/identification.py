@@ -13,28 +13,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from tqdm import tqdm
 
 from torchsoft.parallel import single_threaded
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.colour import (
-    WORSE,
     allow_for_colour,
     colour_notices,
-    declared_colour,
-    growth,
     rewhitened,
     spread,
     undeclared_colour,
-    without_colour,
 )
-from torchsoft.sysid.estimate import contributions, directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.fit import (
     FAR_OFF,
     Fit,
     Loss,
-    Method,
     Stage,
     Unreachable,
     covariance,
@@ -51,7 +46,7 @@ from torchsoft.sysid.plan import (
 )
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.prediction import run_doubts
-from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import coarsened
 from torchsoft.sysid.residual_tests import (
@@ -95,21 +90,11 @@ class Settings(Table):
     rtol: float = Field(RTOL, ge=1e-8, le=1e-2)
     starts: int = Field(1, ge=1, le=2**20)
     loss: Loss = "linear"
-    method: Method = "gauss_newton"
     workers: int = Field(1, ge=1, le=1000)
     seed: int = Field(0, ge=0, le=SEED)
     tightenings: int = Field(2, ge=0, le=10)
     assumptions: Assumed = "checked"
     effort: float = Field(EFFORT, gt=0, le=1e6)
-
-    @model_validator(mode="after")
-    def _the_method_has_the_loss(self) -> "Settings":
-        if self.loss != "linear" and self.method != "gauss_newton":
-            raise ValueError(
-                f"the method '{self.method}' has no robust loss: for loss = '{self.loss}' take "
-                "method = 'gauss_newton'"
-            )
-        return self
 
 
 # Conclusion of a fit
@@ -122,10 +107,8 @@ def at_rest(planned: Fit, tightenings: int) -> Fit:
     colour = partial(shown, "colour of the noise", allow_for_colour)
     fit = colour(planned)
     end = check(fit)
-    if end.colour.found and len(end.stages) > len(fit.stages):
+    if end.colour and len(end.stages) > len(fit.stages):
         end = check(colour(end))  # its noise was that of the residuals before
-    if growth(end) > WORSE:
-        end = check(shown("fit without the colour of the noise", without_colour, end))
     return end
 
 
@@ -152,7 +135,7 @@ def conclude(
     end = at_rest(planned, settings.tightenings if linear and not hopeless else 0)
     stalled = end.stalled or (hopeless and planned.stalled)  # whatever noise was found after that
     end = end._replace(stalled=stalled, converged=end.converged and not stalled)
-    problem, x, at, rtol, free, colour = end.problem, end.x, end.at, end.rtol, end.free, end.colour
+    problem, x, at, rtol, free = end.problem, end.x, end.at, end.rtol, end.free
     c, fitted, runner = problem.coordinates, list(end.which), end.runner
     check, own = end.check, undeclared_colour(end)
     C_free, values, vectors = fisher(end.J)
@@ -160,16 +143,18 @@ def conclude(
     exact = np.concatenate([np.arange(0), *(part.rows for part in left)])  # not saturated
     rows = np.append(exact, np.arange(len(at.r) - len(c.priors), len(at.r)))
     whitened = float(at.r[rows] @ at.r[rows]) / max(len(rows) - int(free.sum()), 1)
+    coloured = problem.with_noise({**problem.noise, **{k: one.noise for k, one in own.items()}})
+    white = rewhitened(coloured, at, left)
     verdicts = judge_residuals(
-        left,
-        at.r,
-        end.J,
+        parts(coloured, white.r, fitted),
+        white.r,
+        white.J[:, free],
         robust=not linear,
         priors=[c.labels[i] for i, _ in c.priors] if end.converged else (),
     )
     larger = any(one.alarming and not (one.test == "level" and one.size < 1) for one in verdicts)
     bound = bool((free & c.at_bound(x)).any())
-    doubtful = not end.converged or bool(own) or bool(colour.refused) or bound or larger
+    doubtful = not end.converged or bool(own) or bound or larger
     checked = Checked([], np.zeros((len(at.r), 0)), end.J)
     if settings.assumptions != "trusted":
         effort = settings.effort if settings.assumptions == "explained" else 0.0
@@ -180,7 +165,7 @@ def conclude(
         if linear
         else covariance(end.J, at.r, end.loss, len(c.priors), exact)
     )
-    C_fit = C_fit + spread(end.J, C_free, left, colour.refused)
+    C_fit = C_fit + spread(end.J, C_free, left, own)
     C[np.ix_(free, free)] = C_fit + checked.widening()
     found = estimates(end, C, shift)
     predicted, notices = {}, [*findings, *(planned if hopeless else end).notices]
@@ -217,7 +202,7 @@ def conclude(
     alarms = residual_notices(verdicts, max(1.0, whitened) ** 0.5 if linear else 1.0)
     against, plain = assumption_doubts(checked), not systematic(verdicts) and not checked.favoured
     notices += [*against, *assumption_notices(checked), *alarms.values()]
-    notices += colour_notices(own, colour)
+    notices += colour_notices(own)
     return IdentificationResult(
         estimates=found,
         labels=[*end.labels],
@@ -237,7 +222,6 @@ def conclude(
         cost={
             "simulations": runner.simulations,
             "jacobians": runner.jacobians,
-            "gradients": runner.gradients,
             "remembered": runner.remembered,
             "samples": len(at.r),
             "wall_s": clock.perf_counter() - began,
@@ -261,10 +245,9 @@ def conclude(
         unknowns=dict(problem.unknowns),
         sensors=dict(problem.sensors),
         coordinates=[replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
-        contributions=contributions(end),
         combinations=seen_together(end, C),
         noise=[
-            ChannelNoise(name, model, [*colour.found[name].scores] if name in colour.found else [])
+            ChannelNoise(name, model, [*end.colour[name].scores] if name in end.colour else [])
             for name, model in problem.noise.items()
         ],
         assumptions=checked.checks,
@@ -286,22 +269,8 @@ def run_notices(end: Fit) -> list[str]:
 
 
 def tested_assumptions(end: Fit, doubtful: bool, effort: float) -> Checked:
-    """Tests of the assumptions at the end of a fit, on residuals whitened by declared colour only:
-    undeclared colour may be the trace of a wrong assumption. The columns in the result are whitened
-    by all of the noise."""
-    problem, check = end.problem, end.check
-    declared = declared_colour(problem)
-    stated = problem.with_noise({k: one for k, one in problem.noise.items() if k in declared})
-    finer = rewhitened(stated, check.finer, parts(problem, check.finer.r, end.which))
-    there = coarsened(
-        end._replace(
-            problem=stated, runner=stated.runner(end.runner), check=check._replace(finer=finer)
-        )
-    )
-    found = check_assumptions(there, doubtful=doubtful, effort=effort)
-    rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
-    columns: Array = rewhitened(problem, rows, parts(stated, rows.r, end.which)).J
-    return found._replace(columns=columns, J=end.J)
+    """Tests of the assumptions at the end of a fit."""
+    return check_assumptions(coarsened(end), doubtful=doubtful, effort=effort)._replace(J=end.J)
 
 
 def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
@@ -413,7 +382,6 @@ def identify(
     plan: Sequence[Stage] | None = None,
     starts: int = 1,
     loss: Loss = "linear",
-    method: Method = "gauss_newton",
     heldout: Sequence[str] = (),
     workers: int = 1,
     checkpoint: str | Path | None = None,
@@ -432,11 +400,10 @@ def identify(
     a recording, so that residuals are smooth in the unknowns. `rtol` is the last stage's. At the
     end a run with a tenth of it tells how far the steps shift the estimates: where that is more
     than `STEP_BIAS` standard deviations, the fit goes on with a tenth of the tolerance, up to
-    `tightenings` times (with the linear loss). `loss` is scipy's robust loss; `method` may descend
-    on the adjoint instead, with the linear loss only. Recordings named in `heldout` are predicted,
-    not fitted; `workers` threads run side by side. With a `checkpoint` folder every run is kept
-    there: an identification that was interrupted, called again with the same arguments, continues
-    where it was.
+    `tightenings` times (with the linear loss). `loss` is scipy's robust loss. Recordings named in
+    `heldout` are predicted, not fitted; `workers` threads run side by side. With a `checkpoint`
+    folder every run is kept there: an identification that was interrupted, called again with the
+    same arguments, continues where it was.
 
     At the end the assumptions (mesh, place of the disc, numbers that are called
     known, faults of sensors, the friction law) are tested to first order, a run each, and intervals
@@ -459,7 +426,6 @@ def identify(
         rtol=rtol,
         starts=starts,
         loss=loss,
-        method=method,
         workers=workers,
         seed=seed,
         tightenings=tightenings,
@@ -482,7 +448,7 @@ def identify(
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
         start = problem.coordinates.start
-        begin = Fit(problem, runner, start, loss=loss, method=method, progress=progress)
+        begin = Fit(problem, runner, start, loss=loss, progress=progress)
         planned = run_plan(begin, plan, seed=seed)
     except Unreachable as error:  # what looked wrong with the recordings may be behind it
         raise Unreachable(error.failed, findings) from None

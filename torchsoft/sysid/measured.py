@@ -285,21 +285,19 @@ def cost(
     starts: int,
     workers: int,
     heldout: tuple[str, ...] = (),
-    method: str = "gauss_newton",
 ) -> Cost:
     """Cost of `default_plan` where every stage takes all its evaluations, and of the checks before
-    and after it; descents on the adjoint take more of them, and memory for a matrix that
-    interpolates between the rows."""
+    and after it."""
     fitted = [r for r in problem.recordings if r.name not in heldout]
     slowest = min(fitted, key=lambda r: r.speed)
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
     loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
 
-    descent, steps, seconds = method != "gauss_newton", 0.0, list[float]()
+    steps, seconds = 0.0, list[float]()
     for recording in fitted:
         first = starts * FIRST if recording is slowest else 0
         stages = [(first + ALL, loose), (FREE, usual), (LAST if rtol < usual else 0, rtol)]
-        runs = [((4 if descent else 1) * number, by, True) for number, by in stages]
+        runs = [(number, by, True) for number, by in stages]
         runs += [(1, loose, False), (1, FINER * rtol, False), (CHECKED, usual, False)]
         mine = [
             c
@@ -313,10 +311,7 @@ def cost(
             step = rig_step(recording.rig, max(len(mine), 1) if differentiated else 0)
             steps += number * length
             seconds[-1] += number * (length * step + RUN)
-    matrix = 3 * 8 / 2**30 if descent else 0.0
-    memory = sorted(
-        rows[r.name] * (rig_row(r.rig) + matrix * rows[r.name]) for r in problem.recordings
-    )
+    memory = sorted(rows[r.name] * rig_row(r.rig) for r in problem.recordings)
     at_once = max(1, min(workers, len(fitted)))
     return Cost(
         steps=steps,

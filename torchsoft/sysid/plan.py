@@ -25,7 +25,6 @@ from torchsoft.sysid.fit import (
     Stage,
     Unreachable,
     chord,
-    descend,
     fisher,
     gauss_newton,
     shift,
@@ -200,7 +199,7 @@ def run_stage(fit: Fit, seed: int) -> Fit:
     fits, failures = list[Fit](), list[Unreachable]()
     for start in (x, *sobol(fit._replace(x=x), seed)):
         try:
-            fits.append(iterated(fit.begun(start, fit.method == "gauss_newton")))
+            fits.append(iterated(fit.begun(start)))
         except Unreachable as error:
             failures.append(error)
     if not fits:
@@ -209,10 +208,8 @@ def run_stage(fit: Fit, seed: int) -> Fit:
 
 
 def iterated(fit: Fit) -> Fit:
-    """The fit of its stage by its method, on its steps."""
-    if fit.method == "gauss_newton":
-        return gauss_newton(fit, fit.stage.evaluations, fit.stage.tolerance)
-    return descend(fit, 4 * fit.stage.evaluations)
+    """The fit of its stage, on its steps."""
+    return gauss_newton(fit, fit.stage.evaluations, fit.stage.tolerance)
 
 
 def scan(fit: Fit, i: int, values: Sequence[float]) -> Array:

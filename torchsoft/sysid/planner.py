@@ -347,7 +347,10 @@ class Planner:
         out, at = np.zeros(signals.values.shape), 0
         for channel, one in self.problem.readouts(x, self.k).items():
             t, measured = self.recording.samples[channel]
-            out = out + one.adjoint(signals, t, measured, w[at : at + len(t)])[1]
+            _, weight = one.residuals(one.expected(signals, t)[0], measured)
+            v, noise = w[at : at + len(t)], self.problem.noise.get(channel)
+            v = v if noise is None else noise.whitener(t).T @ v
+            out = out + one.pulled_back(signals, t, weight * v)
             at += len(t)
         return out
 

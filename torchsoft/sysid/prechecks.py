@@ -1,9 +1,7 @@
-"""Checks of recordings against their rig before any fit: set-points, control loops, signs and
-units.
+"""Checks of recordings against their rig before any fit: set-points, controllers, signs, units.
 
-Signs and units of channels are compared with a run at the start's parameters. The measured
-coordinate of a loop is recognised by the body that follows the set-point. The mean recorded force
-of an actuator is compared with its known law at the measured coordinates.
+Signs and units of channels are compared with a run at the start's parameters. The mean recorded
+force of an actuator is compared with its known law at the measured coordinates.
 """
 
 import math
@@ -19,7 +17,7 @@ from torch import Tensor, nn
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.names import effort_channel
-from torchsoft.physics.parts import COORDINATES, Actuator
+from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.plan import LOOSE
@@ -33,9 +31,9 @@ from torchsoft.tables import shown
 # Checks of recorded set-points: their spacing in time, and the agreement of rates with values.
 #
 # A recorded signal is known at its rows only, with a cubic between them. The error of the cubic
-# is estimated from cubics through every second and every fourth row, whose larger errors show its
-# order. It is stated by its effect: the error of the set-point over the noise of that
-# coordinate's sensor, and that of the effort over the noise of the force.
+# is estimated from that of the cubic through every second row, and from that with other rates, of a
+# spline through the values. It is stated by its effect: the error of the set-point over the noise
+# of that coordinate's sensor, and that of the effort over the noise of the force.
 
 
 def found(code: str, recording: Recording, message: str, grave: bool = False) -> Diagnostic:
@@ -58,12 +56,12 @@ NOTICED = 0.2
 """Error between rows, over a sensor's noise, above which a warning is given: residuals would be off
 by it everywhere."""
 
-HOPELESS, ORDERLESS = 100.0, 1.0
-"""Error between rows, over a sensor's noise, that makes a fit worthless, if its order of
-convergence is at most the second number."""
+HOPELESS = 100.0
+"""Error between rows, over a sensor's noise, that makes a fit worthless."""
 
-ORDERS = (0.5, 4.0)
-"""Least and largest credible order of convergence; a cubic through exact values has the largest."""
+ORDER = 3.0
+"""Order by which the error of a cubic falls with the distance of its rows, where the curve has
+bends between them; 4 where it is smooth."""
 
 PARTS = (0.0, 0.25, 0.5, 0.75)
 """Positions between rows at which signals are compared."""
@@ -74,12 +72,11 @@ known to half of it."""
 
 
 class Gap(NamedTuple):
-    """Error between rows: rms [SI], over the noise of a channel, and its order of convergence."""
+    """Error between rows: rms [SI], and over the noise of a channel."""
 
     channel: str
     error: float
     noises: float
-    order: float
 
 
 def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
@@ -95,14 +92,6 @@ def is_derived(signal: Sampled) -> bool:
     return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
 
 
-def extrapolated(by: Mapping[int, Tensor]) -> tuple[float, float]:
-    """RMS error of a quantity with every row, by Richardson extrapolation from every second and
-    fourth row, and the observed order."""
-    half, quarter = (float((by[2 * k] - by[k]).square().mean().sqrt()) for k in (1, 2))
-    order = float(np.clip(np.log2(max(quarter, 1e-300) / max(half, 1e-300)), *ORDERS))
-    return half / (2**order - 1), order
-
-
 def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
     """Errors between rows of an actuator's set-point, in the channels with sensors."""
     rig, out = recording.rig, []
@@ -113,16 +102,18 @@ def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list
     feed = rig.reference[actuator.feed_forward] if actuator.feed_forward else None
     t, derived = signal.times, is_derived(signal)
     inside = torch.cat([t[:-1] + part * t.diff() for part in PARTS]).sort().values
-    inside = inside[inside <= t[4 * ((len(t) - 1) // 4)]]
+    inside = inside[inside <= t[2 * ((len(t) - 1) // 2)]]
     x, v = signal(inside)
-    places, efforts = {}, {}
-    for every in (1, 2, 4):
-        places[every], rate = cubic(signal, every, derived)(inside)
-        efforts[every] = demanded(actuator, feed, every, inside, places[every], rate, x, v)
+    places, efforts = list[Tensor](), list[Tensor]()
+    for every, without_rates in ((1, derived), (2, derived), (1, True)):
+        place, rate = cubic(signal, every, without_rates)(inside)
+        places.append(place)
+        efforts.append(demanded(actuator, feed, every, inside, place, rate, x, v))
     for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
         if own in sensors and own in recording.samples:
-            error, order = extrapolated(by)
-            out.append(Gap(own, error, error / sensors[own].sd, order))
+            sparser, other_rates = (float((one - by[0]).square().mean().sqrt()) for one in by[1:])
+            error = max(sparser / (2**ORDER - 1), other_rates)
+            out.append(Gap(own, error, error / sensors[own].sd))
     return out
 
 
@@ -173,15 +164,10 @@ def sparse_finding(
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
     apart = float(signal.times.diff().max())
-    enough = apart * (NOTICED / worst.noises) ** (1 / worst.order)
-    rates = f", and its rate is not known (no column {setpoint}_dot)" if is_derived(signal) else ""
-    if worst.order <= ORDERS[0] and not is_derived(signal):  # closer rows would not help
-        text = (
-            f"values and rates of {setpoint} disagree however close the rows are, by "
-            f"{worst.noises:.2g} times the noise of {worst.channel}: is a clock, or a unit of "
-            "time, a little off?"
-        )
-        return found(f"rate of {setpoint}", recording, text, worst.noises > HOPELESS)
+    enough = apart * (NOTICED / worst.noises) ** (1 / ORDER)
+    rates = f", and its rate is not known (no column {setpoint}_dot)"
+    if not is_derived(signal):
+        rates = f", or {setpoint}_dot is not quite its rate (is a clock a little off?)"
     size = (
         f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise "
         f"of {worst.channel}"
@@ -191,12 +177,7 @@ def sparse_finding(
         f"{rates}: what they leave open between them makes {size}; give them every "
         f"{1e3 * enough:.2g} ms"
     )
-    return found(
-        f"set-points {setpoint}",
-        recording,
-        text,
-        grave=worst.noises > HOPELESS and worst.order <= ORDERLESS,
-    )
+    return found(f"set-points {setpoint}", recording, text, worst.noises > HOPELESS)
 
 
 def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
@@ -381,10 +362,6 @@ explanation."""
 NEAR = math.log(4.0)
 """Largest difference of the logarithm of such a factor from that of confused units."""
 
-SAME, APART = 0.1, 0.3
-"""Largest relative difference of a coordinate that follows a set-point, and least one of a
-coordinate that does not."""
-
 Expected = Mapping[str, tuple[Readout, Signals]]
 """Readouts of a run, with its signals, by channel."""
 
@@ -421,7 +398,6 @@ def findings(
     compared with the run."""
     every = [*setpoint_findings(recording, sensors), *noisy(recording, sensors)]
     every += rounded(recording, sensors)
-    every += another_body(recording, sensors, expected)
     for more in (
         against_run(recording, sensors, expected),
         controller_findings(recording, sensors, unknown),
@@ -536,64 +512,3 @@ def against_run(
                     f"the start is {alike:.2f}"
                 )
                 yield found(f"sign of {name}", recording, text, grave=True)
-
-
-def another_body(
-    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
-) -> Iterator[Diagnostic]:
-    """Diagnostics on set-points that another body follows than the measured one, or that the
-    measured body follows in the run only."""
-    rig = recording.rig
-    movable = {
-        f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes
-    }
-    for loop, actuator in rig.loops.items():
-        body, _, axis = actuator.measured.partition(".")
-        own, setpoint = channel(rig, actuator.measured), actuator.setpoint
-        mine, run = (apart(recording, sensors, setpoint, own, by) for by in (None, expected))
-        others = [name for name in rig.bodies if name != body and f"{name}.{axis}" in movable]
-        for other in others:
-            alternative = channel(rig, f"{other}.{axis}")
-            other_data, other_run = (
-                apart(recording, sensors, setpoint, alternative, by) for by in (None, expected)
-            )
-            near = any(part is not None and part < APART for part in (mine, other_run))
-            if other_data is not None and other_data < SAME and not near:
-                evidence = f"{alternative} follows it to {other_data:.1%} of its motion"
-            elif (
-                mine is not None
-                and mine > APART
-                and other_data is None
-                and (run is None or run < SAME)
-                and len(others) == 1
-            ):
-                evidence = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
-            else:
-                continue
-            remedy = f' (say measures = "{other}.{axis}" of the actuator {loop})'
-            code = f"what {setpoint} is of"
-            text = (
-                f"{setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
-                f"or are {own} and {alternative} exchanged? ({evidence})"
-            )
-            yield found(code, recording, text, grave=True)
-
-
-def apart(
-    recording: Recording,
-    sensors: Mapping[str, Sensor],
-    setpoint: str,
-    name: str,
-    expected: Expected | None,
-) -> float | None:
-    """RMS difference of a channel, measured or expected, from a set-point, over the motion of the
-    set-point; None without samples, or where the set-point hardly moves."""
-    if name not in (recording.samples.keys() & sensors.keys() if expected is None else expected):
-        return None
-    t, y = unsaturated(recording, sensors, name)
-    if expected is not None:
-        one, signals = expected[name]
-        y = one.expected(signals, t)[0]
-    values = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
-    moved = float(np.std(values))
-    return float(np.std(values - y)) / moved if moved > MOVES * sensors[name].sd else None

@@ -39,28 +39,13 @@ SAME = 1e-9
 """Difference [s] below which two times are equal."""
 
 
-class Drift(NamedTuple):
-    """Relative changes of numbers of a rig from `first` to `last` [s], linear between them."""
-
-    changes: Mapping[str, float]
-    first: float
-    last: float
-
-    def factor(self, name: str, t: float) -> float:
-        """Value of a number at a time [s] over that at the beginning."""
-        part = (t - self.first) / (self.last - self.first)
-        return 1 + self.changes.get(name, 0.0) * min(max(part, 0.0), 1.0)
-
-
 class RunContext(NamedTuple):
-    """Context of a run: its own copy of the rig, the initial state, the recorded channels, and
-    what drifts."""
+    """Context of a run: its own copy of the rig, the initial state, and the recorded channels."""
 
     rig: Rig
     start: Start
     y0: Begin
     channels: tuple[str, ...]
-    drift: Drift
 
 
 class Grid(NamedTuple):
@@ -77,16 +62,15 @@ class Recording:
     `rig` has the known parameters, nominal values of the unknown ones, the laws, and the reference
     that the run followed; runs use copies of it. `samples` holds times (k,) [s] and values (k,) by
     channel, each with its own times; channels are those of `measurable`, and those of touch.
-    `start` is the start of the run. Numbers of the rig in `drifts` change along the samples, by a
-    part of what they are. Those in `tied` follow from runs, with their derivatives (n,) by the
-    parameters of a run. `dataclasses.replace` makes variants, such as one with another law.
+    `start` is the start of the run. Parameters in `tied` follow from runs, with their derivatives
+    (n,) with respect to the parameters of a run. `dataclasses.replace` makes variants, such as one
+    with another law.
     """
 
     name: str
     rig: Rig = field(repr=False)
     samples: dict[str, tuple[Array, Array]] = field(repr=False)
     start: Start
-    drifts: Mapping[str, float] = field(default_factory=dict, repr=False)
     tied: Mapping[str, Array] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -180,9 +164,8 @@ class Recording:
         rig = deepcopy(self.rig)
         for name, value in rig.named_parameters():
             value.requires_grad_(not name.startswith("reference."))
-        drift = Drift(self.drifts, *self.times[[0, -1]].tolist())
         begin = self.start.begin(rig, self.samples)
-        return RunContext(rig, self.start, begin, self.channels, drift)
+        return RunContext(rig, self.start, begin, self.channels)
 
     def on_a_grid(self, interpolated: bool) -> bool:
         """Whether to simulate a regular grid, every `BETWEEN`, in place of the samples' own times:
@@ -215,7 +198,7 @@ class Recording:
             k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items())
         )
         return sha256(
-            identity(self.rig) + signals + measured + repr((self.start, self.drifts)).encode()
+            identity(self.rig) + signals + measured + repr(self.start).encode()
         ).hexdigest()
 
 

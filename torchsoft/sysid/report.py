@@ -3,7 +3,6 @@ this module the data."""
 
 import base64
 import io
-import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,10 +16,8 @@ from torchsoft.files import save_text
 from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.figures import (
     Trace,
-    correlation_figure,
     direction_name,
     estimates_figure,
-    spectrum_figure,
     trace_figure,
 )
 from torchsoft.sysid.noise import Autoregression
@@ -125,20 +122,6 @@ def prior(e: Estimate) -> Cell:
         return ""
     sd = f"×/÷ {np.exp(e.prior.sd):.3g}" if e.prior.kind == "log-normal" else f"± {e.prior.sd:.2g}"
     return "", f"{grouped(e.prior.median)} {sd}"
-
-
-def contributions(result: IdentificationResult) -> list[list[str]]:
-    """Share of each recording in each parameter, and the factor on the standard deviation without
-    it."""
-    rows = []
-    for e in (e for e in result.estimates if e.identifiable and e.kind == "parameter"):
-        cells = [e.label]
-        for one in result.contributions:
-            factor = one.without[e.label]
-            least = "only here" if factor is None else f"× {factor:.2f}"
-            cells.append(f"{100 * one.shares[e.label]:.0f} % ({least})")
-        rows.append(cells)
-    return rows
 
 
 def correlations(result: IdentificationResult) -> str:
@@ -259,7 +242,6 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
     counts = {
         "simulations": "simulations",
         "jacobians": "Jacobians",
-        "gradients": "gradients",
         "remembered": "of them read from the checkpoint",
     }
     return PAGES.get_template("report.html").render(
@@ -281,18 +263,9 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             for e in parameters
             if e.start
         ],
-        contributions=contributions(result) if len(result.contributions) > 1 else [],
-        sources=[one.source or "priors" for one in result.contributions],
         combined=[
             *(one.sentence for one in result.combinations),
             *(f"{name} may change without a trace in the data" for name in weak),
-        ],
-        spectrum_figure=spectrum_figure(result),
-        correlation_figure=correlation_figure(result),
-        spectrum=[
-            f"{direction_name(d)}: standard deviation {d.sd:.2g}"
-            f"{'' if d.identifiable else ', not identifiable'}"
-            for d in result.directions
         ],
         strong=correlations(result),
         **assumptions(result),
@@ -338,7 +311,7 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             for one in result.recordings
         ],
         definitions={
-            "method": f"{by['method']}, loss {by['loss']}",
+            "loss": by["loss"],
             "tolerance": f"{by['rtol']:g}",
             "seed": str(by["seed"]),
             "sensors": ", ".join(
@@ -348,5 +321,4 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             "units": "SI throughout; pictures show lengths in mm",
             "written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         },
-        decided=json.dumps(by, indent=1, ensure_ascii=False),
     )

@@ -9,7 +9,7 @@ Tests are of one channel in one recording where possible:
     motion    F: no correlation with the predicted reading, its rates, or other channels
     channels  Bartlett: no correlation between channels at one time
     onset     Mann and Whitney: residuals are not larger from a certain time on
-    outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
+    outliers  kurtosis (Anscombe and Glynn): tails are those of a normal distribution
     priors    normal: estimates are where their priors expect them
 
 p-values are adjusted by Holm's method: with a right model, the probability that any falls below
@@ -386,20 +386,15 @@ def onset(mine: Sequence[Part]) -> Verdict | None:
 
 
 def outliers(part: Part, r: Array) -> Verdict:
-    """Tests of the largest residual (Grubbs), and of heavy tails (Anscombe and Glynn)."""
+    """Test of heavy tails (Anscombe and Glynn)."""
     rows = r[part.rows]
     m, at = len(rows), int(np.argmax(np.abs(rows)))
-    sd = float(rows.std(ddof=1)) if m > 2 else 0.0
-    if m < LAGS or sd == 0:
+    if m < LAGS or np.ptp(rows) == 0:
         return part.verdict("outliers", 1.0, 0.0, "(too short to tell)")
-    G = float(np.abs(rows - rows.mean())[at]) / sd
-    beyond = (m - 1) ** 2 - m * G**2
-    t = G * (m * (m - 2) / beyond) ** 0.5 if beyond > 0 else np.inf
-    grubbs = min(1.0, 2 * m * float(stats.t.sf(t, m - 2)))
     tails = float(stats.kurtosistest(rows, alternative="greater").pvalue)
     largest = abs(float(rows[at]))
     words = f"(the largest {largest:.1f} times the noise, at t = {part.t[at]:.4g} s)"
-    return part.verdict("outliers", min(1.0, 2 * min(grubbs, tails)), largest, words)
+    return part.verdict("outliers", tails, largest, words)
 
 
 def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:

@@ -30,7 +30,6 @@ from torchsoft.rigs.written import files_renamed
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.estimate import (
     ChannelResiduals,
-    Contribution,
     Direction,
     Estimate,
 )
@@ -137,7 +136,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
 # The result
 
 
-SCHEMA = "torchsoft-answer-8"
+SCHEMA = "torchsoft-answer-9"
 """Name and version of the file format."""
 
 
@@ -200,7 +199,6 @@ class IdentificationResult(Shown):
     unknowns: dict[str, Unknown] = field(default_factory=dict, repr=False)
     sensors: dict[str, Sensor] = field(default_factory=dict, repr=False)
     coordinates: list[Coordinate] = field(default_factory=list, repr=False)
-    contributions: list[Contribution] = field(default_factory=list, repr=False)
     combinations: list[Combination] = field(default_factory=list, repr=False)
     noise: list[ChannelNoise] = field(default_factory=list, repr=False)
     assumptions: list[AssumptionTest] = field(default_factory=list, repr=False)

@@ -37,16 +37,12 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.prediction import (
     FailedRun,
     Frozen,
-    Misfit,
     Prediction,
-    Readout,
-    Signals,
     Steps,
     initial_state,
-    misfit,
     predict,
 )
-from torchsoft.sysid.recording import BETWEEN, Array, Grid, Recording, RunContext
+from torchsoft.sysid.recording import BETWEEN, Grid, Recording, RunContext
 
 MEANING = (
     "Runs of an identification that is not done; torchsoft removes the .run files in this folder "
@@ -56,7 +52,7 @@ MEANING = (
 RUN = re.compile(r"[0-9a-f]{64}\.run")
 """Names of files with results."""
 
-KINDS = {kind.__name__: kind for kind in (Prediction, Misfit, FailedRun)}
+KINDS = {kind.__name__: kind for kind in (Prediction, FailedRun)}
 """Types of results of a run."""
 
 PROGRAM = (
@@ -170,9 +166,8 @@ class Job(NamedTuple):
     """One run: index of the recording, values of the unknowns, names to differentiate by, and
     steps.
 
-    `interpolated` requests a grid between the samples; `judged` requests the misfit and its
-    gradient in place of the signals, and holds every sensor's readout.
-    `varied` are amounts of variations of the recording, by name.
+    `interpolated` requests a grid between the samples; `varied` are amounts of variations of the
+    recording, by name.
     """
 
     recording: int
@@ -180,7 +175,6 @@ class Job(NamedTuple):
     names: tuple[str, ...]
     steps: Steps
     interpolated: bool = False
-    judged: tuple[Readout, ...] | None = None
     varied: tuple[tuple[str, float], ...] = ()
 
 
@@ -211,7 +205,7 @@ class Runner:
             raise ValueError(f"`workers` must be positive, but is {workers}")
         self.variations = dict(variations or {})
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
-        self.simulations = self.jacobians = self.gradients = self.remembered = 0
+        self.simulations = self.jacobians = self.remembered = 0
         self._work = 0.0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
         beginnings = {recording.beginning for recording in self.recordings}
@@ -235,7 +229,7 @@ class Runner:
         return out
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
-        """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
+        """Results in the order of the jobs: `Prediction` or `FailedRun`."""
         self._starts = {}
         out = [self._journal.recall(job) if self._journal is not None else None for job in jobs]
         remembered = [result is not None for result in out]
@@ -304,7 +298,7 @@ class Runner:
         def watched(one: Recording, derived: bool = False) -> Prediction:
             """The run on a fine grid, with the derivatives of the job if they are asked for; the
             last one of the recording as stated is kept."""
-            fine = plain._replace(names=plain.names if derived else (), judged=None)
+            fine = plain._replace(names=plain.names if derived else ())
             if one is not stated:
                 return run(one, fine, True)
             with self._lock:
@@ -343,9 +337,7 @@ class Runner:
     def _count(self, job: Job, remembered: bool, work: float) -> None:
         self._work += work
         self.remembered += remembered
-        if job.judged is not None:
-            self.gradients += 1
-        elif job.names:
+        if job.names:
             self.jacobians += 1
         else:
             self.simulations += 1
@@ -380,24 +372,11 @@ def simulated(
     start: Callable[[], tuple[Tensor, Tensor]] | None = None,
     grid: Grid | None = None,
 ) -> Any:
-    """A `Prediction`, a `Misfit`, or a `FailedRun`, with a rig that no other thread uses; `start`
+    """A `Prediction` or a `FailedRun`, with a rig that no other thread uses; `start`
     computes the initial state. The grid is the recording's own unless another is given."""
     grid = recording.grid(job.interpolated) if grid is None else grid
-    run = begun, job.values, grid, job.names, job.steps
     try:
-        if job.judged is None:
-            return predict(*run, start() if start is not None else None)
-        return misfit(*run, lambda signals: judge(recording, job.judged or (), signals))
+        known = start() if start is not None else None
+        return predict(begun, job.values, grid, job.names, job.steps, known)
     except SimulationFailed as failure:
         return FailedRun(failure.reason, failure.time)
-
-
-def judge(
-    recording: Recording, judged: Sequence[Readout], signals: Signals
-) -> tuple[float, Array, Array]:
-    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the
-    nuisances of every readout (readouts, nuisances)."""
-    rows = [one.adjoint(signals, *recording.samples[one.channel]) for one in judged]
-    loss = sum(0.5 * float(r @ r) for r, _, _ in rows)
-    on_signals = sum((part for _, part, _ in rows), np.zeros(signals.values.shape))
-    return loss, on_signals, np.stack([part for _, _, part in rows])

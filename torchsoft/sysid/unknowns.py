@@ -560,6 +560,20 @@ class Coordinates:
             if c.name == channel and not c.of_the_rig and c.recording in (None, recording)
         }  # pyright: ignore[reportReturnType]
 
+    def log_prior_volume(self, x: Array) -> tuple[float, Array]:
+        """Logarithm of d value / d x at x (n,) of the coordinates whose prior is normal on a
+        logarithmic scale, or log-normal on a linear one, and its gradient (n,): the factor between
+        densities of values and of coordinates."""
+        total, gradient = 0.0, np.zeros(len(x))
+        for i, prior in self.priors:
+            c = self.all[i]
+            if c.scale == "log" and prior.kind == "normal":
+                total, gradient[i] = total + float(x[i]), 1.0
+            elif c.scale == "linear" and prior.kind == "log-normal":
+                value = c.to_value(x[i])
+                total, gradient[i] = total - math.log(value), -c.slope(x[i]) / value
+        return total, gradient
+
     @property
     def priors(self) -> list[tuple[int, Prior]]:
         """Indices of free coordinates with a prior, and the priors."""
