@@ -33,10 +33,11 @@ FLOWS = {
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
+        sentences
         initial_state recording unknowns noise prediction runs assumptions problem first_samples
         synthetic fit plan prechecks
         residual_tests colour refits assumption_tests new_fits sensitivity suspects estimate
-        result profile identification compare
+        result profile conclusion identification compare
         planner columns configuration measured design figures report .
     """,
     "testing": "energy laws gradients .",

@@ -252,8 +252,8 @@ def test_a_recording_that_looks_wrong_is_rejected_with_the_way_on(folder, capsys
     recorded(folder / "data.csv", 62, F_y=(-1.0, 0.0))
     assert identify() == 2
     message = capsys.readouterr().err
-    assert "recording `data`: effort_y looks as if its sign were opposite: " in message
-    assert message.endswith('; if it is so, say acknowledged = ["sign of effort_y"]\n')
+    assert "Recording `data`: the sign of effort_y looks opposite." in message
+    assert message.endswith('If it is right, say acknowledged = ["sign of effort_y"]\n')
     assert not (folder / "out" / "answer.json").exists()
 
 

@@ -54,8 +54,10 @@ def test_intervals_hold_under_coloured_noise_which_is_named_unless_it_was_declar
         assert one.model.order in (1, 2)
         assert one.tried[0].order == 0
         assert min(one.tried, key=lambda score: score.bic).order == one.model.order
-    said = [notice for notice in answer.notices if "coloured in x_ball (order" in notice]
+    said = [str(one) for one in answer.findings if one.code == "colour"]
     assert len(said) == (colour == "white")
+    assert all("coloured in x_ball (order" in text for text in said)
+    assert answer.verdict == "holds"
     for name, truth in TRUTH.items():
         assert abs(np.log(answer[name].last / truth)) < 3 * answer[name].relative_sd, name
     assert answer[E].relative_sd > 1.3 * np.linalg.inv(fisher(own, answer))[0, 0] ** 0.5

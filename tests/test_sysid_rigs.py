@@ -246,9 +246,9 @@ def test_a_grasp_in_mid_air_reports_that_its_poses_must_be_measured():
         assert result[name].value == pytest.approx(value, rel=4 * result[name].relative_sd)
     assert not result.converged
     assert len(result.stages) <= 7
-    (notice,) = result.notices
-    assert re.search(r"not smooth in .*start\.right\.x", notice)
-    assert "measure every coordinate of the bodies when the recording begins" in notice
+    (found,) = result.findings
+    assert re.search(r"not smooth in .*start\.right\.x", str(found))
+    assert "Measure every coordinate of the bodies when the recording starts" in str(found)
 
 
 def test_a_body_rests_where_the_parameters_let_it_rest(folder):

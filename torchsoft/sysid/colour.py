@@ -12,7 +12,8 @@ from torchsoft.sysid.noise import Autoregression, NoiseFit, fit_noise
 from torchsoft.sysid.plan import iterated
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.residual_tests import FAINT, LEVEL, Part, named, parts
+from torchsoft.sysid.residual_tests import FAINT, LEVEL, Part, parts
+from torchsoft.sysid.sentences import Finding
 
 ROUNDS = 2
 """Most estimates of the noise: from the residuals of the fit, and from those of the fit with that
@@ -113,19 +114,13 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
     return out
 
 
-def colour_notices(undeclared: Mapping[str, NoiseFit]) -> list[str]:
-    """A sentence on undeclared colour, for which intervals allow."""
-    names = [
-        f"{channel} (order {one.noise.order}, neighbouring samples correlate by "
-        f"{correlation(one.noise):.2f})"
-        for channel, one in undeclared.items()
+def colour_findings(undeclared: Mapping[str, NoiseFit]) -> list[Finding]:
+    """A finding on undeclared colour, for which intervals allow."""
+    cases = [
+        {"channel": name, "order": one.noise.order, "correlation": correlation(one.noise)}
+        for name, one in undeclared.items()
     ]
-    if not names:
-        return []
-    return [
-        f"residuals are coloured in {named(names)}, and no sensor declares it; intervals allow for "
-        "it. A wrong model leaves such residuals too: where it is the sensor, declare its `colour`"
-    ]
+    return [Finding("colour", "note", {"cases": cases})] if cases else []
 
 
 def correlation(noise: Autoregression) -> float:

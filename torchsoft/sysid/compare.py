@@ -45,9 +45,10 @@ from torchsoft.sysid.residual_tests import (
     Part,
     judge_residuals,
     parts,
-    residual_notices,
+    residual_findings,
 )
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 
 # Result of a comparison
 
@@ -70,7 +71,7 @@ class LawFit:
     SI units, the reduced chi-squared with its p-value, the Bayesian information criterion, and the
     log density per sample of held-out recordings, with the p-value of their sum of
     squares. `numerical` is the change of the log likelihood by a tenth of the tolerance; `left` has
-    sentences on deviations of the residuals from the stated noise, by the tests of
+    findings on deviations of the residuals from the stated noise, by the tests of
     `torchsoft.sysid.residual_tests`, and `patterned` is whether residuals follow the motion."""
 
     name: str
@@ -84,7 +85,7 @@ class LawFit:
     heldout_p: float | None
     numerical: float
     converged: bool
-    left: list[str]
+    left: list[Finding]
     patterned: bool
 
     @property
@@ -213,8 +214,8 @@ def judged(laws: list[LawFit], against: list[Versus]) -> tuple[Outcome, str | No
             f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard "
             "deviations"
         )
-    sentences += [f"But beware: {sentence}" for sentence in best.left]
-    return "law", best.name, ". ".join(sentences) + "."
+    verdict = " ".join([". ".join(sentences) + ".", *map(str, best.left)])
+    return "law", best.name, verdict
 
 
 def listed(names: list[str]) -> str:
@@ -286,7 +287,7 @@ class Evidence:
         at = self._at(which, FINER * fit.rtol, True)
         J = at.J[:, free]
         self.fitted = density(problem, which, at.r[:m])
-        self.verdicts = judge_residuals(self.fitted.parts, at.r, J)
+        self.tests = judge_residuals(self.fitted.parts, at.r, J)
         self.numerical = abs(0.5 * float(usual @ usual - self.fitted.r @ self.fitted.r))
         self.dof, self.heldout = max(self.fitted.samples - int(free.sum()), 1), None
         if heldout:
@@ -552,8 +553,8 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
                 None if held is None else held.p,
                 one.numerical,
                 one.fit.converged,
-                [*residual_notices(one.verdicts).values()],
-                any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
+                residual_findings(one.tests),
+                any(test.alarming and test.test == "motion" for test in one.tests),
             )
         )
     return out

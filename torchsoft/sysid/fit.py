@@ -16,6 +16,7 @@ from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
 from torchsoft.sysid.recording import Array, Mask
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 from torchsoft.sysid.unknowns import Coordinate
 
 
@@ -226,11 +227,11 @@ part, and the chi2 up to which any fall counts."""
 
 class Unreachable(RuntimeError):
     """The model cannot follow a recording at the start of a fit; `failed` has reason and time by
-    recording, `findings` the doubts about the recordings themselves."""
+    recording, `findings` what looks wrong with the recordings themselves."""
 
-    def __init__(self, failed: dict[str, FailedRun], findings: Sequence[str] = ()) -> None:
+    def __init__(self, failed: dict[str, FailedRun], findings: Sequence[Finding] = ()) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in failed.items())
-        behind = f"; what may be behind it: {'; '.join(findings)}" if findings else ""
+        behind = f". It may be caused by this: {' '.join(map(str, findings))}" if findings else ""
         super().__init__(f"the model cannot reach the data from this start: {reasons}{behind}")
         self.failed, self.findings = failed, tuple(findings)
 
@@ -450,20 +451,15 @@ class Fit(NamedTuple):
         return self._replace(stages=(*self.stages, entry))
 
     @property
-    def notices(self) -> list[str]:
-        """Sentences where the fit made no headway, and where a finer stage could not begin."""
-        out = []
+    def findings(self) -> list[Finding]:
+        """Whether the fit stalled far above the noise, or a finer stage could not start."""
+        out = list[Finding]()
         if self.stalled:
-            out.append(
-                f"the fit made no headway: over {HEADWAY} evaluations chi2 fell by less than "
-                f"{LITTLE:.0%}, to {self.chi2:.3g}, which is far above the noise, and there it "
-                "ended: the model lacks something that these data show"
-            )
+            facts = {"evaluations": HEADWAY, "part": LITTLE, "chi2": self.chi2}
+            out.append(Finding("stalled", "note", facts))
         if self.failure is not None:
-            out.append(
-                f"the fit ended by rtol = {self.rtol:g}: by a finer tolerance {self.failure}; the "
-                "model may lack something that drives its parameters to where it has no solution"
-            )
+            facts = {"rtol": self.rtol, "reason": str(self.failure)}
+            out.append(Finding("stage-failed", "note", facts))
         return out
 
 

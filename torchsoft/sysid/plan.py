@@ -288,7 +288,7 @@ def jacobian_error(J: Array, exact: Array) -> float:
     return float(np.linalg.norm((J - exact) @ steps, axis=0).max(initial=0.0))
 
 
-def settle(fit: Fit, tightenings: int) -> Fit:
+def refine_steps(fit: Fit, tightenings: int) -> Fit:
     """Continue a fit with its Jacobian and a few runs: on steps chosen anew until they do not
     matter, and with a tighter tolerance, at most `tightenings` times, where a tenth of it shifts an
     estimate by more than `STEP_BIAS` or shows an error of the Jacobian above `JACOBIAN_ERROR`, or

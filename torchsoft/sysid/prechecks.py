@@ -7,6 +7,7 @@ force of an actuator is compared with its known law at the measured coordinates.
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,6 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
-from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.names import effort_channel
 from torchsoft.physics.parts import Actuator
@@ -25,6 +25,7 @@ from torchsoft.sysid.prediction import Prediction, Readout, Signals
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 from torchsoft.sysid.unknowns import Sensor
 from torchsoft.tables import shown
 
@@ -36,14 +37,10 @@ from torchsoft.tables import shown
 # of that coordinate's sensor, and that of the effort over the noise of the force.
 
 
-def found(code: str, recording: Recording, message: str, grave: bool = False) -> Diagnostic:
-    """A diagnostic on one recording, an error if it is `grave`."""
-    return Diagnostic(
-        "error" if grave else "warning",
-        recording.name,
-        f"recording `{recording.name}`: {message}",
-        code,
-    )
+def found(code: str, name: str, recording: Recording, grave: bool = False, **facts: Any) -> Finding:
+    """A finding on one recording, an error if it is `grave`; `name` is what a user acknowledges."""
+    facts = {"name": name, "recording": recording.name} | facts
+    return Finding(code, "error" if grave else "warning", facts)
 
 
 def channel(rig: Rig, name: str) -> str:
@@ -134,8 +131,8 @@ def demanded(
     return actuator(torch.stack((place, rate, *more, x, v), -1))
 
 
-def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
-    """Diagnostics on the set-points of a recording. For controllers of several coordinates only
+def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
+    """Findings on the set-points of a recording. For controllers of several coordinates only
     rates are tested here."""
     rig = recording.rig
     recorded = {
@@ -155,33 +152,33 @@ def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> It
 
 def sparse_finding(
     recording: Recording, sensors: Mapping[str, Sensor], name: str
-) -> Diagnostic | None:
-    """Diagnostic on set-points that are too far apart in time."""
+) -> Finding | None:
+    """Finding on set-points that are too far apart in time."""
     gap_list = gaps(recording, sensors, name)
     if not gap_list or (worst := max(gap_list, key=lambda gap: gap.noises)).noises <= NOTICED:
         return None
     setpoint = recording.rig.actuators[name].setpoint
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
-    apart = float(signal.times.diff().max())
-    enough = apart * (NOTICED / worst.noises) ** (1 / ORDER)
-    rates = f", and its rate is not known (no column {setpoint}_dot)"
-    if not is_derived(signal):
-        rates = f", or {setpoint}_dot is not quite its rate (is a clock a little off?)"
-    size = (
-        f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise "
-        f"of {worst.channel}"
+    apart = 1e3 * float(signal.times.diff().max())
+    return found(
+        "set-points",
+        f"set-points {setpoint}",
+        recording,
+        worst.noises > HOPELESS,
+        setpoint=setpoint,
+        apart=apart,
+        error=worst.error,
+        unit=recording.units[worst.channel],
+        noises=worst.noises,
+        channel=worst.channel,
+        enough=apart * (NOTICED / worst.noises) ** (1 / ORDER),
+        **{"lacking" if is_derived(signal) else "given": f"{setpoint}_dot"},
     )
-    text = (
-        f"set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
-        f"{rates}: what they leave open between them makes {size}; give them every "
-        f"{1e3 * enough:.2g} ms"
-    )
-    return found(f"set-points {setpoint}", recording, text, worst.noises > HOPELESS)
 
 
-def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
-    """Diagnostic on rates unlike those of the values."""
+def other_rate(recording: Recording, setpoint: str) -> Finding | None:
+    """Finding on rates unlike those of the values."""
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
     times, values = signal.times, signal.values.detach()
@@ -196,52 +193,40 @@ def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
     ):
         return None
     factor = float(given @ own) / max(float(own @ own), 1e-300)
-    looks = "its sign looks opposite" if factor < 0 else f"it is {factor:.3g} times that"
-    text = (
-        f"{setpoint}_dot is not the rate of {setpoint}: it differs by {off:.3g} rms from that "
-        f"of a spline through it, {size:.3g}; {looks}"
-    )
-    return found(f"rate of {setpoint}", recording, text, grave=True)
+    looks = {"opposite" if factor < 0 else "factor": factor}
+    name = f"rate of {setpoint}"
+    return found("rate", name, recording, True, setpoint=setpoint, off=off, size=size, **looks)
 
 
 # Signs, units, loops and noise
 
 
-def together(every: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """One diagnostic for each code: the first, with the names of the other recordings."""
-    out: list[Diagnostic] = []
-    for code in dict.fromkeys(one.code for one in every):
-        first, *others = sorted(
-            (one for one in every if one.code == code), key=lambda one: one.severity
-        )
-        names = ", ".join(
-            f"`{name}`"
-            for name in dict.fromkeys(one.where for one in others)
-            if name != first.where
-        )
-        out.append(
-            first._replace(message=first.message + (f"; so it is in {names}" if names else ""))
-        )
+def together(every: Sequence[Finding]) -> list[Finding]:
+    """One finding for each name: the gravest, with the names of the other recordings."""
+    out = list[Finding]()
+    for name in dict.fromkeys(one.facts["name"] for one in every):
+        mine = [one for one in every if one.facts["name"] == name]
+        first, *others = sorted(mine, key=lambda one: one.severity)
+        alike = dict.fromkeys(one.facts["recording"] for one in others)
+        alike.pop(first.facts["recording"], None)
+        more = {"others_alike": [f"`{one}`" for one in alike]} if alike else {}
+        out.append(replace(first, facts=first.facts | more))
     return out
 
 
-def accepted(every: Sequence[Diagnostic], acknowledged: Sequence[str]) -> list[str]:
-    """Messages of warnings, and of acknowledged errors. Raises `ValueError` for other errors, and
-    for an acknowledged code without a finding."""
-    codes = dict.fromkeys(one.code for one in every)
-    if strange := [code for code in acknowledged if code not in codes]:
-        there = f"what was found is {', '.join(codes)}" if codes else "nothing looks wrong"
+def accepted(every: Sequence[Finding], acknowledged: Sequence[str]) -> list[Finding]:
+    """Findings on recordings, those that are acknowledged as notes. Raises `ValueError` for other
+    errors, and for an acknowledged name without a finding."""
+    names = dict.fromkeys(one.facts["name"] for one in every)
+    if strange := [name for name in acknowledged if name not in names]:
+        there = f"the findings are {', '.join(names)}" if names else "nothing looks wrong"
         raise ValueError(
-            f"acknowledged: nothing was found that is called {shown(strange[0])}, so leave it out; "
-            f"{there}"
+            f"acknowledged: there is no finding {shown(strange[0])}, so leave it out; {there}"
         )
     for one in every:
-        if one.severity == "error" and one.code not in acknowledged:
-            raise ValueError(f'{one.message}; if it is so, say acknowledged = ["{one.code}"]')
-    return [
-        f"{one.message} (acknowledged)" if one.code in acknowledged else one.message
-        for one in every
-    ]
+        if one.severity == "error" and one.facts["name"] not in acknowledged:
+            raise ValueError(f'{one} If it is right, say acknowledged = ["{one.facts["name"]}"]')
+    return [replace(one, severity="note") for one in every]
 
 
 MISTAKEN = {
@@ -281,8 +266,8 @@ def comparable(recording: Recording, sensors: Mapping[str, Sensor], name: str) -
 
 def controller_findings(
     recording: Recording, sensors: Mapping[str, Sensor], unknown: Collection[str] = ()
-) -> Iterator[Diagnostic]:
-    """Diagnostics on forces whose mean differs from their controller's, where no sensor of the
+) -> Iterator[Finding]:
+    """Findings on forces whose mean differs from their controller's, where no sensor of the
     force or of its coordinates has a fault to be estimated, and no gain is among the `unknown`
     parameters."""
     rig = recording.rig
@@ -291,13 +276,9 @@ def controller_findings(
         force, *others = every = [channel(rig, one) for one in (name, *actuator.measures)]
         lacking = [one for one in every if not comparable(recording, sensors, one)]
         if lacking and force not in lacking and not actuator.is_loop:
-            yield Diagnostic(
-                "note",
-                recording.name,
-                f"recording `{recording.name}`: {force} is not compared "
-                f"with its controller, since {lacking[0]} is not recorded",
-                f"controller of {force}",
-            )
+            name = f"controller of {force}"
+            one = found("not-compared", name, recording, force=force, lacking=lacking[0])
+            yield replace(one, severity="note")
         faults = [(s.bias, s.delay, s.gain, s.drift) for s in map(sensors.get, every) if s]
         if lacking or np.any(faults) or any(id(p) in tensors for p in actuator.parameters()):
             continue
@@ -323,14 +304,9 @@ def controller_findings(
         off = float(np.mean(apart))
         if abs(off) <= 2 * sum(noise) ** 0.5 + ROUGH * float(np.sqrt(np.mean(F**2))):
             continue
-        ask = "are its gains, units, zeros and set-points right?"
-        if feed:
-            ask = f"was a force fed forward that {feed} does not have?"
-        text = (
-            f"{force} is {off:+.3g} {actuator.effort_unit} more, on the average, than the "
-            f"controller gives: {ask}"
-        )
-        yield found(feed or f"loop of {force}", recording, text)
+        ask = {"feed": feed} if feed else {"loop": f"the actuator {name}"}
+        more: dict[str, Any] = {"force": force, "off": off, "unit": actuator.effort_unit} | ask
+        yield found("controller", feed or f"loop of {force}", recording, **more)
 
 
 def shift_of_start(
@@ -366,11 +342,9 @@ Expected = Mapping[str, tuple[Readout, Signals]]
 """Readouts of a run, with its signals, by channel."""
 
 
-def precheck(
-    problem: Problem, runner: Runner, which: Sequence[str] | None = None
-) -> list[Diagnostic]:
-    """Diagnostics on some recordings of a problem, by default all: one for each code."""
-    every, x = list[Diagnostic](), problem.coordinates.start
+def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
+    """Findings on some recordings of a problem, by default all: one for each name."""
+    every, x = list[Finding](), problem.coordinates.start
     which = problem.names if which is None else which
     unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
     jobs = problem.jobs(x, which, LOOSE, None)
@@ -392,8 +366,8 @@ def findings(
     sensors: Mapping[str, Sensor],
     expected: Expected,
     unknown: Collection[str] = (),
-) -> list[Diagnostic]:
-    """Diagnostics on one recording, compared with the readouts `expected` of a run from the start,
+) -> list[Finding]:
+    """Findings on one recording, compared with the readouts `expected` of a run from the start,
     if there is one; `unknown` are the names of unknown parameters. A recording with an error is not
     compared with the run."""
     every = [*setpoint_findings(recording, sensors), *noisy(recording, sensors)]
@@ -416,7 +390,7 @@ ENOUGH, WIDTH = 10, 0.5
 """Samples of a channel whose range, over their noise, is not smaller than that by chance."""
 
 
-def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
+def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
     """Noise that is stated so large that samples could not be as near to each other as they are."""
     for name, sensor in sensors.items():
         y = recording.samples[name][1] if name in recording.samples else np.zeros(0)
@@ -424,26 +398,21 @@ def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagn
             continue
         unit = recording.units[name]
         if np.ptp(y) == 0 and sensor.resolution < sensor.noise and not sensor.saturated(y).any():
-            yield constant(recording, name, f"its noise is stated as {sensor.noise:.3g} {unit}")
+            yield constant(recording, name, noise=sensor.noise)
         elif 0 < np.ptp(y) < WIDTH * sensor.noise:
-            text = (
-                f"the noise of {name} is stated as {sensor.noise:.3g} {unit}, but all of its "
-                f"samples are within {np.ptp(y):.3g} {unit}: is it in the right unit?"
-            )
-            yield found(f"noise of {name}", recording, text, grave=True)
+            facts = {"noise": sensor.noise, "range": float(np.ptp(y)), "unit": unit}
+            yield found("noise", f"noise of {name}", recording, True, channel=name, **facts)
 
 
-def constant(recording: Recording, name: str, contradiction: str) -> Diagnostic:
-    """Diagnostic on a channel whose samples are all equal, with what contradicts that."""
-    y = recording.samples[name][1]
-    text = (
-        f"{name} is constant, {y[0]:.6g} {recording.units[name]} in all of its {len(y)} samples, "
-        f"but {contradiction}: was it recorded? Leave out its sensor, or correct the column"
-    )
-    return found(f"constant {name}", recording, text, grave=True)
+def constant(recording: Recording, name: str, **contradiction: float) -> Finding:
+    """Finding on a channel whose samples are all equal, with what contradicts that: the stated
+    `noise`, or the motion of a `run`."""
+    y, unit = recording.samples[name][1], recording.units[name]
+    facts = {"channel": name, "value": float(y[0]), "unit": unit, "samples": len(y)}
+    return found("constant", f"constant {name}", recording, True, **facts, **contradiction)
 
 
-def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
+def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
     """Warnings on quantised readings whose steps the stated noise and resolution omit."""
     for name, sensor in sensors.items():
         if name not in recording.samples:
@@ -453,11 +422,8 @@ def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Dia
         if not COARSE * max(sensor.noise, sensor.resolution) < q < math.inf:
             continue
         if np.abs(apart / q - np.round(apart / q)).max() < 1e-3:
-            text = (
-                f"{name} comes in steps of {q:.3g} {recording.units[name]}, "
-                f"{q / sensor.noise:.2g} times its noise: say so by its `resolution`"
-            )
-            yield found(f"resolution of {name}", recording, text)
+            facts = {"step": q, "unit": recording.units[name], "ratio": q / sensor.noise}
+            yield found("resolution", f"resolution of {name}", recording, channel=name, **facts)
 
 
 def unsaturated(
@@ -471,8 +437,8 @@ def unsaturated(
 
 def against_run(
     recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
-) -> Iterator[Diagnostic]:
-    """Diagnostics on channels whose sign or unit contradicts the run."""
+) -> Iterator[Finding]:
+    """Findings on channels whose sign or unit contradicts the run."""
     for name, (one, signals) in expected.items():
         (t, y), noise = unsaturated(recording, sensors, name), sensors[name].sd
         if len(t) < 2 * MOVES:
@@ -482,33 +448,22 @@ def against_run(
         if max(measured, run) < MOVES * noise:
             continue
         if measured == 0:
-            moves = f"a run with the parameters of the start moves it by {run:.3g} rms"
-            yield constant(recording, name, moves)
+            yield constant(recording, name, run=run)
             continue
         ratio = measured / max(run, 1e-300)
         if not 1 / LARGER < ratio < LARGER and run > 0:
-            text = (
-                f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the "
-                "start"
-            )
             known = [
                 (abs(math.log(ratio / factor)), confusion)
                 for factor, confusion in confusions(recording.units[name])
             ]
             distance, confusion = min(known, default=(math.inf, ""))
             if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
-                yield found(f"unit of {name}", recording, f"{text}: {confusion}?", grave=True)
+                more = {"channel": name, "ratio": ratio, "confusion": confusion}
+                yield found("unit", f"unit of {name}", recording, True, **more)
             else:
-                yield found(
-                    f"size of {name}",
-                    recording,
-                    f"{text}: is its unit right, and are these parameters?",
-                )
+                yield found("size", f"size of {name}", recording, channel=name, ratio=ratio)
         elif min(measured, run) >= MOVES * noise:
             alike = float(np.mean((y - y.mean()) * (p - p.mean()))) / (measured * run)
             if alike < OPPOSITE:
-                text = (
-                    f"{name} looks as if its sign were opposite: its correlation with a run from "
-                    f"the start is {alike:.2f}"
-                )
-                yield found(f"sign of {name}", recording, text, grave=True)
+                more = {"channel": name, "correlation": alike}
+                yield found("sign", f"sign of {name}", recording, True, **more)

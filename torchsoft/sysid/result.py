@@ -38,6 +38,7 @@ from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.sentences import HEADLINES, IDENTIFIED, Finding
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
 
@@ -145,10 +146,6 @@ LARGEST = 1e9
 
 Verdict = Literal["holds", "doubtful", "does not explain"]
 
-UNEXPLAINED = 1.25
-"""RMS residual of a channel, over its stated noise, above which the headline says that the model
-does not explain the data."""
-
 
 @dataclass(frozen=True)
 class ChannelNoise:
@@ -185,12 +182,7 @@ class IdentificationResult(Shown):
     heldout: dict[
         str, dict[str, Number]
     ]  # NRMSE of recordings that were not fitted, by recording and channel
-    notices: list[str]
-    doubts: list[str]  # the notices that speak against the model
-    # whether residuals are those of a right model, at least under the suspect that is named
-    explained: bool
-    # assumptions that the data would not show to be wrong, though estimates move
-    unseen: list[str]
+    findings: list[Finding]  # the gravest first
     stages: list[dict[str, Any]]
     cost: dict[str, Number]
     made_by: dict[str, Any]
@@ -233,44 +225,24 @@ class IdentificationResult(Shown):
             else:
                 low, high = one.ci95
                 rows.append((one.label, f"{one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}"))
-        rows += [("note", notice) for notice in self.notices]
-        rows += [("unseen", sentence) for sentence in self.unseen]
+        rows += [(one.severity, str(one)) for one in self.findings]
         return self.headline, rows
 
     @property
     def verdict(self) -> Verdict:
         """Whether the model holds, is in doubt, or does not explain the data."""
-        if not self.explained or not all(one.stated < UNEXPLAINED for one in self.residuals):
+        severities = {one.severity for one in self.findings}
+        if "error" in severities:
             return "does not explain"
-        return "doubtful" if self.doubts else "holds"
+        return "doubtful" if "warning" in severities else "holds"
 
     @property
     def headline(self) -> str:
-        """First line of a report: the verdict on the model, where it is not that it holds, and the
-        number of identifiable parameters."""
+        """First line of a report: the verdict, and the number of identifiable parameters."""
         mine = [e for e in self.estimates if e.kind == "parameter"]
-        text = (
-            f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = "
-            f"{self.chi2:.3g}"
-        )
-        if not abs(self.chi2_whitened - self.chi2) < 0.1 * self.chi2:
-            text += f", {self.chi2_whitened:.3g} once whitened"
-        if self.verdict == "doubtful":
-            several = len(self.doubts) > 1
-            held = f"{len(self.doubts)} notes below speak" if several else "a note below speaks"
-            return f"The model is doubtful, {held} against it; if it holds, {text}"
-        if self.verdict == "holds":
-            return text
-        worst = max(self.residuals, key=lambda one: one.stated)
-        size = f"residuals of {worst.channel} are {worst.stated:.2g} times the stated noise"
-        if worst.stated < UNEXPLAINED:
-            size = f"{len(self.doubts)} notes below say what it leaves"
-            if len(self.doubts) == 1:
-                size = "a note below says what it leaves"
-        return (
-            f"The model does not explain the data: {size} (χ² = {self.chi2:.3g}), and "
-            "intervals may miss the truth"
-        )
+        count = sum(e.identifiable for e in mine)
+        identified = IDENTIFIED.format(count=count, parameters=len(mine), chi2=self.chi2)
+        return HEADLINES[self.verdict].format(identified=identified, chi2=self.chi2)
 
     def recorded(self, recording: str | None = None) -> RecordedRig:
         """A recording and its rig, by default the first. Raises `ValueError` for an unknown one,
@@ -385,6 +357,8 @@ class IdentificationResult(Shown):
         """Content of the file."""
         content = {"verdict": self.verdict}
         content |= finite(adapter().dump_python(self, mode="json", by_alias=True))
+        for one, finding in zip(content["findings"], self.findings):
+            one["text"] = str(finding)
         return json.dumps(
             {"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False
         )
@@ -434,6 +408,9 @@ def schema() -> dict[str, Any]:
     """The JSON Schema (2020-12) of the file."""
     definition = finite(adapter().json_schema(by_alias=True, mode="serialization"))
     definition["properties"].pop("rigs", None)
+    finding = definition["$defs"]["Finding"]
+    finding["properties"]["text"] = {"type": "string", "description": "The finding in words."}
+    finding["required"].append("text")
     head = {
         "schema": {"const": SCHEMA, "description": "Name and version of the file's form."},
         "checksum": {
@@ -479,7 +456,11 @@ def load_answer(path: str | Path) -> IdentificationResult:
             f"{path} is damaged: its content is not what was saved; restore it from a copy, or "
             "identify again"
         )
-    content.pop("verdict", None)  # it follows from the rest
+    content.pop("verdict", None)  # it follows from the rest, as texts do
+    findings = content.get("findings")
+    for one in findings if isinstance(findings, list) else ():
+        if isinstance(one, dict):
+            one.pop("text", None)
     # of a steep friction law, which was fitted nevertheless
     with refusing(content, str(path)), warnings.catch_warnings(action="ignore"):
         return adapter().validate_json(json.dumps(content))
