@@ -134,7 +134,7 @@ def main(config: Config) -> None:
     for label in ("poses and F_x", "+ taxels"):
         stated = problem(recordings[FITTED], WITH[label], start)
         found = identify(stated, rtol=config.rtol, assumptions="trusted")
-        print(f"\n{FITTED}, {label}", found.table(), *found.notices, sep="\n")
+        print(f"\n{FITTED}, {label}", found.table(), *found.findings, sep="\n")
         chi2[label] = found.chi2
         fits[label] = {
             name: {

@@ -177,13 +177,13 @@ def main(config: Config) -> None:
                 progress=not config.smoke,
             )  # fmt: skip
             forget(folder)
-            print(found.table(), *found.notices, sep="\n")
+            print(found.table(), *found.findings, sep="\n")
             if name == "noisy":
                 report(found, stated, config.out / "report.html")
             rows.append(
                 {
                     "case": name, "parameters": compared(found, truth, begin), "chi2": found.chi2,
-                    "heldout_nrmse": found.heldout, "notices": found.notices, **found.cost,
+                    "heldout_nrmse": found.heldout, "findings": [*map(str, found.findings)], **found.cost,
                 }
             )  # fmt: skip
     cells = {

@@ -173,7 +173,12 @@ def at_rest(cut: Cut, config: Config) -> dict[str, object]:
         return {"library": [str(error)]}
     given = [name for name in sought(config) if found[name].ci95 is not None]
     wrong = [name for name in given if not holds(found, name)]
-    return {"library": found.notices, "chi2": found.chi2, "intervals": given, "wrong": wrong}
+    return {
+        "library": [*map(str, found.findings)],
+        "chi2": found.chi2,
+        "intervals": given,
+        "wrong": wrong,
+    }
 
 
 def holds(found: IdentificationResult, name: str) -> bool:
@@ -227,7 +232,7 @@ def main(config: Config) -> None:
         cases[case] = {
             "parameters": rows, "coordinates": at.coordinates, "jacobian_s": at.exact_s,
             "jacobian_by_differences_s": at.differences_s, "assuming_rest": result.rest[case],
-            "notices": [one.notices for one in found],
+            "findings": [[*map(str, one.findings)] for one in found],
         }  # fmt: skip
         print(
             f"\n{case}: {at.coordinates} unknowns, a Jacobian in {at.exact_s:.2g} s, by "

@@ -46,7 +46,7 @@ FLOWS = {
         fields places parts control motion outputs geometry initial built build excite written
         course recorded gripped alone check goal run .
     """,
-    "cli": "results rigs plan identify design material dataset reduce plot .",
+    "cli": "results rigs plan identify profile design material dataset reduce plot .",
     "solve.kernel": """
         table arrays objects . invoke linear sources contacts condensed nodal pads domain stage step
         run adjoint tangent build

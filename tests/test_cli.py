@@ -96,6 +96,7 @@ OPTIONS = ("--out", "--workers", "--rtol", "--checkpoint", "--yes", "--no-progre
         ("material fit", ("FILE", "--out", "--test", "--terms", "--length", "--nu", "compliance")),
         ("identify", ("DATA.csv", "CONFIG.toml", *OPTIONS)),
         ("rehearse", ("CONFIG.toml", *OPTIONS)),
+        ("profile", ("DATA.csv", "CONFIG.toml", "--answer", "--of", "--out")),
     ],
 )
 def test_help_names_commands_arguments_and_options(command, words, capsys):
@@ -231,6 +232,19 @@ def test_it_writes_answer_and_page(answered):
     page = (out / "report.html").read_text()
     assert page.startswith("<!doctype html>")
     assert line in page
+
+
+def test_profiles_are_those_of_the_answer(answered, capsys):
+    folder, (_, *files) = answered
+    out, found = folder / "profile", answer(folder / "out")
+    options = ["--answer", str(folder / "out" / "answer.json"), "--of", "contact.K_n"]
+    assert main(["profile", *files, *options, "--out", str(out), "--no-progress"]) == 0
+    (one,) = json.loads((out / "profile.json").read_text())
+    (stated,) = (e for e in found["estimates"] if e["name"] == one["label"])
+    assert one["label"] == "laws.steel_on_rubber.K_n"
+    assert one["best"] == pytest.approx(stated["last"])
+    assert one["wald95"] == pytest.approx(stated["ci95"], rel=0.05)
+    assert "written to" in capsys.readouterr().out
 
 
 @pytest.mark.slow

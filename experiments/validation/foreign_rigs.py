@@ -361,7 +361,7 @@ def study(case: Case, made: Sequence[Made], config: Config) -> Outcome:
             stated(recordings, truth), rtol=config.rtol, workers=config.workers, checkpoint=runs,
             progress=not config.smoke,
         )  # fmt: skip
-        rows, chi2, notices = judged(found, truth), found.chi2, list(found.notices)
+        rows, chi2, notices = judged(found, truth), found.chi2, [*map(str, found.findings)]
     except (Unreachable, ValueError) as error:
         notices = [str(error)]
     named = any(word.lower() in text.lower() for word in case.cause for text in notices)

@@ -75,7 +75,7 @@ class Config:
 
 class Repetition(NamedTuple):
     """One seed: by unknown the error of the logarithm over its predicted standard deviation, that
-    deviation [1] and whether the interval holds; notices, and the orders of the noise found."""
+    deviation [1] and whether the interval holds; codes of findings, and the orders of the noise found."""
 
     unknowns: dict[str, tuple[float, float, bool]]
     notices: list[str]
@@ -140,7 +140,11 @@ def by_identify(stated: Problem, truth: dict[str, float], rtol: float) -> Repeti
     plan = [Stage("all", stated.names, stated.coordinates.labels, rtol, tolerance=1e-3)]
     result = identify(stated, plan=plan, assumptions="trusted")
     found = judged({name: result[name] for name in truth}, truth)
-    return Repetition(found, result.notices, [one.model.order for one in result.noise])
+    codes = [one.code for one in result.findings]
+    colours = [one for one in result.findings if one.code == "colour"]
+    return Repetition(
+        found, codes, [case["order"] for one in colours for case in one.facts["cases"]]
+    )
 
 
 def by_white_least_squares(stated: Problem, truth: dict[str, float], rtol: float) -> Repetition:
@@ -248,7 +252,8 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
         options |= {} if seed < config.checked else {"assumptions": "trusted"}
         result = identify(one.problem, **options)
         path.unlink()
-        return Repetition(judged({name: result[name] for name in truth}, truth), result.notices, [])
+        codes = [one.code for one in result.findings]
+        return Repetition(judged({name: result[name] for name in truth}, truth), codes, [])
 
     return Case(truth, repetition)
 
@@ -272,7 +277,7 @@ CASES: dict[str, Callable[[Config], Case]] = {
 
 def summed(case: Case, found: list[Repetition]) -> dict[str, Any]:
     """A case as `summary.json` holds it."""
-    kinds = Counter(" ".join(note.split()[:6]) for one in found for note in one.notices)
+    kinds = Counter(code for one in found for code in one.notices)
     orders = Counter(order for one in found for order in one.orders)
     out: dict[str, Any] = {
         "notices": dict(kinds),

@@ -312,7 +312,14 @@ class Repetition(NamedTuple):
         return abs(self.off.get(self.worst, 0.0)) > OFF and not self.covered(case)
 
 
-CONTRADICTED = "the data contradict that ", "the data contradict one of "
+CAUSES = "cause", "causes", "rivals"
+
+
+RISKS = {"undetectable", "exact", "undetectable-others", "hinted"}
+"""Findings on errors that the data would not show."""
+
+UNSETTLED = {"rivals", "far", "likeliest", "no-suspect"}
+"""Findings that ask for refits."""
 
 
 def false_causes(case: Case, result: IdentificationResult) -> list[str]:
@@ -320,10 +327,8 @@ def false_causes(case: Case, result: IdentificationResult) -> list[str]:
     right = [one.stated for one in result.assumptions if case.is_right(one.name)]
     return [
         text
-        for text in result.notices
-        if text.startswith(CONTRADICTED)
-        and not case.is_right(text)
-        and not any(stated in text for stated in right)
+        for text in (str(one) for one in result.findings if one.code in CAUSES)
+        if not case.is_right(text) and not any(stated in text for stated in right)
     ]
 
 
@@ -364,17 +369,18 @@ def repeat(case: Case, made: Made, seed: int, config: Config) -> Repetition:
     options: dict[str, Any] = {"rtol": config.rtol, "checkpoint": folder}
     result, identify_s = timed(lambda: identify(one, **options))
     explain_s = None
-    if config.explain and result.made_by["candidates"]:
+    if config.explain and {one.code for one in result.findings} & UNSETTLED:
         result, explain_s = timed(lambda: explain(one, **options))
     forget(folder)
     off = {
         e.name: float(np.log(e.value / TRUTH[e.name]) / e.relative_sd)
         for e in result.estimates if e.value is not None
     }  # fmt: skip
-    named = {one.name: one.odds for one in result.assumptions if one.odds > LIKELY}
-    unseen = list(getattr(result, "unseen", []))
+    named = {one.name: one.score for one in result.assumptions if one.score > LIKELY}
+    unseen = [str(one) for one in result.findings if one.code in RISKS]
+    notices = [str(one) for one in result.findings if one.code not in RISKS]
     return Repetition(
-        off, named, false_causes(case, result), result.verdict, result.notices, unseen,
+        off, named, false_causes(case, result), result.verdict, notices, unseen,
         identify_s, explain_s,
     )  # fmt: skip
 

@@ -288,7 +288,7 @@ HEADLINES = {
 IDENTIFIED = "{count} of {parameters} parameters identifiable, χ² = {chi2:.3g}"
 
 LISTED = 3
-"""Most cases or names that a sentence lists; it counts the others."""
+"""Most cases that a sentence lists; it counts the others."""
 
 
 @dataclass(frozen=True)
@@ -327,7 +327,8 @@ def worded(value: Any, clauses: Sequence[str]) -> Any:
     if isinstance(value, Mapping):
         return ", ".join(f"{name} = {ranged(one)}" for name, one in value.items())
     if isinstance(value, list | tuple):
-        return listed([one if isinstance(one, str) else case(clauses, one) for one in value])
+        names = [one for one in value if isinstance(one, str)]
+        return ", ".join(names) or listed([case(clauses, one) for one in value])
     return value
 
 
@@ -342,7 +343,7 @@ def ranged(value: Any) -> str:
     return " to ".join(f"{end:.4g}" for end in ends)
 
 
-def listed(names: Sequence[str]) -> str:
-    """The first names, and the number of the others."""
-    more = len(names) - LISTED
-    return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
+def listed(cases: Sequence[str]) -> str:
+    """The first cases, and the number of the others."""
+    more = len(cases) - LISTED
+    return ", ".join(cases[:LISTED]) + (f" and {more} more" if more > 0 else "")
