@@ -70,4 +70,4 @@ def optimum(
     """At the coordinates x, of which the names in `free` are fitted, by default all."""
     labels = problem.coordinates.labels if free is None else free
     stage, runner = Stage("optimum", tuple(problem.names), labels, 1e-4), Runner((), workers)
-    return Fit(problem, runner, np.array(x, float), stage, variance=variance).begun()
+    return Fit(problem, runner, np.array(x, float), stage, variance=variance).evaluated()

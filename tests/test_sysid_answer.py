@@ -235,7 +235,7 @@ def test_what_is_saved_comes_back_and_is_what_the_published_schema_says(full, pa
         assert not answer.rigs
     assert isnan(answer.chi2)
     assert answer.noise == whole.noise
-    began = load_answer(path).recordings[1].began
+    began = load_answer(path).recordings[1].initial
     assert began == {"start.disc.x": full["start.disc.x"].last}
 
 

@@ -43,7 +43,7 @@ def same(a: Any, b: Any) -> bool:
 
 def recording(fingerprint: str = "a") -> Any:
     return SimpleNamespace(
-        fingerprint=fingerprint, beginning="", duration=1.0, begin=lambda: None, rig=None
+        fingerprint=fingerprint, start_fingerprint="", duration=1.0, begin=lambda: None, rig=None
     )
 
 
@@ -123,7 +123,7 @@ def test_finished_runs_are_kept_at_an_interruption(tmp_path, monkeypatch, count)
     jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(4)]
     running = threading.Barrier(count)
 
-    def made(recording: Any, begun: Any, job: Job, start: Any) -> Prediction:
+    def made(recording: Any, context: Any, job: Job, start: Any) -> Prediction:
         if job in jobs[:count]:
             running.wait()
         if job is jobs[count - 1]:

@@ -239,8 +239,8 @@ def test_a_grasp_in_mid_air_reports_that_its_poses_must_be_measured():
     built = coarse(outputs={"duration": 2.0, "snapshots": []}).build()
     made = record("lift", built, TRUTH, sensors, seed=3)
     late = {c: (t[t >= 0.8], y[t >= 0.8]) for c, (t, y) in made.samples.items()}
-    begun = estimate_initial_state(replace(made, samples=late), sensors)
-    problem = Problem([begun], sensors, {name: Unknown() for name in TRUTH})
+    made = estimate_initial_state(replace(made, samples=late), sensors)
+    problem = Problem([made], sensors, {name: Unknown() for name in TRUTH})
     result = identify(problem, assumptions="trusted")
     for name, value in TRUTH.items():
         assert result[name].value == pytest.approx(value, rel=4 * result[name].relative_sd)

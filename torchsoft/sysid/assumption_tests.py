@@ -334,7 +334,7 @@ class Judge:
             passed=not self.alarms(again.at.r, again.J),
         )
 
-    def at_rest(self, again: Again, as_stated: Fit) -> AssumptionTest:
+    def refined(self, again: Again, as_stated: Fit) -> AssumptionTest:
         """Test by a repeated fit that goes on until its steps do not matter, as that of the
         parameters did; without estimates where it does not come to rest."""
         fit = refine_steps(again.fit, TIGHTENINGS if again.fit.loss == "linear" else 0)

@@ -589,8 +589,8 @@ FIXED_POINT, CLOSE = 6, 3e-3
 more. To first order in a fault once is exact."""
 
 
-def settled(now: Array, before: Array | None) -> bool:
-    """Whether forces (..., G) have settled."""
+def forces_converged(now: Array, before: Array | None) -> bool:
+    """Whether forces (..., G) have converged."""
     return before is not None and float(np.abs(now - before).max()) <= CLOSE * np.abs(now).max()
 
 
@@ -646,7 +646,7 @@ def off_centre(
         moment = c[:, 0] * free[:, 1] - c[:, 1] * free[:, 0]
         loads = np.column_stack((force, moment))
         made = with_loads(recording, at.t, body, loads)
-        if settled(loads, before):
+        if forces_converged(loads, before):
             break
     return made
 

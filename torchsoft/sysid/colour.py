@@ -26,7 +26,7 @@ def allow_for_colour(fit: Fit) -> Fit:
     where no sensor declares colour."""
     declared = declared_colour(fit.problem)
     for number in range(ROUNDS if declared else 0):
-        began, problem = clock.perf_counter(), fit.problem
+        started, problem = clock.perf_counter(), fit.problem
         now = parts(problem, fit.at.r, fit.which)
         every = colours(now, fit.J, declared)
         found = {channel: every[channel] for channel in declared if channel in every}
@@ -36,10 +36,10 @@ def allow_for_colour(fit: Fit) -> Fit:
         noise = {**problem.noise, **{name: one.noise for name, one in found.items()}}
         problem = problem.with_noise(noise)
         fit = fit._replace(problem=problem, at=rewhitened(problem, fit.at, now))
-        if fit.settled:
+        if fit.step_is_small:
             break
         fit = chord(fit) if number > 0 and fit.loss == "linear" else iterated(fit)
-        fit = fit.noted("with the noise that was found", began)
+        fit = fit.noted("with the noise that was found", started)
     return fit
 
 

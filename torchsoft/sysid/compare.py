@@ -418,12 +418,12 @@ def compare(
     for name, problem in laws.items():
         own = folders.get(name)
         runner = Runner(problem.recordings, workers, Path(own) if own is not None else None)
-        begin = Fit(problem, runner, problem.coordinates.start, progress=progress)
+        start = Fit(problem, runner, problem.coordinates.start, progress=progress)
         try:
             plan = (plans or {}).get(name)
             if plan is None:
                 plan = default_plan(problem, runner, rtol, which, starts)
-            evidence[name] = Evidence(name, fitted(name, begin, which, plan), heldout)
+            evidence[name] = Evidence(name, fitted(name, start, which, plan), heldout)
         except Unreachable as error:
             raise ValueError(f"the law `{name}` cannot follow the recordings: {error}") from None
     best = max(evidence, key=lambda name: evidence[name].total)
@@ -483,12 +483,12 @@ def same_reference(one: Recording, other: Recording) -> bool:
     )
 
 
-def fitted(name: str, begin: Fit, which: Sequence[str], plan: Sequence[Stage]) -> Fit:
+def fitted(name: str, start: Fit, which: Sequence[str], plan: Sequence[Stage]) -> Fit:
     """A law at the end of its plan, with its noise estimated where sensors declare colour. Raises
     `Unreachable`."""
     if not plan or list(plan[-1].recordings) != list(which):
         raise ValueError(f"the last stage of the plan of `{name}` must fit {', '.join(which)}")
-    fit = run_plan(begin, plan, label=f"{name} ")
+    fit = run_plan(start, plan, label=f"{name} ")
     if fit.failure is not None:  # laws are compared by the same tolerance
         raise fit.failure
     return allow_for_colour(fit)

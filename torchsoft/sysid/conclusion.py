@@ -120,7 +120,7 @@ def run_findings(end: Fit) -> list[Finding]:
         if recording.name in end.which:
             with suppress(SimulationFailed):
                 values, grid = end.problem.values(end.x, k), recording.grid(False)
-                for text in run_doubts(recording.begin(), values, grid, end.rtol):
+                for text in run_doubts(recording.run_context(), values, grid, end.rtol):
                     facts = {"recording": recording.name, "text": text}
                     found.setdefault(text, Finding("run", "note", facts))
     return [*found.values()]

@@ -205,7 +205,7 @@ def covariance(
     return inverse @ (max(power, least) * J[:m].T @ J[:m] + J[m:].T @ J[m:]) @ inverse
 
 
-# A fit, from its begin to its end
+# A fit, from its start to its end
 
 
 Notify = Callable[[float], None]
@@ -216,7 +216,7 @@ def silent(chi2: float) -> None:
     """Notify nobody."""
 
 
-SETTLED = 0.2
+SMALL_STEP = 0.2
 """Largest remaining move of a coordinate, in standard deviations, at which a fit has ended."""
 
 
@@ -285,7 +285,7 @@ class Fit(NamedTuple):
     the noise.
 
     `stages` are the result's entries on the fits up to this one; `failure` is the error of a stage
-    that could not begin at its end; `colour` is declared noise, estimated from its residuals, by
+    that could not start at its end; `colour` is declared noise, estimated from its residuals, by
     channel; `check` is that of its steps. `variance` is the factor on the stated variance of the
     noise; `progress` whether bars are shown.
     """
@@ -402,11 +402,11 @@ class Fit(NamedTuple):
             self.free if jacobian else None,
         )
 
-    def begun(self, x: Array | None = None, jacobian: bool = True) -> "Fit":
+    def evaluated(self, x: Array | None = None) -> "Fit":
         """The fit at x (n,), on the steps that its tolerance chooses there. Raises `Unreachable`
         where x cannot be simulated."""
         x = self.x if x is None else x
-        at = self.residuals(x, self.rtol, jacobian)
+        at = self.residuals(x, self.rtol, jacobian=True)
         if at.failed:
             raise Unreachable(at.failed)
         return self._replace(x=x, at=at)
@@ -431,13 +431,13 @@ class Fit(NamedTuple):
         return np.asarray(lsq_linear(R, -Q.T @ r, (np.minimum(low, 0.0), np.maximum(high, 0.0))).x)
 
     @property
-    def settled(self) -> bool:
-        """Whether the Gauss-Newton step is below `SETTLED` standard deviations for all fitted
+    def step_is_small(self) -> bool:
+        """Whether the Gauss-Newton step is below `SMALL_STEP` standard deviations for all fitted
         coordinates."""
-        return bool((np.abs(self.newton_step()) <= SETTLED * self.sd).all())
+        return bool((np.abs(self.newton_step()) <= SMALL_STEP * self.sd).all())
 
-    def noted(self, name: str, began: float) -> "Fit":
-        """The fit with the result's entry on it, which `began` on the clock [s]."""
+    def noted(self, name: str, started: float) -> "Fit":
+        """The fit with the result's entry on it, which `started` on the clock [s]."""
         entry = {
             "name": name,
             "recordings": [*self.which],
@@ -446,7 +446,7 @@ class Fit(NamedTuple):
             "evaluations": self.evaluations,
             "chi2": self.chi2,
             "converged": self.converged,
-            "wall_s": clock.perf_counter() - began,
+            "wall_s": clock.perf_counter() - started,
         }
         return self._replace(stages=(*self.stages, entry))
 
@@ -541,10 +541,10 @@ def gauss_newton(
 def chord(fit: Fit, rounds: int = 5) -> Fit:
     """Chord iteration of a fit whose residuals are on the steps of `fit.at`, and whose Jacobian,
     which is kept, may be on others. A round costs a run, not a Jacobian. It ends where every
-    coordinate would move by less than `SETTLED` standard deviations, a run fails, or the misfit
+    coordinate would move by less than `SMALL_STEP` standard deviations, a run fails, or the misfit
     grows."""
     count = 0
-    while not (converged := fit.settled) and count < rounds:
+    while not (converged := fit.step_is_small) and count < rounds:
         trial = fit.place(fit.x[fit.free] + fit.newton_step())
         there, count = fit.residuals(trial), count + 1
         if there.failed or there.r @ there.r > fit.at.r @ fit.at.r:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from torchsoft.display import hidden
 from torchsoft.sysid.fit import (
-    SETTLED,
+    SMALL_STEP,
     Check,
     Fit,
     Stage,
@@ -149,19 +149,19 @@ def shown(label: str, work: Callable[[Fit], Fit], fit: Fit) -> Fit:
         return work(fit._replace(notify=notify))._replace(notify=silent)
 
 
-def run_plan(begin: Fit, plan: Sequence[Stage], *, seed: int = 0, label: str = "") -> Fit:
+def run_plan(start: Fit, plan: Sequence[Stage], *, seed: int = 0, label: str = "") -> Fit:
     """Fit stage after stage, each from the end of the one before; the end of the last that could
-    begin.
+    start.
 
     A stage that cannot be simulated where the one before it ended, and repeats it by a finer
-    tolerance, ends the plan as `Fit.failure`; any other starts again from the begin. Raises
+    tolerance, ends the plan as `Fit.failure`; any other starts again from the start. Raises
     `Unreachable` where it cannot be simulated there, and `ValueError` for a plan without stages.
     """
     if not plan:
         raise ValueError("`plan` has no stages")
-    end = begin
+    end = start
     for number, stage in enumerate(plan):
-        began, title = clock.perf_counter(), f"{label}{number + 1}/{len(plan)} {stage.name}"
+        started, title = clock.perf_counter(), f"{label}{number + 1}/{len(plan)} {stage.name}"
         work = partial(run_stage, seed=seed + number)
         try:
             fit = shown(title, work, end._replace(stage=stage))
@@ -170,13 +170,13 @@ def run_plan(begin: Fit, plan: Sequence[Stage], *, seed: int = 0, label: str = "
                 raise
             if (stage.recordings, stage.free) == (end.which, end.stage.free):
                 return end._replace(failure=failure)
-            fit = shown(title, work, begin._replace(stage=stage, stages=end.stages))
-        end = fit.noted(stage.name, began)
+            fit = shown(title, work, start._replace(stage=stage, stages=end.stages))
+        end = fit.noted(stage.name, started)
     return end
 
 
 def continued(fit: Fit, *plan: Stage) -> Fit | None:
-    """The end of a plan from a fit; None where it cannot begin there."""
+    """The end of a plan from a fit; None where it cannot start there."""
     with suppress(Unreachable):
         return run_plan(fit, plan)
     return None
@@ -199,7 +199,7 @@ def run_stage(fit: Fit, seed: int) -> Fit:
     fits, failures = list[Fit](), list[Unreachable]()
     for start in (x, *sobol(fit._replace(x=x), seed)):
         try:
-            fits.append(iterated(fit.begun(start)))
+            fits.append(iterated(fit.evaluated(start)))
         except Unreachable as error:
             failures.append(error)
     if not fits:
@@ -297,16 +297,16 @@ def refine_steps(fit: Fit, tightenings: int) -> Fit:
 
     At the end residuals are those on steps that the tolerance chooses there, where these can be
     run, and the Jacobian is that of the check. It has converged if with steps chosen anew no
-    coordinate would move by more than `SETTLED` standard deviations (where steps are only checked,
-    if it had before).
+    coordinate would move by more than `SMALL_STEP` standard deviations (where steps are only
+    checked, if it had before).
     """
     left, rounds, free = tightenings, ROUNDS if tightenings else 0, fit.free
-    began, by = clock.perf_counter(), fit.rtol
+    started, by = clock.perf_counter(), fit.rtol
 
     def along(start: Residuals) -> bool:
         """Fit on other steps from residuals on them, with new Jacobians where the last one does not
         suffice; returns whether the coordinates changed."""
-        nonlocal fit, rounds, left, began, by
+        nonlocal fit, rounds, left, started, by
         end = chord(fit._replace(at=start._replace(J=fit.at.J)))
         if not end.converged:
             end = gauss_newton(end, REFITS, EXACT, anew=True)
@@ -314,8 +314,8 @@ def refine_steps(fit: Fit, tightenings: int) -> Fit:
             rounds = left = 0
         if further := bool((end.x != fit.x).any()):
             name = "steps chosen anew" if end.rtol == by else "tighter tolerance"
-            fit = end.noted(name, began)
-            began, by = clock.perf_counter(), fit.rtol
+            fit = end.noted(name, started)
+            started, by = clock.perf_counter(), fit.rtol
         return further
 
     while True:
@@ -323,7 +323,7 @@ def refine_steps(fit: Fit, tightenings: int) -> Fit:
         if fresh.failed:
             return fit._replace(converged=False, check=Check(fit.rtol, fit.at))
         end = fit._replace(at=fresh._replace(J=fit.at.J))
-        end = end._replace(converged=end.settled if tightenings else fit.converged)
+        end = end._replace(converged=end.step_is_small if tightenings else fit.converged)
         if rounds and not end.converged:
             rounds -= 1
             if along(fresh):
@@ -337,9 +337,9 @@ def refine_steps(fit: Fit, tightenings: int) -> Fit:
         anew = np.abs(shift(J, fresh.r - fit.at.r)) / sd
         shifts, rough = np.abs(bias[free]) / sd, tuple[str, ...]()
         fit, end = (one._replace(at=one.at._replace(J=finer.J)) for one in (fit, end))
-        if not end.converged and tightenings and max(anew.max(), shifts.max()) <= SETTLED:
+        if not end.converged and tightenings and max(anew.max(), shifts.max()) <= SMALL_STEP:
             moves = np.abs(end.newton_step()) / sd
-            order = np.argsort(-moves)[: int(np.sum(moves > SETTLED))]
+            order = np.argsort(-moves)[: int(np.sum(moves > SMALL_STEP))]
             rough = tuple(fit.labels[i] for i in order)
         elif left and not (end.converged and shifts.max() <= STEP_BIAS and error <= JACOBIAN_ERROR):
             left, rounds, fit = left - 1, ROUNDS, fit.by(FINER * fit.rtol)

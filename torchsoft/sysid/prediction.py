@@ -325,11 +325,11 @@ def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
 
 
 def prepared(
-    begun: RunContext, values: Mapping[str, float], names: Sequence[str]
+    context: RunContext, values: Mapping[str, float], names: Sequence[str]
 ) -> tuple[Tensor, list[Tensor]]:
     """Set the rig's parameters, and make its initial state y0 (size,), differentiable by `names`,
     whose tensors are returned, too."""
-    set_parameters(begun.rig, values)
+    set_parameters(context.rig, values)
     at = {
         name: torch.tensor(value, dtype=torch.float64, requires_grad=name in names)
         for name, value in values.items()
@@ -337,8 +337,8 @@ def prepared(
     }
     parameters = tuple(name for name in names if name not in at)
     assert tuple(names[: len(parameters)]) == parameters
-    inputs = [*map(begun.rig.parameter, parameters), *(at[name] for name in names if name in at)]
-    return begun.y0(at), inputs
+    inputs = [*map(context.rig.parameter, parameters), *(at[name] for name in names if name in at)]
+    return context.y0(at), inputs
 
 
 def derivatives(
@@ -384,16 +384,16 @@ def choice(steps: Steps) -> dict[str, Any]:
 
 
 def initial_state(
-    begun: RunContext, values: Mapping[str, float], names: Sequence[str]
+    context: RunContext, values: Mapping[str, float], names: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
     """Initial state y0 (size,) of a run, and its derivatives (size, n) by `names`. Raises
     `SimulationFailed`."""
-    y0, inputs = prepared(begun, values, names)
+    y0, inputs = prepared(context, values, names)
     return y0.detach(), torch.from_numpy(directions(y0, inputs))
 
 
 def predict(
-    begun: RunContext,
+    context: RunContext,
     values: Mapping[str, float],
     grid: Grid,
     names: Sequence[str],
@@ -402,15 +402,15 @@ def predict(
 ) -> Prediction:
     """Signals on the grid, and their derivatives by `names`, if any. `start` is the
     `initial_state`, if known. Raises `SimulationFailed`."""
-    rig, keys = begun.rig, begun.channels
-    y0, dy0 = start or initial_state(begun, values, names)
+    rig, keys = context.rig, context.channels
+    y0, dy0 = start or initial_state(context, values, names)
     set_parameters(rig, values)
     touch = [key for key in keys if key not in measurable(rig)] if names else ()
     wrt = tuple(name for name in names if not name.startswith(PREFIX))
     places = [y0.new_zeros(()).requires_grad_() for _ in names[len(wrt) :]]  # of the start
     leaves = [*map(rig.parameter, wrt), *places]
     along = torch.stack([x - x.detach() for x in leaves]) if leaves else y0.new_zeros(0)
-    reference = reference_from(rig, begun.start, rig.unpack(y0 + dy0 @ along).pose)
+    reference = reference_from(rig, context.start, rig.unpack(y0 + dy0 @ along).pose)
     out = unjudged(
         rig,
         grid.t,
@@ -436,11 +436,11 @@ def predict(
 
 
 def run_doubts(
-    begun: RunContext, values: Mapping[str, float], grid: Grid, steps: Steps
+    context: RunContext, values: Mapping[str, float], grid: Grid, steps: Steps
 ) -> list[str]:
     """Warnings of the run at the end of a fit, which those on the way to it do not give. Raises
     `SimulationFailed`."""
-    y0, _ = prepared(begun, values, ())
-    reference = reference_from(begun.rig, begun.start, begun.rig.unpack(y0.detach()).pose)
-    run = unjudged(begun.rig, grid.t, y0=y0.detach(), reference=reference, **choice(steps))
-    return list(doubts(run, begun.rig, differentiated=True).values())
+    y0, _ = prepared(context, values, ())
+    reference = reference_from(context.rig, context.start, context.rig.unpack(y0.detach()).pose)
+    run = unjudged(context.rig, grid.t, y0=y0.detach(), reference=reference, **choice(steps))
+    return list(doubts(run, context.rig, differentiated=True).values())

@@ -197,14 +197,14 @@ def judge_residuals(
         one: [part for part in parts if part.recording == one]
         for one in dict.fromkeys(part.recording for part in parts)
     }
-    begins = {one: found for one, mine in recordings.items() if (found := onset(mine))}
-    out += begins.values()
+    onsets = {one: found for one, mine in recordings.items() if (found := onset(mine))}
+    out += onsets.values()
     for part in parts:
         if float(np.mean(part.raw**2)) < FAINT**2:
             continue
         out.append(white(part, r))
         out += lines_up(part, [p for p in parts if p.recording == part.recording], r, Q)
-        if not robust and part.recording not in begins:  # what follows are no outliers
+        if not robust and part.recording not in onsets:  # what follows are no outliers
             out.append(outliers(part, r))
     for recording, mine in recordings.items():
         out += together(recording, mine, r, Q)

@@ -46,8 +46,8 @@ from torchsoft.tables import Number, line, refusing, shown
 @dataclass(frozen=True)
 class RecordedRig:
     """A recording and its rig: fingerprint, length [s], start, the rig's class, its parameters and
-    laws before the fit (`description`), the `identified` parameters, and the values `began` of the
-    start's coordinates.
+    laws before the fit (`description`), the `identified` parameters, and the `initial` values of
+    the start's coordinates.
 
     `tables` are those of the rig file that it was built from; None for a rig with parts of its own,
     or with files beside its own.
@@ -63,7 +63,7 @@ class RecordedRig:
     description: dict[str, Any]
     tables: dict[str, Any] | None
     identified: dict[str, float]
-    began: dict[str, float]
+    initial: dict[str, float]
 
     @property
     def known(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
         files_renamed(dict(rig.tables or {}), lambda name, files=files: files.append(name) or name)
         tables = None if rig.tables is None or files else dict(rig.tables)
         identified = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
-        began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
+        initial = {name: value for name, value in values.items() if name.startswith(PREFIX)}
         start = line(str(recording.start), 300)
         one = RecordedRig(
             recording.name,
@@ -128,7 +128,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
             rig.description(),
             tables,
             identified,
-            began,
+            initial,
         )
         out.append(one)
     return out

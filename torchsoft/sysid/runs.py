@@ -208,8 +208,8 @@ class Runner:
         self.simulations = self.jacobians = self.remembered = 0
         self._work = 0.0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
-        beginnings = {recording.beginning for recording in self.recordings}
-        self._alike, self._lock = len(beginnings) < len(self.recordings), Lock()
+        starts = {recording.start_fingerprint for recording in self.recordings}
+        self._alike, self._lock = len(starts) < len(self.recordings), Lock()
         self._starts: dict[Any, tuple[Tensor, Tensor]] = {}
         self._watched: dict[str, Prediction] = {}
         self._idle: list[list[RunContext]] = [
@@ -264,12 +264,12 @@ class Runner:
         else:
             idle = self._idle[job.recording]
             try:
-                begun = idle.pop()
+                context = idle.pop()
             except IndexError:
-                begun = self.recordings[job.recording].begin()
-            start = partial(self._start, begun, job) if self._alike else None
-            result = simulated(self.recordings[job.recording], begun, job, start)
-            idle.append(begun)
+                context = self.recordings[job.recording].run_context()
+            start = partial(self._start, context, job) if self._alike else None
+            result = simulated(self.recordings[job.recording], context, job, start)
+            idle.append(context)
         if self._journal is not None:
             self._journal.keep(job, result)
         return result
@@ -282,8 +282,8 @@ class Runner:
         def run(one: Recording, job: Job = plain, fine: bool = False) -> Any:
             nonlocal work
             tied = tuple(one.tied) if job.names else ()
-            job = job._replace(steps=since(job.steps, one.begins), names=(*tied, *job.names))
-            made = simulated(one, one.begin(), job, grid=between(one, job) if fine else None)
+            job = job._replace(steps=since(job.steps, one.run_start), names=(*tied, *job.names))
+            made = simulated(one, one.run_context(), job, grid=between(one, job) if fine else None)
             if isinstance(made, FailedRun):
                 raise SimulationFailed(made.reason, made.time)
             if one is not stated:  # which is made once for many
@@ -320,12 +320,12 @@ class Runner:
         except SimulationFailed as failure:
             return FailedRun(failure.reason, failure.time)
 
-    def _start(self, begun: RunContext, job: Job) -> tuple[Tensor, Tensor]:
+    def _start(self, context: RunContext, job: Job) -> tuple[Tensor, Tensor]:
         """The initial state of a run, computed once for recordings that begin alike."""
-        key = self.recordings[job.recording].beginning, repr((job.values, job.names))
+        key = self.recordings[job.recording].start_fingerprint, repr((job.values, job.names))
         with self._lock:
             if key not in self._starts:
-                self._starts[key] = initial_state(begun, job.values, job.names)
+                self._starts[key] = initial_state(context, job.values, job.names)
             return self._starts[key]
 
     def _length(self, job: Job) -> float:
@@ -349,12 +349,12 @@ EARLY = 2e-3
 """Steps [s] before frozen ones, where the run of a varied recording begins earlier."""
 
 
-def since(steps: Steps, begin: float) -> Steps:
+def since(steps: Steps, start: float) -> Steps:
     """The same steps for a run that begins at another time [s]."""
-    if not isinstance(steps, Frozen) or begin == steps.knots[0]:
+    if not isinstance(steps, Frozen) or start == steps.knots[0]:
         return steps
     knots = steps.knots
-    early = np.arange(begin, knots[0], EARLY) if begin < knots[0] else np.array([begin])
+    early = np.arange(start, knots[0], EARLY) if start < knots[0] else np.array([start])
     return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
 
 
@@ -367,7 +367,7 @@ def between(recording: Recording, job: Job) -> Grid:
 
 def simulated(
     recording: Recording,
-    begun: RunContext,
+    context: RunContext,
     job: Job,
     start: Callable[[], tuple[Tensor, Tensor]] | None = None,
     grid: Grid | None = None,
@@ -377,6 +377,6 @@ def simulated(
     grid = recording.grid(job.interpolated) if grid is None else grid
     try:
         known = start() if start is not None else None
-        return predict(begun, job.values, grid, job.names, job.steps, known)
+        return predict(context, job.values, grid, job.names, job.steps, known)
     except SimulationFailed as failure:
         return FailedRun(failure.reason, failure.time)

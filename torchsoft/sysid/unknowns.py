@@ -503,7 +503,7 @@ class Coordinates:
             [c.to_x(c.high) for c in self.all]
         )
 
-    def begun(self, known: Mapping[str, float]) -> Array:
+    def with_known(self, known: Mapping[str, float]) -> Array:
         """Vector x (n,) with the `known` entries by label, and the nominal values elsewhere."""
         return np.array([known.get(label, own) for label, own in zip(self.labels, self.start)])
 
