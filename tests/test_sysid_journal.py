@@ -43,7 +43,11 @@ def same(a: Any, b: Any) -> bool:
 
 def recording(fingerprint: str = "a") -> Any:
     return SimpleNamespace(
-        fingerprint=fingerprint, start_fingerprint="", duration=1.0, run_context=lambda: None, rig=None
+        fingerprint=fingerprint,
+        start_fingerprint="",
+        duration=1.0,
+        run_context=lambda: None,
+        rig=None,
     )
 
 

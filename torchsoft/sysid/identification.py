@@ -214,7 +214,7 @@ def concluded(
     far_off: bool,
 ) -> IdentificationResult:
     """The answer at the end of a fit."""
-    problem, c, runner = end.problem, end.problem.coordinates, end.runner
+    problem = end.problem
     C, (C_free, values, vectors) = full_covariance(end, residuals, checked), fisher(end.J)
     shift = np.zeros(len(end.x)) if end.check.bias is None else end.check.bias
     found, channels = estimates(end, C, shift), residual_channels(end)
@@ -223,10 +223,6 @@ def concluded(
     findings += estimate_findings(found, ordering_constraints(problem))
     findings += step_findings(end, found, far_off)
     findings += model_findings(end, residuals, checked, channels)
-    noise = [
-        ChannelNoise(name, model, [*end.colour[name].scores] if name in end.colour else [])
-        for name, model in problem.noise.items()
-    ]
     return IdentificationResult(
         estimates=found,
         labels=[*end.labels],
@@ -240,28 +236,44 @@ def concluded(
         heldout=errors,
         findings=findings,
         stages=[*end.stages],
-        cost={
-            "simulations": runner.simulations,
-            "jacobians": runner.jacobians,
-            "remembered": runner.remembered,
-            "samples": len(end.at.r),
-            "data_seconds": sum(r.duration for r in problem.recordings if r.name in end.which),
-        },
-        made_by={
-            "torchsoft": version("torchsoft"),
-            **made_by,
-            "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
-            "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
-            "recordings": {r.name: r.fingerprint for r in problem.recordings},
-        },
+        cost=work(end),
+        made_by=made_by | provenance(problem),
         covariance=C.tolist(),
         recordings=recorded_rigs(end),
         unknowns=dict(problem.unknowns),
         sensors=dict(problem.sensors),
-        coordinates=[replace(one, fixed=not is_free) for one, is_free in zip(c.all, end.free)],
+        coordinates=[
+            replace(one, fixed=not is_free)
+            for one, is_free in zip(problem.coordinates.all, end.free)
+        ],
         combinations=seen_together(end, C),
-        noise=noise,
+        noise=[
+            ChannelNoise(name, model, [*end.colour[name].scores] if name in end.colour else [])
+            for name, model in problem.noise.items()
+        ],
         assumptions=checked.checks,
         versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
         rigs={recording.name: recording.rig for recording in problem.recordings},
     )
+
+
+def work(end: Fit) -> dict[str, float]:
+    """Numbers of runs, of residuals, and seconds of data of a fit."""
+    runner, recordings = end.runner, end.problem.recordings
+    return {
+        "simulations": runner.simulations,
+        "jacobians": runner.jacobians,
+        "remembered": runner.remembered,
+        "samples": len(end.at.r),
+        "data_seconds": sum(one.duration for one in recordings if one.name in end.which),
+    }
+
+
+def provenance(problem: Problem) -> dict[str, Any]:
+    """What a problem was made of."""
+    return {
+        "torchsoft": version("torchsoft"),
+        "unknowns": {name: one.model_dump() for name, one in problem.unknowns.items()},
+        "sensors": {name: one.model_dump() for name, one in problem.sensors.items()},
+        "recordings": {one.name: one.fingerprint for one in problem.recordings},
+    }

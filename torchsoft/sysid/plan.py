@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import qmc
@@ -288,11 +289,52 @@ def jacobian_error(J: Array, exact: Array) -> float:
     return float(np.linalg.norm((J - exact) @ steps, axis=0).max(initial=0.0))
 
 
+def continued_on(fit: Fit, steps: Residuals, name: str) -> Fit:
+    """The fit, continued on other steps from the residuals on them, with new Jacobians where the
+    last one does not suffice; the same fit where no coordinate moves."""
+    started, end = clock.perf_counter(), chord(fit._replace(at=steps._replace(J=fit.at.J)))
+    if not end.converged:
+        end = gauss_newton(end, REFITS, EXACT, anew=True)
+    return end.noted(name, started) if (end.x != fit.x).any() else fit
+
+
+class StepEffect(NamedTuple):
+    """Effect of finer steps on a fit: the shift of every coordinate (n,), its size and that by
+    steps chosen anew, in standard deviations, and the error of the Jacobian."""
+
+    bias: Array
+    finer: float
+    anew: float
+    jacobian_error: float
+
+    @property
+    def small(self) -> bool:
+        """Whether the tolerance is fine enough."""
+        return self.finer <= STEP_BIAS and self.jacobian_error <= JACOBIAN_ERROR
+
+
+def step_effect(fit: Fit, fresh: Residuals, finer: Residuals) -> StepEffect:
+    """Effect of steps chosen anew, and of those at a tenth of the tolerance."""
+    J, bias = finer.J[:, fit.free], np.zeros(len(fit.x))
+    sd, bias[fit.free] = standard_deviations(J), shift(J, finer.r - fit.at.r)
+    anew = float((np.abs(shift(J, fresh.r - fit.at.r)) / sd).max())
+    return StepEffect(
+        bias, float((np.abs(bias[fit.free]) / sd).max()), anew, jacobian_error(fit.J, J)
+    )
+
+
+def rough_coordinates(end: Fit) -> tuple[str, ...]:
+    """Coordinates that would still move, the largest move first."""
+    moves = np.abs(end.newton_step()) / end.sd
+    order = np.argsort(-moves)[: int(np.sum(moves > SMALL_STEP))]
+    return tuple(end.labels[i] for i in order)
+
+
 def refine_steps(fit: Fit, tightenings: int) -> Fit:
     """Continue a fit with its Jacobian and a few runs: on steps chosen anew until they do not
     matter, and with a tighter tolerance, at most `tightenings` times, where a tenth of it shifts an
     estimate by more than `STEP_BIAS` or shows an error of the Jacobian above `JACOBIAN_ERROR`, or
-    where steps keep the fit from settling. With no tightenings the steps are kept, and only
+    where steps keep the fit from converging. With no tightenings the steps are kept, and only
     checked.
 
     At the end residuals are those on steps that the tolerance chooses there, where these can be
@@ -300,24 +342,7 @@ def refine_steps(fit: Fit, tightenings: int) -> Fit:
     coordinate would move by more than `SMALL_STEP` standard deviations (where steps are only
     checked, if it had before).
     """
-    left, rounds, free = tightenings, ROUNDS if tightenings else 0, fit.free
-    started, by = clock.perf_counter(), fit.rtol
-
-    def along(start: Residuals) -> bool:
-        """Fit on other steps from residuals on them, with new Jacobians where the last one does not
-        suffice; returns whether the coordinates changed."""
-        nonlocal fit, rounds, left, started, by
-        end = chord(fit._replace(at=start._replace(J=fit.at.J)))
-        if not end.converged:
-            end = gauss_newton(end, REFITS, EXACT, anew=True)
-        if end.stalled:
-            rounds = left = 0
-        if further := bool((end.x != fit.x).any()):
-            name = "steps chosen anew" if end.rtol == by else "tighter tolerance"
-            fit = end.noted(name, started)
-            started, by = clock.perf_counter(), fit.rtol
-        return further
-
+    left, rounds = tightenings, ROUNDS if tightenings else 0
     while True:
         fresh = fit.residuals(steps=fit.rtol)
         if fresh.failed:
@@ -326,24 +351,23 @@ def refine_steps(fit: Fit, tightenings: int) -> Fit:
         end = end._replace(converged=end.step_is_small if tightenings else fit.converged)
         if rounds and not end.converged:
             rounds -= 1
-            if along(fresh):
+            moved = continued_on(fit, fresh, "steps chosen anew")
+            if moved is not fit:
+                fit, rounds, left = moved, *((0, 0) if moved.stalled else (rounds, left))
                 continue
         finer = fit.residuals(steps=FINER * fit.rtol, jacobian=True)
         if finer.failed:
             return end._replace(check=Check(fit.rtol, end.at))
-        J, bias = finer.J[:, free], np.zeros(len(fit.x))
-        error = jacobian_error(fit.J, J)
-        bias[free], sd = shift(J, finer.r - fit.at.r), standard_deviations(J)
-        anew = np.abs(shift(J, fresh.r - fit.at.r)) / sd
-        shifts, rough = np.abs(bias[free]) / sd, tuple[str, ...]()
+        effect, rough = step_effect(fit, fresh, finer), tuple[str, ...]()
+        error = effect.jacobian_error
         fit, end = (one._replace(at=one.at._replace(J=finer.J)) for one in (fit, end))
-        if not end.converged and tightenings and max(anew.max(), shifts.max()) <= SMALL_STEP:
-            moves = np.abs(end.newton_step()) / sd
-            order = np.argsort(-moves)[: int(np.sum(moves > SMALL_STEP))]
-            rough = tuple(fit.labels[i] for i in order)
-        elif left and not (end.converged and shifts.max() <= STEP_BIAS and error <= JACOBIAN_ERROR):
-            left, rounds, fit = left - 1, ROUNDS, fit.by(FINER * fit.rtol)
-            if along(finer):
+        if not end.converged and tightenings and max(effect.anew, effect.finer) <= SMALL_STEP:
+            rough = rough_coordinates(end)
+        elif left and not (end.converged and effect.small):
+            left, rounds, tighter = left - 1, ROUNDS, fit.by(FINER * fit.rtol)
+            moved = continued_on(tighter, finer, "tighter tolerance")
+            if moved is not tighter:
+                fit, rounds, left = moved, *((0, 0) if moved.stalled else (rounds, left))
                 continue
             error = 0.0
-        return end._replace(check=Check(end.rtol, finer, bias, error, rough))
+        return end._replace(check=Check(end.rtol, finer, effect.bias, error, rough))
