@@ -183,7 +183,8 @@ def main(config: Config) -> None:
             rows.append(
                 {
                     "case": name, "parameters": compared(found, truth, begin), "chi2": found.chi2,
-                    "heldout_nrmse": found.heldout, "findings": [*map(str, found.findings)], **found.cost,
+                    "heldout_nrmse": found.heldout, "findings": [*map(str, found.findings)],
+                    **found.cost,
                 }
             )  # fmt: skip
     cells = {

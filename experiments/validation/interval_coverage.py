@@ -75,7 +75,8 @@ class Config:
 
 class Repetition(NamedTuple):
     """One seed: by unknown the error of the logarithm over its predicted standard deviation, that
-    deviation [1] and whether the interval holds; codes of findings, and the orders of the noise found."""
+    deviation [1] and whether the interval holds; codes of findings, and the orders of the noise
+    that was found."""
 
     unknowns: dict[str, tuple[float, float, bool]]
     notices: list[str]
@@ -151,7 +152,7 @@ def by_white_least_squares(stated: Problem, truth: dict[str, float], rtol: float
     """As if all noise were white: a few steps by one Jacobian, which is enough from so near."""
     c, runner = stated.coordinates, Runner(stated.recordings)
     stage = Stage("all", stated.names, tuple(one.label for one in c.within(c.free)), rtol)
-    end = chord(Fit(stated, runner, c.start, stage).begun())
+    end = chord(Fit(stated, runner, c.start, stage).evaluated())
     C = fisher(end.at.J)[0] * max(1.0, end.chi2)
     found = estimates(end, C, np.zeros(len(c)))
     return Repetition(judged({e.name: e for e in found}, truth), [], [])
