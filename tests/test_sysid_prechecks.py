@@ -247,7 +247,7 @@ def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_
     same = replace(recordings["rolling"], rig=rig)
     assert not list(controller_findings(same, SENSORS))
     for change, severity, words in (
-        ({"effort_x": lambda t, F: F + 20.0}, "warning", "effort_x is +20 N more, on average"),
+        ({"effort_x": lambda t, F: F + 20.0}, "warning", "effort_x differs by +20 N, on average"),
         ({"theta_C": None}, "note", "not compared with its controller, since theta_C is not rec"),
     ):
         (found,) = controller_findings(changed(same, **change), SENSORS)

@@ -243,7 +243,7 @@ LEFT: dict[str, Any] = {"alarms": (ALARM,), "left": (ALARM,)}
          f"{E} would move by 18 standard deviations, too far for a score test. Run `torchsoft ex"),
         ([suspect("a", 531.0, under={})], {}, "cause", "refit with a free has not converged"),
         ([a], LEFT, "nearest", "the nearest, a = 1.05 (+5 % ± 0.5), the sum of squares falls by 300"
-         ", but residuals still fail a test (motion in x of `roll`)"),
+         ", but residuals still fail a test (correlation with the motion in x of `roll`)"),
         ([linear("a", 300.0)], LEFT, "likeliest", "only a refit can confirm or exclude, is a ="),
         ([linear("a", 300.0)], LEFT | {"left": (), "besides": (suspect("d", 50.0),)}, "likeliest",
          "With d also free nothing would be left."),

@@ -108,8 +108,9 @@ class AssumptionTest(Assumption):
             return {"name": self.otherwise}
         if self.kind not in ("known", "sensor"):
             return {"name": self.name}
-        amount = {"favoured": self.favoured, "unit": self.unit, "sd": self.favoured_sd}
-        return {"name": self.name} | ({"value": self.value} if self.parameter else {}) | amount
+        out = {"name": self.name, "favoured": self.favoured, "sd": self.favoured_sd}
+        relative = self.parameter and self.unit == "%"
+        return out | {"unit": self.unit} | ({"value": self.value} if relative else {})
 
     @property
     def impact(self) -> tuple[str, float, float]:

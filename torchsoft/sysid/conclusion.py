@@ -3,6 +3,7 @@ recordings, and findings on its steps and estimates."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -104,13 +105,22 @@ def model_findings(
     unexplained = "warning" if plain or checked.explained else "error"
     widened = max(1.0, residuals.chi2_whitened) ** 0.5 if end.loss == "linear" else 1.0
     out = suspect_findings(checked, unexplained) + test_findings(checked)
-    out += residual_findings(residuals.tests, widened, unexplained)
-    out += colour_findings(residuals.undeclared)
-    worst = max(channels, key=lambda one: one.stated, default=None)
-    if worst is not None and not worst.stated < UNEXPLAINED:
-        facts = {"channel": worst.channel, "ratio": worst.stated, "chi2": residuals.chi2}
-        out.append(Finding("unexplained", "error", facts))
+    out += size_findings(residual_findings(residuals.tests, widened, unexplained), channels)
+    if not any(one.severity == "error" for one in out):
+        out += colour_findings(residuals.undeclared)
     return out + (risk_findings(checked) if plain else [])
+
+
+def size_findings(alarms: Sequence[Finding], channels: Sequence[ChannelResiduals]) -> list[Finding]:
+    """The alarms of residuals, of which those on their size are errors where a channel exceeds its
+    noise by `UNEXPLAINED`; with such an error where there is no alarm."""
+    worst = max(channels, key=lambda one: one.stated, default=None)
+    if worst is None or worst.stated < UNEXPLAINED:
+        return [*alarms]
+    facts = {"channel": worst.channel, "ratio": worst.stated}
+    first = [replace(one, severity="error") for one in alarms if one.code == "larger"]
+    first = first or [Finding("unexplained", "error", facts)]
+    return first + [one for one in alarms if one.code != "larger"]
 
 
 def run_findings(end: Fit) -> list[Finding]:

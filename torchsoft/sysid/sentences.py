@@ -69,7 +69,7 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "It is {factor:.3g} times that.",
     ),
     "controller": (
-        "Recording `{recording}`: {force} is {off:+.3g} {unit} more, on average, than its "
+        "Recording `{recording}`: {force} differs by {off:+.3g} {unit}, on average, from what its "
         "controller gives.",
         "Was a force fed forward that {feed} does not have?",
         "Are the gains, units, zeros and set-points of {loop} right?",
@@ -129,7 +129,7 @@ SENTENCES: dict[str, tuple[str, ...]] = {
     ),
     # residuals
     "unexplained": (
-        "Residuals of {channel} are {ratio:.2g} times the stated noise (chi2 = {chi2:.3g}).",
+        "Residuals of {channel} are {ratio:.2g} times the stated noise.",
         "Intervals may miss the truth.",
     ),
     "onset": (
@@ -286,6 +286,14 @@ HEADLINES = {
 """First line of a report by its verdict."""
 
 IDENTIFIED = "{count} of {parameters} parameters identifiable, χ² = {chi2:.3g}"
+
+TESTS = {
+    "level": "size",
+    "white": "whiteness",
+    "motion": "correlation with the motion",
+    "channels": "correlation of channels",
+}
+"""Names of tests of residuals."""
 
 LISTED = 3
 """Most cases that a sentence lists; it counts the others."""

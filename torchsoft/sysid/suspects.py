@@ -7,7 +7,7 @@ from typing import Any
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.assumptions import AMOUNTS
 from torchsoft.sysid.sensitivity import Checked
-from torchsoft.sysid.sentences import Finding, Severity
+from torchsoft.sysid.sentences import TESTS, Finding, Severity
 
 LIKELY = 0.01
 """Least score of a suspect that is named beside the best."""
@@ -85,7 +85,7 @@ def without_suspect(checked: Checked, severity: Severity) -> list[Finding]:
 
 def alarms_of(checked: Checked) -> list[dict[str, Any]]:
     """Tests that residuals under the likeliest suspect fail, as cases."""
-    return [{"test": one.test} | one.case for one in checked.alarms]
+    return [{"test": TESTS[one.test]} | one.case for one in checked.alarms]
 
 
 def between(some: Sequence[AssumptionTest]) -> dict[str, list[float]]:
@@ -131,8 +131,12 @@ def risk_findings(checked: Checked) -> list[Finding]:
     for c in measured:
         if abs(c.favoured) > CONTRADICTED * c.favoured_sd and (c.favoured > 0 or not c.one_sided):
             hinted.append(c)
-        if not c.suspected and abs(c.impact[1]) >= 1.0:
-            (hidden if c.detectable <= AMOUNTS * c.amount else exact).append(c)
+        if c.suspected:
+            continue
+        if c.detectable <= AMOUNTS * c.amount and abs(c.impact[1]) >= 1.0:
+            hidden.append(c)
+        elif c.detectable > AMOUNTS * c.amount and abs(c.most_moved[1]) >= 1.0:
+            exact.append(c)
     hidden.sort(key=lambda c: -abs(c.impact[1]))
     exact.sort(key=lambda c: -abs(c.most_moved[1]))
     out = list[Finding]()
