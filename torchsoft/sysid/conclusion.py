@@ -113,13 +113,13 @@ def model_findings(
 
 def size_findings(alarms: Sequence[Finding], channels: Sequence[ChannelResiduals]) -> list[Finding]:
     """The alarms of residuals, of which those on their size are errors where a channel exceeds its
-    noise by `UNEXPLAINED`; with such an error where there is no alarm."""
+    noise by `UNEXPLAINED`; a warning where that may be chance, as with few or coloured samples."""
     worst = max(channels, key=lambda one: one.stated, default=None)
     if worst is None or worst.stated < UNEXPLAINED:
         return [*alarms]
     facts = {"channel": worst.channel, "ratio": worst.stated}
     first = [replace(one, severity="error") for one in alarms if one.code == "larger"]
-    first = first or [Finding("unexplained", "error", facts)]
+    first = first or [Finding("unexplained", "warning", facts)]
     return first + [one for one in alarms if one.code != "larger"]
 
 
