@@ -20,9 +20,10 @@ from torchsoft import (
 from torchsoft.solve.stepper import ImplicitStepper
 
 
-def test_second_order_on_a_smooth_motion(fidelity):
+@pytest.mark.parametrize("inertial", [False, True])
+def test_second_order_on_a_smooth_motion(inertial):
     """A grasped disc set moving so gently that no node slips, touches or leaves."""
-    model = coarse(pad__inertial=fidelity == "inertial")
+    model = coarse(pad__inertial=inertial)
     y0, t = grasped(model, (1e-4, 5e-5)), times(0.032, 2)
     place = lambda h: simulate(model, t, y0=y0, step=h).state.pose["disc"][-1, :2]
     fine = place(3.2e-2 / 1024)

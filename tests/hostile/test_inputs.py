@@ -33,21 +33,19 @@ SMALL = 1e-3
 COARSE = {"elements_x": 20, "elements_y": 1}
 BRIEFLY = torch.tensor([0.0, 2e-3, 6e-3], dtype=torch.float64)
 
-Lines = Callable[[str], Tally]
-
 
 def attack(
-    line: Tally, changed: Mutant, make: Callable[[], Any], follow: Callable[[Any], Any] | None
+    tally: Tally, changed: Mutant, read: Callable[[], Any], use: Callable[[Any], None] | None
 ) -> Any:
-    """Count one input; what is made of it, or None where it was refused. `follow` raises
-    `AssertionError` for what is accepted and is nonsense, and may refuse with a sentence too."""
-    shown = f"{line.kind} {changed.place} = {changed.new!r:.60}"
-    made = line.call(shown, make, blamed=changed.named)
+    """Count one input; what is made of it, or None where it was rejected. `use` raises
+    `AssertionError` for what is accepted and is nonsense, and may reject it with a sentence too."""
+    shown = f"{changed.place} = {changed.new!r:.60}"
+    made = tally.call(shown, read, blamed=changed.named)
     if made is not None and changed.no_number:
-        line.held(False, f"{shown}: accepted in the place of a number")
-    elif made is not None and follow:
-        later = partial(follow, made)
-        line.call(f"{shown}, later", later, (ValueError, RuntimeError), limit=6 * LIMIT)
+        tally.held(False, f"{shown}: accepted in the place of a number")
+    elif made is not None and use:
+        later = partial(use, made)
+        tally.call(f"{shown}, used", later, (ValueError, RuntimeError), limit=6 * LIMIT)
     return made
 
 
@@ -155,22 +153,21 @@ KINDS: dict[str, tuple[Any, Callable[[], list[dict[str, Any]]], int, Callable[[A
     "rig files": (RigFile, rigs, 8000, run_briefly),
     "dataset configurations": (Config, datasets, 4000, design_briefly),
 }
-"""What reads a configuration, valid ones, how many mutants, and how every third of the accepted is
-followed."""
+"""What reads a configuration, valid ones, how many mutants, and what every third of the accepted is
+used for."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("way", "share"), [("values", 1.0), ("text", 0.25)])
 def test_a_mutated_table_is_finite_or_rejected_by_its_field(kind, way, share, tally, tmp_path):
     """With one value changed, or its text damaged."""
-    table, valid, number, follow = KINDS[kind]
-    line, rng, trees = tally(f"{kind}: {way}"), random(kind + way), valid()
-    path = tmp_path / "mutant.toml"
+    table, valid, number, use = KINDS[kind]
+    rng, trees, path = random(kind + way), valid(), tmp_path / "mutant.toml"
     assert all(map(table.model_validate, trees))
+    read = partial(from_toml, path, table.model_validate)
     for i in range(count(share * number)):
-        changed = written(path, trees[i % len(trees)], way, i, rng)
-        read = partial(from_toml, path, table.model_validate)
-        attack(line, changed, read, follow if i % 3 == 0 else None)
+        changed = written(path, trees[i % len(trees)], way, rng)
+        attack(tally, changed, read, use if i % 3 == 0 else None)
 
 
 # identifications
@@ -255,10 +252,6 @@ depth = 44e-3
 laws."""
 
 
-def identification(slow: bool) -> dict[str, Any]:
-    return {"rig": "paper"} | tomllib.loads(STATED + SLOW if slow else STATED)
-
-
 def run_once(case: measured.Case) -> None:
     """The estimate, and one run from the start: residuals are finite, or the reason is a
     sentence."""
@@ -275,23 +268,18 @@ def run_once(case: measured.Case) -> None:
     assert out.failed or (np.isfinite(out.r).all() and np.isfinite(out.J).all()), "not finite"
 
 
-@pytest.fixture
-def folder(tmp_path):
+@pytest.mark.parametrize(("way", "number"), [("values", 4000), ("text", 1000)])
+def test_a_mutated_identification_is_finite_or_rejected_by_its_field(way, number, tmp_path, tally):
     table = cells()
     parts = {"data": table, "third": table, "second": [row[:5] + row[6:10] for row in table]}
     parts["force"] = [[row[0], *row[10:12], "Temp [K]"] for row in table]
     for name, rows in parts.items():
         (tmp_path / f"{name}.csv").write_text(csv_text(rows), encoding="utf-8")
-    (tmp_path / "rig.toml").write_text(document(identification(True)), encoding="utf-8")
-    return tmp_path
-
-
-@pytest.mark.parametrize(("way", "number"), [("values", 4000), ("text", 1000)])
-def test_a_mutated_identification(way, number, folder, tally):
-    line, rng, path = tally(f"identifications: {way}"), random(way), folder / "rig.toml"
-    load = partial(measured.load, [folder / "data.csv"], path)
-    trees = identification(False), identification(True)
-    assert attack(line, Mutant(), load, run_once)
+    quick, slow = ({"rig": "paper"} | tomllib.loads(text) for text in (STATED, STATED + SLOW))
+    rng, path = random(way), tmp_path / "rig.toml"
+    path.write_text(document(slow), encoding="utf-8")
+    load = partial(measured.load, [tmp_path / "data.csv"], path)
+    assert attack(tally, Mutant(), load, run_once)
     for i in range(count(number)):
-        changed = written(path, trees[i % 10 == 5], way, i, rng)
-        attack(line, changed, load, run_once if i % 10 == 0 else None)
+        changed = written(path, slow if i % 10 == 5 else quick, way, rng)
+        attack(tally, changed, load, run_once if i % 10 == 0 else None)

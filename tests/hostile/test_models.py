@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, coarse, grasp, still, times
+from conftest import COARSE, PAPER, grasped, still, times, towards
 from torch import Tensor
 
 from hostile.trial import count, random
@@ -20,7 +20,6 @@ from torchsoft import (
     Ellipse,
     NoEquilibrium,
     Profile,
-    Reference,
     RoundedBox,
     SimulationFailed,
     excite,
@@ -32,13 +31,9 @@ from torchsoft.solve.gradients import GradientFailed
 
 pytestmark = pytest.mark.slow
 
-REFUSALS = ValueError, SimulationFailed, NoEquilibrium, GradientFailed, NotImplementedError
+REJECTIONS = ValueError, SimulationFailed, NoEquilibrium, GradientFailed, NotImplementedError
 WILD = 0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e308, -1e5
 FRICTION = "laws.steel_on_rubber.friction"
-CHOICES: dict[str, Any] = {
-    "pad.elements_x": range(8, 33), "pad.elements_y": (1, 2, 3), "contact.points": (0, 1, 2),
-    "pad.inertial": (False, False, True), "pads.L.bonded_sides": (False, False, True),
-}  # fmt: skip
 SIZES = ("length", "height", "radius", "origin", "elements_x", "elements_y", "x", "theta", "nu")
 """Values that leave no rig if they are changed much, or at all."""
 grad = partial(torch.autograd.grad, allow_unused=True, materialize_grads=True)
@@ -62,9 +57,13 @@ def build(rng: np.random.Generator) -> BuiltRig:
         if isinstance(row["value"], float) and name.rpartition(".")[2] not in SIZES
         and rng.random() < 0.4
     }  # fmt: skip
-    values |= {name: some(*choices) for name, choices in CHOICES.items()}
-    values["pad.nu"] = float(rng.uniform(-0.9, 0.499))
-    values["contact.mu_k"] = values.get(f"{FRICTION}.mu_s", 0.8) * rng.uniform(0.3, 1.0)
+    values |= {
+        "pad.elements_x": some(*range(8, 33)), "pad.elements_y": some(1, 2, 3),
+        "contact.points": some(0, 1, 2), "pads.L.bonded_sides": some(False, False, True),
+        "pad.nu": float(rng.uniform(-0.9, 0.499)),
+        "contact.mu_k": values.get(f"{FRICTION}.mu_s", 0.8) * rng.uniform(0.3, 1.0),
+        "pad.inertial": some(False, False, True),
+    }  # fmt: skip
     sines = {"kind": "multi_sine", "band": (5.0, 40.0), "seed": int(rng.integers(99))}
     roll, press = some(
         ({"kind": "strokes", "travel": near(5e-3), "stroke_time": 0.05}, None),
@@ -117,11 +116,11 @@ def run_randomly(rng: np.random.Generator) -> bool:
 
 @pytest.mark.timeout(1800)
 def test_random_models_run_or_say_why_not(tally):
-    line, ran = tally("random models"), 0
+    ran = 0
     for number in range(count(1000)):
         run = partial(run_randomly, random("models", number))
-        ran += bool(line.call(f"model {number}", run, REFUSALS, limit=30.0))
-    assert ran >= 0.3 * line.tried, f"only {ran} of {line.tried} models ran"
+        ran += bool(tally.call(f"model {number}", run, REJECTIONS, limit=30.0))
+    assert ran >= 0.3 * tally.tried, f"only {ran} of {tally.tried} models ran"
 
 
 T, THREADS = times(6e-3, 4), 8
@@ -132,19 +131,22 @@ T, THREADS = times(6e-3, 4), 8
 def test_threads_give_the_bits_of_runs_alone(number, runs, tally):
     """Eight threads that start at once, of which two share a model, round after round; with laws
     that all meet for the first time."""
-    line, base = tally(f"threads, {runs} runs each"), COARSE | {"pad.elements_x": 24}
+    mesh = {"pad.elements_x": 24}
     for round in range(count(number)):
         models = [
-            coarse(pad__elements_x=24), coarse(pad__elements_x=24, pad__inertial=True),
-            coarse(pad__elements_x=24, contact__points=2), still(base, friction=law(round)),
+            still(COARSE | mesh | own, **part)
+            for own, part in (
+                ({}, {}), ({"pad.inertial": True}, {}), ({"contact.points": 2}, {}),
+                ({}, {"friction": law(round)}),
+            )
         ]  # fmt: skip
-        starts, barrier = [grasp(model, (0.05, 0.0)) for model in models], Barrier(THREADS)
+        starts, barrier = [grasped(model, (0.05, 0.0)) for model in models], Barrier(THREADS)
 
         def run(thread: int, i: int, models: Any = models, starts: Any = starts) -> list[Tensor]:
             """States, forces and derivatives."""
-            model, (y0, held) = models[thread % 4], starts[thread % 4]
-            x = Profile([0.0, 6e-3], [0.06, 0.06 + 2e-5 * ((thread + i) % 5)])
-            how = {"y0": y0, "reference": Reference(x_d=x, y_d=held["y_d"], F_ff=held["F_ff"])}
+            model, y0 = models[thread % 4], starts[thread % 4]
+            x_d = Profile([0.0, 6e-3], [0.06, 0.06 + 2e-5 * ((thread + i) % 5)])
+            how: dict[str, Any] = {"y0": y0, "reference": towards(model, x_d)}
             if i % 4 == 3:
                 run = simulate(model, T, **how, gradient="forward", wrt=["pad.E", "contact.K_n"])
                 return [run.y, run.force["L"], run.sensitivities]
@@ -161,4 +163,4 @@ def test_threads_give_the_bits_of_runs_alone(number, runs, tally):
             results = [*pool.map(work, range(THREADS))]
         for thread, found in enumerate(results):
             same = [all(map(torch.equal, one, run(thread, i))) for i, one in enumerate(found)]
-            line.held(all(same), f"round {round}, thread {thread}: other bits in {same}")
+            tally.held(all(same), f"round {round}, thread {thread}: other bits in {same}")
