@@ -154,9 +154,9 @@ def test_the_adjoint_of_a_stage_is_its_tangent_transposed(name, forces):
     assert backwards == pytest.approx(bar @ out, rel=1e-8)
 
 
-CALLS, MOST, RATIO = 600_000, 1.5, 0.77
+CALLS, MOST, RATIO = 600_000, 2.0, 0.77
 """Calls of a law in the reference loop; the largest time of a run over what it was, which was
-`RATIO` of the loop's."""
+`RATIO` of the loop's on one processor, and up to 0.97 on another."""
 
 
 def test_a_run_is_as_fast_as_it_was():

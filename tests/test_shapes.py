@@ -348,14 +348,14 @@ def test_an_eccentric_disc_rocks_like_a_pendulum():
     expected = TAU * np.sqrt((J + m * (radius - e) ** 2) / (m * g * e))
     assert period == pytest.approx(expected, rel=0.01)
     values = [built.rig.parameter(f"bodies.ellipse.centre_{axis}") for axis in "xy"]
-    for value, slope in zip(values, torch.autograd.grad(run["theta_ellipse"][100], values)):
+    for value, slope in zip(values, torch.autograd.grad(run["theta_ellipse"][40], values)):
         ends = []
         for h in (-1e-9, 1e-9):
             with torch.no_grad():
                 value += h
-                ends.append(float(built.run(knots=run.knots)["theta_ellipse"][100]))
+                ends.append(float(built.run(knots=run.knots)["theta_ellipse"][40]))
                 value -= h
-        assert float(slope) == pytest.approx((ends[1] - ends[0]) / 2e-9, rel=1e-5)
+        assert float(slope) == pytest.approx((ends[1] - ends[0]) / 2e-9, rel=1e-6)
 
 
 def test_a_centre_of_mass_without_a_shape_is_rejected():

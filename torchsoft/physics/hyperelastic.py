@@ -280,9 +280,9 @@ class Yeoh(_ByShear):
         C20: Coefficient = 0.0, C30: Coefficient = 0.0, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
         super().__init__(None, nu, rho, tau, depth, moduli, times)
-        self.C10, self.C20, self.C30 = (
-            parameter(x, name) for name, x in (("C10", C10), ("C20", C20), ("C30", C30))
-        )
+        self.C10 = parameter(C10, "C10")
+        self.C20 = parameter(C20, "C20")
+        self.C30 = parameter(C30, "C30")
 
     @property
     def shear(self) -> Tensor:

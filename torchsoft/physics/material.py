@@ -144,10 +144,9 @@ class StandardLinearSolid(Material):
         tau_instant: InstantRetardation = INSTANT,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
-        self.E_instant, self.tau, self.tau_instant = (
-            parameter(x, name)
-            for name, x in (("E_instant", E_instant), ("tau", tau), ("tau_instant", tau_instant))
-        )
+        self.E_instant = parameter(E_instant, "E_instant")
+        self.tau = parameter(tau, "tau")
+        self.tau_instant = parameter(tau_instant, "tau_instant")
 
     def well_posed(self) -> str:
         return "E_instant is below E" if self.E_instant.item() < self.E.item() else ""

@@ -59,9 +59,9 @@ class RateAndState(nn.Module):
         theta_0: Annotated[float, Quantity("s", 1e-12, 1e12, "age of contacts at the start")] = 1.0,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.mu_0, self.a, self.b, self.D_c = (
-            parameter(x, name) for name, x in (("mu_0", mu_0), ("a", a), ("b", b), ("D_c", D_c))
-        )
+        self.mu_0 = parameter(mu_0, "mu_0")
+        self.a, self.b = parameter(a, "a"), parameter(b, "b")
+        self.D_c = parameter(D_c, "D_c")
         self.V_0 = parameter(V_0, "V_0", trained=False)
         self.theta_0 = parameter(theta_0, "theta_0")
 

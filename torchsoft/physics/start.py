@@ -1,6 +1,6 @@
 """States from coordinates of bodies: placed, moving, at rest on pads, touching or pressing."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,14 @@ from torchsoft.physics.graph import Graph
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.state import State
-from torchsoft.physics.statics import NoEquilibrium, resting, standing, unstretched
+from torchsoft.physics.statics import (
+    RESIDUAL,
+    NoEquilibrium,
+    no_signals,
+    resting,
+    standing,
+    unstretched,
+)
 from torchsoft.physics.validity import check_values
 
 REST = "rest"
@@ -129,16 +136,33 @@ def placed(rig: Graph, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
                 rests.setdefault(name, []).append(i)
             elif isinstance(value, str | Mapping):
                 presses[name] = value
-                pose[name][i] = torch.tensor(AWAY, dtype=torch.float64)
             else:
                 pose[name][i] = scalar(f"{name}.{COORDINATES[i]}", value)
-    places = {name: torch.stack(at) for name, at in pose.items()}
+    places = lifted({name: torch.stack(at) for name, at in pose.items()}, presses)
     for name, axes in rests.items():
         if 1 in axes:
             places[name] = at_height(places[name], scalar(name, above(rig, places, name)))
-    still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+    return balanced(rig, places, rests, presses)
+
+
+def lifted(pose: Mapping[str, Tensor], names: Iterable[str]) -> Poses:
+    """Poses (3,) with some bodies high above all others."""
+    away = torch.tensor(AWAY, dtype=torch.float64)
+    return {**pose} | {name: at_height(pose[name], away) for name in names}
+
+
+def balanced(
+    rig: Graph, pose: Mapping[str, Tensor], rests: Mapping[str, Sequence[int]],
+    presses: Mapping[str, Any], residual: float = RESIDUAL,
+) -> Poses:  # fmt: skip
+    """Poses (3,) with the coordinates `rests` in balance, first with the pressing bodies out of
+    contact and then with them `pressed`; the balance to a last step `residual` [m]. Raises as
+    `placed`."""
+    places = lifted(pose, presses)
     if rests:
-        places = resting(rig, places, rests, signals=still, actuators=())
+        places = resting(
+            rig, places, rests, signals=no_signals(rig), actuators=(), residual=residual
+        )
     return pressed(rig, places, presses, rests)
 
 
@@ -149,7 +173,6 @@ def pressed(
     or a force, {"bracket": {"depth": 1e-3}}; the coordinates `rests` give way. Raises as
     `placed`."""
     places, pushed = dict(pose), dict[str, Tensor]()
-    still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
     for name, value in presses.items():
         height = upon(rig, places, name)
         if isinstance(value, Mapping) and "force" in value:
@@ -160,6 +183,7 @@ def pressed(
         places[name] = at_height(places[name], height)
     if any(value != TOUCH for value in presses.values()):
         free = {**rests} | {name: sorted({*rests.get(name, ()), 1}) for name in pushed}
+        still = no_signals(rig)
         places = resting(rig, places, free, signals=still, actuators=(), pushed=pushed)
     return places
 

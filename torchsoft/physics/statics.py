@@ -208,10 +208,23 @@ def standing(
 def standing_loads(rig: Graph, pose: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Forces and moments left on bodies that stand at `pose` (3,) [N, N, N.m], no actuator pushing.
     Differentiable and raises as `settled`."""
-    still = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
-    state = State({}, unstretched(rig, ()), dict(pose), {}, still)
-    state = state._replace(pads={name: carried(rig, name, state) for name in rig.pads})
-    return net_loads(rig, state, torch.zeros(len(rig.signals), 2, dtype=torch.float64), ())
+    return net_loads(rig, standing_state(rig, pose), no_signals(rig), ())
+
+
+def standing_state(
+    rig: Graph, pose: Mapping[str, Tensor], known: dict[str, Tensor] | None = None
+) -> State:
+    """State of bodies that stand at `pose` (..., 3) [m, m, rad], with pads settled around them from
+    displacements `known` nearby (see `carried`), and no point stretched."""
+    batch = next(iter(pose.values())).shape[:-1]
+    still = {name: torch.zeros(*batch, 3, dtype=torch.float64) for name in rig.bodies}
+    state = State({}, unstretched(rig, batch), dict(pose), {}, still)
+    return state._replace(pads={name: carried(rig, name, state, known) for name in rig.pads})
+
+
+def no_signals(rig: Graph) -> Tensor:
+    """Zero signals and rates (signals, 2)."""
+    return torch.zeros(len(rig.signals), 2, dtype=torch.float64)
 
 
 def unstretched(rig: Graph, batch: Sequence[int]) -> dict[str, Tensor]:
@@ -294,11 +307,8 @@ def resting(
 
     def loads(q: Tensor) -> Tensor:
         """Net loads on the free coordinates (..., n) [N]."""
-        batch = q.shape[:-1]
-        still = {name: torch.zeros(*batch, 3, dtype=q.dtype) for name in rig.bodies}
-        state = State({}, unstretched(rig, batch), poses(q), {}, still)
-        state = state._replace(pads={name: carried(rig, name, state, known) for name in rig.pads})
-        net = net_loads(rig, state, followed.expand(*batch, -1, -1), actuators)
+        state = standing_state(rig, poses(q), known)
+        net = net_loads(rig, state, followed.expand(*q.shape[:-1], -1, -1), actuators)
         net |= {name: net[name] + load for name, load in (pushed or {}).items()}
         return torch.cat([net[name][..., axes] for name, axes in sought.items()], -1) / scale
 

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar, cast
+from typing import Annotated, Any, Self, TypeVar
 
 import torch
 from pydantic import Field, PrivateAttr, model_validator
@@ -14,7 +14,6 @@ from torch import nn
 from torchsoft.display import Shown, suggestion
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.channels import units
-from torchsoft.physics.motion import Piecewise
 from torchsoft.physics.names import check_names
 from torchsoft.physics.parts import COORDINATES, ORDERS, PD, Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
@@ -25,9 +24,11 @@ from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.fields import Group, at_field, called_alike, with_entry
 from torchsoft.rigs.initial import (
+    followed_motions,
     holding_effort,
     initial_poses,
     reference,
+    setpoints,
     settled_pads,
     signal,
 )
@@ -519,14 +520,11 @@ class RigFile(Shown, Group):
         starts = {name: body.given for name, body in self.bodies.items()}
         driven = [f"{body}.{axis}" for body, axis, kind in self.coordinates() if kind == "driven"]
         poses = initial_poses(self, rig, {name: signal(self, name) for name in driven})
-        rig.reference = reference(self, poses, partial(holding_effort, self, rig, poses))
+        held = partial(holding_effort, self, rig, poses, setpoints(self, poses))
+        rig.reference = reference(self, poses, held)
         y0 = settled_pads(self, rig, poses, rig.reference)
         warn_of_moments(rig, y0, starts)
-        followed = {
-            name: (one, one.values.detach().clone())
-            for name, motion in self.motion.items() if motion.follows_start
-            for one in [cast(Piecewise, rig.reference[name])]
-        }  # fmt: skip
+        followed = followed_motions(self, poses, held, rig.reference)
         solver, y0 = self.solver.model_dump(exclude_none=True), moving(rig, y0, starts)
         built = BuiltRig(rig, y0, self.outputs.times(), self, followed, solver)
         built.last.update(key=built.key(rig), start=Initial(y0, rig.reference))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,7 +15,13 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import Starts, moving
 from torchsoft.physics.structure import values_of
 from torchsoft.physics.validity import check_values
-from torchsoft.rigs.initial import RigFile, initial_poses, settled_pads, started_values
+from torchsoft.rigs.initial import (
+    Followed,
+    RigFile,
+    holding_effort,
+    initial_poses,
+    settled_pads,
+)
 from torchsoft.solve.simulate import Initial, simulate
 from torchsoft.solve.trajectory import Trajectory
 
@@ -31,15 +38,15 @@ class BuiltRig:
     the times t (T,) [s] of the outputs, the last of which is the end of the motion.
 
     `file` is the rig file that it was built from, and `solver` the choice of steps. `followed`
-    holds the motions that have a value given as "start" or "held", by name, and their values (k,)
-    as built; `last` the last start without a gradient. Unpacks to rig, y0, t.
+    holds the motions that have a value given as "start" or "held", by name; `last` the last start
+    without a gradient. Unpacks to rig, y0, t.
     """
 
     rig: Rig
     y0: Tensor
     t: Tensor
     file: RigFile = field(repr=False)
-    followed: Mapping[str, tuple[Piecewise, Tensor]] = field(repr=False)
+    followed: Mapping[str, Followed] = field(repr=False)
     solver: Mapping[str, Any] = field(default_factory=dict, repr=False)
     last: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
@@ -64,13 +71,13 @@ class BuiltRig:
         if key and self.last.get("key") == key:
             return self.last["start"]
         check_values(rig)
-        own, signals = self.rig.reference, {}
+        reference = own = self.rig.reference
         poses = initial_poses(self.file, rig, self.driven)
-        now = started_values(self.file, rig, poses)
-        for name, (signal, built) in self.followed.items():
-            if name.replace(".", ":") in own.signals and own[name] is signal:
-                signals[name] = signal.with_values(following(signal.values, built, now[name]))
-        reference = own.replaced(signals)
+        for name, one in self.followed.items():
+            if name.replace(".", ":") in own.signals and own[name] is one.signal:
+                held = partial(holding_effort, self.file, rig, poses, reference)
+                values = following(one.signal.values, one.values, one.at_start(poses, held))
+                reference = reference.replaced({name: one.signal.with_values(values)})
         y0 = moving(rig, settled_pads(self.file, rig, poses, reference), self.starts)
         if key:
             self.last.update(key=key, start=Initial(y0, reference))

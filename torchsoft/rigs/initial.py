@@ -3,7 +3,7 @@ parameters, differentiable in them."""
 
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +12,13 @@ from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import NoPlace, Poses, placed
-from torchsoft.physics.statics import NoEquilibrium, resting, standing, standing_loads
+from torchsoft.physics.statics import (
+    NoEquilibrium,
+    no_signals,
+    resting,
+    standing,
+    standing_loads,
+)
 from torchsoft.rigs.geometry import at
 from torchsoft.rigs.motion import HELD, MotionContext
 
@@ -65,15 +71,9 @@ def signal(
     file: RigFile, name: str, poses: Mapping[str, Tensor] | None = None, held: Held | None = None
 ) -> Piecewise:
     """One motion, for bodies that start at `poses`. Raises `ValueError` naming the field."""
-    roles: dict[str, set[str]] = {}
-    for role, coordinate in file.followers()[name]:
-        roles.setdefault(role, set()).add(coordinate)
-    (follows, *more), (fed, *others) = (
-        sorted(roles.get(role, ())) or [""] for role in ("setpoint", "feed_forward")
-    )
-    body, axis = at(follows) if follows and not more else ("", 0)
-    start = poses[body][axis] if poses is not None and body else None
-    effort = partial(held, fed) if held and fed and not others else None
+    follower, fed = sole_user(file, name, "setpoint"), sole_user(file, name, "feed_forward")
+    start = placed_at(poses, follower) if poses is not None and follower else None
+    effort = partial(held, fed) if held and fed else None
     context = MotionContext(
         name, file.unit(name), start, effort, file.outputs.duration, file.folder
     )
@@ -89,34 +89,113 @@ def reference(file: RigFile, poses: Mapping[str, Tensor], held: Held) -> Referen
     return Reference(**{name: signal(file, name, poses, held) for name in file.motion})
 
 
-def started_values(file: RigFile, rig: Rig, poses: Poses) -> dict[str, Tensor]:
-    """Values (k,) of the motions that have some given as "start" or "held", by name."""
-    held = partial(holding_effort, file, rig, poses)
-    names = [name for name, motion in file.motion.items() if motion.follows_start]
-    return {name: signal(file, name, poses, held).values for name in names}
+def sole_user(file: RigFile, motion: str, role: str) -> str:
+    """The one coordinate that uses a motion in a role; empty where there is none, or several."""
+    users = {coordinate for one, coordinate in file.followers()[motion] if one == role}
+    return users.pop() if len(users) == 1 else ""
 
 
-def holding_effort(file: RigFile, rig: Rig, start: Poses, coordinate: str, time: float) -> Tensor:
+def placed_at(poses: Mapping[str, Tensor], coordinate: str) -> Tensor:
+    """Value () [m or rad] of a coordinate such as "disc.x"."""
+    body, axis = at(coordinate)
+    return poses[body][axis]
+
+
+def setpoints(file: RigFile, poses: Mapping[str, Tensor]) -> Reference:
+    """The motions that coordinates follow, for bodies that start at `poses`. Raises as `signal`."""
+    fed = {"feed_forward"}
+    names = [k for k, users in file.followers().items() if {role for role, _ in users} != fed]
+    return Reference(**{name: signal(file, name, poses) for name in names})
+
+
+class FollowedStart(NamedTuple):
+    """The coordinate whose start the values of a motion follow, such as "bracket.y", its place
+    [m or rad] when they were made, and their derivatives (k,) or (1,) with respect to it."""
+
+    coordinate: str
+    place: float
+    weights: tuple[float, ...]
+
+    def shift(self, poses: Mapping[str, Tensor]) -> Tensor:
+        """Change (k,) or (1,) of the values for bodies that start at `poses`."""
+        moved = placed_at(poses, self.coordinate) - self.place
+        return moved * torch.tensor(self.weights, dtype=torch.float64)
+
+
+class HeldEffort(NamedTuple):
+    """The time [s] at which values of a feed-forward hold their coordinate, the effort [N or N.m]
+    that did so when they were made, and their derivatives (k,) or (1,) with respect to it."""
+
+    coordinate: str
+    time: float
+    effort: float
+    weights: tuple[float, ...]
+
+    def shift(self, held: Held) -> Tensor:
+        """Change (k,) or (1,) of the values for efforts that hold coordinates."""
+        more = held(self.coordinate, self.time) - self.effort
+        return more * torch.tensor(self.weights, dtype=torch.float64)
+
+
+class Followed(NamedTuple):
+    """A motion with values given as "start" or "held": the signal and its values (k,) as built, the
+    start that they follow, and the efforts that they hold."""
+
+    signal: Piecewise
+    values: Tensor
+    start: FollowedStart | None
+    held: tuple[HeldEffort, ...]
+
+    def at_start(self, poses: Mapping[str, Tensor], held: Held) -> Tensor:
+        """Values (k,) for bodies that start at `poses`."""
+        start = [self.start.shift(poses)] if self.start else []
+        return sum((*start, *(one.shift(held) for one in self.held)), self.values)
+
+
+def followed_motions(
+    file: RigFile, poses: Mapping[str, Tensor], held: Held, built: Reference
+) -> dict[str, Followed]:
+    """Motions with values given as "start" or "held", by name, those that coordinates follow before
+    those that are fed forward; as built for bodies that start at `poses`."""
+    out = {}
+    for name, motion in file.motion.items():
+        if not motion.follows_start:
+            continue
+        follower, fed = sole_user(file, name, "setpoint"), sole_user(file, name, "feed_forward")
+        start = None
+        if any(weights := motion.start_weights):
+            place = float(placed_at(poses, follower))
+            start = FollowedStart(follower, place, tuple(weights))
+        efforts = tuple(
+            HeldEffort(fed, time, float(held(fed, time)), tuple(weights))
+            for time, weights in motion.held_weights.items()
+        )
+        one: Any = built[name]
+        out[name] = Followed(one, one.values.detach().clone(), start, efforts)
+    return dict(sorted(out.items(), key=lambda item: bool(item[1].held)))
+
+
+def holding_effort(
+    file: RigFile, rig: Rig, start: Poses, signals: Reference, coordinate: str, time: float
+) -> Tensor:
     """The effort () [N, N.m] that holds a coordinate, without friction, with bodies at their
     set-points at a time [s], or else where they rest or start. Raises `ValueError`."""
-    poses, known = at_setpoints(file, start, time)
-    still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
+    poses, known = at_setpoints(file, start, signals, time)
     rests = file.rests(known)
     try:
         if rests:
-            poses = resting(rig, poses, rests, signals=still, actuators=())
+            poses = resting(rig, poses, rests, signals=no_signals(rig), actuators=())
         loads = standing_loads(rig, poses)
     except NoEquilibrium as error:
         raise ValueError(
             f'"{HELD}" asks for balance where set-points are at t = {time:g} s, and there is '
             f"none: {error}"
         ) from None
-    body, axis = at(coordinate)
-    return -loads[body][axis]
+    return -placed_at(loads, coordinate)
 
 
 def at_setpoints(
-    file: RigFile, start: Poses, time: float
+    file: RigFile, start: Poses, signals: Reference, time: float
 ) -> tuple[Poses, Collection[tuple[str, int]]]:
     """Poses at a time [s] of bodies that follow set-points and drives exactly and start at `start`,
     and the coordinates that do, by body and axis."""
@@ -124,7 +203,7 @@ def at_setpoints(
     moved, t = set[tuple[str, int]](), torch.tensor(time, dtype=torch.float64)
     for name, users in file.followers().items():
         for body, axis in (at(one) for role, one in users if role in ("driven", "setpoint")):
-            rows[body][axis] = signal(file, name, start)(t)[0]
+            rows[body][axis] = signals[name](t)[0]
             moved.add((body, axis))
     return {name: torch.stack(row) for name, row in rows.items()}, moved
 

@@ -262,25 +262,31 @@ def modes(rig: Graph, y: Tensor, reference: Reference) -> Modes:
 LOOPS = 2.0
 """Growth rate of a mode over that without loops, from which on the loops are its cause."""
 
+POSES = 10
+"""Largest number of poses in which pads are settled to look for an unstable loop."""
+
 UNSTABLE = "lower the gains, raise the pads' tau or E, or measure what is pushed"
 """Remedies for an unstable loop."""
 
 
 @torch.no_grad()
 def instability(rig: Rig, run: Trajectory) -> str:
-    """A sentence on an unstable loop with its remedy, from the modes about the poses in which the
-    contacts of a run carried most, each of them; empty where no mode grows there, or one does
-    without loops."""
+    """A message on an unstable loop with its remedy, from the modes about the pose in which the
+    contacts of a run carried most, each of them, and in which the pads settle; empty where no mode
+    grows there, or one does without loops."""
     if not run.force or not rig.actuators:
         return ""
     soft = condensed(rig)
     least = torch.stack([force.detach()[..., 0].sum(-1) for force in run.force.values()]).amin(0)
-    k = int(least.argmax())
-    still = Reference(**{name: Profile([0.0], [float(run[name][k])]) for name in rig.signals})
-    try:
-        y = standing(soft, {name: pose[k].detach() for name, pose in run.state.pose.items()})
-    except NoEquilibrium:
+    for k in least.argsort(descending=True)[:POSES].tolist():
+        try:
+            y = standing(soft, {name: pose[k].detach() for name, pose in run.state.pose.items()})
+            break
+        except NoEquilibrium:
+            continue
+    else:
         return ""
+    still = Reference(**{name: Profile([0.0], [float(run[name][k])]) for name in rig.signals})
     values, moves = modes(soft, y, still)
     free = Graph(
         bodies=rig.bodies, pads=soft.pads, contacts=rig.contacts, reference=rig.reference,

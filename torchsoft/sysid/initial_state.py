@@ -21,9 +21,10 @@ from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.start import AWAY, REST, at_height, pressed
-from torchsoft.physics.statics import NoEquilibrium, resting, settled, standing
+from torchsoft.physics.start import REST, balanced
+from torchsoft.physics.statics import NoEquilibrium, settled, standing
 from torchsoft.rigs.built import BuiltRig
+from torchsoft.rigs.initial import FollowedStart
 from torchsoft.solve.progress import SimulationFailed
 
 Array = NDArray[np.float64]
@@ -81,15 +82,6 @@ class Start(Protocol):
         ...
 
 
-class FollowedStart(NamedTuple):
-    """A motion that follows where a coordinate starts, such as "bracket.y": the place [m, rad] at
-    which its values were made, and their derivatives (k,) or (1,) with respect to it."""
-
-    coordinate: str
-    place: float
-    weights: tuple[float, ...]
-
-
 class Standing(NamedTuple):
     """Bodies stand at known places, `lead` [s] before the first sample, and pads have settled
     around them.
@@ -122,14 +114,10 @@ class Standing(NamedTuple):
         }  # fmt: skip
         solved = [f"{name}.{COORDINATES[i]}" for name, axes in rests.items() for i in axes]
         solved += [f"{name}.y" for name in presses]
-        followed = {}
-        for name in built.followed:
-            (coordinate, *more) = sorted(
-                {at for role, at in file.followers()[name] if role == "setpoint"}
-            ) or [""]
-            if coordinate in solved and not more and any(file.motion[name].start_weights):
-                place, weights = out.place(coordinate), file.motion[name].start_weights
-                followed[name] = FollowedStart(coordinate, place, tuple(weights))
+        followed = {
+            name: one.start for name, one in built.followed.items()
+            if one.start and one.start.coordinate in solved
+        }  # fmt: skip
         return out._replace(presses=presses, followed=followed)
 
     @classmethod
@@ -183,23 +171,16 @@ class Standing(NamedTuple):
             {name: torch.tensor(one[k], dtype=torch.float64) for name, one in self.bodies.items()}
             for k in range(2)
         )
-        still = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
 
         def state(values: Mapping[str, Tensor]) -> Tensor:
             pose = dict(given)
-            for name in self.presses:  # bodies rest before others press them
-                pose[name] = at_height(pose[name], torch.tensor(AWAY, dtype=torch.float64))
             for name in self.position_sd:
                 if (place := values.get(f"{PREFIX}{name}")) is not None:
                     body, axis = name.split(".")
                     row = torch.eye(3, dtype=torch.float64)[COORDINATES.index(axis)]
                     pose[body] = pose[body] + (place - self.place(name)) * row
             try:
-                if self.rests:
-                    pose = resting(
-                        rig, pose, self.rests, signals=still, actuators=(), residual=BALANCED
-                    )
-                pose = pressed(rig, pose, self.presses, self.rests)
+                pose = balanced(rig, pose, self.rests, self.presses, BALANCED)
                 reference = reference_from(rig, self, pose)
                 found = rig.unpack(standing(rig, pose, at, reference))
             except NoEquilibrium as error:
@@ -233,12 +214,9 @@ class Known(NamedTuple):
 def reference_from(rig: Rig, start: Start, pose: Mapping[str, Tensor]) -> Reference:
     """The reference of a run whose bodies start at `pose` (3,), with set-points that follow."""
     signals = {}
-    for name, (coordinate, place, weights) in getattr(start, "followed", {}).items():
-        body, axis = coordinate.split(".")
-        moved = pose[body][COORDINATES.index(axis)] - place
+    for name, one in getattr(start, "followed", {}).items():
         signal: Piecewise = rig.reference[name]  # pyright: ignore[reportAssignmentType]
-        values = signal.values + moved * torch.tensor(weights, dtype=torch.float64)
-        signals[name] = signal.with_values(values)
+        signals[name] = signal.with_values(signal.values + one.shift(pose))
     return rig.reference.replaced(signals)
 
 
