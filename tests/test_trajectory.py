@@ -227,20 +227,14 @@ def test_a_progress_bar_is_shown_to_people_only(capfd):
 
 
 def test_a_start_is_stated_by_coordinates():
-    model = coarse()
-    settled = model.unpack(rest(model).detach())
-    x, y, _ = settled.pose["disc"].tolist()
-    bracket = {"x": x, "y": float(settled.pose["bracket"][1]) + 1e-3}
-    found = model.unpack(model.state(disc={"x": x, "y": "rest"}, bracket=bracket).detach())
-    torch.testing.assert_close(found.pose["disc"], settled.pose["disc"], rtol=0, atol=1e-12)
-    torch.testing.assert_close(found.pads["L"], settled.pads["L"], rtol=0, atol=1e-7)
-    assert not bool(found.pads["U"].any())
-    disc = {"x": x, "y": y, "v_x": 0.01, "omega": -0.5}
-    moving = model.state({"disc": disc, "bracket": bracket})
-    state = model.unpack(moving)
+    model, place = coarse(), {"x": 0.06, "y": 0.0241}
+    disc = place | {"v_x": 0.01, "omega": -0.5}
+    start = model.state({"disc": disc, "bracket": {"x": 0.06, "y": 0.06}})
+    state = model.unpack(start)
     assert state.velocity["disc"].tolist() == [0.01, 0.0, -0.5]
-    assert state.pose["disc"].tolist() == [x, y, 0.0]
-    assert simulate(model, T[:3], y0=moving.detach())["v_x"][0] == 0.01
+    assert state.pose["disc"].tolist() == [*place.values(), 0.0]
+    assert not bool(state.pads["U"].any())
+    assert simulate(model, T[:3], y0=start.detach())["v_x"][0] == 0.01
 
 
 # the package

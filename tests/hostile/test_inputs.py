@@ -12,7 +12,7 @@ import torch
 
 from hostile.damage import Mutant, document, written
 from hostile.processes import ROOT
-from hostile.specimens import cells, csv_text
+from hostile.specimens import cells, csv_text, rigs
 from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft import RigFile, simulate
 from torchsoft.cost import Costly, agree
@@ -30,7 +30,6 @@ pytestmark = pytest.mark.slow
 SMALL = 1e-3
 """Meshes whose stiffness takes more memory than this [GiB] are not built here."""
 
-COARSE = {"elements_x": 20, "elements_y": 1}
 BRIEFLY = torch.tensor([0.0, 2e-3, 6e-3], dtype=torch.float64)
 
 
@@ -55,58 +54,6 @@ def finite(*tensors: torch.Tensor) -> None:
 
 # configurations
 # ----------------------------------------------------------------------
-
-MOTIONS = """
-[[motion]]
-kind = "hold"
-value = 60e-3
-[[motion]]
-kind = "profile"
-times = [0.4, 1.0]
-values = [0.0, 5e-3]
-offset = "start"
-[[motion]]
-kind = "strokes"
-travel = 5e-3
-stroke_time = 0.2
-since = 0.4
-until = 0.9
-[[motion]]
-kind = "spline"
-times = [0.0, 0.5, 1.0]
-values = [60e-3, 62e-3, 61e-3]
-[[motion]]
-kind = "sines"
-components = [{ amplitude = 1e-3, frequency = 2.0, phase = 0.3 }]
-since = 0.4
-[[motion]]
-kind = "multi_sine"
-amplitude = 1e-3
-band = [0.5, 8.0]
-components = 3
-seed = 1
-since = 0.4
-[[motion]]
-kind = "chirp"
-amplitude = 1e-3
-first = 0.3
-last = 8.0
-since = 0.4
-"""
-
-
-def coarse(name: str) -> RigFile:
-    """A ready rig on coarse meshes."""
-    file = RigFile.ready(name)
-    return file.override(pads=dict.fromkeys(file.pads, COARSE))
-
-
-def rigs() -> list[dict[str, Any]]:
-    """Ready rigs, and the paper's, moved along its pads in every way."""
-    files = [coarse(name) for name in ("paper", "light_grasp", "two_fingers", "drop")]
-    short = files[0].override(outputs={"duration": 1.0, "snapshots": []})
-    files += [short.override({"motion.x_d": way}) for way in tomllib.loads(MOTIONS)["motion"]]
-    return [file.model_dump(mode="json", exclude_unset=True) for file in files]
 
 
 def datasets() -> list[dict[str, Any]]:
