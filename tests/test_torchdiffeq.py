@@ -4,7 +4,6 @@ import importlib
 import subprocess
 import sys
 from contextlib import nullcontext
-from typing import Any
 
 import pytest
 import torch
@@ -28,24 +27,9 @@ def test_an_import_leaves_torchdiffeq_alone_and_pysindy_for_later():
 
 @pytest.fixture
 def foreign_solver():
-    """torchdiffeq with a solver of its own under the name, and the stepper registered after it."""
-
-    class Euler:
-        def __init__(self, func: Any, y0: torch.Tensor, *_: object, **options: object) -> None:
-            self.func, self.y0 = func, y0
-
-        def integrate(self, t: torch.Tensor) -> torch.Tensor:
-            rows = [self.y0]
-            for i in range(1, len(t)):
-                rows.append(rows[-1] + (t[i] - t[i - 1]) * self.func(t[i - 1], rows[-1]))
-            return torch.stack(rows)
-
-        @classmethod
-        def valid_callbacks(cls) -> set[str]:
-            return set()
-
+    """torchdiffeq with another solver under the name, and the stepper registered after it."""
     before = SOLVERS[METHOD]
-    SOLVERS[METHOD] = Euler
+    SOLVERS[METHOD] = SOLVERS["euler"]
     register_method()
     register_method()
     yield
