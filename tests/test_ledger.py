@@ -101,6 +101,7 @@ def test_a_pad_pressed_flat_is_reported_once_with_all_its_runs():
     ("slip", "jumps"),
     [
         (Coulomb(0.5, 0.4), True),
+        (lambda E, F_N, R: torch.where(0.5 * F_N <= E, (E - 0.4 * F_N) / R, 0.0), True),
         (Coulomb(0.5, 0.5), False),
         (SmoothSlip(0.5, 0.4, 0.05), False),
     ],
@@ -255,6 +256,7 @@ def part(name: str, make: Callable[[], nn.Module], *by: str) -> Any:
         part("law", Loop, "the law of `actuators.a`.*by disc.x's rate are"),
         part("shape", lambda: Disc(0.02), "the shape of `disc`.*by x, y are"),
         part("material", lambda: Rubber(**RUBBER, tau=0.01), "material of `P`.*by `tau` are"),
+        part("material", lambda: Gel(lambda c, x: c.detach() * x**2), "by `c` are"),
         part("material", lambda: Gel(lambda c, x: c * x.detach() * x), r"F_xx \(a stress\).*`c`"),
         part("signal", lambda: Swing(lambda a: a.detach()), "by `signals.x_d.amplitude` are"),
         part("signal", lambda: Swing(Tensor.item), "by `signals.x_d.amplitude` are"),

@@ -242,9 +242,12 @@ def test_a_start_is_stated_by_coordinates():
 
 
 def test_a_star_imports_what_is_public():
+    import pydoc
+
     names: dict[str, Any] = {}
     exec("from torchsoft import *", names)
     assert {"RigFile", "simulate", "Rig", "Trajectory"} <= names.keys()
     assert "torch" not in names
+    assert "simulate_batch" in pydoc.plain(pydoc.render_doc(torchsoft))
     assert all(hasattr(torchsoft, name) for name in dir(torchsoft))
     assert (Path(torchsoft.__file__).parent / "py.typed").is_file()
