@@ -44,7 +44,7 @@ def rolled():
     return re.escape(out)
 
 
-NOWHERE: list[dict[str, str | None]] = [
+NOWHERE: list[dict[str, Any]] = [
     {"HOME": "/nonexistent"}, {"HOME": None, "MPLCONFIGDIR": None, "TMPDIR": "/nonexistent"},
     {"HOME": "/", "XDG_CACHE_HOME": "/proc/nothing"}, {"TORCHSOFT_CACHE_DIR": "/nonexistent"},
 ]  # fmt: skip
