@@ -60,26 +60,33 @@ def test_decreasing_times_are_rejected_or_warned_of():
         odeint(model, y0, f64(4e-5, 0.0), method="rk4", options={"step_size": 5e-6})
 
 
-def test_odeint_adjoint_equals_odeint():
+@pytest.mark.parametrize(
+    ("given", "rounding"),
+    [
+        ({"options": {"step_size": 2e-3, "tolerance": 1e-10}}, 1e-13),
+        ({"rtol": 1e-4, "atol": 1e-5}, 1e-9),
+    ],
+    ids=["step", "tolerances"],
+)
+def test_odeint_adjoint_equals_odeint(given, rounding):
     """Interval by interval, for a batch of two, every parameter and the initial states: the same
-    but for the order of sums, whose terms cancel."""
+    but for the order of sums, whose terms cancel, and the steps of each interval."""
     model, found = coarse(), []
     y0 = grasped(model, (0.02, 0.0))
     y0 = torch.stack((y0, 1.0001 * y0))
     for verb in (odeint, odeint_adjoint):
         model.zero_grad(set_to_none=True)
         start, t = y0.clone().requires_grad_(), f64(0.3, 0.31, 0.325, 0.34)
-        options = {"step_size": 2e-3, "tolerance": 1e-10}
-        state = model.unpack(verb(model, start, t, method=METHOD, options=options))
+        state = model.unpack(verb(model, start, t, method=METHOD, **given))
         x, theta = state.pose["disc"][..., 0], state.pose["disc"][..., 2]
         (1e3 * x * t[:, None] + theta + state.velocity["bracket"][..., 1]).sum().backward()
         known = [p for p in model.parameters() if p.grad is not None]
         found.append([start.grad, *(p.grad * p.detach() for p in known)])
     (by_y0, *bars), (again, *others) = found
-    assert float((by_y0 - again).abs().max()) < 1e-11 * float(by_y0.abs().max())
+    assert float((by_y0 - again).abs().max()) < 1e2 * rounding * float(by_y0.abs().max())
     largest = max(float(bar.abs().max()) for bar in bars)
     for bar, other in zip(bars, others, strict=True):
-        assert float((bar - other).abs().max()) <= 1e-13 * largest
+        assert float((bar - other).abs().max()) <= rounding * largest
 
 
 def test_odeint_adjoint_of_a_forgotten_run_says_so():

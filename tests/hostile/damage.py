@@ -186,7 +186,7 @@ class Mutant(NamedTuple):
         return number(self.old) and isinstance(self.new, bool | str | list | dict)
 
     def named(self, text: str) -> bool:
-        """Whether a refusal names the changed place, by its last name, or the place in a table of
+        """Whether a rejection names the changed place, by its last name, or the place in a table of
         measurements that it contradicts; a range or a table is named by itself."""
         names = [part for part in self.place if isinstance(part, str)]
         if names and names[-1] not in ("kind", "low", "high"):

@@ -1,5 +1,5 @@
 """Mutated configurations, identification files and tables of measurements: accepted and then
-finite, or refused in a sentence that names the field, or file, row and column."""
+finite, or rejected in a sentence that names the field, or file, row and column."""
 
 import tomllib
 from collections.abc import Callable
@@ -195,7 +195,7 @@ nu = 0.45
 tau = 10e-3
 depth = 44e-3
 """
-"""What a file may state; and what takes longer, a recording that begins in motion and competing
+"""What a file may state; and what takes longer, a recording that starts in motion and competing
 laws."""
 
 
