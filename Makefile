@@ -8,7 +8,7 @@ OUT    ?= out/grasp_and_roll
 .PHONY: run test test-slow test-hostile test-newest lint docs wheel clean
 
 run: $(STAMP)
-	$(BIN)/python experiments/grasp_and_roll.py --out $(OUT)
+	$(BIN)/python -m experiments.grasp_and_roll --out $(OUT)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest

@@ -17,7 +17,7 @@ FLOWS = {
         caller display extras diagnostic files parallel tables csvfile quantity codegen
         physics cost
         solve testing plan
-        plot materials rigs sysid reduced datasets envs experiment cli __main__
+        plot materials rigs sysid reduced datasets envs cli __main__
     """,
     "codegen": "graph operations trace emit . stops",
     "physics": """

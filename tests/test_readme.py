@@ -150,12 +150,6 @@ def test_links_lead_somewhere(page):
         assert target.startswith("http") or (page.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/start.md"])
-def test_the_two_commands_come_first(page):
-    lines = blocks(ROOT / page, "sh")[0].splitlines()
-    assert [line.partition("#")[0].split() for line in lines] == [["make", "run"], ["make", "test"]]
-
-
 def test_quoted_messages_are_those_of_the_sources():
     sources = "".join(
         re.sub(r'"\s*\n\s*f?"', "", path.read_text(encoding="utf-8"))
