@@ -282,6 +282,14 @@ def test_odd_values_of_an_argument_of_a_run_are_rejected_with_its_name(name, sta
             simulate(**given)
 
 
+@pytest.mark.parametrize("name", ["gradient", "wrt", "touch"])
+@pytest.mark.parametrize("odd", ["x", None, True, 3, NAN, np.zeros(3), f64(1, 2), [3], {}])
+def test_odd_names_of_a_run_are_rejected(name, odd, start):
+    given = {"gradient": "forward", "wrt": ["gravity"]} | {name: odd}
+    with pytest.raises(ValueError, match=f"`{name}` must be"):
+        simulate(start[0], T, y0=start[1], **given)
+
+
 @pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap])
 @pytest.mark.parametrize("by", ["y0", "t", "knots"])
 def test_a_run_in_a_transform_of_torch_func_is_rejected_with_the_way_on(by, transform, start):
