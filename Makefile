@@ -8,7 +8,7 @@ OUT    ?= out/grasp_and_roll
 .PHONY: run test test-slow test-hostile test-newest lint docs wheel clean
 
 run: $(STAMP)
-	$(BIN)/python experiments/grasp_and_roll.py --out $(OUT)
+	$(BIN)/python -m experiments.grasp_and_roll --out $(OUT)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
@@ -22,7 +22,6 @@ test-newest:
 	$(NEWEST) tests/newest.py $(NEWEST)
 
 test-hostile: $(STAMP)
-	rm -rf out/hostile
 	$(BIN)/python -m pytest -m slow --dist worksteal tests/hostile --timeout 1800
 
 lint: $(STAMP)

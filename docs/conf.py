@@ -106,6 +106,7 @@ RETARGETED = {
     "](../data_gen/README.md": "](datasets.md",
     "](../examples/identify/README.md": "](files.md",
     "](../examples/gallery/README.txt": "](gallery/index",
+    "](../../examples/gallery/README.txt": "](gallery/index",
     "](../docs/": "](",
     "](../../docs/": "](",
     "](docs/": "](",

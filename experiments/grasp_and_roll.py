@@ -7,7 +7,7 @@ Eq. 20-30, controllers Eq. 31-34, contact Eq. 8-13, bracket moment Eq. 35. The p
 friction numbers: with the default set friction stays locked in, with the "paper-like" set (K_t =
 100 N/m) it fades in the grasp, as the paper reports. Both are run.
 
-Command: .venv/bin/python experiments/grasp_and_roll.py [--table] [--smoke]
+Command: .venv/bin/python -m experiments.grasp_and_roll [--smoke]
 Expected (default set; the paper's number in brackets): grasping force 80.85 N; x_C(10 s) = 40.000
 mm (40); y_C in the grasp 23.199 mm (23.20); y_Br between 48.564 and 48.600 mm (48.6); theta(10 s) =
 1.090 rad, anticlockwise, -0.0035 rad at the end; peak speed 4.41 mm/s; peak F_x 0.43 N, of which a
@@ -16,17 +16,15 @@ nodes of each pad in contact; energy residual 1e-6. About 40 s on one core with 
 animation; each simulation takes 2 s of that, with four points an element 7 s.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from torch import Tensor
 
+from experiments.frame import COARSE, Table, options, write
 from torchsoft import BuiltRig, NoEquilibrium, Rig, RigFile, Trajectory
-from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.plot import diagram
 from torchsoft.plot.animation import animate, player
 from torchsoft.plot.dashboard import dashboard
@@ -66,7 +64,6 @@ class Config:
     out: Path = Path("out/grasp_and_roll")  # folder for everything that is written
     rtol: float = 1e-5  # relative tolerance of the stepper
     animation: bool = True  # write the animation
-    table: bool = False  # only print the table of the summary that is already in `out`
     smoke: bool = False  # 0.6 s on a coarse mesh
 
 
@@ -126,99 +123,67 @@ def manipulate(config: Config, friction: str, changes: Mapping[str, Any]) -> Run
     return Run(friction, file, built.rig, run, force, finer)
 
 
-def run(config: Config) -> tuple[Run, Run]:
-    """The default and the paper-like friction set."""
-    return manipulate(config, "default", {}), manipulate(config, "paper-like", PAPER_LIKE)
+PUBLISHED = {
+    "x_C(0 s) [mm]": "60", "x_C(10 s) [mm]": "40", "x_C(15 s) [mm]": "40", "x_C(25 s) [mm]": "60",
+    "x_C(30 s) [mm]": "60", "y_C in the grasp, 0.375 s [mm]": "23.20",
+    "y_Br from 0.5 s on, lowest [mm]": "48.6", "y_Br from 0.5 s on, highest [mm]": "48.6",
+    "peak speed of the disc [mm/s]": "4.375 (desired)",
+    "direction of rolling out": "anticlockwise", "grasping force fed forward [N]": "not given",
+    "energy residual / injected": "-", "steps": "-", "Newton iterations a step": "-",
+    "wall time of the stepping [s]": "-",
+}  # fmt: skip
+"""Numbers that the paper prints; of others it has curves only."""
 
 
-def summary(run: Run) -> dict[str, Any]:
-    """The run in numbers; None for what it did not reach. F_y_hold_N counts downwards, at 5 s."""
+def quantities(run: Run) -> dict[str, float | str | None]:
+    """The run in numbers; None for what it did not reach."""
     r = run.trajectory
 
-    def at(time: float, signal: Tensor, unit: float = 1) -> float | None:
-        return unit * signal[r.at(time)].item() if time <= r.t[-1] + 1e-9 else None
+    def at(time: float, channel: str, scale: float = 1.0) -> float | None:
+        return scale * r[channel][r.at(time)].item() if time <= r.t[-1] + 1e-9 else None
 
-    held = r["y_Br"][r.t >= 0.5]
-    rolling_out = (r.t >= 1) & (r.t <= 9)
-    pads = {"L": "lower", "U": "upper"}
-    touching = {pads[name]: (force[..., 0] > 0).sum(-1) for name, force in r.force.items()}
+    def touching(pad: str) -> int | None:
+        return int((r.force[pad][r.at(5), :, 0] > 0).sum()) if r.t[-1] >= 5 else None
+
+    held = 1e3 * r["y_Br"][r.t >= 0.5]
+    spin = r["omega_C"][(r.t >= 1) & (r.t <= 9)].mean()  # nan in a run that ends before
+    turns = "anticlockwise" if spin > 0 else "clockwise" if spin < 0 else None
     return {
-        "x_C_mm": {str(time): at(time, r["x_C"], 1e3) for time in (0, 10, 15, 25, 30)},
-        "y_C_grasp_mm": at(0.375, r["y_C"], 1e3),
-        "y_Br_hold_mm": {
-            "min": 1e3 * held.min().item() if len(held) else None,
-            "max": 1e3 * held.max().item() if len(held) else None,
-        },
-        "theta_10_rad": at(10, r["theta_C"]),
-        "theta_30_rad": at(30, r["theta_C"]),
-        "peak_speed_mm_s": 1e3 * r["v_x_C"].abs().max().item(),
-        "F_y_hold_N": at(5, -r["effort_y"]),
-        "F_x_peak_N": r["effort_x"].abs().max().item(),
-        "F_x_peak_finer_N": run.finer["effort_x"].abs().max().item(),
-        "M_Br_peak_Nm": r["M_U"].abs().max().item(),
-        "contact_nodes": {name: at(5, count) for name, count in touching.items()},
-        "angular_momentum_sign_out": int(r["omega_C"][rolling_out].mean().sign())
-        if r.t[-1] >= 9
-        else None,
-        "energy_residual_rel": r.energy_residual_rel,
+        **{f"x_C({time} s) [mm]": at(time, "x_C", 1e3) for time in (0, 10, 15, 25, 30)},
+        "y_C in the grasp, 0.375 s [mm]": at(0.375, "y_C", 1e3),
+        "y_Br from 0.5 s on, lowest [mm]": held.min().item(),
+        "y_Br from 0.5 s on, highest [mm]": held.max().item(),
+        "peak speed of the disc [mm/s]": 1e3 * r["v_x_C"].abs().max().item(),
+        "direction of rolling out": turns,
+        "theta(10 s) [rad]": at(10, "theta_C"),
+        "theta(30 s) [rad]": at(30, "theta_C"),
+        "downward force F_y at 5 s [N]": at(5, "effort_y", -1.0),
+        "peak horizontal force F_x [N], contact points on nodes": r["effort_x"].abs().max().item(),
+        f"the same, {POINTS} points an element": run.finer["effort_x"].abs().max().item(),
+        "peak bracket moment [N.m]": r["M_U"].abs().max().item(),
+        "nodes in contact at 5 s, lower pad": touching("L"),
+        "nodes in contact at 5 s, upper pad": touching("U"),
+        "grasping force fed forward [N]": run.grasp_force,
+        "energy residual / injected": r.energy_residual_rel,
         "steps": r.stats.steps,
-        "newton_per_step": r.stats.newton_per_step,
-        "failed_steps": r.stats.failed_steps,
-        "wall_s": r.stats.wall_s,
-        "friction": run.friction,
-        "grasp_force_N": run.grasp_force,
-        "parameters": run.file.table(),
+        "Newton iterations a step": r.stats.newton_per_step,
+        "wall time of the stepping [s]": r.stats.wall_s,
     }
 
 
-ROWS = (  # what, published value, key, format
-    ("x_C(0 s) [mm]", "60", "x_C_mm.0", ".3f"),
-    ("x_C(10 s) [mm]", "40", "x_C_mm.10", ".3f"),
-    ("x_C(15 s) [mm]", "40", "x_C_mm.15", ".3f"),
-    ("x_C(25 s) [mm]", "60", "x_C_mm.25", ".3f"),
-    ("x_C(30 s) [mm]", "60", "x_C_mm.30", ".3f"),
-    ("y_C in the grasp, 0.375 s [mm]", "23.20", "y_C_grasp_mm", ".3f"),
-    ("y_Br from 0.5 s on, lowest [mm]", "48.6", "y_Br_hold_mm.min", ".3f"),
-    ("y_Br from 0.5 s on, highest [mm]", "48.6", "y_Br_hold_mm.max", ".3f"),
-    ("peak speed of the disc [mm/s]", "4.375 (desired)", "peak_speed_mm_s", ".3f"),
-    ("direction of rolling out", "anticlockwise", "angular_momentum_sign_out", "turn"),
-    ("theta(10 s) [rad]", "curve only", "theta_10_rad", ".4f"),
-    ("theta(30 s) [rad]", "curve only", "theta_30_rad", ".4f"),
-    ("downward force F_y at 5 s [N]", "curve only", "F_y_hold_N", ".2f"),
-    ("peak horizontal force F_x [N], contact points on nodes", "curve only", "F_x_peak_N", ".3f"),
-    (f"the same, {POINTS} points an element", "curve only", "F_x_peak_finer_N", ".3f"),
-    ("peak bracket moment [N.m]", "curve only", "M_Br_peak_Nm", ".3f"),
-    ("nodes in contact at 5 s, lower pad", "curve only", "contact_nodes.lower", "d"),
-    ("nodes in contact at 5 s, upper pad", "curve only", "contact_nodes.upper", "d"),
-    ("grasping force fed forward [N]", "not given", "grasp_force_N", ".3f"),
-    ("energy residual / injected", "-", "energy_residual_rel", ".1e"),
-    ("steps (Newton iterations each)", "-", "steps", "d"),
-    ("wall time of the stepping [s]", "-", "wall_s", ".2f"),
-)
+def table(default: Mapping[str, Any], paper_like: Mapping[str, Any]) -> Table:
+    """The published values beside those of both runs."""
 
-
-def table(numbers: Mapping[str, Any]) -> str:
-    """The published values beside the runs', as Markdown."""
-
-    def cell(source: Mapping[str, Any], key: str, form: str) -> str:
-        value: Any = source
-        for part in key.split("."):
-            value = value[part]
+    def cell(value: float | str | None) -> str:
         if value is None:
             return "-"
-        if form == "turn":
-            return {1: "anticlockwise", -1: "clockwise", 0: "none"}[value]
-        return f"{value:{form}}" + (f" ({source['newton_per_step']:.2f})" if key == "steps" else "")
+        return f"{value:#.5g}" if isinstance(value, float) else str(value)
 
-    columns = numbers, numbers["paper_like"]
-    head = ("", "paper", *(f"{c['friction']} friction" for c in columns))
-    return markdown(
-        head,
-        [
-            (quantity, paper, *(cell(c, key, form) for c in columns))
-            for quantity, paper, key, form in ROWS
-        ],
-    )
+    rows = [
+        (name, PUBLISHED.get(name, "curve only"), cell(value), cell(paper_like[name]))
+        for name, value in default.items()
+    ]
+    return Table(("", "paper", "default friction", "paper-like friction"), rows)
 
 
 CURVES = (  # title, channel, its set-point, label, scale
@@ -272,33 +237,29 @@ def figures(run: Run) -> dict[str, Figure]:
     return out
 
 
-def save(config: Config, runs: tuple[Run, Run]) -> None:
-    """Everything into `out`, the paper-like friction set under "paper_like" in the summary."""
-    first, other = runs
-    config.out.mkdir(parents=True, exist_ok=True)
-    first.trajectory.save(config.out / "trajectory.nc")
-    other.trajectory.save(config.out / "trajectory_paper_like.nc")
-    (config.out / "multibond.dot").write_text(diagram.dot(first.rig), encoding="utf-8")
-    content = summary(first) | {"paper_like": summary(other)}
-    pictures = figures(first) | {"over_time": over_time(runs)}
+def main(config: Config) -> None:
+    default = manipulate(config, "default", {})
+    paper_like = manipulate(config, "paper-like", PAPER_LIKE)
+    found = {"default": quantities(default), "paper_like": quantities(paper_like)}
+    pictures = figures(default) | {"over_time": over_time((default, paper_like))}
     pictures |= {
-        f"{name}_paper_like": one for name, one in figures(other).items() if name != "multibond"
+        f"{name}_paper_like": one
+        for name, one in figures(paper_like).items()
+        if name != "multibond"
     }
-    write(config, content, pictures, table(content))
+    parameters = default.file.table(), paper_like.file.table()
+    content = {**found, "parameters": dict(zip(found, parameters))}
+    write(config, content, {"paper": table(**found)}, pictures)
+    default.trajectory.save(config.out / "trajectory.nc")
+    paper_like.trajectory.save(config.out / "trajectory_paper_like.nc")
+    (config.out / "multibond.dot").write_text(diagram.dot(default.rig), encoding="utf-8")
     if config.animation:
         animate(
-            first.trajectory, config.out / "animation.gif", frames=12 if config.smoke else 150,
+            default.trajectory, config.out / "animation.gif", frames=12 if config.smoke else 150,
             title="Grasp and roll; the first half second in slow motion", follow="disc.x",
             slow=0.5, progress=True,
         )  # fmt: skip
-        player(first.trajectory, config.out / "player.html", title="Grasp and roll")
-
-
-def main(config: Config) -> None:
-    if config.table:
-        print(table(json.loads((config.out / "summary.json").read_text(encoding="utf-8"))))
-    else:
-        save(config, run(config))
+        player(default.trajectory, config.out / "player.html", title="Grasp and roll")
 
 
 if __name__ == "__main__":

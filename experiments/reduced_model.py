@@ -16,7 +16,7 @@ Slip. A light grasp, the horizontal loop on the bracket, strokes ever faster: th
 lower pad and the upper one slips. Held out: other strokes. Errors are root mean squares over the
 signal's range, worst of the six states.
 
-Command: .venv/bin/python experiments/reduced_model.py [--smoke]
+Command: .venv/bin/python -m experiments.reduced_model [--smoke]
 Expected: stick: 8 terms, the very ones above; held-out error 0.3 % of range (node transitions in
 the spin), more than 100 times faster than the full model; k, c and the masses within 10 % of the
 expectation but for the spin's k (-11 %) and c_r (-16 %). Slip: 12 terms, 1 % up to 40 m/s2, 2 to
@@ -35,9 +35,10 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import nn
 
-from torchsoft import Profile, Reference, Rig, RigFile, Trajectory, excite, hold, simulate
-from torchsoft.experiment import COARSE, at_the_points, grid, numbers, options, write
+from experiments.frame import COARSE, Table, grid, numbers, options, write
+from torchsoft import Profile, Reference, Rig, RigFile, excite, hold, simulate
 from torchsoft.files import finite
+from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Waves, wave
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
@@ -80,22 +81,6 @@ class Config:
     other_times: tuple[float, ...] = (0.15, 0.1, 0.055, 0.045, 0.035, 0.03, 0.025, 0.02)
     speeds: tuple[float, ...] = (0.005, 0.01, 0.02)  # that tanh(s' / speed) is tried with [m/s]
     smoke: bool = False  # a size that takes seconds
-
-
-def slipping(model: Rig, run: Trajectory) -> float:
-    """Part of the touching nodes of the upper pad that slip faster than 1 mm/s, over time."""
-    every = at_the_points(model, run.t[::20], run.y[::20])
-    depth, speed = (x.chunk(2, -1)[list(model.contacts).index("U")] for x in every)
-    return float(((depth > 0) & (speed > 1e-3)).sum() / (depth > 0).sum())
-
-
-def compared(model: ReducedModel, static: dict[tuple[str, str], float]) -> list[dict[str, Any]]:
-    """The coefficients beside what is expected of them; None where mechanics has no such term."""
-    rows = model.coefficient_table()
-    for row in rows:
-        value = static.get((row["equation"], row["term"]))
-        row |= {"expected": value, "error": None if value is None else row["value"] / value - 1}
-    return rows
 
 
 def refit(
@@ -168,40 +153,33 @@ def indices(model: Rig) -> tuple[list[int], list[int], int]:
     return q, v, q[0]
 
 
-def expected(grasp: Grasp, frequency: float = 1.0) -> dict[str, float]:
-    """k, c, r and c_r of the linearised full model, pads and stretches condensed at a low frequency
-    [Hz]."""
+def expected(grasp: Grasp, frequency: float = 1.0) -> tuple[float, dict[tuple[str, str], float]]:
+    """The rolling radius r [m], and what mechanics expects of every coefficient, by equation and
+    term: k, c, r and c_r are those of the linearised full model, pads and stretches condensed at a
+    low frequency [Hz]."""
     model, w = grasp.model, 2j * np.pi * frequency
     q, v, first = indices(model)
     inner = slice(0, first)
     disc, bracket = model.bodies["disc"], model.bodies["bracket"]
-    masses = np.array([disc.mass.item(), disc.inertia.item(), bracket.mass.item()])
+    m, inertia, m_Br = masses = [x.item() for x in (disc.mass, disc.inertia, bracket.mass)]
     A = linearised(model, grasp.y, grasp.still).numpy()
-    followed = np.linalg.solve(
-        w * np.eye(inner.stop) - A[inner, inner], A[inner, q] + w * A[inner, v]
-    )
-    Z = masses[:, None] * (
+    followed = np.linalg.solve(w * np.eye(first) - A[inner, inner], A[inner, q] + w * A[inner, v])
+    forces = np.array(masses)[:, None] * (
         A[np.ix_(v, q)] + w * A[np.ix_(v, v)] + A[v, inner] @ followed
     )  # force, moment per motion
-    spring = -Z[0, 0] / 2  # k + i omega c
-    r = (Z[1, 2] / -spring).real
-    rolling = -(Z[1, 1] + 2 * r**2 * spring)
-    names = ("m", "I", "m_Br", "k", "c", "r", "c_r")
-    return dict(zip(names, (*masses, spring.real, spring.imag / w.imag, r, rolling.imag / w.imag)))
-
-
-def by_mechanics(e: dict[str, float]) -> dict[tuple[str, str], float]:
-    """What mechanics expects of every coefficient, by equation and term."""
-    spin = -e["r"] / e["I"]
-    return {
-        ("v_C", "x_Br - 2 x_C"): e["k"] / e["m"],
-        ("v_C", "v_Br - 2 v_C"): e["c"] / e["m"],
-        ("omega", "x_Br + 2 r theta"): spin * e["k"],
-        ("omega", "v_Br + 2 r omega"): spin * e["c"],
-        ("omega", "omega"): -e["c_r"] / e["I"],
-        ("v_Br", "x_Br - x_C + r theta"): -e["k"] / e["m_Br"],
-        ("v_Br", "v_Br - v_C + r omega"): -e["c"] / e["m_Br"],
-        ("v_Br", "F_x"): 1 / e["m_Br"],
+    spring = -forces[0, 0] / 2  # k + i omega c
+    r = float((forces[1, 2] / -spring).real)
+    c_r = -(forces[1, 1] + 2 * r**2 * spring).imag / w.imag
+    k, c = spring.real, spring.imag / w.imag
+    return r, {
+        ("v_C", "x_Br - 2 x_C"): k / m,
+        ("v_C", "v_Br - 2 v_C"): c / m,
+        ("omega", "x_Br + 2 r theta"): -r * k / inertia,
+        ("omega", "v_Br + 2 r omega"): -r * c / inertia,
+        ("omega", "omega"): -c_r / inertia,
+        ("v_Br", "x_Br - x_C + r theta"): -k / m_Br,
+        ("v_Br", "v_Br - v_C + r omega"): -c / m_Br,
+        ("v_Br", "F_x"): 1 / m_Br,
     }
 
 
@@ -226,13 +204,17 @@ def study_stick(config: Config) -> dict[str, Any]:
         whole.run(grid(config.scenario * file.outputs.duration, 2e-3))
         for _ in range(1 if config.smoke else 3)
     ]
-    parts, held = expected(grasp), record(full[0])
+    held, (radius, mechanical) = record(full[0]), expected(grasp)
+    coefficients = reduced.coefficient_table()
+    for row in coefficients:
+        value = mechanical.get((row["equation"], row["term"]))
+        row |= {"expected": value, "error": None if value is None else row["value"] / value - 1}
     return {
         "terms": len(reduced.terms), "heldout_nrmse": score(reduced, held).worst,
         "speedup": min(run.stats.wall_s for run in full) / rollout_time(reduced, held),
-        "equations": reduced.text(), "mechanics": parts,
-        "rolling_radius_mm": {"found": 1e3 * r, "expected": 1e3 * parts["r"]},
-        "coefficients": compared(reduced, by_mechanics(parts)),
+        "equations": reduced.text(),
+        "rolling_radius_mm": {"found": 1e3 * r, "expected": 1e3 * radius},
+        "coefficients": coefficients,
     }  # fmt: skip
 
 
@@ -246,7 +228,7 @@ class Stroke(NamedTuple):
     wall_s: float
 
 
-def strokes(config: Config, travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
+def strokes(travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
     """Strokes there and back from a light grasp with the horizontal loop on the bracket."""
     roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
     e = Excitation(roll, duration=0.5 + 4 * stroke_time + 0.01, depth=depth)
@@ -255,7 +237,9 @@ def strokes(config: Config, travel: float, stroke_time: float, depth: float = DE
     run = built.run(t[: start + 1], step=5e-4)
     rest = built.run(t[start:], y0=run.y[-1], step=5e-4)
     peak = float(np.abs(np.gradient(rest["v_x_Br"].numpy(), 5e-4)).max())
-    return Stroke(record(rest), peak, slipping(built.rig, rest), rest.stats.wall_s)
+    states = rest.contact_state["U"]
+    slipping = float((states == SLIPPING).sum() / (states > 0).sum())
+    return Stroke(record(rest), peak, slipping, rest.stats.wall_s)
 
 
 def sticking(model: ReducedModel) -> ReducedModel:
@@ -274,8 +258,8 @@ def sticking(model: ReducedModel) -> ReducedModel:
 
 
 def study_slip(config: Config) -> dict[str, Any]:
-    train = [strokes(config, -20e-3, T).record for T in config.stroke_times]
-    other = {T: strokes(config, 15e-3, T) for T in (*config.checking_times, *config.other_times)}
+    train = [strokes(-20e-3, T).record for T in config.stroke_times]
+    other = {T: strokes(15e-3, T) for T in (*config.checking_times, *config.other_times)}
     r = rolling_radius([train[int(np.argmax(config.stroke_times))]])
     recipe = Recipe(width=0.004, window=min(config.stroke_times) * 4)
     checks = [other[T].record for T in config.checking_times]
@@ -296,7 +280,7 @@ def study_slip(config: Config) -> dict[str, Any]:
         }
         for T, one in sorted(other.items(), reverse=True)
     ]  # fmt: skip
-    deep = strokes(config, 15e-3, 0.04, depth=2 * DEPTH)
+    deep = strokes(15e-3, 0.04, depth=2 * DEPTH)
     return {
         "terms": len(model.terms),
         "heldout_nrmse": float(np.mean([one["nrmse"] for one in by_stroke if one["held_out"]])),
@@ -306,49 +290,46 @@ def study_slip(config: Config) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def run(config: Config) -> dict[str, Any]:
+def tables(found: dict[str, Any]) -> dict[str, Table]:
+    """Both regimes; the coefficients beside mechanics; errors under slip by stroke."""
+    names = {"terms": "terms", "heldout_nrmse": "held-out error", "speedup": "speed-up"}
+    regimes = {
+        regime: {shown: one[name] for name, shown in names.items()} for regime, one in found.items()
+    }
+    coefficients = [
+        (
+            f"{row['equation']}' of {row['term']}", f"{row['value']:.4g}",
+            "{:.4g} .. {:.4g}".format(*row["interval"]),
+            "-" if row["error"] is None else f"{row['error']:+.1%}",
+        )
+        for row in found["stick"]["coefficients"]
+    ]  # fmt: skip
+    columns = ("acceleration_m_s2", "slipping", "nrmse", "nrmse_linear")
+    strokes = {
+        f"{one['stroke_time_s']:g} s": {name: one[name] for name in columns}
+        for one in found["slip"]["by_stroke"]
+    }
+    strokes["another grasp"] = {"nrmse": found["slip"]["another_grasp"]}
+    head = ("coefficient", "found", "90 % interval", "over mechanics less one")
+    return {
+        "regimes": numbers("regime", regimes),
+        "coefficients": Table(head, coefficients),
+        "strokes": numbers("stroke under slip", strokes, ".2g"),
+    }
+
+
+def main(config: Config) -> None:
     if config.smoke:
         config = replace(
             config, taps=6, tap_time=0.15, validation=2e-4, scenario=0.2,
             thresholds=(0.03, 0.07, 0.14), models=10, stroke_times=(0.08, 0.05, 0.03),
             checking_times=(0.06,), other_times=(0.025,), speeds=(0.005,),
         )  # fmt: skip
-    return finite({"stick": study_stick(config), "slip": study_slip(config)})
-
-
-def table(found: dict[str, Any]) -> str:
-    """Both regimes; the coefficients beside mechanics; errors under slip by stroke."""
-    regimes = {
-        name: {
-            "terms": one["terms"], "held-out NRMSE": one["heldout_nrmse"],
-            "speed-up": one["speedup"],
-        }
-        for name, one in found.items()
-    }  # fmt: skip
-    coefficients = {
-        f"{row['equation']}' of {row['term']}": {
-            "found": row["value"], **dict(zip(("5 %", "95 %"), row["interval"]))
-        } | ({} if row["error"] is None else {"over mechanics less one": row["error"]})
-        for row in found["stick"]["coefficients"]
-    }  # fmt: skip
-    keys = ("acceleration_m_s2", "slipping", "nrmse", "nrmse_linear")
-    strokes = {
-        f"{one['stroke_time_s']:g} s": {key: one[key] for key in keys}
-        for one in found["slip"]["by_stroke"]
-    }
-    strokes["another grasp"] = {"nrmse": found["slip"]["another_grasp"]}
-    return "\n\n".join((
-        numbers("regime", regimes), numbers("coefficient", coefficients),
-        numbers("stroke under slip", strokes, 2),
-    ))  # fmt: skip
-
-
-def main(config: Config) -> None:
     with threadpool_limits(1):  # what is timed, is timed on one core
-        found = run(config)
+        found = finite({"stick": study_stick(config), "slip": study_slip(config)})
     for name, one in found.items():
         print(f"\n{name}:", *one["equations"], sep="\n")
-    write(config, found, table=table(found))
+    write(config, found, tables(found))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""What `check` reports of a rig before it is run: impossible files, rigs that make no sense, and
-estimates of what pads and bodies will do, as runs of the same rigs end."""
+"""What `check` reports of a rig: impossible files, rigs that make no sense, and what a run at a
+loose tolerance does to pads and bodies."""
 
 import re
 from pathlib import Path
@@ -12,9 +12,8 @@ from test_rig_parts import RUBBER, changed, coarse_tree
 
 from torchsoft import RigFile
 from torchsoft.rigs.check import check
-from torchsoft.rigs.course import Estimate
 
-# one pad and one body; compressions of runs are in comments
+# one pad and one body
 # ----------------------------------------------------------------------
 
 FIRM = {"kind": "kelvin_voigt", "E": 0.75e6, "nu": 0.45, "tau": 10e-3, "depth": 44e-3}
@@ -78,32 +77,32 @@ REST, HIGH = {"x": 0.0, "y": "rest"}, {"x": 0.0, "y": 60e-3}
 FLAT = {"theta": 0.0}
 
 ALONE: dict[str, tuple[RigFile, str]] = {
-    "pressed": (on_one_pad(REST, press=600.0),
-                r"warning: pads.ground: .*leaves linear elasticity: at t = 0\.3 s"),  # 48 %
-    "pressed a little": (on_one_pad(REST, press=50.0), ""),  # 11 %
+    "pressed": (on_one_pad(REST, press=600.0), r"warning: pads.ground: .*compressed by 48%"),
+    "pressed a little": (on_one_pad(REST, press=50.0), ""),
     "fallen": (on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 1.0}),
-               r"warning: pads.ground: .*`disc` comes onto `ground` with 0\.7"),  # 31 %
-    "fallen lightly": (on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 0.1}), ""),  # 10 %
+               r"warning: pads.ground: .*at t = 0\.085\d s it is compressed by 3\d%"),
+    "fallen lightly": (on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 0.1}), ""),
     "thrown": (on_one_pad(HIGH | {"v_y": -3.0}, FIRM | {"tau": 1e-3}),
-               r"warning: bodies.disc: .* with 3\.1.* m/s, and a trial fails"),
-    "thrown away": (on_one_pad(HIGH | {"v_x": 3.0}, GEL, 12e-3), ""),
+               r"error: pads.ground: .*at t = 0\.01\d* s it is compressed by 5\d%"),
+    "thrown away": (on_one_pad(HIGH | {"v_x": 3.0}, GEL, 12e-3),
+                    r"warning: bodies.disc: the run ends early: at t = 0\.02.* it left the space"),
     "dragged": (on_one_pad(REST, press=100.0, far=20e-3, disc=FLAT),
-                "warning: pads.ground: .*is dragged over it by 20 mm"),  # 61 %
-    "dragged lightly": (on_one_pad(REST, press=10.0, far=20e-3, disc=FLAT), ""),  # 10 %
-    "rolled": (on_one_pad(REST, press=50.0, far=20e-3), ""),  # 11 %
+                "warning: pads.ground: .*friction shears it by 6.% of its height, and"),
+    "dragged lightly": (on_one_pad(REST, press=10.0, far=20e-3, disc=FLAT), ""),
+    "rolled": (on_one_pad(REST, press=50.0, far=20e-3), ""),
     "tipped": (on_one_pad(REST, press=60.0, far=20e-3, disc={"shape": TALL}),
-               "warning: bodies.disc: .*friction tips it onto an edge"),  # 45 %
+               "warning: pads.ground: .*`disc` is tipped by -6.* degrees onto an edge"),
     "out of reach": (on_one_pad({"x": 0.0, "y": 0.525}),
-                     "error: bodies.disc: .*outside the space over the pad"),  # lost at t = 0
-    "inclined": (inclined(), ""),  # slides off
+                     "error: bodies.disc: .*at t = 0.* it left the space over the pad `ground`"),
+    "inclined": (inclined(), "warning: bodies.disc: .*at t = 3.* reached the end of the pad"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ALONE)
-def test_one_pad_is_judged_as_its_run_ends(name):
+def test_one_pad_is_judged_by_its_run(name):
     file, expected = ALONE[name]
     found = [str(one) for one in check(file) if one.severity != "note"]
-    assert len(found) == bool(expected)
+    assert len(found) == bool(expected), found
     assert all(re.search(expected, one) for one in found), found
 
 
@@ -114,6 +113,11 @@ STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": BALL}
 SQUARE = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 20e-3, "radius": 3e-3}
 BOX = {"shape": SQUARE, "start": {"theta": "rest"}}
 CSV = {"motion.x_d": {"kind": "csv", "file": "x.csv", "column": "x_d"}}
+THIN = {
+    "bodies.disc": {"shape": {"kind": "circle", "radius": 1.5e-3}, "start": {"y": "rest"}},
+    "bodies.bracket.start.y": 13.1e-3, "motion.y_d.values": ("start", 9.9e-3),
+    "motion.press.values": (0.0, -80.0), "motion.x_d.values": ("start", "start"),
+}  # fmt: skip
 STEPS = "".join(f"{0.01 * i},{round(0.03 * i, 1)}\n" for i in range(250))
 
 
@@ -144,8 +148,6 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
         r"contacts\.lower: the pad `lower` is bonded to the body `disc`"),
     "nothing to touch with": ({"contacts.lower.body": "bracket"},
         r"contacts\.lower\.body: `bracket` has no shape"),
-    "loop without a motion": ({"actuators.x.setpoint": None},
-        r"actuators\.x: setpoint is missing: the gains Kp, Kd and Ki need"),
     "no such motion": ({"actuators.x.setpoint": "w"}, r"motion\.w is missing: .* of bracket\.x"),
     "motion of nothing": ({"motion.wave": {"kind": "hold"}}, r"motion\.wave: nothing follows it"),
     "law of nothing": ({"laws.wet": DRY}, r"laws\.wet: no contact follows it; name it as the law"),
@@ -156,8 +158,6 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
         r"mass and density each say how heavy it is; give one"),
     "no density": ({"bodies.disc": {"depth": 1e-2}}, r"density is missing: depth is given"),
     "two moduli": ({"materials.rubber.shore_a": 30}, r"E and shore_a each say how stiff it is"),
-    "slender": ({"bodies.disc.shape": {"kind": "ellipse", "a": 40e-3, "b": 10e-3}},
-        r"bodies\.disc\.shape: the axes a and b differ by more than a factor of 3"),
     "inertial": ({"materials.rubber": {"kind": "prony", **RUBBER, "moduli": [1e5], "tau": [0.1]},
         "pads.lower.inertial": True}, r"lower\.inertial: an inertial pad has one retardation time"),
     "taken name": ({"bodies.keys": {"x": 0.0, "y": 0.0, "theta": 0.0}},
@@ -188,20 +188,22 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "overlap": ({"bodies.stone": STONE},
         r"error: bodies\.disc: it and bodies\.stone overlap by .* mm at t = 0 s"),
     "no room": ({"motion.y_d.values": ("start", 40e-3)},
-        r"error: contacts\.upper: `disc` does not fit: at t = 0\.4 s"),
+        r"warning: pads\.upper: .*it is compressed by 4\d%"),
     "not carried": ({"bodies.ball": {"mass": 0.1, "shape": BALL, "start": {"x": 0.0, "y": 0.1}}},
         r"error: bodies\.ball: nothing carries it: it has no contact with any pad"),
     "beside the pad": ({"bodies.disc.start": {"x": 0.1, "y": 0.03}},
         r"error: bodies\.disc: nothing carries it: no pad that it has a contact with lies under"),
     "never touches": ({"motion.y_d.values": ("start", 50.05e-3), "motion.press.values": (0.0, 0.0)},
-        r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
+        r"warning: contacts\.upper: `upper` never touches `disc`"),
     "lets go": ({"motion.y_d": {"kind": "profile", "times": (0.0, 0.4, 1.0),
         "values": ("start", 49e-3, 72e-3)}},
-        r"note: contacts\.upper: .*let go.*at t = .* s they are 2\d\.\d mm apart"),
+        r"note: contacts\.upper: `upper` lets go of `disc`: they touch last at t = 0\.5"),
     "a meganewton": ({"motion.press.values": (0.0, -1e6)},
-        r"error: motion\.press: at t = 2 s it pushes `bracket` with 1e\+06 N, but"),
+        r"error: bodies\.disc: the run ends early: at t = 0\.04.* down to its bonded base; press"),
     "through the disc": ({"motion.y_d.values": ("start", -0.05)},
-        r"error: pads\.lower: it and pads\.upper overlap by .* mm at t = 0\.2 s"),
+        r"error: bodies\.disc: the run ends early: at t = 0\.15.* down to its bonded base"),
+    "pads beside a thin rod": (THIN,
+        r"error: pads\.lower: it and pads\.upper overlap by 0\.\d* mm at t = "),
     "unstable": ({"materials.rubber.tau": 1e-4, "bodies.bracket.start.y": 49.5e-3,
         "actuators.x": {"measures": "disc.x", "Kp": 1e6, "Kd": 10.0},
         "motion.y_d": {"kind": "hold"}}, r"the rig is unstable at t = "),
@@ -214,9 +216,11 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
         r"warning: solver\.step: steps of 0\.05 s are too coarse: motion\.y_d goes",
         r"warning: laws\.dry\.friction: slip is not single-valued",
         r"warning: outputs\.interval: outputs every 0\.01 s .* up to 50 Hz; take 0\.005 s"),
-    "cannot roll": (moved(BOX, 20e-3, -30.0), "warning: bodies.disc: .*cannot roll"),  # 95 %
+    "cannot roll": (moved(BOX, 20e-3, -30.0),
+        "warning: pads.upper: .*friction shears it by 9.%.*`disc` is tipped by -1.* degrees"),
     "cannot roll, pressed": (moved({"theta": 0.0}, 20e-3, -200.0),
-        "warning: pads.lower: .*cannot roll", "warning: pads.upper: .*cannot roll"),  # 53 %
+        "warning: pads.lower: .*friction shears it by 5.% of its height, and",
+        "warning: pads.upper: .*friction shears it by 5.%"),
     # recorded motions
     "early end": (csv("t [s],x_d [mm]\n0,0\n1,1\n"), r"x\.csv ends at 1 s, .* lasts until 2 s"),
     "no column": (csv("t [s],x [mm]\n0,0\n1,1\n"),
@@ -226,7 +230,7 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "a clock": (csv("t [s],x_d [mm]\n1.7e9,0\n1.7000001e9,1\n"),
         r"begins at 1\.7e\+09 s, and the run ends at 2 s: .* say from_first = true"),
     "an encoder, strain": (
-        csv(f"t [s],x_d [mm]\n{STEPS}") | {"motion.y_d.values": ("start", 45.8e-3)},
+        csv(f"t [s],x_d [mm]\n{STEPS}") | {"motion.y_d.values": ("start", 44e-3)},
         r"warning: motion\.x_d\.file: .*in steps of 0\.0001 m, as of an encoder: .*0\.01 m/s",
         r"warning: pads\.\w+: the strain leaves linear elasticity: at"),
     "milliseconds": (csv("t [s],x_d [m]\n0,0\n1000,1e-3\n2000,0\n"),
@@ -258,12 +262,7 @@ def quiet(tmp_path_factory):
     return "\n".join(found)
 
 
-SLOW = "too heavy", "no room", "cannot roll"
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW)) for x in REPORTED]
-)
+@pytest.mark.parametrize("name", REPORTED)
 def test_what_is_wrong_is_reported_with_its_field(name, quiet, tmp_path):
     changes, *expected = REPORTED[name]
     found = reported(changes, tmp_path)
@@ -275,15 +274,10 @@ def test_what_is_wrong_is_reported_with_its_field(name, quiet, tmp_path):
 @pytest.mark.parametrize(
     "changes",
     [
-        moved({"theta": 0.0}, 20e-3, -30.0),  # 20 %
-        *(
-            pytest.param(one, marks=pytest.mark.slow)
-            for one in (
-                moved(BOX, 2e-3, -30.0),  # 13 %
-                moved(BOX, 20e-3, -30.0, mu=0.2),  # it slides: 11 %
-                moved({}, 20e-3, -300.0),  # it rolls: 22 %
-            )
-        ),
+        moved({"theta": 0.0}, 20e-3, -30.0),
+        moved(BOX, 2e-3, -30.0),
+        moved(BOX, 20e-3, -30.0, mu=0.2),  # it slides
+        moved({}, 20e-3, -300.0),  # it rolls
     ],
 )
 def test_pads_that_are_moved_gently_are_not_warned_about(changes, tmp_path):
@@ -304,7 +298,6 @@ def test_weights_that_are_no_network_are_reported(tmp_path, arrays, expected):
     assert re.search(rf"^error: actuators\.x\.network: .*{expected}", found), found
 
 
-@pytest.mark.slow
 def test_a_loop_that_is_about_to_close_is_not_judged():
     """The bracket does not hold the disc yet, so that the loop over both is unstable there."""
     file = RigFile.ready("paper")
@@ -328,21 +321,16 @@ def test_steps_are_held_against_the_modes(step, is_coarse):
 def test_a_body_that_falls_freely_asks_for_finer_steps():
     """It comes down with sqrt(2 g h), though it starts at rest."""
     file = on_one_pad(HIGH, GEL, 12e-3, disc={"mass": 0.1}, solver={"step": 0.05})
-    assert any("a body comes flying" in one.message for one in check(file))
+    (found,) = (one for one in check(file) if "a body comes flying" in one.message)
+    assert re.search(r"take 0\.006[789] s or less", found.message)  # a quarter of its radius
 
 
-def test_what_two_pads_grip_is_taken_along():
-    """Fingertips go around a box that they hold, and the box with them, as in the run."""
-    file = RigFile.ready("fingertips")
-    estimate = Estimate(file, file.build())
-    for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
-        assert estimate(time)["box"] == pytest.approx([0.0, 45e-3, angle], abs=2e-4)
-    assert estimate(0.5)["box"][1] < 22e-3  # not lifted yet
-
-
-def test_the_estimate_by_statics_is_where_the_run_ends(tmp_path):
-    file = RigFile.from_tree(coarse_tree()).override(outputs={"duration": 0.45})
-    built = file.build()
-    expected, run = Estimate(file, built).balanced(0.45), built.run()
-    for name in ("disc", "bracket"):
-        assert float(run[f"y_{name}"][-1]) == pytest.approx(expected[name][1], abs=3e-5)
+def test_a_long_run_is_checked_until_it_takes_too_long():
+    """Shaken quickly for minutes; the time until which it was checked is reported."""
+    shake = {"kind": "chirp", "amplitude": 1e-3, "first": 20.0, "last": 20.0}
+    file = RigFile.from_tree(coarse_tree()).override(
+        motion={"x_d": shake}, outputs={"duration": 300.0, "interval": 0.01}
+    )
+    (found,) = (one for one in check(file) if one.where == "solver")
+    assert found.severity == "note"
+    assert re.search(r"what happens after t = \d+(\.\d+)? s is not checked", found.message)

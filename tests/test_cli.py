@@ -15,30 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import IDENTIFIED as CONFIG
 
 from torchsoft import RigFile, files
 from torchsoft.cli import main
 from torchsoft.solve import model, stepper
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "identify" / "rolling.csv"
-CONFIG = """
-rig = "paper"
-[settings]
-laws.steel_on_rubber.friction.v_s = 0.05
-actuators.x.measures = "bracket.x"
-bodies.disc.start.x = 60.3e-3
-bodies.bracket.start.x = 60.3e-3
-[unknowns."laws.steel_on_rubber.K_n"]
-nominal = 1e5
-[unknowns."materials.rubber.E"]
-nominal = 0.7e6
-[sensors]
-x_C.noise = 10e-6
-y_Br.noise = 10e-6
-F_y.noise = 0.1
-[fit]
-rtol = 1e-3
-"""
 
 
 def recorded(path: Path, count: int, without: str = "", **changes: tuple[float, float]) -> Path:
@@ -86,26 +69,20 @@ def test_neither_an_import_nor_help_waits_for_torch(code):
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-OPTIONS = ("--out", "--workers", "--rtol", "--checkpoint", "--yes", "--no-progress")
+COMMANDS = (
+    "", "init", "check", "run", "plot", "plan", "reduce", "design", "rehearse", "identify",
+    "explain", "profile", "material fit", "material presets", "dataset make", "dataset check",
+    "dataset export",
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("", ("identify", "material")),
-        ("material fit", ("FILE", "--out", "--test", "--terms", "--length", "--nu", "compliance")),
-        ("identify", ("DATA.csv", "CONFIG.toml", *OPTIONS)),
-        ("rehearse", ("CONFIG.toml", *OPTIONS)),
-        ("profile", ("DATA.csv", "CONFIG.toml", "--answer", "--of", "--out")),
-    ],
-)
-def test_help_names_commands_arguments_and_options(command, words, capsys):
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command, capsys):
     with pytest.raises(SystemExit) as end:
         main([*command.split(), "--help"])
-    assert end.value.code == 0
     out, err = capsys.readouterr()
-    assert err == ""
-    assert [word for word in words if word not in out] == []
+    assert (end.value.code, err) == (0, "")
+    assert out.startswith(f"usage: torchsoft {command}".rstrip())
 
 
 @pytest.mark.parametrize(
@@ -347,10 +324,13 @@ def test_a_run_that_is_told_to_end_keeps_what_is_simulated(sign, tmp_path, monke
     file, integrate = tmp_path / "rig.toml", stepper.ImplicitStepper.integrate
     assert main(["init", str(file)]) == 0
 
+    runs = iter(("check", "run"))
+
     def told(self, *arguments, **options):
+        now = next(runs)
         for number, out in enumerate(integrate(self, *arguments, **options)):
             yield out
-            if number == 1:
+            if now == "run" and number == 1:
                 os.kill(os.getpid(), sign)
 
     monkeypatch.setattr(stepper.ImplicitStepper, "integrate", told)

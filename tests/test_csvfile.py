@@ -67,6 +67,31 @@ def test_numbers_come_back_whatever_the_form(tmp_path_factory, form, rows):
     assert np.allclose(table.values["x"], [scale * x for _, x in rows], rtol=1e-14, atol=0)
 
 
+CELLS = ["1", "-2.5", "3e2", "", " 4 ", "1,5", "2.000,5", "x", "nan", "inf", "1_0", "0x1", "\uff11",
+         "1%", '"5"', "1e999", "+.5", "#"]  # fmt: skip
+ROWS = st.lists(st.lists(st.sampled_from(CELLS), max_size=4), max_size=5)
+ROWS |= st.lists(st.lists(st.sampled_from(CELLS[:3]), min_size=3, max_size=3), max_size=5)
+
+
+@settings(max_examples=200, derandomize=True)
+@given(ROWS, st.sampled_from(",;\t"))
+def test_pandas_reads_what_the_cells_say_or_leaves_it(tmp_path_factory, rows, separator):
+    """Values, numbers of rows and errors are those of the reader of single cells."""
+    lines = [["t [s]", "strain [1]", "note [N]"], *rows]
+    path = tmp_path_factory.mktemp("csv") / "test.csv"
+    path.write_text("\n".join(map(separator.join, lines)), encoding="utf-8")
+    found = []
+    for body in (csvfile.plain_body, lambda *_: None):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(csvfile, "plain_body", body)
+            try:
+                table = read(path, ignore=["note"])
+                found.append([*table.rows, *map(repr, table.values["t"]), *table.values["strain"]])
+            except ValueError as error:
+                found.append(str(error))
+    assert repr(found[0]) == repr(found[1])
+
+
 def test_other_headings_and_columns_to_ignore(tmp_path):
     path = tmp_path / "test.csv"
     path.write_text("Zeit [s],Kraft [N],Temp,Weg [mm]\n0,1.5,20,1\n0.5,-2,x,2\n1.25,3e3,,4\n")
@@ -74,6 +99,12 @@ def test_other_headings_and_columns_to_ignore(tmp_path):
     table = read(path, headings=headings, ignore=["Temp"])
     assert table.ignored == ("Temp",)
     assert np.allclose(table.values["x"], X)
+    for wrong, message in (
+        ({}, "`Temp` is not known"),
+        ({"Kraft": "forse"}, "is given as `forse`"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(path, headings=headings | wrong)
     assert read(path, headings={"Zeit": "t"}, ignore=None).ignored == ("Kraft", "Temp", "Weg")
 
 

@@ -26,7 +26,7 @@ from torchsoft.rigs.goal import Goal, drawn, plan_file
 from torchsoft.rigs.written import template, to_toml
 
 ROOT = Path(__file__).parents[1]
-FILE = RigFile.from_toml(ROOT / "experiments" / "reorient.toml").override(
+FILE = RigFile.from_toml(ROOT / "examples" / "plan" / "reorient.toml").override(
     pads={"left_tip": {"elements_x": 40, "elements_y": 2, "points": 1},
           "right_tip": {"elements_x": 40, "elements_y": 2, "points": 1}},
     motion={"left_x": {"times": [0.0, 0.2, 0.5], "values": ["start"] * 3},

@@ -31,10 +31,10 @@ from torchsoft import (
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.setup import von_mises
 from torchsoft.plot import figures
-from torchsoft.plot.animation import animate, frame_times, pace
-from torchsoft.plot.dashboard import RIPPLE, dashboard, energy_groups, panels
+from torchsoft.plot.animation import animate, frame_times
+from torchsoft.plot.dashboard import dashboard, energy_groups, panels
 from torchsoft.plot.diagram import LAYER, dot, graph_of, multibond_graph, positions
-from torchsoft.plot.scene import Scene, instants, straight_up
+from torchsoft.plot.scene import instants, straight_up
 from torchsoft.rigs import RigFile
 
 Done = tuple[Rig, Trajectory]
@@ -269,12 +269,6 @@ def test_panels_show_what_their_axes_name(done):
     assert float(moment.abs().max()) > 1.0
 
 
-def test_ripples_are_explained_in_a_whole_dashboard_only(done, monkeypatch):
-    monkeypatch.setattr("torchsoft.plot.dashboard.ripples", lambda run: True)
-    assert dashboard(done[1]).get_supxlabel() == RIPPLE
-    assert not dashboard(done[1], only=["scene", "disc.y"]).get_supxlabel()
-
-
 @pytest.mark.parametrize(
     ("curve", "length"),
     [
@@ -300,22 +294,6 @@ def test_a_start_with_most_of_the_change_gets_a_third_of_the_time_axis(curve, le
     assert (f"first {length} s enlarged" in axes.get_xlabel()) == bool(length)
 
 
-def test_a_loaded_run_has_the_same_mesh(done, tmp_path):
-    done[1].save(tmp_path / "run.nc")
-    drawn = []
-    for run in (done[1], Trajectory.load(tmp_path / "run.nc")):
-        scene = Scene(Figure().subplots(), run.setup)
-        scene.show(instants(run, [0.1])[0])
-        drawn.append(np.array(scene.layers["L"].get_segments()))
-    np.testing.assert_allclose(*drawn, atol=1e-9)
-
-
-def test_a_video_says_how_fast_it_is():
-    assert [pace(speed) for speed in (1.0, 2.517, 0.1)] == [
-        "", "\n2.5 times as fast", "\n10 times slower",
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(
     "only", [["scene"], ["friction"], ["stress", "scene"], ["disc.y", "friction", "disc.y"]]
 )
@@ -324,13 +302,6 @@ def test_a_dashboard_of_some_panels_draws_each_once(done, only):
     titles = [title for axes in figure.axes if (title := axes.get_title(loc="left")[3:])]
     expected = ["t = 0.1 s" if name == "scene" else name for name in {*only}]
     assert sorted(titles) == sorted(expected)
-
-
-def test_save_writes_the_whole_file_or_none(done, tmp_path):
-    figures.save(dashboard(done[1], only=["effort_y"]), tmp_path / "moment.png", dpi=50)
-    assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
-    with Image.open(tmp_path / "moment.png") as picture:
-        assert picture.format == "PNG"
 
 
 @pytest.mark.parametrize("build", [coarse, lambda: coarse(pad__inertial=True), hand])

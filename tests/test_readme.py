@@ -41,7 +41,9 @@ ELSEWHERE = {
     "rehearse fit.toml": "test_sysid_rigs.py",
     "tcp://head": "test_datasets.py",
     "dask_jobqueue": "a cluster",
-    "dataset slurm": "test_datasets_sharing.py",
+    "dataset slurm": "test_datasets.py",
+    "LeRobotDataset": "a package",
+    "out/the_well": "a package",
     "sbatch": "a cluster",
 }
 """Parts of blocks that need more than a test has, and where they are tried instead."""
@@ -148,12 +150,6 @@ def test_targets_of_make_exist():
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         assert target.startswith("http") or (page.parent / target).exists(), target
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/start.md"])
-def test_the_two_commands_come_first(page):
-    lines = blocks(ROOT / page, "sh")[0].splitlines()
-    assert [line.partition("#")[0].split() for line in lines] == [["make", "run"], ["make", "test"]]
 
 
 def test_quoted_messages_are_those_of_the_sources():

@@ -4,6 +4,7 @@ by tables; names that are taken; and what a built rig does."""
 import json
 import pickle
 import re
+import tomllib
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,6 +17,7 @@ from test_controllers import file as controlled
 
 from torchsoft import Body, BuiltRig, Circle, Profile, Reference, Rig, RigFile, hold
 from torchsoft.rigs.build import READY, ready
+from torchsoft.rigs.written import to_toml
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
 COULOMB = {"kind": "coulomb", "mu_s": 0.8, "mu_k": 0.7}
@@ -212,7 +214,7 @@ CHANGES = st.fixed_dictionaries(
 )  # fmt: skip
 
 
-@settings(max_examples=20, derandomize=True)
+@settings(max_examples=20, derandomize=True, deadline=None)
 @given(changes=CHANGES)
 def test_changes_arrive_once_and_undo(changes):
     changed, before = PAPER.override(changes), PAPER.table()
@@ -274,10 +276,10 @@ def test_a_file_comes_before_a_ready_rig_of_its_name(tmp_path):
 
 
 @pytest.mark.parametrize("name", ready())
-def test_rig_files_are_pickled(name):
+def test_rig_files_are_pickled_and_written(name):
     file = RigFile.ready(name)
     again = pickle.loads(pickle.dumps(file))
-    assert again == file
+    assert again == file == RigFile.from_tree(tomllib.loads(to_toml(file)), file.folder)
     assert again.folder == file.folder
     assert again.model_fields_set == file.model_fields_set
 
@@ -371,22 +373,6 @@ def test_a_built_rig_runs_as_its_file_says():
     assert one.run(rtol=1e-4).stats.steps != 6  # a choice of steps replaces the file's
     y0 = rig.state(disc={"x": 61e-3, "y": "rest"}, bracket={"x": 61e-3, "y": "touch"})
     assert one.run(times(0.01, 2), y0=y0)["x_C"][0] == 61e-3
-
-
-def test_the_start_follows_the_parameters():
-    """Differentiable, and that of the file as long as nothing was changed."""
-    one = brief()
-    assert (one.start() - one.y0).abs().max() < 1e-12
-    radius = one.rig.parameter("disc.radius")
-    height = one.rig.layout.slices["pose", "disc"].start + 1
-    (slope,) = torch.autograd.grad(one.start()[height], radius)
-    with torch.no_grad():
-        radius.copy_(radius + 1e-6)
-        moved = one.start()
-        made = brief({"disc.radius": radius.item()})
-    assert (moved - made.y0).abs().max() < 1e-12
-    assert slope.item() == pytest.approx((moved - one.y0)[height].item() / 1e-6, rel=1e-4)
-    assert 0.9 < slope.item() < 1.1
 
 
 def test_coordinates_that_are_not_free_are_filled_in():

@@ -18,7 +18,7 @@ from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, QuadMesh
 from torchsoft.physics.shapes import Contour, RoundedBox, RoundedPolygon, Superellipse
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.check import check
-from torchsoft.rigs.geometry import Scene, collision, surface
+from torchsoft.rigs.geometry import Scene, collision
 from torchsoft.rigs.written import template, to_toml
 
 SQUARE = [[-20e-3, -20e-3], [20e-3, -20e-3], [16e-3, 20e-3], [-16e-3, 20e-3]]
@@ -151,7 +151,7 @@ def in_a_rig(kind: str, table: dict[str, Any]) -> dict[str, Any]:
     pads = {"lower": part, "upper": {"base": "bracket", "mirrored": True} | part}
     if kind != "fingertip":
         return {"pads": pads}
-    higher = {"bracket": {"start": {"y": 80.1e-3}}}
+    higher = {"bracket": {"start": {"y": 80.1e-3}}, "disc": {"start": {"x": 0.0}}}  # on the top
     return {"pads": pads, "bodies": higher, "motion": {"y_d": {"values": ["start", 79e-3]}}}
 
 
@@ -179,9 +179,9 @@ def test_every_kind_of_part_is_built_written_and_runs(kind, folder):
         assert disc.mass.item() == pytest.approx(mass, rel=1e-12)
         inertia = mass * disc.shape.gyration().item()
         assert disc.inertia.item() == pytest.approx(inertia, rel=1e-12)
-    doubts = [str(one) for one in check(file) if one.severity != "note"]
-    assert [one for one in doubts if "cannot roll" not in one] == []  # it is rolled by 20 mm later
-    run = file.override(outputs={"duration": 0.12}).build().run()
+    pressed = file.override(outputs={"duration": 0.4})
+    assert [str(one) for one in check(pressed) if one.severity != "note"] == []
+    run = pressed.build().run()
     assert run.energy_residual_rel < 1e-3
     load = float(run.loads["disc"][0, 1])
     assert load == pytest.approx(disc.mass.item() * 9.81, rel=1e-3)  # it rests
@@ -204,28 +204,20 @@ def test_a_mesh_from_a_file_is_the_block_that_it_was_made_of(folder):
     assert found[0] == pytest.approx(found[1], rel=1e-9)
 
 
-def test_the_middle_of_a_hollow_pad_is_below_its_ends(folder):
-    """And what lies in the hollow does not overlap it."""
+def test_what_lies_in_the_hollow_of_a_pad_does_not_overlap_it(folder):
     hollow = COARSE | {"kind": "curved", "radius": -0.05, "height": 3e-3}
-    built = rig(folder, pads={"lower": hollow}, bodies={"disc": {"start": {"x": 0.0}}}).build()
-    pose = {name: x.numpy() for name, x in built.rig.unpack(built.y0).pose.items()}
-    lower = built.rig.pads["lower"]
-    at, sag = surface(lower, pose), 0.05 - (0.05**2 - 0.04**2) ** 0.5
-    assert at.depth(np.array([0.0, 3e-3])) == pytest.approx(0.0, abs=1e-12)
-    assert at.depth(np.array([39.999e-3, 3e-3])) == pytest.approx(sag, rel=1e-2)
+    lower = rig(folder, pads={"lower": hollow}).assemble().pads["lower"]
     for bottom, overlap in ((6e-3, False), (2e-3, True)):
         inner = Pad(PadMesh(10e-3, 5e-3, 8, 2), lower.material, origin=(-5e-3, bottom))
-        assert (collision(lower, inner, pose) > 1e-6) == overlap
+        assert (collision(lower, inner, {}) > 1e-6) == overlap
 
 
-def test_the_reach_of_a_turned_ellipse_is_the_closed_form():
+def test_a_point_in_a_turned_ellipse_is_inside_along_its_long_axis():
     rig = Rig(bodies={"body": Body(1.0, Ellipse(0.03, 0.015))}, pads={}, contacts={})
-    lean, to = 0.5, 0.3
-    reach = Scene(rig, {"body": np.array([0.0, 0.0, lean])}).reach(
-        "body", np.array([np.cos(to), np.sin(to)])
-    )
-    closed = np.hypot(0.03 * np.cos(to - lean), 0.015 * np.sin(to - lean))
-    assert reach == pytest.approx(closed, rel=1e-12)
+    scene = Scene(rig, {"body": np.array([0.01, 0.0, 0.5])})
+    for angle, is_inside in ((0.5, True), (-0.5, False)):
+        place = [0.01 + 0.028 * np.cos(angle), 0.028 * np.sin(angle)]
+        assert (scene.inside("body", np.array([place])) > 0) == is_inside
 
 
 def test_pads_that_cross_without_a_node_in_each_other_overlap():

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
+from conftest import IDENTIFIED as CONFIG
 from conftest import PAPER, paper
 
 from torchsoft.csvfile import UNITS
@@ -27,27 +28,6 @@ from torchsoft.sysid.measured import STATED, cost, load, stem, vocabulary
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
-CONFIG = """
-rig = "paper"
-[settings]
-laws.steel_on_rubber.friction.v_s = 0.05
-actuators.x.measures = "bracket.x"
-bodies.disc.start.x = 60.3e-3
-bodies.bracket.start.x = 60.3e-3
-
-[unknowns."laws.steel_on_rubber.K_n"]
-nominal = 1e5
-[unknowns."materials.rubber.E"]
-nominal = 0.7e6
-
-[sensors]
-x_C.noise = 10e-6
-y_Br.noise = 10e-6
-F_y.noise = 0.1
-
-[fit]
-rtol = 1e-3
-"""
 
 SIGNALS = ("x_d", "y_d", "F_ff")
 LAW = "laws.steel_on_rubber"

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import COARSE, PAPER, RIG, excited, still, stroked
-from test_experiments import experiment
 from test_sysid import check_derivatives, fit
 from torch import Tensor
 
@@ -236,19 +235,3 @@ def test_a_start_that_does_not_fit_its_rig_is_rejected(moving, change, message):
 def test_first_samples_that_do_not_suffice_are_rejected(cut, how, message):
     with pytest.raises(ValueError, match=message):
         estimate_initial_state(cut[0], **{"sensors": RIG} | how)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Newton did not converge")  # where rest is assumed, wrongly
-def test_the_experiment_with_an_unknown_start(tmp_path):
-    """Errors of a few standard deviations, a price for not knowing the start, and rest not assumed
-    in silence."""
-    module = experiment("unknown_start")
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    ((case, (found,)),) = result.found.items()
-    price = result.prices[case]
-    assert list(price.unknown) == ["laws.steel_on_rubber.K_n", E, TAU]
-    for name, sd in price.unknown.items():
-        assert abs(np.log(found[name].last / module.TRUTH[name])) < 4 * sd, name
-        assert 1.0 < sd / price.known[name] < 5.0, name
-    assert result.rest[case]["library"]

@@ -14,7 +14,7 @@ rigs        RigFile, BuiltRig, excite; Rig, Body, Pad, Contact, SoftContact, Act
             Integral, Lagging, StateFeedback, controller
 meshes      PadMesh, CurvedPadMesh, FingertipMesh, QuadMesh
 materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony; at finite strain NeoHookean,
-            MooneyRivlin, Yeoh, Ogden, Hyperelastic (an energy of one's own)
+            MooneyRivlin, Yeoh, Ogden, Hyperelastic (a custom energy)
 shapes      Circle, Ellipse, Superellipse, RoundedBox, RoundedPolygon, Contour,
             Eccentric
 friction    SmoothSlip, AgeingSlip, Coulomb, RateAndState, or any torch function

@@ -1,7 +1,7 @@
 """Cost of work, stated before it begins: hours, and more memory than there is, need the user's
 consent.
 
-The times are those of one core of a usual machine; they are meant to tell minutes from hours.
+The times are those of one core of a usual machine; they distinguish minutes from hours.
 """
 
 import os
@@ -15,7 +15,7 @@ LONG = 3600.0
 """Work that takes longer than this [s] needs the user's word."""
 
 RUN = 0.05
-"""Time [s] that a run takes besides its steps."""
+"""Time [s] that a run takes without its steps."""
 
 DIFFERENTIATED = {False: 2.5, True: 2.0}
 """Times of a step without sensitivities that one with a few takes, of condensed and of nodal

@@ -13,6 +13,8 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from io import StringIO
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,7 +89,7 @@ class Numbers(NamedTuple):
     columns left out, and the row of the heading."""
 
     values: dict[str, NDArray[np.float64]]
-    rows: list[int]
+    rows: Sequence[int]
     ignored: tuple[str, ...]
     heading: int
 
@@ -106,52 +108,96 @@ def read(
     for written, name in headings.items():
         if name not in known:
             raise ValueError(
-                f"{path}: the column {shown(written)} stands for `{line(name, 80)}`, which is not "
+                f"{path}: the column {shown(written)} is given as `{line(name, 80)}`, which is not "
                 f"known{hint(written, 2)}"
             )
     names = {name: name for name in known.keys() - headings.values()} | dict(headings)
-    places, comma = table(path, {*names, *(ignore or ())})
-    if not places:
+    rows, separator, lines = opened(path, {*names, *(ignore or ())})
+    if not rows:
         raise ValueError(f"{path} is empty{hint('', 1)}")
-    (first, cells), *places = places
-    if places and unit_row(cells, [cell.strip() for cell in places[0][1]]):
-        units = (cell.strip().strip("[]()") for cell in places.pop(0)[1])
-        cells = [f"{cell.strip()} [{unit}]" if unit else cell for cell, unit in zip(cells, units)]
-    head = heading(f"{path}, row {first}", cells, known, names, hint, ignore)
+    (first, cells), *rows = rows
+    last = first
+    if rows and unit_row(cells, [cell.strip() for cell in rows[0][1]]):
+        last, units = rows.pop(0)
+        named = ((cell.strip(), unit.strip().strip("[]()")) for cell, unit in zip(cells, units))
+        cells = [f"{name} [{unit}]" if unit else name for name, unit in named]
+    columns = heading(f"{path}, row {first}", cells, known, names, hint, ignore)
+    comma = separator in (";", "\t")
+    values, numbers = plain_body(lines[last:], columns, separator, comma), range(0)
+    if values is not None:
+        numbers = range(last + 1, last + 1 + len(values))
+    else:
+        rows = separated(path, lines[last:], separator, last) if lines else rows
+        values, numbers = body(path, rows, columns, comma), [row for row, _ in rows]
+    left_out = tuple(name_and_unit(cell)[0] for cell, one in zip(cells, columns) if one is None)
+    by_name = dict(zip((one.name for one in columns if one), values.T))
+    return Numbers(by_name, numbers, left_out, first)
+
+
+def plain_body(
+    lines: Sequence[str], columns: Sequence[Column | None], separator: str, comma: bool
+) -> NDArray[np.float64] | None:
+    """Values (rows, columns) of the lines below the heading of a text, where every line has a row
+    of plain numbers; None for all else, which `body` reads, or rejects with row and column."""
+    import pandas as pd  # takes half a second, and runs without tables do not need it
+
+    lines = lines[: len(lines) - sum(1 for _ in takewhile(str.isspace, reversed(lines)))]
+    used = {place: one for place, one in enumerate(columns) if one}
+    between = len(columns) - 1
+    if not lines or any('"' in one or one.count(separator) != between for one in lines):
+        return None
+    try:
+        frame = pd.read_csv(
+            StringIO("".join(lines)), sep=separator, header=None, usecols=[*used], dtype=np.float64,
+            decimal="," if comma and any("," in one for one in lines) else ".",
+            na_values=[""], keep_default_na=False,
+        )  # fmt: skip
+    except ValueError:
+        return None
+    values = frame.to_numpy()
+    if len(values) != len(lines) or np.isinf(values).any() or np.isnan(values).all(1).any():
+        return None
+    return values * [one.size for one in used.values()]
+
+
+def body(
+    path: Path, rows: Rows, columns: Sequence[Column | None], comma: bool
+) -> NDArray[np.float64]:
+    """Values (rows, columns) of the cells below a heading. Raises `ValueError` naming row and
+    column."""
     values: list[list[float]] = []
     marks: set[str] = set()
-    for row, others in places:
-        if len(others) != len(head):
+    for row, cells in rows:
+        if len(cells) != len(columns):
             raise ValueError(
-                f"{path}, row {row} has {len(others)} cells, but there are {len(head)} columns"
+                f"{path}, row {row} has {len(cells)} cells, but there are {len(columns)} columns"
             )
-        used = [(one, cell) for one, cell in zip(head, others) if one]
+        used = [(one, cell) for one, cell in zip(columns, cells) if one]
         values.append([number(path, row, one, cell, comma) for one, cell in used])
         if comma and len(marks) < 2:
             marks.update(mark for _, cell in used for mark in ",." if mark in cell)
     if len(marks) > 1:
         raise ValueError(f"{path} has decimal commas and decimal points: write all with points")
-    columns = np.array(values).reshape(len(places), sum(one is not None for one in head)).T
-    left_out = tuple(name_and_unit(cell)[0] for cell, one in zip(cells, head) if one is None)
-    by_name = dict(zip((one.name for one in head if one), columns))
-    return Numbers(by_name, [row for row, _ in places], left_out, first)
+    return np.array(values).reshape(len(rows), sum(one is not None for one in columns))
 
 
-def table(path: Path, names: Collection[str]) -> tuple[Rows, bool]:
-    """The rows of a file from its heading on, which is the row with most of the `names`, and
-    whether commas are decimal. Raises `ValueError` for numbers before the heading."""
+def opened(path: Path, names: Collection[str]) -> tuple[Rows, str, list[str]]:
+    """Rows from the heading on, which is the row with most of the `names`: all of a workbook, the
+    first ones of a text, with its separator and all its lines. Raises `ValueError` for numbers
+    before the heading."""
     check_file(path, LARGEST)
+    separator, lines = "", list[str]()
     if path.suffix.lower() in (".xlsx", ".xlsm"):
-        rows, separator = sheet(path, names), ""
+        rows = sheet(path, names)
     elif path.suffix.lower() == ".xls":
         raise ValueError(f"{path} is a workbook of an old Excel: save it as .xlsx or as CSV")
     else:
         lines = decoded(path).splitlines(keepends=True)
-        heads = {one: first_rows(path, lines, one) for one in SEPARATORS}
+        first = {one: first_rows(path, lines, one) for one in SEPARATORS}
         separator = max(
-            SEPARATORS, key=lambda one: (begin(heads[one], names)[0], widest(heads[one]))
+            SEPARATORS, key=lambda one: (begin(first[one], names)[0], widest(first[one]))
         )
-        rows = separated(path, lines, separator)
+        rows = first[separator] or separated(path, lines, separator)
     at = begin(rows, names)[1]
     for row, cells in rows[:at]:
         if len(cells) == len(rows[at][1]) > 1 and all(numeric(cell) for cell in cells):
@@ -159,7 +205,7 @@ def table(path: Path, names: Collection[str]) -> tuple[Rows, bool]:
                 f"{path}, row {row} is of numbers, but stands before the heading in row "
                 f"{rows[at][0]}"
             )
-    return rows[at:], separator in (";", "\t")
+    return rows[at:], separator, lines
 
 
 def begin(rows: Rows, names: Collection[str]) -> tuple[int, int]:
@@ -193,21 +239,23 @@ def first_rows(path: Path, lines: Sequence[str], separator: str) -> Rows:
     """Rows in which the heading is looked for; none where another separator must be the right one,
     since with this one a cell is too long."""
     try:
-        return separated(path, lines[:PREAMBLE], separator)
+        return separated(path, lines[: PREAMBLE + 1], separator)
     except ValueError:
         return []
 
 
-def separated(path: Path, lines: Sequence[str], separator: str) -> Rows:
-    """Rows of a text. Raises `ValueError` where it is no CSV."""
+def separated(path: Path, lines: Sequence[str], separator: str, before: int = 0) -> Rows:
+    """Rows of a text that so many lines stand `before`. Raises `ValueError` where it is no CSV."""
     reader = csv.reader(lines, delimiter=separator)
     try:
-        return [(reader.line_num, cells) for cells in reader if any(x.strip() for x in cells)]
+        return [
+            (before + reader.line_num, cells) for cells in reader if any(x.strip() for x in cells)
+        ]
     except csv.Error:
         raise ValueError(
-            f"{path}, row {reader.line_num}: a cell has more than {csv.field_size_limit()} "
-            "characters: separate columns with commas, semicolons or tabs, and look for a "
-            "quotation mark that is not closed"
+            f"{path}, row {before + reader.line_num}: a cell has more than "
+            f"{csv.field_size_limit()} characters: separate columns with commas, semicolons or "
+            "tabs, and look for a quotation mark that is not closed"
         ) from None
 
 
@@ -215,7 +263,7 @@ def sheet(path: Path, names: Collection[str]) -> Rows:
     """Rows of the visible sheet of an Excel workbook with the heading. Raises `ValueError`."""
     try:
         with warnings.catch_warnings(action="ignore"):  # of styles that openpyxl does not know
-            book = opened(path)
+            book = workbook(path)
             sheets = {
                 one.title: [
                     (i, [displayed(cell) for cell in cells])
@@ -241,7 +289,7 @@ def sheet(path: Path, names: Collection[str]) -> Rows:
     return sheets[best[0]]
 
 
-def opened(path: Path) -> Any:
+def workbook(path: Path) -> Any:
     """An Excel workbook, its chart sheets empty: openpyxl fails where it does not know a drawing.
     Raises `ModuleNotFoundError`, and what openpyxl raises."""
     excel = needed("openpyxl.reader.excel", "excel")

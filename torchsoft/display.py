@@ -48,8 +48,8 @@ def nearest(name: object, known: Iterable[str]) -> str | None:
 
 
 def suggestion(name: object, known: Iterable[str], listed: str = "known are") -> str:
-    """The end of a refusal of `name`: the nearest of the known names, and after the words `listed`
-    all of them, or those next to it where they are many."""
+    """The end of a rejection of `name`: the nearest of the known names, and after the words
+    `listed` all of them, or those next to it where they are many."""
     names = list(dict.fromkeys(known))
     near = nearest(name, names)
     if near is None:

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all and made to last, and JSON without infinities."""
+"""Files: written whole or not at all, checksums at their ends, and JSON without infinities."""
 
 import errno
 import json
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ SEAL, DIGEST = b"\ntorchsoft-sha256\n", 64
 
 SEALED = 64e9
 """Size [B] of a file with a checksum at the most."""
+
+BLOCK = 2**20
+"""Bytes that are read at once."""
 
 CHECKPOINT = "torchsoft-checkpoint"
 """File that marks a folder of unfinished runs."""
@@ -37,9 +40,9 @@ NO_LOCKS = errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
     """A path beside `path` to write to, which replaces `path` at the end: the file appears whole or
-    not at all, and lasts.
+    not at all. A `durable` one outlasts a power failure: it is on the disk when this ends.
 
     Missing folders are made. The partial file is removed when writing it fails; one that a killed
     process left is removed by the next that writes the same file. Its writer holds a lock on it, so
@@ -61,8 +64,12 @@ def replacing(path: str | Path) -> Iterator[Path]:
     assert own is not None  # of a name of its own
     try:
         yield partial
-        flush(partial)
+        if durable:
+            flush(partial)
         partial.replace(path)
+        if durable:
+            with suppress(OSError):  # of file systems that cannot
+                flush(path.parent)
     except BaseException as error:
         partial.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (None, str(partial), partial):
@@ -70,7 +77,6 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise
     finally:
         own.release()
-    flush_folder(path.parent)
 
 
 @contextmanager
@@ -119,11 +125,8 @@ def remove_partials(paths: Iterable[Path]) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that lasts, and those above it."""
-    if not path.is_dir() and path != path.parent:
-        make_folder(path.parent)
-        path.mkdir(exist_ok=True)
-        flush_folder(path.parent)
+    """Make a folder, and those above it."""
+    path.mkdir(parents=True, exist_ok=True)
 
 
 MEGABYTE = 1e6
@@ -172,7 +175,7 @@ def check_file(path: str | Path, most: float) -> Path:
 
 
 def flush(path: Path) -> None:
-    """Have the operating system write a file to the disk."""
+    """Have the operating system write a file, or the names in a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -180,37 +183,36 @@ def flush(path: Path) -> None:
         os.close(handle)
 
 
-def flush_folder(path: Path) -> None:
-    """The same for the names in a folder, where the file system can."""
-    with suppress(OSError):
-        flush(path)
+def seal(path: Path) -> None:
+    """Append the checksum of a file's content to it, where formats such as HDF5 do not look."""
+    with path.open("r+b") as file:
+        checksum = file_digest(file, "sha256").hexdigest()
+        file.write(checksum.encode() + SEAL)
 
 
-def sealed(content: bytes | memoryview) -> bytes:
-    """The content of a file with its checksum at the end, where formats such as HDF5 do not
-    look."""
-    return bytes(content) + sha256(content).hexdigest().encode() + SEAL
+def check_seal(path: str | Path) -> Path:
+    """The path of a file that ends with the checksum of its content. Raises `ValueError` for any
+    other.
 
-
-def unsealed(path: str | Path) -> bytes:
-    """The content of such a file. Raises `ValueError` for one that does not end with the checksum
-    of its content.
-
-    The libraries that read a format may hang or crash with a damaged file, and say nothing of it.
+    The libraries that read a format may hang or crash with a damaged file, and do not report it.
     """
-    whole = check_file(path, SEALED).read_bytes()
-    content = whole[: -DIGEST - len(SEAL)]
-    if not whole.endswith(SEAL):
+    with check_file(path, SEALED).open("rb") as file:
+        content, left = sha256(), os.fstat(file.fileno()).st_size - DIGEST - len(SEAL)
+        while left > 0 and (part := file.read(min(left, BLOCK))):
+            content.update(part)
+            left -= len(part)
+        end = file.read()
+    if not end.endswith(SEAL):
         raise ValueError(
             f"{path} has no checksum at its end: it is a file of another kind, or was cut or "
             "changed; save it anew"
         )
-    if sealed(content) != whole:
+    if end != content.hexdigest().encode() + SEAL:
         raise ValueError(
             f"{path} is damaged: its content is not what was saved; save it anew or restore it "
             "from a copy"
         )
-    return content
+    return Path(path)
 
 
 def finite(value: Any) -> Any:

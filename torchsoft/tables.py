@@ -1,5 +1,5 @@
-"""Tables: validated data, from Python or from a TOML file. A table refuses in one sentence that
-names every wrong field, its value and the values allowed.
+"""Tables: validated data, from Python or from a TOML file. A table rejects input in one sentence
+that names every wrong field, its value and the values allowed.
 """
 
 import json
@@ -51,7 +51,7 @@ Number = Annotated[
 
 
 class InvalidTable(ValueError):
-    """Refusal of a table, in one sentence."""
+    """Rejection of a table, in one sentence."""
 
 
 @contextmanager

@@ -11,16 +11,16 @@ the judge's own uncertainty. No gradient is looked at to choose the step.
 
 Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms with mu_s = 0.3, mu_k
 = 0.2, v_s = 50 mm/s), `make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20
-um above touching) and `full` (the 30 s manipulation). How far gradients depend on the step is in
-`step_accuracy.py`, and their price in `benchmark.py`.
+um above touching) and `full` (the 30 s manipulation). The step that a
+gradient needs, and its cost, are in `step_accuracy.py`.
 
-Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
+Command: .venv/bin/python -m experiments.validation.gradient_accuracy [--smoke]
 Expected, largest error among parameters whose central difference is itself known to 1e-6: 6e-7 in
 each of the short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's
 uncertainty. About five minutes on one core.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,39 +30,32 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Rig, RigFile, simulate
-from torchsoft.experiment import COARSE, at_the_points, grid, markdown, options, write
-from torchsoft.physics.channels import Seen, read
+from experiments.frame import COARSE, Table, grid, options, write
+from torchsoft import Rig, RigFile, Trajectory, simulate
+from torchsoft.physics.energy import SLIPPING
 
-NEWTON = 1e-10  # Newton's tolerance of every run here [N].
+NEWTON = 1e-10
+"""Newton's tolerance of every run here [N]."""
 
-
-FLOOR = (1e-7, 1e-7, 1e-6, 1e-6, 1e-6, 1e-5, 1e-7, 1e-7, 1e-3, 1e-3)
-"""Smallest scale of each signal in the loss: m, m, rad, m/s, m/s, rad/s, m, m, N, N."""
-
-
-CHANNELS = (
-    "x_C", "y_C", "theta_C", "v_x_C", "v_y_C", "omega_C", "x_Br", "y_Br", "effort_x", "effort_y",
-)  # fmt: skip
-
+SIGNALS = {
+    "x_C": 1e-7, "y_C": 1e-7, "theta_C": 1e-6, "v_x_C": 1e-6, "v_y_C": 1e-6, "omega_C": 1e-5,
+    "x_Br": 1e-7, "y_Br": 1e-7, "effort_x": 1e-3, "effort_y": 1e-3,
+}  # fmt: skip
+"""Signals in the loss, with the smallest scale of each: m, rad, m/s, rad/s, N."""
 
 FEW = "laws.steel_on_rubber.K_n", "laws.steel_on_rubber.friction.mu_s", "materials.rubber.E"
 """Parameters of the smoke size."""
 
-
-FINER = {"bodies.disc.shape.radius": 1e-2}  # Factors on the relative steps of central differences.
-
-
-Gradient = dict[str, float]
+FINER = {"bodies.disc.shape.radius": 1e-2}
+"""Factors on the relative steps of central differences; of the radius 1e-4 is two ramps."""
 
 
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/gradient_accuracy")
+    # relative steps of the central differences; fewer for `full`, where a run takes a second
     steps: tuple[float, ...] = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 1e-6)
-    """relative steps of the central differences; a hundredth of them for the radius, of which 1e-4
-    is two ramps"""
-    full_steps: tuple[float, ...] = (3e-5, 1e-5)  # the same for `full`, where a run takes a second
+    full_steps: tuple[float, ...] = (3e-5, 1e-5)
     duration: float = 30.0  # of the full window [s]
     smoke: bool = False  # three parameters on a coarse mesh
 
@@ -78,45 +71,44 @@ class Window:
     t: Tensor
     step: float
 
+    def run(self) -> Trajectory:
+        """The run, differentiable if gradients are on."""
+        how: dict[str, Any] = {"step": self.step, "tolerance": NEWTON, "gradient": "discrete"}
+        return simulate(self.model, self.t, y0=self.y0, **how)
 
-def states(window: Window) -> Tensor:
-    """The run (T, size), differentiable if gradients are on."""
-    w = window
-    return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient="discrete").y
+    def parameters(self, few: bool) -> dict[str, Tensor]:
+        """The trained scalar parameters, called as in the rig file."""
+        names = FEW if few else self.model.description()["parameters"]
+        every = {name: self.model.parameter(name) for name in names}
+        return {name: p for name, p in every.items() if p.requires_grad}
 
 
-def signals(model: Rig, y: Tensor, t: Tensor) -> Tensor:
-    """(T, 10): pose and velocity of the disc, pose of the bracket, control force."""
-    follow = model.follow(t)
-    values = read(Seen(model, model.unpack(y, follow), follow))
-    return torch.stack([values[name] for name in CHANNELS], -1)
+def events(run: Trajectory) -> dict[str, int]:
+    """Points that touch, leave and start to slip between the outputs."""
+    states = torch.cat(list(run.contact_state.values()), -1)
+    on, slips = states > 0, states == SLIPPING
+    starts = lambda now: int((now[1:] & ~now[:-1]).sum())
+    return {"touch": starts(on), "leave": starts(~on), "slip_onsets": starts(slips)}
+
+
+def signals(run: Trajectory) -> Tensor:
+    """`SIGNALS` of a run, (T, signals)."""
+    return torch.stack([run[name] for name in SIGNALS], -1)
 
 
 @torch.no_grad()
-def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
-    """The loss of the docstring as a function of the states, its constants from the nominal run."""
-    model, t = window.model, window.t
-    nominal = signals(model, states(window), t)
-    centre, scale = (
-        nominal.mean(0),
-        torch.maximum(nominal.std(0), torch.tensor(FLOOR, dtype=torch.float64)),
-    )
+def make_loss(window: Window) -> Callable[[Trajectory], Tensor]:
+    """The loss of the docstring as a function of a run, its constants from the nominal one."""
+    t, nominal = window.t, signals(window.run())
+    floor = torch.tensor(list(SIGNALS.values()), dtype=torch.float64)
+    centre, scale = nominal.mean(0), torch.maximum(nominal.std(0), floor)
     weight = (0.5 + (t - t[0]) / (t[-1] - t[0]))[:, None]
 
-    def loss(y: Tensor) -> Tensor:
-        z = (signals(model, y, t) - centre) / scale
+    def loss(run: Trajectory) -> Tensor:
+        z = (signals(run) - centre) / scale
         return (weight * (z + 0.5 * z**2)).mean()
 
     return loss
-
-
-def scalars(model: Rig, config: Config) -> dict[str, Tensor]:
-    """The trained scalar parameters, called as in the rig file."""
-    every = {name: model.parameter(name) for name in model.description()["parameters"]}
-    return {
-        name: p for name, p in every.items()
-        if p.requires_grad and (not config.smoke or name in FEW)
-    }  # fmt: skip
 
 
 def richardson(values: list[float], steps: tuple[float, ...]) -> tuple[float, float]:
@@ -134,43 +126,20 @@ def richardson(values: list[float], steps: tuple[float, ...]) -> tuple[float, fl
 
 
 @torch.no_grad()
-def central_differences(
-    window: Window,
-    loss: Callable[[Tensor], Tensor],
-    chosen: Mapping[str, Tensor],
-    steps: tuple[float, ...],
-) -> tuple[Gradient, Gradient]:
+def central_difference(
+    window: Window, loss: Callable[[Trajectory], Tensor], p: Tensor, steps: tuple[float, ...]
+) -> tuple[float, float]:
     """dL/dp by central differences, and the judge's uncertainty over it."""
-    value, unsure = {}, {}
-    for name, p in chosen.items():
-        keep, at = p.clone(), []
-        for relative in steps:
-            ends, got = (
-                [keep * (1 + sign * relative * FINER.get(name, 1.0)) for sign in (1, -1)],
-                [],
-            )
-            for end in ends:
-                p.copy_(end)
-                got.append(loss(states(window)).item())
-            at.append((got[0] - got[1]) / (ends[0] - ends[1]).item())
-        p.copy_(keep)
-        value[name], spread = richardson(at, steps)
-        unsure[name] = spread / abs(value[name]) if value[name] else 0.0
-    return value, unsure
-
-
-@torch.no_grad()
-def events(window: Window, y: Tensor) -> dict[str, Any]:
-    """Nodes that touch, leave and begin to slip between the outputs."""
-    parts = [
-        at_the_points(window.model, window.t[rows], y[rows])
-        for rows in torch.arange(len(y)).split(200)
-    ]
-    depth, speed = (torch.cat(part) for part in zip(*parts))
-    on, slips = depth > 0, (speed > 0) & (depth > 0)
-    changes = {"touch": on[1:] & ~on[:-1], "leave": on[:-1] & ~on[1:]}
-    changes |= {"slip_onsets": slips[1:] & ~slips[:-1]}
-    return {name: some.sum().item() for name, some in changes.items()}
+    nominal, values = p.clone(), []
+    for relative in steps:
+        ends, losses = [nominal * (1 + sign * relative) for sign in (1, -1)], []
+        for end in ends:
+            p.copy_(end)
+            losses.append(loss(window.run()).item())
+        values.append((losses[0] - losses[1]) / (ends[0] - ends[1]).item())
+    p.copy_(nominal)
+    value, spread = richardson(values, steps)
+    return value, spread / abs(value) if value else 0.0
 
 
 def stroke(file: RigFile) -> Window:
@@ -195,7 +164,7 @@ def windows(config: Config) -> list[Window]:
     )
     model, y0, _ = file.build()
     with torch.no_grad():
-        path = states(Window("path", model, y0, grid(roll, 0.01), 2e-3))
+        path = Window("path", model, y0, grid(roll, 0.01), 2e-3).run().y
     above = float(model.unpack(y0).pose["bracket"][1]) + 2e-5
     lowered, y_above, _ = file.override({"bodies.bracket.start.y": above}).build()
     return [
@@ -207,24 +176,23 @@ def windows(config: Config) -> list[Window]:
     ]
 
 
-def judge_window(window: Window, config: Config) -> dict[str, Any]:
+def judge(window: Window, config: Config) -> dict[str, Any]:
     """Errors of the adjoint over one window."""
-    loss, chosen = make_loss(window), scalars(window.model, config)
-    y = states(window)
-    gradient = torch.autograd.grad(loss(y), list(chosen.values()), materialize_grads=True)
+    loss, parameters = make_loss(window), window.parameters(few=config.smoke)
+    run = window.run()
+    changes = events(run)
+    gradient = torch.autograd.grad(loss(run), list(parameters.values()), materialize_grads=True)
     steps = config.full_steps if window.name == "full" else config.steps
-    judge, unsure = central_differences(window, loss, chosen, steps)
-    off = {
-        n: 0.0 if g == judge[n] else abs(g / judge[n] - 1) if judge[n] else float("inf")
-        for n, g in zip(chosen, map(Tensor.item, gradient))
-    }
-    return {
-        "events": events(window, y.detach()), "gradient": judge, "judge_uncertainty": unsure,
-        "relative_error": off,
-    }  # fmt: skip
+    errors, unsure = {}, {}
+    for (name, p), found in zip(parameters.items(), gradient):
+        finer = tuple(FINER.get(name, 1.0) * relative for relative in steps)
+        value, unsure[name] = central_difference(window, loss, p, finer)
+        off = abs(found.item() - value)
+        errors[name] = off / abs(value) if value else float("inf") if off else 0.0
+    return {"events": changes, "relative_error": errors, "judge_uncertainty": unsure}
 
 
-def table(found: dict[str, dict[str, Any]]) -> str:
+def table(found: dict[str, dict[str, Any]]) -> Table:
     """By window the largest error, and the largest where the judge is sure."""
     rows = []
     for name, window in found.items():
@@ -237,15 +205,15 @@ def table(found: dict[str, dict[str, Any]]) -> str:
     head = ("window", "touch / leave / slip onsets",
             "largest error (parameter, judge's own uncertainty)",
             "largest where the judge knows 1e-6")  # fmt: skip
-    return markdown(head, rows)
+    return Table(head, rows)
 
 
 def main(config: Config) -> None:
     if config.smoke:
         config = replace(config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), duration=0.6)
     every = tqdm(windows(config), unit="window", disable=None)
-    found = {window.name: judge_window(window, config) for window in every}
-    write(config, {"windows": found}, table=table(found))
+    found = {window.name: judge(window, config) for window in every}
+    write(config, {"windows": found}, {"gradients": table(found)})
 
 
 if __name__ == "__main__":

@@ -5,26 +5,22 @@ seeds the share of those that do is binomial, and so is its own interval (Cloppe
 over the predicted standard deviations should be normal with mean 0 and deviation 1.
 
 - The paper's rig: the three motions of `identify_contact.py`, 1.4 s of each, on half the usual
-  mesh, eight parameters, begun where most are some standard deviations off. White noise, then noise
-  that is an autoregression of order one (rho = 0.9, as large as stated), which nobody declares, so
-  that `identify` has to find it; then the same recordings by white least squares, as if the colour
-  were ignored.
+  mesh, eight parameters, started where most are some standard deviations off. White noise, then
+  noise that is an autoregression of order one (rho = 0.9, as large as stated), which nobody
+  declares, so that `identify` has to find it.
 - Rig files: two fingers that lift a disc and two jaws that turn one, with other numbers than their
   files state. `identify` gets the recording as a CSV file, the rig's file, and eight unknowns by
-  the names of that file, and begins at the numbers that the file states. Assumptions are tested for
+  the names of that file, and starts at the numbers that the file states. Assumptions are tested for
   the first seed only: the model is right. The fingers do what their file says; the jaws of
   `orientation.toml` never slip, so that here they grip lightly and twist the disc until it does.
 
-Command: .venv/bin/python experiments/validation/interval_coverage.py [--seeds 100] [--workers 2]
+Command: .venv/bin/python -m experiments.validation.interval_coverage [--seeds 100] [--workers 2]
 [--cases white "two jaws"] [--smoke]
-Expected: of 100 seeds between 90 and 99 for every parameter of the paper's rig where colour is
-found or is not there, about half where it is ignored; a false alarm about one of a hundred
-recordings with white noise. Of rig files, 50 seeds, between 86 and 100 %, about 94 % of all, no
-notice. A quarter of an hour for 100 seeds of the paper's rig, twenty minutes for 50 of both rig
-files.
+Expected: of 100 seeds between 90 and 99 for every parameter of the paper's rig. Of rig files, 50
+seeds, between 86 and 100 %, about 94 % of all, no notice. A quarter of an hour for 100 seeds of the
+paper's rig, twenty minutes for 50 of both rig files.
 """
 
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -35,27 +31,31 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from experiments.frame import COARSE, Table, options, repeated, write
+from experiments.identify_contact import (
+    FEW,
+    HELD_OUT,
+    SENSORS,
+    TRUTH,
+    coloured,
+    motions,
+    nominal,
+    problem,
+)
 from torchsoft import RigFile, csvfile, excite
-from torchsoft.experiment import COARSE, RIG, markdown, options, repeated, write
-from torchsoft.rigs.excite import CATALOGUE, Excitation
-from torchsoft.sysid import Problem, Sensor, Stage, identify, record
-from torchsoft.sysid.estimate import Estimate, estimates
-from torchsoft.sysid.fit import Fit, chord, fisher
+from torchsoft.sysid import IdentificationResult, Sensor, Stage, identify, record
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.measured import load
-from torchsoft.sysid.runs import Runner
 from torchsoft.tables import toml_row
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-import identify_contact
-from identify_contact import FITTED, MU_K, noisy, truths
-
 OFF = 1.002
-"""Where a fit of the paper's rig begins, over the truth."""
+"""Where a fit of the paper's rig starts, over the truth."""
 
 LONGEST = 1.4
 """Duration of a motion of the paper's rig [s]."""
+
+RHO = 0.9
+"""Correlation of neighbouring samples of the coloured noise."""
 
 RATE, EXACT = 200.0, 1e-7
 """Of rig files: samples a second, and relative tolerance of the runs that are recorded."""
@@ -67,95 +67,45 @@ class Config:
     seeds: int = 100
     cases: tuple[str, ...] = field(default_factory=lambda: tuple(CASES))
     rtol: float = 3e-5  # of the fits of the paper's rig; data have a hundredth of it
-    rho: float = 0.9  # correlation of neighbouring samples of the coloured noise
     workers: int = 2
     checked: int = 1  # seeds of a rig file whose assumptions are tested
-    smoke: bool = False  # two seeds, a few unknowns, the beginnings of the motions, nothing tested
-
-
-class Repetition(NamedTuple):
-    """One seed: by unknown the error of the logarithm over its predicted standard deviation, that
-    deviation [1] and whether the interval holds; codes of findings, and the orders of the noise
-    that was found."""
-
-    unknowns: dict[str, tuple[float, float, bool]]
-    notices: list[str]
-    orders: list[int]
+    smoke: bool = False  # two seeds, a few unknowns, short motions, nothing tested
 
 
 class Case(NamedTuple):
-    """Truth by unknown, and the repetition of a seed."""
+    """Truth by unknown, and the identification of a seed."""
 
     truth: dict[str, float]
-    repetition: Callable[[int], Repetition]
-
-
-def judged(found: Mapping[str, Estimate], truth: Mapping[str, float]) -> dict[str, Any]:
-    """Error over deviation, deviation and whether the interval holds, by unknown."""
-    out = {}
-    for name, value in truth.items():
-        e = found[name]
-        held = e.ci95 is not None and e.ci95[0] <= value <= e.ci95[1]
-        out[name] = float(np.log(e.last / value)) / e.relative_sd, e.relative_sd, held
-    return out
+    identified: Callable[[int], IdentificationResult]
 
 
 # the paper's rig
 # ----------------------------------------------------------------------
 
 
-def papers(config: Config, rho: float, way: Callable[..., Repetition]) -> Case:
-    """Repetitions of the paper's rig with noise whose neighbouring samples correlate by rho."""
-    truth = truths(config.smoke)
-    nominal = RigFile.ready("paper").override(
-        {"contact.v_s": 0.05} | ({MU_K: 0.5} if config.smoke else {}) | COARSE
-    )
-    motions = {
-        name: CATALOGUE[name]._replace(duration=min(CATALOGUE[name].duration, LONGEST))
-        for name in FITTED
-    }
-    if config.smoke:
-        strokes = {"kind": "strokes", "travel": 12e-3, "stroke_time": 0.2}
-        shake = {"kind": "multi_sine", "band": (2.0, 12.0)}
-        shaking = shake | {"amplitude": 8e-3, "seed": 0}, shake | {"amplitude": 2e-4, "seed": 1}
-        motions = {
-            "strokes": Excitation(strokes, duration=0.9),
-            "shaking": Excitation(*shaking, duration=0.9),
-        }
-    exact = [
-        record(name, excite(nominal, e).build(), truth, RIG, rtol=1e-2 * config.rtol, noise=0.0)
-        for name, e in motions.items()
-    ]
+def papers(config: Config, rho: float) -> Case:
+    """The paper's rig with noise whose neighbouring samples correlate by rho."""
+    truth, file = FEW if config.smoke else TRUTH, nominal(config.smoke).override(COARSE)
+    exact = []
+    for name, e in motions(config.smoke).items():
+        if config.smoke or name != HELD_OUT:
+            built = excite(file, e._replace(duration=min(e.duration, LONGEST))).build()
+            exact.append(record(name, built, truth, SENSORS, rtol=1e-2 * config.rtol, noise=0.0))
 
-    def repetition(seed: int) -> Repetition:
-        rng = np.random.default_rng(seed)
-        recordings = [noisy(one, rng, rho) for one in exact]
-        start = {name: OFF * value for name, value in truth.items()}
-        return way(identify_contact.problem(recordings, start), truth, config.rtol)
+    def identified(seed: int) -> IdentificationResult:
+        rng, recordings = np.random.default_rng(seed), []
+        for one in exact:
+            samples = {
+                channel: (t, y + SENSORS[channel].noise * coloured(len(t), rho, rng))
+                for channel, (t, y) in one.samples.items()
+            }
+            recordings.append(replace(one, samples=samples))
+        stated = problem(recordings, {name: OFF * value for name, value in truth.items()})
+        labels = stated.coordinates.labels
+        plan = [Stage("all", stated.names, labels, config.rtol, tolerance=1e-3)]
+        return identify(stated, plan=plan, assumptions="trusted")  # the model is right
 
-    return Case(truth, repetition)
-
-
-def by_identify(stated: Problem, truth: dict[str, float], rtol: float) -> Repetition:
-    """As a user would have it, in one stage; the model is known to be right."""
-    plan = [Stage("all", stated.names, stated.coordinates.labels, rtol, tolerance=1e-3)]
-    result = identify(stated, plan=plan, assumptions="trusted")
-    found = judged({name: result[name] for name in truth}, truth)
-    codes = [one.code for one in result.findings]
-    colours = [one for one in result.findings if one.code == "colour"]
-    return Repetition(
-        found, codes, [case["order"] for one in colours for case in one.facts["cases"]]
-    )
-
-
-def by_white_least_squares(stated: Problem, truth: dict[str, float], rtol: float) -> Repetition:
-    """As if all noise were white: a few steps by one Jacobian, which is enough from so near."""
-    c, runner = stated.coordinates, Runner(stated.recordings)
-    stage = Stage("all", stated.names, tuple(one.label for one in c.within(c.free)), rtol)
-    end = chord(Fit(stated, runner, c.start, stage).evaluated())
-    C = fisher(end.at.J)[0] * max(1.0, end.chi2)
-    found = estimates(end, C, np.zeros(len(c)))
-    return Repetition(judged({e.name: e for e in found}, truth), [], [])
+    return Case(truth, identified)
 
 
 # rig files
@@ -225,7 +175,7 @@ JAWS = Laboratory(
 
 
 def of_a_file(config: Config, lab: Laboratory) -> Case:
-    """Repetitions of a rig file: recordings and identification are files, as a user's are."""
+    """A rig file: recordings and identification are files, as a user's are."""
     shorter = {"outputs": {"duration": 0.8, "snapshots": []}} if config.smoke else {}
     settings = lab.settings | shorter
     file = RigFile.ready(lab.file).override(**settings)
@@ -241,7 +191,7 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
     start = Standing.of(built.rig, built.y0)._replace(rests=file.rests())
     exact = record("measured", built, truth, sensors, start=start, rate=RATE, rtol=EXACT, noise=0.0)
 
-    def repetition(seed: int) -> Repetition:
+    def identified(seed: int) -> IdentificationResult:
         rng, path = np.random.default_rng(seed), folder / f"{seed}.csv"
         columns = {"t": exact.times} | {
             channel: y + lab.noise[channel] * rng.standard_normal(len(y))
@@ -249,14 +199,13 @@ def of_a_file(config: Config, lab: Laboratory) -> Case:
         }
         csvfile.write(path, columns, {"t": "s", **exact.units})
         one = load([path], folder / "fit.toml")
-        options: dict[str, Any] = one.config.fit.model_dump()
-        options |= {} if seed < config.checked else {"assumptions": "trusted"}
-        result = identify(one.problem, **options)
+        how: dict[str, Any] = one.config.fit.model_dump()
+        how |= {} if seed < config.checked else {"assumptions": "trusted"}
+        result = identify(one.problem, **how)
         path.unlink()
-        codes = [one.code for one in result.findings]
-        return Repetition(judged({name: result[name] for name in truth}, truth), codes, [])
+        return result
 
-    return Case(truth, repetition)
+    return Case(truth, identified)
 
 
 def stated(lab: Laboratory, settings: Mapping[str, Any], truth: Mapping[str, float]) -> str:
@@ -268,32 +217,29 @@ def stated(lab: Laboratory, settings: Mapping[str, Any], truth: Mapping[str, flo
 
 
 CASES: dict[str, Callable[[Config], Case]] = {
-    "white": lambda c: papers(c, 0.0, by_identify),
-    "coloured": lambda c: papers(c, c.rho, by_identify),
-    "coloured, ignored": lambda c: papers(c, c.rho, by_white_least_squares),
+    "white": lambda c: papers(c, 0.0),
+    "coloured": lambda c: papers(c, RHO),
     "two fingers": lambda c: of_a_file(c, FINGERS),
     "two jaws": lambda c: of_a_file(c, JAWS),
 }
 
 
-def summed(case: Case, found: list[Repetition]) -> dict[str, Any]:
-    """A case as `summary.json` holds it."""
-    kinds = Counter(code for one in found for code in one.notices)
-    orders = Counter(order for one in found for order in one.orders)
-    out: dict[str, Any] = {
-        "notices": dict(kinds),
-        "orders": {str(k): v for k, v in sorted(orders.items())},
-        "parameters": {},
-    }
-    for name, value in case.truth.items():
-        off, deviation, held = zip(*(one.unknowns[name] for one in found))
-        own = stats.binomtest(sum(held), len(found)).proportion_ci(0.95)
-        out["parameters"][name] = {
-            "truth": value, "relative_sd": float(np.median(deviation)), "inside": sum(held),
-            "share": sum(held) / len(found), "ci95": [own.low, own.high],
-            "mean": float(np.mean(off)), "sd": float(np.std(off, ddof=1)), "errors": off,
+def judged(truth: Mapping[str, float], found: list[IdentificationResult]) -> dict[str, Any]:
+    """Of all seeds of a case: by unknown, errors of its logarithm over their predicted standard
+    deviations, and how many intervals hold; findings by their code."""
+    parameters = {}
+    for name, value in truth.items():
+        every = [result[name] for result in found]
+        errors = [float(np.log(e.last / value)) / e.relative_sd for e in every]
+        inside = sum(e.ci95 is not None and e.ci95[0] <= value <= e.ci95[1] for e in every)
+        own = stats.binomtest(inside, len(found)).proportion_ci(0.95)
+        parameters[name] = {
+            "truth": value, "relative_sd": float(np.median([e.relative_sd for e in every])),
+            "inside": inside, "ci95": [own.low, own.high], "mean": float(np.mean(errors)),
+            "sd": float(np.std(errors, ddof=1)), "errors": errors,
         }  # fmt: skip
-    return out
+    notices = Counter(one.code for result in found for one in result.findings)
+    return {"notices": notices, "parameters": parameters}
 
 
 def main(config: Config) -> None:
@@ -302,19 +248,19 @@ def main(config: Config) -> None:
     rows, cells = {}, []
     for name in config.cases:
         case = CASES[name](config)
-        rows[name] = summed(case, repeated(case.repetition, config.seeds, config.workers, name))
+        found = repeated(case.identified, config.seeds, config.workers, name)
+        rows[name] = judged(case.truth, found)
         for unknown, one in rows[name]["parameters"].items():
-            low, high = one["ci95"]
-            shares = f"{one['inside']} of {config.seeds}", f"{low:.0%} .. {high:.0%}"
-            errors = f"{one['mean']:+.2f}", f"{one['sd']:.2f}"
-            cells.append((name, unknown, f"{one['relative_sd']:.2%}", *shares, *errors))
-        print(f"{name}: notices {rows[name]['notices']}, orders found {rows[name]['orders']}")
+            cells.append((
+                name, unknown, f"{one['relative_sd']:.2%}", f"{one['inside']} of {config.seeds}",
+                "{:.0%} .. {:.0%}".format(*one["ci95"]), f"{one['mean']:+.2f}", f"{one['sd']:.2f}",
+            ))  # fmt: skip
+        print(f"{name}: notices {dict(rows[name]['notices'])}")
     head = (
         "case", "unknown", "standard deviation", "intervals that hold the truth",
         "its own 95 % interval", "mean error / sd", "sd of that",
     )  # fmt: skip
-    content = {"seeds": config.seeds, "cases": rows}
-    write(config, content, table=markdown(head, cells))
+    write(config, {"seeds": config.seeds, "cases": rows}, {"intervals": Table(head, cells)})
 
 
 if __name__ == "__main__":

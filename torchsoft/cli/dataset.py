@@ -18,10 +18,9 @@ Writes a job array that makes a dataset in parts to the standard output, for `sb
 to the screen. Where some of it is made already, the array has the parts that are not."""
 
 EXPORT = """\
-Writes a finished dataset, without its failed trajectories, in the form of another project:
-the-well   fields over each pad's surface in HDF5, as The Well reads them
-lerobot    motions, forces and set-points as episodes of LeRobot v3
-mcap       a log a trajectory, for Foxglove and the like; `torchsoft identify` reads them"""
+Writes an MCAP log for every trajectory of a finished dataset that did not fail, for Foxglove and
+the like; `torchsoft identify` reads them. The documentation has recipes for LeRobot and The
+Well."""
 
 CLUSTER = 16
 """Assumed number of workers of a cluster."""
@@ -61,10 +60,10 @@ def add_commands(commands: Any) -> None:
     one.add_argument("store", help="folder or fsspec URL")
     one.add_argument("--picture", type=Path, help="where to draw what the set covers")
     one = add_command(
-        own, "export", export, "write a dataset in the form of another project", EXPORT
+        own, "export", export, "write the trajectories of a dataset as MCAP logs", EXPORT
     )
     one.add_argument("store", help="folder or fsspec URL")
-    one.add_argument("--to", required=True, metavar="FORM", help="one of these")
+    one.add_argument("--to", choices=("mcap",), default="mcap", help="format of the logs")
     one.add_argument("--out", type=Path, required=True, help="a new folder")
 
 
@@ -159,8 +158,8 @@ def check(options: argparse.Namespace) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """Export a dataset to the format of another project."""
-    from torchsoft.datasets.export import export
+    """Write a dataset as logs."""
+    from torchsoft.datasets.export import export_logs
 
-    say(export(options.store, options.to, options.out))
+    say(export_logs(options.store, options.out))
     return 0

@@ -8,13 +8,12 @@ from torchsoft.cli.results import add_command, add_out, say, try_folder
 from torchsoft.materials.kinds import ENERGIES, PULLS
 
 if TYPE_CHECKING:
-    from torchsoft.materials.deck import Deck
     from torchsoft.materials.energies import EnergyFit
     from torchsoft.materials.fit import Fit
     from torchsoft.materials.modulus import Modulus
 
 MATERIAL_FIT = """\
-Which material did this, in a test or in a deck of finite elements?
+Which material did this in a test?
 
 FILE is a table (CSV, or an Excel workbook) whose headings have units, `stress [MPa]`, in any
 order: over time `t` with one of `strain`, `stretch`, `elongation` and one of `stress`, `force`,
@@ -23,12 +22,11 @@ strain or a stress put on at t = 0 and held; a frequency sweep `frequency` with 
 and `loss_modulus`, or `storage_shear_modulus` and `loss_shear_modulus`, or `tan_delta` as the
 second; a pull without `t`, of which --range says the strains that its modulus is of, or --energy
 the strain energy that it is to have, with --also for further tables and --relaxation for its
-branches. Or a deck,
-FILE.inp, with *VISCOELASTIC, TIME=PRONY. The whole history counts: ramps need not be cut off.
+branches. The whole history counts: ramps need not be cut off.
 
 A relaxation test and a sweep give a relaxation series (prony), a creep test a generalised Kelvin
-chain, a pull a modulus (kelvin_voigt). Says what the rows do not tell. Writes material.toml, with
-the names of the constructor's arguments, summary.json and fit.png."""
+chain, a pull a modulus (kelvin_voigt). Reports what the rows do not determine. Writes
+material.toml, with the names of the constructor's arguments, summary.json and fit.png."""
 
 PRESETS = """\
 Rubbers from the literature, every coefficient marked `published`, with where, `fitted` to published
@@ -43,7 +41,7 @@ def add_commands(commands: Any) -> None:
     commands = material.add_subparsers(required=True, metavar="COMMAND")
     help = "fit a material to a test"
     one = add_command(commands, "fit", fit_material, help, MATERIAL_FIT)
-    one.add_argument("file", type=Path, metavar="FILE", help="the test, or the deck")
+    one.add_argument("file", type=Path, metavar="FILE", help="the test")
     add_out(one, "material")
     one.add_argument(
         "--test",
@@ -90,10 +88,6 @@ def add_commands(commands: Any) -> None:
         "--ignore", action="append", default=[], metavar="HEADING",
         help="a column to leave out; again for others",
     )  # fmt: skip
-    one.add_argument(
-        "--unit", choices=("Pa", "kPa", "MPa", "GPa", "psi"), help="unit of a deck's stresses"
-    )
-    one.add_argument("--name", help="which material of a deck")
     for name, (value, meaning) in ASSUMED.items():
         one.add_argument(f"--{name}", type=float, help=f"{meaning} (assumed: {value:g})")
     add_command(commands, "presets", list_presets, "list rubbers from the literature", PRESETS)
@@ -104,16 +98,16 @@ SIZES = {
     "area": "cross-section before the test [m2], which `force` is divided by",
 }
 ASSUMED = {
-    "nu": (0.45, "Poisson's ratio [1], which no test in one dimension tells"),
-    "rho": (1100.0, "density [kg/m3], which no test tells"),
+    "nu": (0.45, "Poisson's ratio [1], which no test in one dimension determines"),
+    "rho": (1100.0, "density [kg/m3], which no test determines"),
     "depth": (44e-3, "depth of the pads [m]"),
-    "tau": (10e-3, "retardation time [s], which a pull does not tell"),
+    "tau": (10e-3, "retardation time [s], which a pull does not determine"),
 }
-"""Numbers that a test may not tell: assumed values and meanings."""
+"""Values that a test may not determine: assumed values and meanings."""
 
 
 def fit_material(options: argparse.Namespace) -> int:
-    """Read a material from a test or a deck, and write it."""
+    """Fit a material to a test, and write it."""
     from torchsoft.materials.written import FILES, printed, write
     from torchsoft.physics.material import KelvinVoigt
     from torchsoft.quantity import quantities
@@ -126,8 +120,7 @@ def fit_material(options: argparse.Namespace) -> int:
                 values[name] = quantities(KelvinVoigt)[name].check(value)
             except ValueError as error:
                 raise ValueError(f"--{name} {error}") from None
-    nu = values["nu"]
-    found = deck(options) if options.file.suffix.lower() == ".inp" else tested(options, nu)
+    found = tested(options, values["nu"])
     assumed = {
         name: value
         for name, value in values.items()
@@ -135,38 +128,23 @@ def fit_material(options: argparse.Namespace) -> int:
     }
     for name, value in given.items():
         if value is not None and name not in assumed:
-            raise ValueError(f"{options.file}: it tells {name} itself: leave --{name} out")
+            raise ValueError(f"{options.file}: the test determines {name}: leave --{name} out")
     try_folder(options.out, options.force)
-    told = {name: x for name, x in vars(options).items() if name in OPTIONS}
-    write(found, options.out, assumed, told)
+    stated = {name: x for name, x in vars(options).items() if name in OPTIONS}
+    write(found, options.out, assumed, stated)
     say(printed(found))
     say(f"written to {', '.join(str(options.out / name) for name in FILES)}")
     return 0
 
 
 TIMELESS = ("kelvin_voigt", *ENERGIES)
-"""Kinds of materials whose tests tell no time."""
+"""Kinds of materials whose tests determine no time."""
 
 OPTIONS = (
     "test", "energy", "also", "relaxation", "fast", "true", "terms", *SIZES, "range", "column",
-    "ignore", "unit", "name", *ASSUMED,
+    "ignore", *ASSUMED,
 )  # fmt: skip
 """Options that say how a file is read."""
-
-
-def deck(options: argparse.Namespace) -> "Deck":
-    """The material of a deck. Raises `ValueError`."""
-    from torchsoft.materials.deck import read_deck
-    from torchsoft.materials.measured import PRESSURE
-
-    for name in (one for one in OPTIONS if one not in ("unit", "name", *ASSUMED)):
-        if getattr(options, name):
-            raise ValueError(f"{options.file}: a deck needs no --{name}")
-    if options.unit is None:
-        raise ValueError(
-            f"{options.file}: a deck has no units: say that of its stresses, --unit MPa"
-        )
-    return read_deck(options.file, unit=PRESSURE[options.unit], name=options.name)
 
 
 def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus | EnergyFit":
@@ -175,9 +153,6 @@ def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus | EnergyFit
     from torchsoft.materials.measured import Pull, read
     from torchsoft.materials.modulus import modulus
 
-    for name in ("unit", "name"):
-        if getattr(options, name) is not None:
-            raise ValueError(f"{options.file}: --{name} is of decks, FILE.inp")
     pairs = [one.partition("=")[::2] for one in options.column]
     if not all(name and heading for name, heading in pairs):
         raise ValueError("--column must be NAME=HEADING, as force=Standardkraft")

@@ -24,10 +24,11 @@ The file is checked first, and a rig that makes no sense is not run. Interrupted
 simulated until then is written."""
 
 CHECK = """\
-Says what is wrong or dangerous in a rig file before any run: bodies that overlap or do not fit,
-a loop that is unstable, strains beyond linear elasticity, steps that are too coarse, bodies that
-nothing carries, recordings that end early. The exit status is 2 where there is an error;
-warnings and notes are said only."""
+Reports what is wrong or dangerous in a rig file: bodies that overlap or that nothing carries, loops
+that cannot work, recordings that end early. It then runs the rig at a loose tolerance, and reports
+bodies that are lost, strains beyond linear elasticity, contacts that never touch, unstable loops
+and steps that are too long. The exit status is 2 where there is an error, and 0 where there are
+only warnings and notes."""
 
 INIT = """\
 Writes NAME.toml, a rig to start from: a disc between two pads, with the unit and the meaning of
@@ -42,7 +43,7 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
     add_progress(one)
     add_yes(one)
-    one = add_command(commands, "check", check_rig, "say what is wrong in a rig file", CHECK)
+    one = add_command(commands, "check", check_rig, "report what is wrong in a rig file", CHECK)
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
     add_yes(one)
     one = add_command(commands, "init", init_rig, "write a rig file to start from", INIT)
@@ -55,7 +56,7 @@ def run_rig(options: argparse.Namespace) -> int:
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
-    from torchsoft.rigs.run import cost, largest_strains, notes, run
+    from torchsoft.rigs.run import cost, run
     from torchsoft.solve.progress import SimulationFailed
 
     out: Path = options.out or Path("out") / options.file.stem
@@ -83,10 +84,6 @@ def run_rig(options: argparse.Namespace) -> int:
         f"steps), energies balanced to {done.trajectory.energy_residual_rel:.1e} of what was "
         f"injected; written to {out}"
     )
-    said = {one.where for one in found}
-    for one in notes(done.trajectory, largest_strains(done.trajectory)):
-        if one.where not in said:
-            say(one, error=True)
     return 0
 
 

@@ -25,15 +25,16 @@ from torchsoft.datasets.files import (
 )
 from torchsoft.datasets.generate import points
 from torchsoft.datasets.reader import Vouched, open_dataset
+from torchsoft.datasets.subject import SPLITS
 from torchsoft.files import PARTIAL
-from torchsoft.plot.figures import STYLE, save
+from torchsoft.plot.figures import STYLE, new_figure, save
 from torchsoft.tables import line
 
 MANY = 0.5
 """Share of trajectories that failed from which a set is called wrong."""
 
-MOST = 3
-"""Most trajectories of each kind in the picture."""
+MOST = 5
+"""Most trajectories whose channels are in the picture."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -209,51 +210,32 @@ def summary(url: str, data: xr.Dataset) -> str:
 
 @rc_context(STYLE)
 def figure(data: xr.Dataset, config: Config) -> Figure:
-    """Coverage of a dataset: scatter plots of neighbouring parameters by split, with failures
-    crossed; counts by kind and split; time series of some sound trajectories."""
-    ranged = config.parameters
-    by = [name for name in ("kind", "split") if name in data]
-    names, series = list(ranged), moving(data, config)
-    count = len(names) + 1 + len(series)
-    columns = min((4, 3, 5), key=lambda n: -count % n)  # with the fewest empty cells
-    table = data[[*names, *by, "failed"]].to_dataframe()[[*names, *by, "failed"]].reset_index()
-    table["split"] = table["split"].where(table["failed"] == 0, "failed")
-    fig = Figure(figsize=(13, 11.6 / columns * -(-count // columns)), layout="constrained")
-    title = f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed"
-    fig.suptitle(title, x=0.01, ha="left")
-    panels = fig.subplots(-(-count // columns), columns, squeeze=False).ravel()
-    for ax, x, y in zip(panels, names, [*names[1:], names[0]]):
-        for name, some in table.groupby("split"):
-            ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4, label=name)
-        label, other = (f"{name} [{data[name].units}]" for name in (x, y))
-        ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
-    fig.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
-    for ax in panels[count:]:
-        ax.set_axis_off()
-    counts = table.groupby(by).size()
-    (counts.unstack() if len(by) > 1 else counts).plot.bar(
-        stacked=True, ax=panels[len(names)], ylabel="trajectories [1]", legend=False,
-        color=[f"C{i}" for i in range(len(set(table["split"])))],
-    )  # fmt: skip
-    sound = table[table["failed"] == 0]
-    some = (sound.groupby("kind").head(MOST) if "kind" in by else sound.head(MOST)).index
-    for ax, name in zip(panels[len(names) + 1 :], series):
-        ax.plot(data.time, data[name][some].T, lw=0.7)
-        ax.set(xlabel="time [s]", ylabel=f"{name} [{data[name].units}]")
-    for ax in fig.axes:
-        ax.tick_params(axis="x", labelsize=7, which="both", rotation=20)
-    return fig
-
-
-def moving(data: xr.Dataset, config: Config) -> list[str]:
-    """Names of the series, three at the most, that the picture shows: the liveliest, each over its
-    own largest value."""
-    names = list(config.subject.signals)
-    values = data[names].isel(trajectory=np.flatnonzero(data.failed == 0)[:MOST])
-    spread = {
-        name: float(one.std() / max(float(abs(one).max()), 1e-300)) for name, one in values.items()
-    }
-    return sorted(names, key=lambda name: -spread[name])[:3]
+    """Coverage of a dataset: each drawn parameter over the next one by split, with failures
+    crossed, and up to three channels of some sound trajectories over time."""
+    drawn, series = config.parameters, list(config.subject.signals)[:3]
+    columns = min(4, len(drawn) + len(series))
+    rows = -(-(len(drawn) + len(series)) // columns)
+    failed = data.failed.values.astype(bool)
+    title = f"{config.title}: {len(failed)} trajectories, {failed.sum()} failed"
+    picture = new_figure(title, 13, 11.6 / columns * rows)
+    panels = picture.subplots(rows, columns, squeeze=False).ravel()
+    following = dict(zip(drawn, [*list(drawn)[1:], *drawn]))
+    for axes, (x, y) in zip(panels, following.items()):
+        for split in SPLITS:
+            some = data.isel(trajectory=~failed & (data.split.values == split))
+            axes.plot(some[x], some[y], ".", label=split)
+        axes.plot(data[x][failed], data[y][failed], "x", label="failed")
+        axes.set(xscale=drawn[x].scale, yscale=drawn[y].scale)
+        axes.set(xlabel=f"{x} [{data[x].units}]", ylabel=f"{y} [{data[y].units}]")
+    for axes, name in zip(panels[len(drawn) :], series):
+        axes.plot(data.time, data[name][np.flatnonzero(~failed)[:MOST]].T, lw=0.7)
+        axes.set(xlabel="time [s]", ylabel=f"{name} [{data[name].units}]")
+    for axes in panels[len(drawn) + len(series) :]:
+        axes.set_axis_off()
+    if drawn:
+        keys = panels[0].get_legend_handles_labels()
+        picture.legend(*keys, loc="outside upper right", ncols=4)
+    return picture
 
 
 def report(url: str, picture: Path | None = None, say: Callable[[str], None] = print) -> int:

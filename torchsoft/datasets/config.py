@@ -1,5 +1,6 @@
 """Configuration of a dataset: the TOML file, validated."""
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Self
 
@@ -26,13 +27,8 @@ class Config(Fields):
 
     @property
     def subject(self) -> Subject:
-        """The subject of this configuration, cached by its hash."""
-        key = self.hash
-        if key not in _subjects:
-            while len(_subjects) >= SUBJECTS:
-                _subjects.pop(next(iter(_subjects)), None)
-            _subjects[key] = Subject(self)
-        return _subjects[key]
+        """The subject of this configuration; a process keeps those of the last few."""
+        return subject_of(self.model_dump_json())
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Config":
@@ -41,7 +37,7 @@ class Config(Fields):
         return from_toml(path, lambda tree: cls.model_validate(embedded(tree, Path(path).parent)))
 
 
-SUBJECTS = 4
-"""Most subjects in the cache of a process."""
-
-_subjects: dict[str, Subject] = {}
+@lru_cache(maxsize=4)
+def subject_of(config: str) -> Subject:
+    """The subject of a valid configuration, written in JSON."""
+    return Subject(Fields.model_validate_json(config))

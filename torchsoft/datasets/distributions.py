@@ -31,6 +31,11 @@ class Related(Table):
 
     ratio_to: str | None = None
 
+    @property
+    def related(self) -> str:
+        """The parameter that it multiplies, in words."""
+        return f", times `{self.ratio_to}`" if self.ratio_to else ""
+
     @model_serializer(mode="wrap")
     def _only_what_is_said(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         unsaid = {"ratio_to": None, "either_sign": False}
@@ -53,6 +58,13 @@ class Uniform(Related):
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"a logarithmic range needs low > 0, but low = {self.low}")
         return self
+
+    @property
+    def words(self) -> str:
+        """The distribution in words."""
+        scale = ", logarithmic" if self.scale == "log" else ""
+        sign = ", of either sign" if self.either_sign else ""
+        return f"{self.low:g} to {self.high:g}{scale}{sign}{self.related}"
 
     def at(self, u: float) -> float:
         """The value at u in [0, 1]."""
@@ -96,7 +108,7 @@ class Normal(Related):
     def _is_ordered(self) -> Self:
         if not self.low < self.high:
             raise ValueError(
-                f"low = {self.low} should be below high = {self.high}; without bounds of your own "
+                f"low = {self.low} should be below high = {self.high}; without stated bounds "
                 f"they are {WIDTH:g} times sd = {self.sd} from mean = {self.mean}"
             )
         below, above = self._tails
@@ -106,6 +118,12 @@ class Normal(Related):
                 f"{self.low} and high = {self.high}"
             )
         return self
+
+    @property
+    def words(self) -> str:
+        """The distribution in words."""
+        spread = f"normal, mean {self.mean:g}, standard deviation {self.sd:g}"
+        return f"{spread}, {self.low:g} to {self.high:g}{self.related}"
 
     @property
     def _tails(self) -> tuple[float, float]:
@@ -133,6 +151,11 @@ class Choice(Related):
 
     choices: Annotated[tuple[float, ...], LISTED] = Field(min_length=1, max_length=10_000)
     scale: ClassVar[Literal["linear"]] = "linear"
+
+    @property
+    def words(self) -> str:
+        """The distribution in words."""
+        return f"one of {', '.join(f'{x:g}' for x in self.choices)}{self.related}"
 
     @property
     def low(self) -> float:
@@ -177,4 +200,4 @@ class Kind(Table):
     fixed: dict[str, Any] = Field(default_factory=dict)
     """values in it, or whole tables such as a motion, by the names of the rig file's tables"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
-    """distributions of its own, besides those of all kinds or in their place"""
+    """distributions of its own, added to those of all kinds, or in their place"""

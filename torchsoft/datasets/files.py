@@ -103,9 +103,9 @@ def read_bytes(url: str, key: str) -> bytes | None:
 
 
 def write_bytes(url: str, key: str, data: bytes) -> None:
-    """Write a file of the dataset atomically."""
+    """Write a file of the dataset, which appears whole or not at all."""
     if here := folder(url):
-        with replacing(here / key) as partial:
+        with replacing(here / key, durable=True) as partial:
             partial.write_bytes(data)
     else:
         fs, root = filesystem(url)

@@ -112,7 +112,7 @@ THREADS = 3
 interpreter's lock."""
 
 STATICS = 0.5
-"""Time [s] of a trajectory besides its steps: static equilibrium of the start and of the grasp, and
+"""Time [s] of a trajectory without its steps: static equilibrium of the start and of the grasp, and
 energies."""
 
 MANY, TRIED = 200, 8
@@ -324,7 +324,7 @@ SPARE, LEAST = 3.0, 600.0
 """Requested time over the estimate [1], and least requested time [s]."""
 
 BASE = 1.5
-"""Memory of a process [GiB] besides its shard."""
+"""Memory of a process [GiB] without its shard."""
 
 BEGINNING = 5
 """Time [s] that a process takes to begin with its first shard."""
@@ -364,7 +364,7 @@ def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
     estimates = (
         f"each of {len(left)} tasks: {price.sentence}; all of them: "
         f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk; "
-        f"besides, every task takes {BEGINNING:g} s to start and {BASE:g} GiB for its process"
+        f"every task also takes {BEGINNING:g} s to start and {BASE:g} GiB for its process"
     )
     script = SCRIPT.format(
         name=f"torchsoft-{path.stem}".replace(" ", "-"), parts=parts,

@@ -1,5 +1,5 @@
 """Reading of a dataset, for torch's `DataLoader` and for xarray. Files unlike their digests are
-refused."""
+rejected."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -116,7 +116,7 @@ class Trajectories(Shown, Dataset[dict[str, Tensor]]):
     """Windows of the trajectories of one split, from memory where they fit.
 
     Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number
-    of the trajectory as (), in one of `DTYPES`, besides `trajectory` and `start`, its origin.
+    of the trajectory as (), in one of `DTYPES`, with `trajectory` and `start`, its origin.
     `window` is a number of samples, the whole run by default; windows of a trajectory begin every
     `stride` samples, `window` by default. Failed simulations are left out, and trajectories of
     unfinished shards too where `unfinished` says so.

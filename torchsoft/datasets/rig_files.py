@@ -68,7 +68,7 @@ def place(file: RigFile, name: str) -> Place:
     and for a table that the dataset replaces."""
     if name in file.names:
         full = " and ".join(map(repr, file.full(name)))
-        raise ValueError(f"`{line(name, 80)}` is short; in a file say what it stands for, {full}")
+        raise ValueError(f"`{line(name, 80)}` is short; in a file write the full name, {full}")
     found = place_in(file, name)
     if (own := OWN.get(str(found.keys[0]))) is not None:
         raise ValueError(f"`{line(name, 80)}` has no part in a dataset, whose own {own} decide it")

@@ -50,5 +50,5 @@ class Variable:
 
     @property
     def empty(self) -> Any:
-        """The value that stands for an unknown."""
+        """The value of an unknown."""
         return {"O": "", "f": np.nan}.get(self.kept.kind, 0)

@@ -82,14 +82,14 @@ class Transition(NamedTuple):
 class Dynamics:
     """A built rig under actions. `actions` are the ranges of the signals of the reference that an
     action in [-1, 1] sets, `observations` those of channels, by which they are scaled to [-1, 1]
-    (not clipped); an array of touch such as "skin.normal" stands for all of its channels.
+    (not clipped); an array of touch such as "skin.normal" names all of its channels.
 
     An observation holds the channels, then the distances to the goal over their scales, then the
     action that was reached. Between two control times, `interval` [s] apart, a signal goes linearly
     from one action to the next. Until `begin` [s] the rig follows its own motion, and all other
     signals always do. `disturbances` are signals that nothing observes: an episode adds a peak to
     each, at one control time, from the one before and until the one after; between control times
-    they are lines. `samples` are the outputs of the run that a reward of one's own is given.
+    they are lines. `samples` are the outputs of the run that a custom reward is given.
 
     Raises `ValueError` naming the field.
     """

@@ -5,23 +5,20 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
-import matplotlib
 import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.registry import BackendFilter, backend_registry
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.caller import warn
-from torchsoft.display import suggestion
 from torchsoft.envs.dynamics import (
     Dynamics,
     Moment,
@@ -33,14 +30,12 @@ from torchsoft.envs.dynamics import (
 )
 from torchsoft.parallel import cores, executor, parallel_map
 from torchsoft.physics.arguments import number, whole
-from torchsoft.plot.scene import Scene, force_scale, instants
+from torchsoft.plot.scene import Instant, Scene, force_scale, instants
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.trajectory import Trajectory
-
-Mode = Literal["rgb_array", "human"]
 
 FRAMES_PER_SECOND = 10
 
@@ -77,7 +72,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     Raises `ValueError` naming the field and the remedy.
     """
 
-    metadata = {"render_modes": list(get_args(Mode)), "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
 
     def __init__(
         self, rig: RigFile | BuiltRig | str | Path, *, actions: Ranges,
@@ -85,7 +80,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
         bounds: Ranges | None = None, held: Sequence[str] = (), failure_reward: float = -1.0,
         parameters: Ranges | None = None, disturbances: Ranges | None = None, samples: int = 1,
-        judged: bool = False, render_mode: Mode | None = None,
+        judged: bool = False, render_mode: Literal["rgb_array"] | None = None,
     ) -> None:  # fmt: skip
         self._file = RigFile.from_toml(RigFile.path(rig)) if isinstance(rig, str | Path) else rig
         if not isinstance(self._file, RigFile | BuiltRig):
@@ -122,11 +117,13 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         free = self.dynamics.coordinates
         self.bounds = checked("bounds", bounds or {}, free, "free are")
         self.held = self._checked_held(held)
-        if render_mode is not None and render_mode not in get_args(Mode):
+        if render_mode not in (None, "rgb_array"):
             raise ValueError(
-                f"`render_mode` is {render_mode!r}; {suggestion(render_mode, get_args(Mode))}"
+                f"`render_mode` must be 'rgb_array' or None, but is {render_mode!r}; show the "
+                "pictures of `render` with matplotlib's `imshow`, or wrap the environment in "
+                "gymnasium's `HumanRendering`"
             )
-        self.render_mode, self._view = render_mode, None
+        self.render_mode, self._scene = render_mode, None
         most = float(np.finfo(np.float32).max)
         self.action_space = Box(-1.0, 1.0, (len(actions),), np.float32)
         self.observation_space = Box(-most, most, (self.dynamics.size,), np.float32)
@@ -173,8 +170,6 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._begun, self._versions = self._drawn_start(), versions
         target, peaks = self._drawn_target(options or {}), self._drawn_peaks()
         self.moment, self._over = self._begun._replace(target=target, peaks=peaks), False
-        if self.render_mode == "human":
-            self.render()
         return self._seen(self.dynamics.observe(self.moment)), self._info(self.moment)
 
     def _drawn_target(self, options: Mapping[str, Any]) -> Tensor:
@@ -242,8 +237,6 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.judged:
             found = doubts(done.outcome.trajectory(), self.dynamics.rig)
             info["doubts"] = list(found.values())
-        if self.render_mode == "human":
-            self.render()
         reward = self.failure_reward if ended else float(done.reward)
         return self._seen(done.observation), reward, bool(ended), truncated, info
 
@@ -267,24 +260,26 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             goal = {"distance": math.hypot(*self.dynamics.distance(now).tolist())}
         return {"time": self.dynamics.start + now.steps * self.dynamics.interval} | goal
 
-    def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The picture (height, width, 3), or None in the mode "human", which shows it in a
-        window."""
+    def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The picture (height, width, 3), with the limits and the scale of forces of the first one
+        of this rig."""
         if self.moment is None or self.render_mode is None:
             raise ValueError("nothing to render: give a `render_mode`, and call `reset` first")
-        if self._view is None:
-            self._view = View(self.dynamics.look(self.moment))
-        picture = self._view.picture(self.dynamics.look(self.moment))
-        if self.render_mode == "human":
-            self._view.show(picture)
-            return None
-        return picture
+        run = self.dynamics.look(self.moment)
+        (instant,) = instants(run, [float(run.t[0])])
+        if self._scene is None:
+            self._scene = scene_of(run, instant)
+        self._scene.show(instant)
+        axes = self._scene.axes
+        axes.set_title(f"t = {instant.time:.3f} s")
+        canvas = axes.figure.canvas
+        assert isinstance(canvas, FigureCanvasAgg)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-        self._view = None
+        """Forget the limits of the pictures."""
+        self._scene = None
 
 
 # Vectors of environments in threads.
@@ -359,55 +354,16 @@ class _Done(NamedTuple):
         return self.begun
 
 
-# Pictures of an environment with matplotlib.
-
-
 ROOM = 0.25
 """Margin around the first picture, over its size."""
 
 
-class View:
-    """The scene of an episode, with the limits and the force scale of its first picture."""
-
-    def __init__(self, run: Trajectory) -> None:
-        (first,) = instants(run, [float(run.t[0])])
-        self.figure = Figure(figsize=(6.0, 4.8), dpi=100, layout="constrained")
-        self.canvas, axes = FigureCanvasAgg(self.figure), self.figure.subplots()
-        self.scene = Scene(axes, run.setup, curves=force_scale(run.setup, [first]))
-        sides = [np.array(x) for x in self.scene.limits([first])]
-        x, y = (side + ROOM * np.diff(side) * [-1, 1] for side in sides)
-        axes.set(xlim=x, ylim=y, xlabel="x [mm]", ylabel="y [mm]")
-        self.axes, self._window = axes, None
-
-    def picture(self, run: Trajectory) -> NDArray[np.uint8]:
-        """RGB (height, width, 3) of the first sample of a run."""
-        (instant,) = instants(run, [float(run.t[0])])
-        self.scene.show(instant)
-        self.axes.set_title(f"t = {instant.time:.3f} s")
-        self.canvas.draw()
-        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
-
-    def show(self, picture: NDArray[np.uint8]) -> None:
-        """Show a picture in a window. Raises `ValueError` where matplotlib's backend has no
-        windows."""
-        from matplotlib import pyplot
-
-        if matplotlib.get_backend() not in backend_registry.list_builtin(BackendFilter.INTERACTIVE):
-            raise ValueError(
-                f"`render_mode` 'human' needs a window, which matplotlib's `{pyplot.get_backend()}`"
-                " has not; set MPLBACKEND, or take 'rgb_array'"
-            )
-        if self._window is None:
-            self._window = pyplot.figure()
-            self._window.figimage(picture, resize=True)
-            pyplot.show(block=False)
-        self._window.images[0].set_data(picture)
-        pyplot.pause(1e-3)
-
-    def close(self) -> None:
-        """Close the window."""
-        if self._window is not None:
-            from matplotlib import pyplot
-
-            pyplot.close(self._window)
-            self._window = None
+def scene_of(run: Trajectory, first: Instant) -> Scene:
+    """Axes for the pictures of an episode, with room around the first of them."""
+    figure = Figure(figsize=(6.0, 4.8), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    scene = Scene(figure.subplots(), run.setup, curves=force_scale(run.setup, [first]))
+    sides = [np.array(x) for x in scene.limits([first])]
+    x, y = (side + ROOM * np.diff(side) * [-1, 1] for side in sides)
+    scene.axes.set(xlim=x, ylim=y, xlabel="x [mm]", ylabel="y [mm]")
+    return scene

@@ -8,6 +8,7 @@ the others are solved for (variable projection).
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -55,14 +56,50 @@ class EnergyFit:
         return self.pulls[0]
 
     @property
+    def test(self) -> str:
+        """Kinds of tests."""
+        return " and ".join(dict.fromkeys(pull.test for pull in self.pulls))
+
+    @property
+    def described(self) -> str:
+        """What was fitted, and how well."""
+        return f"{self.kind}, residual {self.rms:.2%} of the largest"
+
+    def method(self) -> dict[str, Any]:
+        """How the coefficients were found, and how well they fit, for a summary in JSON."""
+        own: dict[str, Any] = {
+            "method": "least squares of the nominal stress of an incompressible specimen",
+            "tables": [
+                {
+                    "file": pull.path.name,
+                    "test": pull.test,
+                    "rows": len(pull.strain),
+                    "strains": list(pull.strains),
+                }
+                for pull in self.pulls
+            ],
+            "residual_rms": self.rms,
+            "residual_of": "of the largest",
+        }
+        if self.relaxation is None:
+            return own
+        return own | {
+            "relaxation": {
+                "file": self.relaxation.measured.path.name,
+                "sha256": sha256(self.relaxation.measured.path.read_bytes()).hexdigest(),
+                **self.relaxation.method(),
+            }
+        }
+
+    @property
     def rms(self) -> float:
         """Root mean square of the residuals over the largest stress of their table."""
         parts = [(p.stress - f) / np.abs(p.stress).max() for p, f in zip(self.pulls, self.fitted)]
         return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
     def table(self) -> dict[str, Any]:
-        """The arguments of the material's constructor that the tests tell, and with branches a tau
-        that is small beside their times."""
+        """The arguments of the material's constructor that the tests determine, and with branches a
+        tau that is small beside their times."""
         values, count = list(self.values.values()), self.relaxation.terms if self.relaxation else 0
         own = arguments(self.kind, values[: len(values) - 2 * count])
         if not count:
@@ -72,8 +109,9 @@ class EnergyFit:
 
     def relaxing(self, series: Fit, fast: bool) -> "EnergyFit":
         """The energy with the branches of a relaxation test: strengths over its relaxed modulus,
-        and times. Pulls that were `fast` against them tell the energy at first, which is that of
-        the relaxed material times 1 + the sum of these strengths, others the relaxed one."""
+        and times. Pulls that were `fast` against them determine the instantaneous energy, which is
+        that of the relaxed material times 1 + the sum of these strengths; others determine the
+        relaxed one."""
         count, E = series.terms, series.values["E"]
         shares = {f"E_{k}": series.values[f"E_{k}"] / E for k in range(1, count + 1)}
         part = 1 / (1 + sum(shares.values())) if fast else 1.0
@@ -87,11 +125,12 @@ class EnergyFit:
         values |= {name: series.values[name] for name in times}
         sd |= {name: series.sd[name] for name in times}
         said = (
-            f"fast against the times of {series.measured.path.name}, so that they tell 1 + the sum "
-            "of its strengths over its relaxed modulus times the relaxed energy, which is written"
+            f"fast against the times of {series.measured.path.name}, so that they determine 1 + "
+            "the sum of its strengths over its relaxed modulus times the relaxed energy, which is "
+            "written"
             if fast
-            else f"slow against the times of {series.measured.path.name}, so that they tell the "
-            "relaxed energy"
+            else f"slow against the times of {series.measured.path.name}, so that they determine "
+            "the relaxed energy"
         )
         own = (*self.notices[:-1], f"the pulls count as {said}", *series.notices)
         return replace(self, values=values, sd=sd, notices=own, relaxation=series)
@@ -151,15 +190,15 @@ def fit_energy(
     its table; `terms` are those of Ogden's, one by default. Poisson's ratio `nu` makes E of a shear
     modulus.
 
-    Raises `ValueError` for `terms` of another kind, for more of them than the rows tell, and where
-    the shear modulus of the best fit is not positive.
+    Raises `ValueError` for `terms` of another kind, for more of them than the rows determine, and
+    where the shear modulus of the best fit is not positive.
     """
     if terms is not None and kind != "ogden":
         raise ValueError(f"`terms` are those of ogden, but the energy is {kind}")
     count = 2 * (terms or 1) if kind == "ogden" else len(ENERGIES[kind])
     rows = sum(len(pull.strain) for pull in pulls)
     if rows < 2 * count or not 1 <= (terms or 1) <= len(EXPONENTS):
-        raise ValueError(f"{rows} rows do not tell {count} coefficients; take fewer terms")
+        raise ValueError(f"{rows} rows do not determine {count} coefficients; take fewer terms")
     sizes = np.concatenate([np.full(len(p.stress), np.abs(p.stress).max()) for p in pulls])
     target = np.concatenate([pull.stress for pull in pulls]) / sizes
 
@@ -172,6 +211,7 @@ def fit_energy(
 
     def columns(exponents: Array) -> Array:
         """Stresses per coefficient in which they are linear, over `sizes`: (rows, coefficients)."""
+        exponents = np.where(abs(exponents) < STEP, STEP, exponents)  # zero is no exponent
         units = [(1.0, alpha) for alpha in exponents] if kind == "ogden" else np.eye(count).tolist()
         return np.stack([column(*one) for one in units], 1)
 
@@ -190,6 +230,7 @@ def fit_energy(
         starts = [np.roll(EXPONENTS, -k)[: terms or 1] for k in range(len(EXPONENTS))]
         found = [least_squares(residuals, start, bounds=bounds, max_nfev=100) for start in starts]
         exponents = min(found, key=lambda one: (solved(columns(one.x)).sum() <= 0, one.cost)).x
+        exponents = np.where(abs(exponents) < STEP, STEP, exponents)
     A = columns(exponents)
     linear = solved(A)
     best = [*linear.tolist(), *exponents.tolist()]
@@ -239,7 +280,7 @@ def notices(
         yield from (f"{pull.test}: {notice}" for notice in pull.notices)
     if len({pull.test for pull in pulls}) == 1 and len(values) > 1:
         yield (
-            "one kind of test does not tell an energy of several coefficients in others: a pad "
+            "one kind of test does not determine an energy of several coefficients: a pad "
             "that is pressed is sheared too; add a table of compression, shear or biaxial tension"
         )
     reached = [x for pull in pulls if pull.test != "shear" for x in stretches(pull)] or [1.0]
@@ -250,7 +291,7 @@ def notices(
             nearest = falls[np.abs(np.log(falls)).argmin()]
             yield (
                 f"not stable: in {test} the nominal stress falls at a stretch of {nearest:.3g}; a "
-                "pad that comes there gives way at once, so take fewer terms or more tests"
+                "pad that comes there collapses, so take fewer terms or more tests"
             )
     unsure = [name for name in values if not sd[name] <= UNSURE * abs(values[name])]
     if unsure:

@@ -49,7 +49,7 @@ VANISHED = 1e-6
 """Strength over the sum of all below which a term is none."""
 
 FLOW = 100.0
-"""Longest time of a chain that stands for a flow, over that of the test."""
+"""Longest time of a chain that represents a flow, over that of the test."""
 
 ROUNDING = 1e-12
 """Residual over the largest answer below which a fit is exact."""
@@ -75,6 +75,11 @@ class Fit:
     scores: Mapping[int, float]
     correlation: float
     notices: tuple[str, ...]
+
+    @property
+    def test(self) -> str:
+        """Kind of test."""
+        return self.measured.test
 
     @property
     def kind(self) -> str:
@@ -107,12 +112,28 @@ class Fit:
         return float(np.sqrt(np.mean((self.residual / self.measured.size) ** 2)))
 
     @property
-    def residual_of(self) -> str:
-        """The response that `rms` is a part of."""
-        return "of each row" if self.measured.relative else "of the largest"
+    def described(self) -> str:
+        """What was fitted, and how well."""
+        part = "of each row" if self.measured.relative else "of the largest"
+        return f"{self.kind} of {self.terms} terms, residual {self.rms:.2%} {part}"
+
+    def method(self) -> dict[str, Any]:
+        """How the coefficients were found, and how well they fit, for a summary in JSON."""
+        return {
+            "method": "nonnegative least squares on a logarithmic grid of times, then least "
+            "squares in strengths and times together; the number of terms by Schwarz's criterion "
+            "(BIC)",
+            "rows": len(self.measured.t),
+            "resolved_s": list(self.measured.window),
+            "largest_strain": self.measured.largest_strain,
+            "criterion": {str(count): score for count, score in self.scores.items()},
+            "residual_rms": self.rms,
+            "residual_of": "of each row" if self.measured.relative else "of the largest",
+            "residual_correlation": self.correlation,
+        }
 
     def table(self) -> dict[str, Any]:
-        """The arguments of the material's constructor that the test tells, and tau_instant."""
+        """The arguments of the material's constructor that the test determines, and tau_instant."""
         symbol, argument = ("E", "moduli") if self.kind == "prony" else ("J", "J")
         numbers = range(1, self.terms + 1)
         tau = [self.values[f"tau_{k}"] for k in numbers]
@@ -147,7 +168,7 @@ class Trial(NamedTuple):
 def fit(measured: Measured | Spectrum, *, terms: int | None = None) -> Fit:
     """The series with the least criterion among those whose every strength the rows determine, if
     there is one, or with as many `terms` as asked for. Raises `ValueError` where the rows are too
-    few for these, or tell no modulus that remains."""
+    few for these, or determine no relaxed modulus."""
     shortest, longest = measured.window
     most = min(MOST, 2 + int(math.log10(longest / shortest)), (len(measured.answer) - 2) // 2)
     if terms is not None and not 1 <= terms <= most:
@@ -173,12 +194,14 @@ def fit(measured: Measured | Spectrum, *, terms: int | None = None) -> Fit:
         )
     scores = {count: trial.score for count, trial in tried.items()}
     fits = [concluded(measured, tried[k], scores) for k in sorted(tried, key=scores.__getitem__)]
-    told = [one for one in fits if not one.undetermined]
-    if terms is not None or not told or told[0] is fits[0]:
+    determined = [one for one in fits if not one.undetermined]
+    if terms is not None or not determined or determined[0] is fits[0]:
         return fits[0]
-    left = f"{fits[0].terms} terms fit better, but {told[0].terms} are taken: the rows do not "
+    left = (
+        f"{fits[0].terms} terms fit better, but {determined[0].terms} are taken: the rows do not "
+    )
     left += f"determine {', '.join(fits[0].undetermined)} of the others"
-    return replace(told[0], notices=(*told[0].notices, left))
+    return replace(determined[0], notices=(*determined[0].notices, left))
 
 
 def beginnings(measured: Measured | Spectrum, count: int) -> list[Array]:
@@ -292,7 +315,7 @@ def notices(
     (shortest, longest), terms = measured.window, (len(values) - 1) // 2
     verb = "creeps" if measured.test == "creep" else "relaxes"
     sentences = [
-        f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not tell what "
+        f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not show what "
         f"{verb} faster, and what {verb} slower counts to the relaxed modulus E, which may be "
         "lower still"
     ]
@@ -315,7 +338,7 @@ def notices(
     if measured.flows:
         sentences.append(
             "the creep flows: under a held stress the strain still grows in proportion to time at "
-            "the end, so that no E remains; the slowest term stands for a dashpot, and holds up to "
+            "the end, so that no E remains; the slowest term represents a dashpot, and holds up to "
             "the end of the test only"
         )
     if correlation > COLOURED:

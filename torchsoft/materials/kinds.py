@@ -20,4 +20,4 @@ ENERGIES: Mapping[str, tuple[str, ...]] = {
     "yeoh": ("C10", "C20", "C30"),
     "ogden": ("mu", "alpha"),
 }
-"""Energies, and the arguments of their constructors that tests tell."""
+"""Energies, and the arguments of their constructors that tests determine."""

@@ -102,7 +102,7 @@ class Measured:
 
     @property
     def largest_strain(self) -> float | None:
-        """Largest strain [1]; None where the table does not tell it."""
+        """Largest strain [1]; None where the table does not state it."""
         return None if self.per_load else float(np.abs(self.strain).max())
 
     @property
@@ -157,7 +157,7 @@ class Spectrum:
 
     @property
     def t(self) -> Array:
-        """Times (n,) [s] that the frequencies stand for."""
+        """Times (n,) [s] that the frequencies correspond to."""
         return 1.0 / self.omega
 
     @property
@@ -224,33 +224,65 @@ def read(
     values = table.values
     check_rows(path, table)
     if "frequency" in values:
-        for name, given in (("length", length), ("area", area), ("strains", strains)):
-            if given is not None:
-                raise ValueError(f"{path}: a sweep needs no `{name}`")
+        reject(path, "a sweep needs no", length=length, area=area, strains=strains)
         if test not in (None, "sweep"):
             raise ValueError(f"{path}: `frequency` is of a sweep, not of a {test} test")
         return sweep(path, table, nu)
     if test == "sweep":
         raise ValueError(f"{path} has no column `frequency`{hint('frequency', 2)}")
-    if alone := {"modulus", "compliance"} & values.keys():
-        if len(values) != 2 or "t" not in values:
-            raise ValueError(
-                f"{path}: `{min(alone)}` stands alone beside `t`, but there is {', '.join(values)}"
-            )
-        own: Test = "relaxation" if alone == {"modulus"} else "creep"
-        if test not in (None, own):
-            raise ValueError(f"{path}: `{min(alone)}` is of a {own} test, not of a {test} test")
-        for name, given in (("length", length), ("area", area)):
-            if given is not None:
-                raise ValueError(f"{path}: nothing is to be divided by the `{name}`")
-        if not values[min(alone)].any():
-            raise ValueError(f"{path}: the {min(alone)} is zero throughout")
-        one = np.ones_like(values["t"])
-        if own == "relaxation":
-            return Measured(path, "relaxation", values["t"], one, values["modulus"], True)
-        return Measured(path, "creep", values["t"], values["compliance"], one, True)
+    if {"modulus", "compliance"} & values.keys():
+        reject(path, "nothing is to be divided by the", length=length, area=area)
+        return per_load(path, values, test)
+    strain, stress = loaded(path, table, test, length, area)
+    if true and test != "shear":
+        stress = stress / (1 + strain)
+    pull: PullTest | None = next((one for one in PULLS if one == test), None)
+    if pull is not None:
+        return pulled(path, pull, table.rows, strain, stress, strains, whole)
+    if "t" not in values:
+        raise ValueError(
+            f"{path} has no column `t`: over time it would be a relaxation or a creep test; for a "
+            "modulus say test = tension or compression, and the range of strains"
+        )
+    if strains is not None:
+        raise ValueError(f"{path}: a range of strains is of a tension or a compression test")
+    own = test if test in ("relaxation", "creep") else held(path, strain, stress)
+    return Measured(path, own, values["t"], strain, stress)
+
+
+def reject(path: Path, reason: str, **options: object) -> None:
+    """Raises `ValueError` for an option that is given although the table has no use for it."""
+    for name, given in options.items():
+        if given is not None:
+            raise ValueError(f"{path}: {reason} `{name}`")
+
+
+def per_load(path: Path, values: Mapping[str, Array], test: Test | None) -> Measured:
+    """The test of a table that has the response to a unit load put on at t = 0. Raises `ValueError`
+    for other columns or another test, and for a response that is zero."""
+    response = "modulus" if "modulus" in values else "compliance"
+    if values.keys() != {"t", response}:
+        raise ValueError(
+            f"{path}: `{response}` stands alone beside `t`, but there is {', '.join(values)}"
+        )
+    own = "relaxation" if response == "modulus" else "creep"
+    if test not in (None, own):
+        raise ValueError(f"{path}: `{response}` is of a {own} test, not of a {test} test")
+    if not values[response].any():
+        raise ValueError(f"{path}: the {response} is zero throughout")
+    t, load, answer = values["t"], np.ones_like(values["t"]), values[response]
+    strain, stress = (load, answer) if own == "relaxation" else (answer, load)
+    return Measured(path, own, t, strain, stress, per_load=True)
+
+
+def loaded(
+    path: Path, table: csvfile.Numbers, test: Test | None, length: float | None, area: float | None
+) -> tuple[Array, Array]:
+    """Nominal strain [1] and stress [Pa] (n,), positive in tension. Raises `ValueError` where one
+    is zero throughout or they are opposite, and for compression to nothing."""
     gauge = "an elongation needs the gauge length, `length` (--length) [m]"
     section = "a force needs the cross-section, `area` (--area) [m2]"
+    values = table.values
     strain = nominal(path, values, ("strain", "stretch", "elongation"), "length", length, gauge)
     stress = nominal(path, values, ("stress", "force"), "area", area, section)
     for name, x in (("strain", strain), ("stress", stress)):
@@ -273,20 +305,7 @@ def read(
             "specimen that is compressed to nothing has -1: look at the unit of the column, at "
             "the gauge length, and at the test"
         )
-    if true and test != "shear":
-        stress = stress / (1 + strain)
-    pull: PullTest | None = next((one for one in PULLS if one == test), None)
-    if pull is not None:
-        return pulled(path, pull, table.rows, strain, stress, strains, whole)
-    if "t" not in values:
-        raise ValueError(
-            f"{path} has no column `t`: over time it would be a relaxation or a creep test; for a "
-            "modulus say test = tension or compression, and the range of strains"
-        )
-    if strains is not None:
-        raise ValueError(f"{path}: a range of strains is of a tension or a compression test")
-    own = test if test in ("relaxation", "creep") else held(path, strain, stress)
-    return Measured(path, own, values["t"], strain, stress)
+    return strain, stress
 
 
 def held(path: Path, strain: Array, stress: Array) -> Literal["relaxation", "creep"]:
@@ -324,7 +343,7 @@ def sweep(path: Path, table: csvfile.Numbers, nu: float | None) -> Spectrum:
     if there not in ways:
         raise ValueError(
             f"{path}: beside `frequency` stand storage_modulus and loss_modulus, of tension, or "
-            "storage_shear_modulus and loss_shear_modulus; tan_delta may stand for the second; but "
+            "storage_shear_modulus and loss_shear_modulus; tan_delta may replace the second; but "
             f"there is {', '.join(sorted(there)) or 'none'}"
         )
     one = ways[there]
@@ -446,7 +465,7 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
         if name in POSITIVE and bad.any():
             unit = next(unit for unit, size in KNOWN[name].items() if size == 1)
             raise ValueError(
-                f"{path}, row {table.rows[bad.argmax()]}, column `{name}`: "
+                f"{path}, row {table.rows[int(bad.argmax())]}, column `{name}`: "
                 f"{column[bad.argmax()]:.4g} {unit} is not above zero: look at the signs and the "
                 "offsets of the sensors, and leave out rows of noise alone"
             )
@@ -470,8 +489,8 @@ def hint(name: str, columns: int) -> str:
     known = "; ".join(f"{column} [{', '.join(units)}]" for column, units in KNOWN.items())
     return (
         f"{'; separate columns with commas, semicolons or tabs' if columns == 1 else ''}; columns "
-        f"and their units are {known}; one of another name is told by --column NAME={name or 'ITS'}"
-        f", others are left out by --ignore"
+        f"and their units are {known}; give one of another name by --column NAME={name or 'ITS'}"
+        f"; leave others out by --ignore"
     )
 
 

@@ -32,8 +32,30 @@ class Modulus:
         stress = self.measured.stress
         return float(np.sqrt(np.mean((stress - self.fitted) ** 2)) / np.abs(stress).max())
 
+    @property
+    def test(self) -> str:
+        """Kind of test."""
+        return self.measured.test
+
+    @property
+    def described(self) -> str:
+        """What was fitted, and how well."""
+        low, high = self.measured.strains
+        return f"strains from {low:g} to {high:g}, residual {self.rms:.2%} of the largest"
+
+    def method(self) -> dict[str, Any]:
+        """How the modulus was found, and how well it fits, for a summary in JSON."""
+        return {
+            "method": "slope of a straight line by least squares",
+            "rows": len(self.fitted),
+            "strains": list(self.measured.strains),
+            "slopes_at_ends": list(self.ends),
+            "residual_rms": self.rms,
+            "residual_of": "of the largest",
+        }
+
     def table(self) -> dict[str, Any]:
-        """The argument of the material's constructor that the test tells."""
+        """The argument of the material's constructor that the test determines."""
         return dict(self.values)
 
     def material(self, *, nu: float, rho: float, depth: float, tau: float) -> KelvinVoigt:

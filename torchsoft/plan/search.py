@@ -115,10 +115,10 @@ class Search:
             raise Stopped
         try:
             evaluation = self.evaluator.evaluate(z, gradient=gradient)
-        except ValueError as refused:
+        except ValueError as error:
             if not self.history:
                 raise
-            evaluation = Evaluation(z, torch.zeros(0), None, self.evaluator.terms, str(refused))
+            evaluation = Evaluation(z, torch.zeros(0), None, self.evaluator.terms, str(error))
         if evaluation.failure:
             self.failures.append(evaluation.failure)
         else:

@@ -206,7 +206,7 @@ class Scene:
         self, axes: Axes, setup: Setup, *, curves: tuple[float, float] | None = None,
         stress: float | None = None, size: float = 1.0,
     ) -> None:  # fmt: skip
-        self.setup, self.curves = setup, curves
+        self.axes, self.setup, self.curves = axes, setup, curves
         self.thickness = plates(setup)
         self.shapes = {
             name: MM * body.outline

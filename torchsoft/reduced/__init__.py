@@ -1,5 +1,5 @@
-"""Reduced models: sparse equations of the disc's and the bracket's motion, recovered from runs of
-the full model."""
+"""Reduced models for any rig with one body between two pads: sparse equations of the motion of the
+body (`disc`) and of the base of one pad (`bracket`), recovered from runs of the full model."""
 
 from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel

@@ -10,18 +10,17 @@ from torch import Tensor
 
 from torchsoft.parallel import single_threaded
 from torchsoft.physics.arguments import Numbers
-from torchsoft.physics.motion import Piecewise
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import Starts, moving
 from torchsoft.physics.structure import values_of
 from torchsoft.physics.validity import check_values
 from torchsoft.rigs.initial import (
     Followed,
-    RigFile,
     holding_effort,
     initial_poses,
     settled_pads,
 )
+from torchsoft.rigs.schema import RigTables
 from torchsoft.solve.simulate import Initial, simulate
 from torchsoft.solve.trajectory import Trajectory
 
@@ -45,7 +44,7 @@ class BuiltRig:
     rig: Rig
     y0: Tensor
     t: Tensor
-    file: RigFile = field(repr=False)
+    file: RigTables = field(repr=False)
     followed: Mapping[str, Followed] = field(repr=False)
     solver: Mapping[str, Any] = field(default_factory=dict, repr=False)
     last: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
@@ -56,7 +55,7 @@ class BuiltRig:
     @property
     def starts(self) -> Starts:
         """Coordinates and rates at which bodies start, by body, as the file gives them."""
-        return {name: body.given for name, body in self.file.bodies.items()}
+        return self.file.starts
 
     @single_threaded()
     def initial(self, rig: Rig | None = None) -> Initial:
@@ -72,7 +71,8 @@ class BuiltRig:
             return self.last["start"]
         check_values(rig)
         reference = own = self.rig.reference
-        poses = initial_poses(self.file, rig, self.driven)
+        driven: Any = {name: own[name] for name in self.file.driven}
+        poses = initial_poses(self.file, rig, driven)
         for name, one in self.followed.items():
             if name.replace(".", ":") in own.signals and own[name] is one.signal:
                 held = partial(holding_effort, self.file, rig, poses, reference)
@@ -87,13 +87,6 @@ class BuiltRig:
         """All that the start of a rig depends on; empty where that is not known."""
         found, motion = values_of(rig), values_of(self.rig.reference)
         return (*found, *motion) if found and motion else ()
-
-    @property
-    def driven(self) -> dict[str, Piecewise]:
-        """Motions of driven coordinates, by name."""
-        kinds = self.file.coordinates()
-        names = [f"{body}.{axis}" for body, axis, kind in kinds if kind == "driven"]
-        return {name: self.rig.reference[name] for name in names}  # pyright: ignore[reportReturnType]
 
     def start(self) -> Tensor:
         """The state (size,) at the start, for the parameters that the rig has now, which it is

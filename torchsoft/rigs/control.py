@@ -149,32 +149,27 @@ def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -
         )
     if sum(array.size for array in arrays.values()) > WEIGHTS:
         raise ValueError(f"it has more than {WEIGHTS} numbers, which are too many to be compiled")
+    for name, array in arrays.items():
+        if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite numbers")
     width, parts = len(inputs), list[nn.Module]()
     for i in found:
-        weight, bias = arrays[f"{i}.weight"], arrays[f"{i}.bias"]
-        last = i == found[-1]
-        if (
-            weight.ndim != 2
-            or weight.shape[1] != width
-            or bias.shape != weight.shape[:1]
-            or (last and len(bias) != efforts)
-        ):
+        both = (arrays[f"{i}.{part}"].astype(np.float64) for part in ("weight", "bias"))
+        weight, bias = map(torch.from_numpy, both)
+        rows, shown = bias.numel(), "n"
+        if i == found[-1]:
+            rows, shown = efforts, str(efforts)
+        if weight.shape != (rows, width) or bias.shape != (rows,):
             raise ValueError(
-                f"{i}.weight has the shape {weight.shape} and {i}.bias {bias.shape}, but must have "
-                f"({efforts if last else 'n'}, {width}) and ({efforts if last else 'n'},): from "
-                f"{len(inputs)} inputs ({', '.join(inputs)}) to "
-                f"{'one effort' if efforts == 1 else f'{efforts} efforts'}"
+                f"{i}.weight has the shape {tuple(weight.shape)} and {i}.bias {tuple(bias.shape)}, "
+                f"but must have ({shown}, {width}) and ({shown},): from {len(inputs)} inputs "
+                f"({', '.join(inputs)}) to {efforts} effort{'s' * (efforts > 1)}"
             )
-        for name, array in (("weight", weight), ("bias", bias)):
-            if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-                raise ValueError(f"{i}.{name} must be finite numbers")
-        linear = nn.Linear(width, len(bias), dtype=torch.float64)
-        with torch.no_grad():
-            linear.weight.copy_(torch.from_numpy(weight.astype(np.float64)))
-            linear.bias.copy_(torch.from_numpy(bias.astype(np.float64)))
-        parts += [linear] if last else [linear, nn.Tanh()]
-        width = len(bias)
-    return nn.Sequential(*parts)
+        linear = nn.Linear(width, rows, dtype=torch.float64)
+        linear.load_state_dict({"weight": weight, "bias": bias})
+        parts += [linear, nn.Tanh()]
+        width = rows
+    return nn.Sequential(*parts[:-1])
 
 
 Names = Annotated[tuple[str, ...], LISTED]

@@ -1,10 +1,8 @@
-"""Geometry of undeformed rigs: surfaces of pads and outlines of bodies in the world, gaps and
-overlaps."""
+"""Geometry of undeformed rigs: points of pads and outlines of bodies in the world, and overlaps."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
-import networkx as nx
 import numpy as np
 import torch
 
@@ -14,41 +12,11 @@ from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.shapes import Shape
 
-FACING = -0.9
-"""Scalar product of two surfaces' normals below which they face each other."""
-
-CORNERS = 1440
-"""Number of points of an outline at which its curvature is computed."""
+PARTS = 32
+"""Number of points on each side of a pad's outline that are tested for being inside another pad."""
 
 Poses = Mapping[str, Array]
 """Poses (3,) [m, m, rad] by body."""
-
-
-class Surface(NamedTuple):
-    """An undeformed pad in the world: highest middle of its free surface [m], outward normal and
-    direction along it (2,); its half length and its height [m]; and its profile from left to right
-    (nodes, 2) [m], along the surface from the middle and outwards."""
-
-    middle: Array
-    normal: Array
-    along: Array
-    half: float
-    height: float
-    profile: Array
-
-    def depth(self, place: Array) -> Array:
-        """Depth [m] of points (..., 2) under the surface, along the normal at its middle; negative
-        above it."""
-        outwards = np.interp((place - self.middle) @ self.along, *self.profile.T)
-        return outwards - (place - self.middle) @ self.normal
-
-    def off(self, place: Array) -> float:
-        """Distance [m] of a point (2,) beyond the pad's ends; negative between them."""
-        return float(abs((place - self.middle) @ self.along) - self.half)
-
-    def faces(self, other: "Surface") -> bool:
-        """Whether two surfaces face each other."""
-        return bool(self.normal @ other.normal < FACING)
 
 
 def at(coordinate: str) -> tuple[str, int]:
@@ -69,28 +37,9 @@ def in_world(pad: Pad, pose: Poses, placed: Array) -> Array:
     return base[:2] + turned(placed, base[2])
 
 
-def surface(pad: Pad, pose: Poses) -> Surface:
-    """Surface of a pad with its base at its pose."""
-    mesh = pad.mesh
-    own = mesh.nodes[mesh.free[mesh.surface]]
-    left, right, top = own[:, 0].min(), own[:, 0].max(), own[:, 1].max()
-    middle = np.array([0.5 * (left + right), top])
-    origin, along, normal = in_world(
-        pad, pose, pad.placed(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-    )
-    profile = (own - middle)[np.argsort(own[:, 0], kind="stable")]
-    return Surface(
-        origin, normal - origin, along - origin, 0.5 * (right - left), mesh.height, profile
-    )
-
-
 def nodes(pad: Pad, pose: Poses) -> Array:
     """All nodes (nodes, 2) of an undeformed pad in the world [m]."""
     return in_world(pad, pose, pad.placed(pad.mesh.nodes))
-
-
-PARTS = 32
-"""Number of points on each side of a pad's outline that are tested for being inside another pad."""
 
 
 def collision(one: Pad, other: Pad, pose: Poses) -> float:
@@ -124,37 +73,15 @@ class Scene(NamedTuple):
     pose: Poses
 
     def shape(self, body: str) -> Shape:
-        """Shape of a body that has a contact."""
+        """Shape of a body that has one."""
         shape = self.rig.bodies[body].shape
         assert shape is not None
         return shape
 
-    def pad(self, contact: str) -> Pad:
-        return self.rig.pads[self.rig.contacts[contact].pad]
-
-    def surface(self, contact: str) -> Surface:
-        """Surface of a contact's pad."""
-        return surface(self.pad(contact), self.pose)
-
     def points(self, contact: str) -> Array:
         """Contact points (points, 2) of a contact's pad in the world [m]."""
-        pad = self.pad(contact)
+        pad = self.rig.pads[self.rig.contacts[contact].pad]
         return in_world(pad, self.pose, pad.point_positions.numpy())
-
-    def away(self, contact: str) -> bool:
-        """Whether a body is outside the space over the pad of a contact that it must not leave."""
-        own, (low, high) = self.rig.contacts[contact], self.pad(contact).space
-        base = np.zeros(3) if (on := self.pad(contact).base) is None else self.pose[on]
-        place = turned(self.pose[own.body][:2] - base[:2], -base[2])
-        return not own.may_leave and bool(((place < low) | (place > high)).any())
-
-    def reach(self, body: str, direction: Array) -> float:
-        """Extent [m] of a body from its centre along a unit vector of the world."""
-        return float(
-            self.shape(body)
-            .support(torch.from_numpy(turned(direction, -self.pose[body][2])))
-            .detach()
-        )
 
     def inside(self, body: str, places: Array) -> float:
         """Depth [m] of the deepest of some points (n, 2) of the world in a body; negative where all
@@ -162,39 +89,42 @@ class Scene(NamedTuple):
         own = turned(places - self.pose[body][:2], -self.pose[body][2])
         return -float(self.shape(body)(torch.from_numpy(own))[0].detach().min())
 
-    def pressed(self, contact: str) -> float:
-        """Depth [m] of the undeformed pad of a contact in the body; negative where they are
-        apart."""
-        return self.inside(self.rig.contacts[contact].body, self.points(contact))
-
     def outline(self, body: str) -> Array:
         """Points on the outline of a body (points, 2) [m]."""
         return self.pose[body][:2] + turned(self.shape(body).outline().numpy(), self.pose[body][2])
 
-    def corner(self, body: str) -> float:
-        """Smallest convex radius of curvature of a body [m]."""
-        return 1 / float(self.shape(body).curvature(self.shape(body).outline(CORNERS)).max())
+    def carried(self, body: str) -> bool:
+        """Whether one of the body's contacts is with a pad that it touches or that lies under its
+        centre."""
+        x, y, _ = self.pose[body]
+        for name, contact in self.rig.contacts.items():
+            if contact.body != body:
+                continue
+            points = self.points(name)
+            over = points[:, 0].min() < x < points[:, 0].max()
+            below = points[np.abs(points[:, 0] - x).argmin(), 1] < y
+            if (over and below) or self.inside(body, points) > 0:
+                return True
+        return False
 
-    def facing(self, body: str) -> list[tuple[str, str]]:
-        """Pairs of contacts of a body whose pads face each other across it."""
-        at = {
-            key: self.surface(key)
-            for key, contact in self.rig.contacts.items()
-            if contact.body == body
-        }
-        own = list(at)
-        return [
-            (a, b) for i, a in enumerate(own) for b in own[i + 1 :]
-            if at[a].faces(at[b]) and at[a].depth(at[b].middle) < at[a].height
-            and abs((at[b].middle - at[a].middle) @ at[a].along) < at[a].half + at[b].half
-        ]  # fmt: skip
-
-
-def tied(rig: Graph, contacts: Iterable[str]) -> nx.Graph:
-    """Graph of the bodies, with an edge where one of the contacts is between a body and a pad on
-    another body. The ground connects nothing."""
-    graph = nx.Graph()
-    graph.add_nodes_from(rig.bodies)
-    pairs = ((rig.pads[rig.contacts[key].pad].base, rig.contacts[key].body) for key in contacts)
-    graph.add_edges_from((base, body) for base, body in pairs if base is not None)
-    return graph
+    def overlaps(self) -> dict[tuple[str, str], float]:
+        """Depths [m] of overlaps between all pairs of bodies and pads without a contact, negative
+        or 0 where they are apart, by the fields of a rig file."""
+        rig, depths = self.rig, dict[tuple[str, str], float]()
+        solid = [name for name, body in rig.bodies.items() if body.shape is not None]
+        touching = {(contact.body, contact.pad) for contact in rig.contacts.values()}
+        for i, one in enumerate(solid):
+            for other in solid[i + 1 :]:
+                depths[f"bodies.{one}", f"bodies.{other}"] = max(
+                    self.inside(other, self.outline(one)), self.inside(one, self.outline(other))
+                )
+            for name, pad in rig.pads.items():
+                if (one, name) not in touching and pad.base != one:
+                    depth = self.inside(one, nodes(pad, self.pose))
+                    depths[f"bodies.{one}", f"pads.{name}"] = depth
+        pads = list(rig.pads)
+        for i, one in enumerate(pads):
+            for other in pads[i + 1 :]:
+                depth = collision(rig.pads[one], rig.pads[other], self.pose)
+                depths[f"pads.{one}", f"pads.{other}"] = depth
+        return depths

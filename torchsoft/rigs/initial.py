@@ -21,9 +21,7 @@ from torchsoft.physics.statics import (
 )
 from torchsoft.rigs.geometry import at
 from torchsoft.rigs.motion import HELD, MotionContext
-
-RigFile = Any
-"""A `RigFile`, whose module imports this one."""
+from torchsoft.rigs.schema import RigTables
 
 Held = Callable[[str, float], Tensor]
 """Effort () [N, N.m] that holds a coordinate at a time [s]."""
@@ -33,7 +31,7 @@ STIFF = 100.0
 not blamed on the contact."""
 
 
-def initial_poses(file: RigFile, rig: Rig, driven: Mapping[str, Piecewise]) -> Poses:
+def initial_poses(file: RigTables, rig: Rig, driven: Mapping[str, Piecewise]) -> Poses:
     """Initial poses (3,) [m, m, rad] by body; `driven` gives the motions of driven coordinates.
     Raises `ValueError` naming the field."""
     none = torch.zeros((), dtype=torch.float64)
@@ -42,9 +40,8 @@ def initial_poses(file: RigFile, rig: Rig, driven: Mapping[str, Piecewise]) -> P
     for name, one in driven.items():
         body, axis = at(name)
         held[body][axis] = one(none)[0]
-    starts = {name: body.given for name, body in file.bodies.items()}
     try:
-        return placed(rig, starts, {name: torch.stack(rows) for name, rows in held.items()})
+        return placed(rig, file.starts, {name: torch.stack(rows) for name, rows in held.items()})
     except NoPlace as error:
         raise ValueError(f"bodies.{error.body}.start.{error.axis}: {error.reason}") from None
     except NoEquilibrium as error:
@@ -56,7 +53,7 @@ def initial_poses(file: RigFile, rig: Rig, driven: Mapping[str, Piecewise]) -> P
         ) from None
 
 
-def settled_pads(file: RigFile, rig: Rig, poses: Poses, reference: Reference) -> Tensor:
+def settled_pads(file: RigTables, rig: Rig, poses: Poses, reference: Reference) -> Tensor:
     """State (size,) of bodies that stand at `poses`, their pads settled around them, at the start
     of a reference. Raises `ValueError`."""
     try:
@@ -68,7 +65,7 @@ def settled_pads(file: RigFile, rig: Rig, poses: Poses, reference: Reference) ->
 
 
 def signal(
-    file: RigFile, name: str, poses: Mapping[str, Tensor] | None = None, held: Held | None = None
+    file: RigTables, name: str, poses: Mapping[str, Tensor] | None = None, held: Held | None = None
 ) -> Piecewise:
     """One motion, for bodies that start at `poses`. Raises `ValueError` naming the field."""
     follower, fed = sole_user(file, name, "setpoint"), sole_user(file, name, "feed_forward")
@@ -84,12 +81,12 @@ def signal(
         raise ValueError(f"{prefix}{error}") from None
 
 
-def reference(file: RigFile, poses: Mapping[str, Tensor], held: Held) -> Reference:
+def reference(file: RigTables, poses: Mapping[str, Tensor], held: Held) -> Reference:
     """All motions, for bodies that start at `poses`. Raises `ValueError` naming the field."""
     return Reference(**{name: signal(file, name, poses, held) for name in file.motion})
 
 
-def sole_user(file: RigFile, motion: str, role: str) -> str:
+def sole_user(file: RigTables, motion: str, role: str) -> str:
     """The one coordinate that uses a motion in a role; empty where there is none, or several."""
     users = {coordinate for one, coordinate in file.followers()[motion] if one == role}
     return users.pop() if len(users) == 1 else ""
@@ -101,7 +98,7 @@ def placed_at(poses: Mapping[str, Tensor], coordinate: str) -> Tensor:
     return poses[body][axis]
 
 
-def setpoints(file: RigFile, poses: Mapping[str, Tensor]) -> Reference:
+def setpoints(file: RigTables, poses: Mapping[str, Tensor]) -> Reference:
     """The motions that coordinates follow, for bodies that start at `poses`. Raises as `signal`."""
     fed = {"feed_forward"}
     names = [k for k, users in file.followers().items() if {role for role, _ in users} != fed]
@@ -153,7 +150,7 @@ class Followed(NamedTuple):
 
 
 def followed_motions(
-    file: RigFile, poses: Mapping[str, Tensor], held: Held, built: Reference
+    file: RigTables, poses: Mapping[str, Tensor], held: Held, built: Reference
 ) -> dict[str, Followed]:
     """Motions with values given as "start" or "held", by name, those that coordinates follow before
     those that are fed forward; as built for bodies that start at `poses`."""
@@ -176,7 +173,7 @@ def followed_motions(
 
 
 def holding_effort(
-    file: RigFile, rig: Rig, start: Poses, signals: Reference, coordinate: str, time: float
+    file: RigTables, rig: Rig, start: Poses, signals: Reference, coordinate: str, time: float
 ) -> Tensor:
     """The effort () [N, N.m] that holds a coordinate, without friction, with bodies at their
     set-points at a time [s], or else where they rest or start. Raises `ValueError`."""
@@ -195,7 +192,7 @@ def holding_effort(
 
 
 def at_setpoints(
-    file: RigFile, start: Poses, signals: Reference, time: float
+    file: RigTables, start: Poses, signals: Reference, time: float
 ) -> tuple[Poses, Collection[tuple[str, int]]]:
     """Poses at a time [s] of bodies that follow set-points and drives exactly and start at `start`,
     and the coordinates that do, by body and axis."""
@@ -208,7 +205,7 @@ def at_setpoints(
     return {name: torch.stack(row) for name, row in rows.items()}, moved
 
 
-def too_stiff(file: RigFile, rig: Rig) -> str:
+def too_stiff(file: RigTables, rig: Rig) -> str:
     """Error message on a contact too stiff for its pad to be solved; empty if there is none."""
     for name, contact in rig.contacts.items():
         give = float(rig.pads[contact.pad].compliance().diagonal().max())

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Sampled
-from torchsoft.rigs.course import Estimate
+from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.motion import CsvTable, quantum
 
 LONGER = 100.0
@@ -14,26 +14,27 @@ OUTPUTS_PER_PERIOD = 4
 """Fewest outputs in a period of a motion."""
 
 
-def recordings(e: Estimate) -> Iterator[Diagnostic]:
+def recordings(ready: BuiltRig) -> Iterator[Diagnostic]:
     """Findings on recorded motions that do not cover the run, and on waves too fast for the
     outputs."""
-    interval = e.file.outputs.interval
-    for name, motion in e.file.motion.items():
-        one, fastest = e.rig.reference[name], motion.fastest()
+    file, end = ready.file, ready.file.outputs.duration
+    interval = file.outputs.interval
+    for name, motion in file.motion.items():
+        one, fastest = ready.rig.reference[name], motion.fastest()
         if isinstance(motion, CsvTable) and isinstance(one, Sampled):
             first, last = float(one.times[0]), float(one.times[-1])
-            if first >= e.file.outputs.duration:
+            if first >= end:
                 yield Diagnostic(
                     "error", f"motion.{name}.file",
                     f"{motion.file} begins at {first:g} s, and the run ends at "
-                    f"{e.file.outputs.duration:g} s: where its times are of a clock, say "
+                    f"{end:g} s: where its times are of a clock, say "
                     "from_first = true",
                 )  # fmt: skip
-            elif last > LONGER * e.file.outputs.duration:
+            elif last > LONGER * end:
                 yield Diagnostic(
                     "warning", f"motion.{name}.file",
                     f"{motion.file} lasts {last:g} s, and the run shows "
-                    f"{e.file.outputs.duration:g} s of it: are its times in milliseconds?",
+                    f"{end:g} s of it: are its times in milliseconds?",
                 )  # fmt: skip
             elif first > 0:
                 sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
@@ -42,15 +43,15 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
                 each = float(one.times.diff().median())
                 yield Diagnostic(
                     "warning", f"motion.{name}.file",
-                    f"{motion.file} is in steps of {step:.3g} {e.file.unit(name)}, as of an "
+                    f"{motion.file} is in steps of {step:.3g} {file.unit(name)}, as of an "
                     f"encoder: rates of the set-point jump by {step / each:.2g} "
-                    f"{e.file.unit(name)}/s from row to row; smooth the column",
+                    f"{file.unit(name)}/s from row to row; smooth the column",
                 )  # fmt: skip
-            if last < e.file.outputs.duration * (1 - 1e-9):
+            if last < end * (1 - 1e-9):
                 yield Diagnostic(
                     "error", f"motion.{name}.file",
                     f"{motion.file} ends at {last:g} s, but the run lasts until "
-                    f"{e.file.outputs.duration:g} s: nothing says what is wanted then; shorten "
+                    f"{end:g} s: nothing says what is wanted then; shorten "
                     f"outputs.duration to {last:g}, or record longer",
                 )  # fmt: skip
         if fastest * interval * OUTPUTS_PER_PERIOD > 1:

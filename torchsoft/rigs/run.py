@@ -4,7 +4,7 @@ video."""
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from tqdm import tqdm
 
@@ -18,9 +18,10 @@ from torchsoft.physics.mesh.mesh import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.built import BuiltRig
+from torchsoft.rigs.check import EFFORT, LOOSE, ROWS
 from torchsoft.rigs.fields import at_field
-from torchsoft.solve.diagnostics import SMALL_STRAIN, doubts, strained
+from torchsoft.rigs.findings import Run, strains
+from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
@@ -30,15 +31,7 @@ FLOPS = 1e10
 """Floating-point operations a second [1/s] of block products on one core of a usual machine."""
 
 
-class RunOutcome(NamedTuple):
-    """A run, complete or up to its early end, and the cause of that end."""
-
-    ready: BuiltRig
-    trajectory: Trajectory
-    stopped: SimulationFailed | Interrupted | None
-
-
-def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
+def carry_out(file: RigFile, *, progress: bool = False) -> Run:
     """Simulate a rig file. A failure or Ctrl-C ends the run early; the outcome then holds the run
     so far.
 
@@ -53,13 +46,13 @@ def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
     except (SimulationFailed, Interrupted) as stop:
         if stop.trajectory is None:
             raise
-        return RunOutcome(ready, stop.trajectory, stop)
-    return RunOutcome(ready, run, None)
+        return Run(ready, stop.trajectory, stop)
+    return Run(ready, run, None)
 
 
 def run(
     file: RigFile, out: Path, *, found: list[Diagnostic] | None = None, progress: bool = False
-) -> RunOutcome:
+) -> Run:
     """Simulate and write the results to the folder `out`: data first, pictures only of complete
     runs. `found` are findings of the check, for the summary. Raises `OSError` for a folder that
     cannot be made, and the errors of `carry_out`."""
@@ -74,7 +67,7 @@ def run(
     return done
 
 
-def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[str, Any]:
+def summary(file: RigFile, done: Run, found: list[Diagnostic]) -> dict[str, Any]:
     """The run in numbers, in SI units, and its provenance."""
     run, rig = done.trajectory, done.ready.rig
     stopped = done.stopped
@@ -85,7 +78,6 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
         if isinstance(stopped, SimulationFailed)
         else "interrupted"
     )
-    largest = largest_strains(run)
     return {
         "title": file.title,
         "stopped": reason,
@@ -104,7 +96,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             name: {
                 "largest_displacement_over_height": float(u.norm(dim=-1).max())
                 / rig.pads[name].mesh.height,
-                "largest_strain": largest[name][0],
+                "largest_strain": largest_strain(run, name),
             }
             for name, u in run.displacement.items()
         },
@@ -119,7 +111,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             "worst_imbalance_over_injected": run.energy_residual_rel,
         },
         "doubts": list(doubts(run, rig).values()),
-        "notes": [str(one) for one in notes(run, largest)],
+        "notes": [str(one) for one in strains(done)],
         "stepping": vars(run.stats) | {"newton_per_step": run.stats.newton_per_step},
         "findings": [one._asdict() for one in found],
         "torchsoft": version("torchsoft"),
@@ -127,23 +119,11 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
     }
 
 
-def largest_strains(run: Trajectory) -> dict[str, tuple[float, float]]:
-    """The largest strain [1] of each pad, where it gives way most, and its time [s]."""
-    found = {}
-    for name, u in run.displacement.items():
-        k = int(u.detach().norm(dim=-1).amax(-1).argmax())
-        strain = run.setup.pads[name].largest_strain(u[k].detach().numpy())
-        found[name] = float(strain), float(run.t[k])
-    return found
-
-
-def notes(run: Trajectory, largest: dict[str, tuple[float, float]]) -> list[Diagnostic]:
-    """Notes on the `largest_strains` of linear pads in a run."""
-    return [
-        Diagnostic("note", f"pads.{name}", strained(strain, time))
-        for name, (strain, time) in largest.items()
-        if strain > SMALL_STRAIN and not run.setup.pads[name].finite
-    ]
+def largest_strain(run: Trajectory, pad: str) -> float:
+    """The largest strain [1] of a pad, where it gives way most."""
+    u = run.displacement[pad].detach()
+    row = int(u.norm(dim=-1).amax(-1).argmax())
+    return float(run.setup.pads[pad].largest_strain(u[row].numpy()))
 
 
 def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, float]]:
@@ -166,27 +146,30 @@ def condensing_time(mesh: Mesh) -> float:
 def cost(file: RigFile, runs: bool) -> Cost:
     """Cost of a check, and with `runs` of a run after it. Raises `ValueError` for a mesh file that
     cannot be read."""
-    meshes = []
+    span, solver = file.outputs.duration, file.solver
+    steps, rows = min(span * steps_per_second(LOOSE), EFFORT), float(ROWS)
+    if runs and solver.step is not None:
+        steps += span / solver.step
+    elif runs:
+        steps += span * steps_per_second(solver.rtol or RTOL)
+    if runs:
+        rows += span / file.outputs.interval
+    meshes = list[Mesh]()
+    seconds, memory = 0.0, 0.0
     for name, table in file.pads.items():
         with at_field(f"pads.{name}"):
-            meshes.append(table.mesh(file.folder))
-    seconds = sum(condensing_time(mesh) for mesh in set(meshes))
-    memory, steps = max(mesh.memory for mesh in meshes), 0.0
-    if runs:
-        span, s = file.outputs.duration, file.solver
-        steps = span / s.step if s.step is not None else span * steps_per_second(s.rtol or RTOL)
-        for mesh, table in zip(meshes, file.pads.values()):
-            material = file.materials[table.material].build(file.folder)
-            finite = isinstance(material, Hyperelastic)
-            fields = material.branches if finite else 1
-            nodal = table.inertial or finite
-            surface, free, _ = mesh.counts()
-            points = table.points * surface
-            own = step_time(surface, points, free if nodal else 0, finite, fields)
-            seconds += 0.5 * steps * own
-            nodes = fields * free if nodal else surface
-            memory += span / file.outputs.interval * row_bytes(nodes, points) / 2**30
-    return Cost(steps, seconds, memory)
+            mesh = table.mesh(file.folder)
+        meshes.append(mesh)
+        material = file.materials[table.material].build(file.folder)
+        finite = isinstance(material, Hyperelastic)
+        fields = material.branches if finite else 1
+        nodal = table.inertial or finite
+        surface, free, _ = mesh.counts()
+        points = table.points * surface
+        seconds += 0.5 * steps * step_time(surface, points, free if nodal else 0, finite, fields)
+        memory += rows * row_bytes(fields * free if nodal else surface, points) / 2**30
+    seconds += sum(condensing_time(mesh) for mesh in set(meshes))
+    return Cost(steps, seconds, memory + max(mesh.memory for mesh in meshes))
 
 
 def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]:

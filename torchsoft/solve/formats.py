@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as xml
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchsoft.extras import needed
-from torchsoft.files import check_file, replacing, sealed, unsealed
+from torchsoft.files import check_file, check_seal, replacing, seal
 from torchsoft.physics.mesh import Array, StoredMesh
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.setup import Setup, von_mises
@@ -284,17 +283,18 @@ def save(data: xr.Dataset, path: str | Path) -> None:
     """Write a trajectory's dataset, perhaps a changed one, as NetCDF with a checksum at the end of
     the file."""
     with replacing(path) as partial:
-        partial.write_bytes(sealed(data.to_netcdf(engine="h5netcdf")))
+        partial.write_bytes(data.to_netcdf(engine="h5netcdf"))
+        seal(partial)
 
 
 def load(path: str | Path) -> xr.Dataset:
     """The run in a file of `save`. Raises `ValueError` for any other file and for one that is
     damaged, and `OSError`."""
-    content = BytesIO(unsealed(path))
-    try:
-        return xr.load_dataset(content, engine="h5netcdf", decode_times=False)
-    except Exception as error:  # whatever the libraries make of other content
-        raise ValueError(f"{path} is not a NetCDF file ({type(error).__name__})") from error
+    with check_seal(path).open("rb") as file:
+        try:
+            return xr.load_dataset(file, engine="h5netcdf", decode_times=False)
+        except Exception as error:  # whatever the libraries make of other content
+            raise ValueError(f"{path} is not a NetCDF file ({type(error).__name__})") from error
 
 
 def read(path: str | Path) -> Trajectory:

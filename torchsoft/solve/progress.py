@@ -11,12 +11,13 @@ from torchsoft.solve.steps import Plan
 
 
 class SimulationFailed(RuntimeError):
-    """A run that ended early: when and why. `time` [s]; `trajectory` holds the run until then, if
-    any."""
+    """A run that ended early: when and why. `time` [s]; `contact` is that whose body was lost, ""
+    for another cause, and `left` whether the body left the space over the pad; `trajectory` holds
+    the run until then, if any."""
 
-    def __init__(self, reason: str, time: float) -> None:
+    def __init__(self, reason: str, time: float, contact: str = "", left: bool = False) -> None:
         super().__init__(reason)
-        self.reason, self.time = reason, time
+        self.reason, self.time, self.contact, self.left = reason, time, contact, left
         self.trajectory: Any = None
 
 

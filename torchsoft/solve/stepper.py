@@ -369,5 +369,8 @@ class ImplicitStepper:
             "loosen rtol or atol, or look for a jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
         }
-        reasons |= self._lost(which) if status >= OFF_THE_PAD else {}
-        return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)
+        lost = status >= OFF_THE_PAD
+        reasons |= self._lost(which) if lost else {}
+        contact = list(self.rig.contacts)[which] if lost else ""
+        left = status in (OFF_THE_PAD, LOST)
+        return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time, contact, left)

@@ -91,7 +91,7 @@ class Columns:
 
     path: Path
     values: dict[str, Array]
-    rows: list[int]
+    rows: Sequence[int]
     row: str = "row"
     ignored: tuple[str, ...] = ()
 

@@ -141,7 +141,7 @@ class Journal:
             self.folder / CHECKPOINT
         ).is_file():  # another identification was done with the folder
             self._open()
-        with replacing(path) as partial:
+        with replacing(path, durable=True) as partial:
             partial.write_bytes(sha256(name + content).digest() + content)
 
 

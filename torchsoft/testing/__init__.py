@@ -1,4 +1,4 @@
-"""Checks for pytest: of a rig's gradients, of its energies, and of laws of one's own.
+"""Checks for pytest: of a rig's gradients, of its energies, and of custom laws.
 
 Each returns what it found and raises `CheckFailed`, an `AssertionError`, with a sentence on every
 fault.

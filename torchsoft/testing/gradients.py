@@ -60,7 +60,7 @@ difference noise."""
 class Derivative(NamedTuple):
     """The derivative of a value by the relative change of a parameter, or along a random direction
     of one of several entries, of the start or of the knots of the reference: by the adjoint,
-    forward (None: of values of one's own, and of parameters of several entries), by central
+    forward (None: of custom values, and of parameters of several entries), by central
     differences with their uncertainty (None: taken together only), and its error by the steps, as
     the change at a tenth of the tolerance shows it (None: not asked for). `scale` is the largest
     derivative of the value, by adjoint or by differences, or the value where it is larger; of all

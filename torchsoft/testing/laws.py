@@ -1,4 +1,4 @@
-"""Whether a law of one's own is one: a friction law, or that of an actuator."""
+"""Whether a custom law is valid: a friction law, or that of an actuator."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress

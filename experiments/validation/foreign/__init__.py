@@ -6,7 +6,7 @@ to differ in what a fit takes for granted: the mesh, the friction law, where the
 put down.
 """
 
-from foreign.motion import Run, simulate
-from foreign.numbers import Numbers
+from experiments.validation.foreign.motion import Run, simulate
+from experiments.validation.foreign.numbers import Numbers
 
 __all__ = ["Numbers", "Run", "simulate"]

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import root
 
-from foreign.numbers import Numbers
-from foreign.pad import Array, compliance
-from foreign.step import TAKEN_IN, march
+from experiments.validation.foreign.numbers import Numbers
+from experiments.validation.foreign.pad import Array, compliance
+from experiments.validation.foreign.step import TAKEN_IN, march
 
 COLUMNS = (
     "x_C",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from foreign.numbers import Numbers
+from experiments.validation.foreign.numbers import Numbers
 
 Array = NDArray[np.float64]
 
@@ -51,6 +51,6 @@ def compliance(p: Numbers) -> Array:
     K = sparse.block_array([[K_xx, K_xy], [K_xy.T, K_yy]]).tocsc() * p.depth
     top = np.arange(p.across + 1) * p.through + p.through - 1  # nodes go up each column
     dofs = np.stack((top, top + (p.across + 1) * p.through), -1).ravel()
-    loads = np.zeros((K.shape[0], len(dofs)))
+    loads = np.zeros((2 * (p.across + 1) * p.through, len(dofs)))
     loads[dofs, np.arange(len(dofs))] = 1.0
     return np.ascontiguousarray(splu(K).solve(loads)[dofs])

@@ -1,0 +1,1 @@
+"""Programs that measure what torchsoft does: `python -m experiments.NAME`."""

@@ -1,0 +1,1 @@
+"""Programs that show that torchsoft is right: `python -m experiments.validation.NAME`."""
