@@ -172,7 +172,7 @@ def test_what_a_file_does_not_resolve_is_nothing(page, values):
 
 def test_forces_of_nothing_are_none(run):
     still = replace(run, force={k: x * torch.tensor([1.0, 1e-13]) for k, x in run.force.items()})
-    series = {one["name"]: one["series"] for one in charts(still)[1:]}
+    series = {one["name"]: one["series"] for one in charts(still, [*range(51)])}
     assert all(one["values"]["step"] == one["values"]["low"] == 0 for one in series["friction"])
     assert all(one["values"]["step"] > 0 for one in series["normal force"])
 

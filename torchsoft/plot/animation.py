@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -266,37 +266,40 @@ def opening(run: Trajectory, rows: list[int]) -> int:
     return int((total >= 0.5 * total.max()).argmax())
 
 
-def charts(run: Trajectory) -> list[dict[str, Any]]:
-    """The times, then groups of curves over time, each group with one unit. Forces of less than a
+def chart(
+    name: str, unit: str, lines: Mapping[str, tuple[Array, str]], least: float = 0.0
+) -> dict[str, Any]:
+    """Curves with one unit, of values and a colour by name. Less than `least` is drawn as zero."""
+    series = []
+    for line, (values, colour) in lines.items():
+        seen = np.where(np.abs(values) > least, values, 0.0)  # not a number is zero, too
+        series.append({"name": line, "colour": colour, "values": packed(seen)})
+    return {"name": name, "unit": unit, "series": series}
+
+
+def charts(run: Trajectory, rows: list[int]) -> list[dict[str, Any]]:
+    """All curves over the times of `rows`, in charts of one unit each. Forces of less than a
     billionth of the largest are drawn as zero."""
-    rows = frame_rows(run, CHART_SAMPLES)
-    t = run.t.numpy()[rows].round(9).tolist()
-    out: list[dict[str, Any]] = []
-
-    def group(name: str, unit: str, lines: list[tuple[str, Array, str]], least: float = 0) -> None:
-        series = [
-            {"name": one, "colour": colour, "values": packed(np.where(abs(x) > least, x, 0.0))}
-            for one, values, colour in lines
-            for x in [np.nan_to_num(values[rows])]
-        ]
-        out.append({"name": name, "unit": unit, "series": series})
-
+    out = []
     for curve in curves(run):
         name, _, unit = curve.label.rpartition(" [")
-        lines = [("actual", curve.values, COLOURS[0])]
+        lines = {"actual": (curve.values[rows], COLOURS[0])}
         if curve.setpoint is not None:
-            lines.insert(0, ("set-point", curve.setpoint, "#999999"))
-        group(name, unit.rstrip("]"), lines)
-    if run.force:
-        least = 1e-9 * max(float(x[..., 0].detach().sum(-1).max()) for x in run.force.values())
-        for kind, (unit, series) in sums(run).items():
-            lines = [(*one, colour) for one, colour in zip(series.items(), COLOURS * len(series))]
-            group(kind, unit, lines, {"N": least, "%": 1e-7}.get(unit, 0.0))
+            lines = {"set-point": (curve.setpoint[rows], "#999999")} | lines
+        out.append(chart(name, unit.rstrip("]"), lines))
+    largest = [float(x[..., 0].detach().sum(-1).max()) for x in run.force.values()]
+    least = {"N": 1e-9 * max(largest, default=0.0), "%": 1e-7}
+    for kind, (unit, series) in sums(run).items():
+        colours = zip(series.items(), COLOURS * len(series))
+        lines = {contact: (values[rows], colour) for (contact, values), colour in colours}
+        out += [chart(kind, unit, lines, least.get(unit, 0.0))] if lines else []
     shown = {one for body in run.setup.bodies.values() for one in body.channels.values()}
-    for name, values in run.channels.items():
-        if name not in shown and float(values.detach().abs().max()) > 0:
-            group(name, run.units.get(name, ""), [(name, values.detach().numpy(), COLOURS[0])])
-    return [{"t": t}, *out]
+    for name, channel in run.channels.items():
+        values = channel.detach().numpy()
+        if name not in shown and np.abs(values).max() > 0:
+            lines = {name: (values[rows], COLOURS[0])}
+            out.append(chart(name, run.units.get(name, ""), lines))
+    return out
 
 
 def player(run: Trajectory, path: Path, *, frames: int = 300, title: str = "") -> None:
@@ -308,7 +311,7 @@ def player(run: Trajectory, path: Path, *, frames: int = 300, title: str = "") -
     times = run.t.numpy()[rows]
     first_shown = opening(run, rows)
     shown = instants(run, times[[first_shown, len(times) // 2, -1]].tolist())
-    (first, *curves_) = charts(run)
+    samples = frame_rows(run, CHART_SAMPLES)
     about = {
         "title": title or "torchsoft", "times": times.round(9).tolist(),
         "opening": first_shown,
@@ -321,7 +324,8 @@ def player(run: Trajectory, path: Path, *, frames: int = 300, title: str = "") -
             for name, body in run.setup.bodies.items()
         },
         "pads": pads(run, rows), "contacts": contacts(run, rows),
-        "scale": force_scale(run.setup, shown), "t": first["t"], "charts": curves_,
+        "scale": force_scale(run.setup, shown), "t": run.t.numpy()[samples].round(9).tolist(),
+        "charts": charts(run, samples),
         "note": RIPPLE if ripples(run) else "",
         "made": {k: str(v) for k, v in run.made_by.items() if isinstance(v, str)},
     }  # fmt: skip
