@@ -213,8 +213,7 @@ def fit(
     equations = {target: solve(problem, target, recipe) for target in problem.regressions}
     model = build(problem, equations, feedback)
     scores = [score(model, one) for one in problem.records]
-    if not _warn_of_misses(model, problem.records, scores):
-        _warn_of_mechanics(model, problem.records)
+    _warn_of_faults(model, problem.records, scores, problem.records)
     return model
 
 
@@ -278,49 +277,46 @@ def score(model: ReducedModel, on: Record) -> Score:
     return Score(over_range, over_deviation, out)
 
 
-def _warn_of_misses(
-    model: ReducedModel, records: Sequence[Record], scores: Sequence[Score]
-) -> bool:
-    """Warn of the record with the worst rollout, with the remedy, if it is a gross miss or has
-    another control law. Returns whether it does."""
-    misses = [max(one.over_deviation.values()) for one in scores]
-    i = int(np.argmax(misses))
-    on, out = records[i], scores[i]
-    state = max(out.over_deviation, key=out.over_deviation.__getitem__)
-    miss = (
-        f"misses it: the error of {state} is {misses[i]:.3g} of its standard deviations"
-        if out.rollout.diverged_at is None
-        else str(out.rollout)
-    )
-    wrong = []
+def _other_laws(model: ReducedModel, on: Record) -> list[str]:
+    """Inputs of the record that have another control law than the model's feedback."""
+    out = []
     for name, law in model.feedback.items():
         if name in on.series:
             error = on.columns(list(law)) @ list(law.values()) - on.series[name]
             if np.sqrt((error**2).mean()) > LAW_OFF * on.series[name].std():
-                wrong.append(
-                    f"{name} off by {amount(float(np.abs(error).max()), UNITS.get(name, name))}"
-                )
-    if misses[i] <= GROSS and not wrong:
-        return False
+                largest = amount(float(np.abs(error).max()), UNITS.get(name, name))
+                out.append(f"{name} off by {largest}")
+    return out
+
+
+def _miss(model: ReducedModel, records: Sequence[Record], scores: Sequence[Score]) -> str:
+    """Message on the record with the worst rollout, with the remedy, if that is a gross miss or has
+    another control law; empty else."""
+    misses = [max(one.over_deviation.values()) for one in scores]
+    i = int(np.argmax(misses))
+    other_laws, found = _other_laws(model, records[i]), scores[i]
+    if misses[i] <= GROSS and not other_laws:
+        return ""
+    miss = str(found.rollout)
+    if found.rollout.diverged_at is None:
+        state = max(found.over_deviation, key=found.over_deviation.__getitem__)
+        miss = f"misses it: the error of {state} is {misses[i]:.3g} of its standard deviations"
     if "F_x" in model.outer:
         remedy = (
             "give `feedback`, the law that makes F_x: under a recorded F_x nothing holds the "
             "position, and it drifts"
         )
-    elif wrong:
+    elif other_laws:
         remedy = (
-            f"its `feedback` makes {', '.join(wrong)}: give the gains of the rig, on the "
+            f"its `feedback` makes {', '.join(other_laws)}: give the gains of the rig, on the "
             "coordinate that its loop measures, and count x_d from where this one starts"
         )
     else:
         remedy = (
-            "take small taps of a settled grasp, sampled every 0.25 ms, that begin at rest, and "
-            f"no coarse samples of a large motion; here a sample is {1e3 * on.step:.3g} ms"
+            "take small taps of a settled grasp, sampled every 0.25 ms, that begin at rest, and no "
+            f"coarse samples of a large motion; here a sample is {1e3 * records[i].step:.3g} ms"
         )
-    warn(
-        f"the reduced model is not to be trusted: rolled out on record {i}, it {miss}; {remedy}",
-    )
-    return True
+    return f"the reduced model is not to be trusted: rolled out on record {i}, it {miss}; {remedy}"
 
 
 def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
@@ -352,12 +348,18 @@ def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
     return out
 
 
-def _warn_of_mechanics(model: ReducedModel, records: Sequence[Record]) -> None:
-    if wrong := contradictions(model, records):
+def _warn_of_faults(
+    model: ReducedModel, on: Sequence[Record], scores: Sequence[Score], fitted: Sequence[Record]
+) -> None:
+    """Warn of a rollout that misses one of the records `on`, or of coefficients that contradict
+    mechanics."""
+    if miss := _miss(model, on, scores):
+        warn(miss)
+    elif wrong := contradictions(model, fitted):
         warn(
             f"the reduced model contradicts mechanics: {'; '.join(wrong)}. Its coefficients are "
             "not those of the rig, although it may predict well: kick disc and bracket at the "
-            "start of the taps, sample them every 0.25 ms, and keep them to some micrometres",
+            "start of the taps, sample them every 0.25 ms, and keep them to some micrometres"
         )
 
 
@@ -414,8 +416,7 @@ def choose(
         )
     good = [i for i, row in enumerate(tried) if row["nrmse"] <= SLACK * best]
     chosen = min(good, key=lambda i: (tried[i]["terms"], tried[i]["nrmse"]))
-    if not _warn_of_misses(models[chosen], validation, scores[chosen]):
-        _warn_of_mechanics(models[chosen], problem.records)
+    _warn_of_faults(models[chosen], validation, scores[chosen], problem.records)
     return Choice(models[chosen], chosen, tried)
 
 
