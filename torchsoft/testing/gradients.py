@@ -404,7 +404,7 @@ class Probe:
             for name, p in self.leaves.items()
             if p.ndim == 0 and name != "start" and not name.startswith("reference.")
         ]
-        names = [*numbers, *{"start"}.intersection(self.leaves)]
+        names = [*numbers, "start"] if "start" in self.leaves else numbers
         if not names or not isinstance(self.values, RandomSums):
             return {}
         initial = started(self.rig, self.steps.begin, "forward")
