@@ -245,7 +245,10 @@ def strokes(travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
 def sticking(model: ReducedModel) -> ReducedModel:
     """The model's limit for small slip: every tanh(s' / speed) is s' / speed."""
     equations = {
-        name: [(replace(term, form=term.slope, saturation=None), x) for term, x in pairs]
+        name: [
+            (replace(term, factors=tuple(f._replace(shape="linear") for f in term.factors)), x)
+            for term, x in pairs
+        ]
         for name, pairs in model.equations().items()
     }
     return ReducedModel(

@@ -3,12 +3,11 @@ and bad data reported."""
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, press, times
+from conftest import coarse, press, times
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
@@ -30,7 +29,7 @@ from torchsoft.reduced import (
     score,
 )
 from torchsoft.reduced.fit import contradictions
-from torchsoft.reduced.ode import BEYOND, Term
+from torchsoft.reduced.ode import BEYOND, Factor, Held, Term
 from torchsoft.reduced.records import KINEMATICS, STATES
 from torchsoft.reduced.terms import variable
 from torchsoft.rigs import RigFile
@@ -82,10 +81,6 @@ def changed(one: Record, **series: np.ndarray) -> Record:
     return replace(one, series=one.series | series)
 
 
-def fitted(motions: list[Record], recipe: Recipe = RECIPE, library: Any = LIBRARY) -> ReducedModel:
-    return fit(assemble(motions, library, recipe), recipe, LAW)
-
-
 # fits
 # ----------------------------------------------------------------------
 
@@ -99,7 +94,7 @@ def test_known_equations_are_recovered(motions, saturating):
         wanted = {"v_C": TRUTH["v_C"] | {upper.text: 3.0}}
         library = joined(library, {"v_C": [upper]})
         recipe = replace(RECIPE, threshold=0.02, window=0.15)
-    model = fitted(motions, recipe, library)
+    model = fit(assemble(motions, library, recipe), recipe)
     for target, terms in wanted.items():
         found = {term.text: x for term, x in model.equations()[target]}
         assert found == pytest.approx(terms, rel=0.05)
@@ -129,7 +124,7 @@ def test_ensembles_give_intervals_and_leave_the_global_generator(motions):
     noisy = lambda x: x + 0.005 * x.std() * rng.standard_normal(len(x))
     rough = [changed(one, **{k: noisy(x) for k, x in one.series.items()}) for one in motions]
     recipe, before = replace(RECIPE, models=20, threshold=0.05), np.random.get_state()[1].copy()  # noqa: NPY002
-    one, other = fitted(rough, recipe), fitted(rough, recipe)
+    one, other = (fit(assemble(rough, LIBRARY, recipe), recipe) for _ in range(2))
     assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
     assert one.intervals == other.intervals
     rows = one.coefficient_table()
@@ -155,20 +150,19 @@ def test_a_fit_that_misses_its_record_warns_why(motions):
     ):
         with pytest.warns(UserWarning, match=message):
             fit(problem, recipe, feedback)
-    long = [motion(truth(), seed, 3.0) for seed in range(4)]
-    slow = [Record(x.t[::100], {k: y[::100] for k, y in x.series.items()}) for x in long]
+    slow, some = Recipe(width=0.05, window=3.0), (motion(truth(), seed, 3.0) for seed in range(4))
+    some = [Record(x.t[::100], {k: y[::100] for k, y in x.series.items()}) for x in some]
     with pytest.warns(UserWarning, match=r"record \d, it .*; take small taps .* a sample is 10 ms"):
-        fitted(slow, Recipe(width=0.05, window=3.0))
+        fit(assemble(some, LIBRARY, slow), slow, LAW)
 
 
 def test_coefficients_that_no_rig_has_are_named(motions):
     """Against the mass that a run states; a spring and a dashpot that drive; opposite signs."""
-    right, heavy = (
-        [replace(one, mass=mass) for one in motions] for mass in (1 / TRUTH["v_Br"]["F_x"], 0.6)
-    )
-    assert contradictions(truth(), right) == []
+    known = [replace(one, mass=1 / TRUTH["v_Br"]["F_x"]) for one in motions]
+    assert contradictions(truth(), known) == []
+    heavy = [replace(one, mass=0.6) for one in motions]
     with pytest.warns(UserWarning, match=r"mechanics: 2\.46 F_x in v_Br', where 1 / m is 1\.67\. "):
-        fitted(heavy)
+        fit(assemble(heavy, LIBRARY, RECIPE), RECIPE, LAW)
     wrong = {"v_C": list(zip(LIBRARY["v_C"][:2], (1e5, -9e2))), "omega": [], "v_Br": []}
     model = ReducedModel(STATES, ("F_x",), KINEMATICS, wrong, feedback=LAW)
     drives, opposite = contradictions(model, motions)
@@ -176,21 +170,21 @@ def test_coefficients_that_no_rig_has_are_named(motions):
     assert opposite.endswith("in v_C' have opposite signs")
 
 
-REJECTED = [
-    (lambda one: [changed(one, omega=one.t * np.nan)], {}, "'omega' has values that are not fin"),
-    (lambda one: [changed(one, F_x=0 * one.t + 3.0)], {}, r"`F_x` of v_Br' is constant \(3"),
-    (lambda one: [one], {"domains": 40}, r"too little data for v_C'.*`v_C`; at least 10 rows"),
-    (lambda one: [one], {"width": 3e-4}, r"a sample every .* ms is too seldom for the weak"),
-    (lambda one: [one, Record(2 * one.t, one.series)], {}, "one time step"),
-    (lambda one: [], {}, "no records to fit: give one"),
-    (lambda one: [Record(one.t, {"x_C": one.t})], {}, "no series theta"),
-    (lambda one: [Record(one.t[:9], one.series)], {}, r"has shape \(3001,\), but `t` \(9,\)"),
-    (lambda one: [Record(one.t**2, one.series)], {}, "not equally spaced|a step is .* ms"),
-    (lambda one: [record(one.series, one.t[::-1])], {}, "times that rise"),
-]
-
-
-@pytest.mark.parametrize(("records", "how", "message"), REJECTED)
+@pytest.mark.parametrize(
+    ("records", "how", "message"),
+    [
+        (lambda one: [changed(one, omega=np.full(3001, np.nan))], {}, "'omega' has values that ar"),
+        (lambda one: [changed(one, F_x=np.full(3001, 3.0))], {}, r"`F_x` of v_Br' is constant \(3"),
+        (lambda one: [one], {"domains": 40}, r"too little data for v_C'.*`v_C`; at least 10 rows"),
+        (lambda one: [one], {"width": 3e-4}, r"a sample every .* ms is too seldom for the weak"),
+        (lambda one: [one, Record(2 * one.t, one.series)], {}, "one time step"),
+        (lambda one: [], {}, "no records to fit: give one"),
+        (lambda one: [Record(one.t, {"x_C": one.series["x_C"]})], {}, "no series theta"),
+        (lambda one: [Record(one.t[:9], one.series)], {}, r"has shape \(3001,\), but `t` \(9,\)"),
+        (lambda one: [Record(one.t**2, one.series)], {}, "not equally spaced|a step is .* ms"),
+        (lambda one: [record(one.series, one.t[::-1])], {}, "times that rise"),
+    ],
+)  # fmt: skip
 def test_records_that_determine_nothing_are_rejected(motions, records, how, message):
     with pytest.raises(ValueError, match=message):
         assemble(records(motions[0]), LIBRARY, replace(RECIPE, **how))
@@ -199,7 +193,7 @@ def test_records_that_determine_nothing_are_rejected(motions, records, how, mess
 def test_terms_that_depend_on_each_other_or_on_nothing_are_rejected(motions):
     terms = LIBRARY | {"v_C": [variable("x_C"), variable("x_Br"), LIBRARY["v_C"][0]]}
     with pytest.raises(ValueError, match=r"column `.*` of v_C' is a combination of the other"):
-        fitted(motions[:1], RECIPE, terms)
+        assemble([motions[0]], terms, RECIPE)
     with pytest.raises(ValueError, match="needs the variable 'F_y'"):
         ReducedModel(("v_C",), (), {}, {"v_C": [(variable("F_y"), 1.0)]})
     with pytest.raises(ValueError, match="set `signal`"):
@@ -213,20 +207,22 @@ def test_terms_that_depend_on_each_other_or_on_nothing_are_rejected(motions):
 @pytest.mark.parametrize("nonlinear", [False, True])
 def test_all_routes_are_one(nonlinear):
     """Rollout, torchdiffeq and scipy through the same terms."""
-    extra = ((friction(R, 0.01)["v_C"][1], 5.0),) if nonlinear else ()
+    product = Term("x_C |v_C|", "m m/s", (Factor({"x_C": 1.0}), Factor({"v_C": 1.0}, "abs")))
+    extra = ((friction(R, 0.01)["v_C"][1], 5.0), (product, -1e6)) if nonlinear else ()
     model, one = truth(*extra), motion(truth(*extra), 7, duration=0.005)
     assert model.linear is not nonlinear
     t, u, y0 = one.t, 20 * one.columns(("x_d", "x_d_dot")), 20 * one.columns(STATES)[0]
     fast = model.rollout(t, y0, u).y
-    model.signal = lambda when: f64(*(np.interp(float(when), t, column) for column in u.T))
-    start, step = torch.from_numpy(y0), {"step_size": 2e-5}
+    model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
+    given, step = (torch.from_numpy(y0), torch.from_numpy(t)), {"step_size": 2e-5}
     with torch.no_grad():
-        slow = odeint(model, start, torch.from_numpy(t), method="rk4", options=step).numpy()
-        rates = lambda when, y: model(when, torch.from_numpy(y)).numpy()
-        exact = solve_ivp(rates, t[[0, -1]], y0, "LSODA", t, rtol=1e-9, atol=1e-12).y.T
+        slow = odeint(model, *given, method="rk4", options=step).numpy()
+    outer = lambda when: [np.interp(when, t, column) for column in u.T]
+    rates = lambda when, y: model.rates(torch.from_numpy(np.append(y, outer(when)))).detach()
+    exact = solve_ivp(rates, t[[0, -1]], y0, "LSODA", t, rtol=1e-9, atol=1e-12).y.T
     for found, limit in ((slow, 1e-5), (fast, 1e-3 if nonlinear else 1e-5)):
         assert (np.abs(found - exact).max(0) < limit * np.abs(exact).max(0)).all()
-    assert torch.equal(model(0.01, torch.stack((start, 2 * start)))[0], model(0.01, start))
+    assert torch.equal(model(0.01, torch.stack((given[0], 2 * given[0])))[0], model(0.01, given[0]))
 
 
 def test_gradients_through_torchdiffeq_are_those_of_the_rollout():
@@ -234,7 +230,7 @@ def test_gradients_through_torchdiffeq_are_those_of_the_rollout():
     of the exact rollout."""
     model, one = truth(), motion(truth(), 3, duration=0.02)
     t, u, y0 = one.t, one.columns(model.outer), one.columns(STATES)[0]
-    model.signal = lambda when: f64(*(np.interp(float(when), t, column) for column in u.T))
+    model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
     start = torch.from_numpy(y0).requires_grad_()
     step = {"step_size": 5e-5}
     odeint(model, start, torch.from_numpy(t), method="rk4", options=step)[-1, 0].backward()
@@ -251,12 +247,12 @@ def test_gradients_through_torchdiffeq_are_those_of_the_rollout():
 
 @pytest.mark.parametrize("nonlinear", [False, True])
 def test_divergence_is_reported_with_its_time(nonlinear):
-    """v' = 5 v from v = 1 leaves 100 times its scale at ln(100) / 5; a constant 5 tanh(v / 1e-3)
-    adds ln(1 / 2) to the logarithm."""
-    pairs, constant = [(variable("v_C"), 5.0)], Term("tanh", "1", {"v_C": 1.0}, 1e-3)
-    pairs += [(constant, 5.0)] * nonlinear
-    when = np.log((BEYOND + nonlinear) / (1 + nonlinear)) / 5
-    model = ReducedModel(("v_C",), (), {}, {"v_C": pairs})
+    """v' = a v from v = 1 leaves 100 times its scale at ln(100) / a; v' = v^2 blows up at t = 1."""
+    term, value, when = variable("v_C"), 5.0, np.log(BEYOND) / 5
+    if nonlinear:
+        square = Term("v_C v_C", "m2/s2", (Factor({"v_C": 1.0}), Factor({"v_C": 1.0})))
+        term, value, when = square, 1.0, 1 - 1 / BEYOND
+    model = ReducedModel(("v_C",), (), {}, {"v_C": [(term, value)]})
     out = model.rollout(np.linspace(0, 2, 2001), np.array([1.0]), np.empty((2001, 0)))
     assert out.diverged_at == pytest.approx(when, abs=2e-3)
     finite = np.isfinite(out.y[:, 0])
@@ -264,24 +260,22 @@ def test_divergence_is_reported_with_its_time(nonlinear):
     assert not finite[-1]
 
 
-def test_equations_read_in_text():
+def test_equations_read_in_text_and_latex():
     model = truth()
     assert model.with_feedback(None).text() == model.text()
     assert model.with_feedback(None).outer == ("F_x",)
     assert "v_C' = 1.15e+05 (x_Br - 2 x_C) + 1100 (v_Br - 2 v_C)" in model.text()
-    assert any("omega' = - 1.1e+07 (x_Br + 2 r theta)" in line for line in model.text())
+    row = r"\frac{d}{dt} \dot\theta &= - 1.1\cdot 10^{7}\,(x_{Br} + 2 r \theta)"
+    assert row in model.latex()
 
 
 # records
 # ----------------------------------------------------------------------
 
 
-def run_of(file: RigFile, outputs: dict[str, Any], **motion: Any) -> Trajectory:
-    return file.override(outputs=outputs, motion=motion).build().run(rtol=1e-4)
-
-
-def profile(*values: Any) -> dict[str, Any]:
-    return {"kind": "profile", "times": [0.0, 0.02], "values": values}
+def run_of(file: RigFile) -> Trajectory:
+    built = file.build()
+    return simulate(built.rig, built.t, y0=built.y0, rtol=1e-4)
 
 
 BRIEF = {"duration": 0.02, "interval": 5e-4, "snapshots": ()}
@@ -290,7 +284,8 @@ BRIEF = {"duration": 0.02, "interval": 5e-4, "snapshots": ()}
 @pytest.fixture(scope="module")
 def beside():
     """A run whose loop measures the bracket, 0.3 mm beside the disc."""
-    return run_of(template("t"), BRIEF, x_d=profile("start", 1e-4))
+    x_d = {"kind": "profile", "times": [0.0, 0.02], "values": ["start", 1e-4]}
+    return run_of(template("t").override(outputs=BRIEF, motion={"x_d": x_d}))
 
 
 def test_records_of_a_run_and_of_a_dataset_are_the_same():
@@ -338,7 +333,9 @@ def test_bodies_of_a_record_have_any_names(beside):
         record(beside, disc="disk")
     with pytest.raises(ValueError, match=r"has none of x_C, .*, x_d.*; .* as in \{\"x_C\": data"):
         record({"x_disc": beside["x_disc"]}, beside.t)
-    run = run_of(RigFile.ready("orientation"), BRIEF, theta_d=profile(0.0, 1e-2))
+    theta_d = {"kind": "profile", "times": [0.0, 0.02], "values": [0.0, 1e-2]}
+    motion = {"theta_d": theta_d}
+    run = run_of(RigFile.ready("orientation").override(outputs=BRIEF, motion=motion))
     one, turn = record(run, bracket="upper").series, run["effort_turn_upper"]
     assert np.array_equal(one["F_x"], (run["effort_carry_upper"] + turn).numpy())
     assert float(turn.abs().max()) > 0.1
@@ -356,7 +353,7 @@ def test_saved_runs_are_reduced_by_a_command(tmp_path, capsys):
         ]
         x_d = {"kind": "sines", "since": 0.6, "until": 1.0, "components": waves}
         outputs = {"duration": 0.95, "interval": 2.5e-4, "snapshots": []}
-        run_of(template("t"), outputs, x_d=x_d).save(path)
+        run_of(template("t").override(motion={"x_d": x_d}, outputs=outputs)).save(path)
     command = ["reduce", *files, "--begin", "0.6", "--radius", "0.0194"]
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     summary = json.loads((tmp_path / "out" / "reduced.json").read_text())

@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-import torch
 
 from torchsoft.caller import warn
 from torchsoft.display import Shown, amount
 from torchsoft.extras import needed
-from torchsoft.reduced.ode import UNITS, ReducedModel, Rollout, Table, Term
+from torchsoft.reduced.ode import ReducedModel, Rollout, Term, symbol
 from torchsoft.reduced.records import KINEMATICS, STATES, Record
 from torchsoft.reduced.terms import Candidates
 
@@ -34,9 +33,6 @@ which the record has another law."""
 
 MASS_OFF = 0.1
 """Relative error of the coefficient of F_x above which it is not 1 / m."""
-
-SLACK = 1.1
-"""Error of the chosen model, over the least error of all, at the most."""
 
 ROWS_PER_TERM = 10
 """Fewest rows of a regression per candidate term."""
@@ -53,8 +49,7 @@ class Recipe:
     Rows are integrals against test functions of half-width `width` [s], `domains` in each window of
     `window` [s]. `models` is the number of ensemble members, 0 for none. Coefficients of an
     ensemble are medians; their intervals are the 5th and 95th percentiles, the spread over the
-    choice of overlapping rows, and not the error of the equation's form. Random choices repeat
-    from fit to fit.
+    choice of overlapping rows, and not the error of the equation's form.
     """
 
     threshold: float = 0.02
@@ -62,6 +57,7 @@ class Recipe:
     width: float = 0.015
     window: float = 0.5
     domains: int = 60
+    seed: int = 0
 
 
 SAMPLED = 4
@@ -71,12 +67,13 @@ SAMPLED = 4
 @dataclass(frozen=True, repr=False)
 class Regression:
     """The scaled regression of one equation: columns (rows, terms) and rate (rows,) of unit root
-    mean square, and the `unit` (terms,) of its coefficients in SI units."""
+    mean square, and their original sizes."""
 
     terms: list[Term]
     columns: np.ndarray
     rate: np.ndarray
-    unit: np.ndarray
+    column_size: np.ndarray
+    rate_size: float
 
 
 @dataclass(frozen=True, repr=False)
@@ -116,74 +113,76 @@ def assemble(
         raise ValueError("there are no records to fit: give one at least, as `record(run)`")
     if max(steps) > min(steps) * (1 + 1e-6):
         raise ValueError(f"the records must have one time step, but have {sorted(set(steps))} s")
-    names = (*states, *inputs)
+    names, kinematics = (*states, *inputs), {k: v for k, v in KINEMATICS.items() if k in states}
+    every = {target: [(term, 1.0) for term in terms] for target, terms in candidates.items()}
+    model = ReducedModel(states, inputs, kinematics, every)
     data = [one.columns(names) for one in records]
-    for name, values in zip(names, np.concatenate(data).T):
-        if not np.isfinite(values).all():
-            raise ValueError(f"series {name!r} has values that are not finite")
+    for one in data:
+        broken = ~np.isfinite(one).all(0)
+        if broken.any():
+            raise ValueError(
+                f"series {names[int(broken.argmax())]!r} has values that are not finite"
+            )
+    targets = list(candidates)
+    columns = [model.phi(one) for one in data]
+    velocities = [one[:, [names.index(target) for target in targets]] for one in data]
+    for i, (target, term) in enumerate(zip(model.targets, model.terms)):
+        values = np.concatenate([column[:, i] for column in columns])
+        if np.ptp(values) <= 1e-12 * np.abs(values).max():
+            raise ValueError(
+                f"column `{term.text}` of {target}' is constant ({values[0]:g}); leave it out, or "
+                "excite it"
+            )
+    phi, rate = _weak(columns, velocities, steps[0], recipe)
     out = {}
-    for target, terms in candidates.items():
-        table = Table.of(terms, names)
-        columns = [table.values(torch.from_numpy(one)).numpy() for one in data]
-        for term, values in zip(terms, np.concatenate(columns).T):
-            if np.ptp(values) <= 1e-12 * np.abs(values).max():
-                raise ValueError(
-                    f"column `{term.text}` of {target}' is constant ({values[0]:g}); leave it out, "
-                    "or excite it"
-                )
-        velocities = [one[:, [names.index(target)]] for one in data]
-        out[target] = _regression(target, terms, *_weak(columns, velocities, steps[0], recipe))
+    for j, target in enumerate(targets):
+        mine = [i for i, name in enumerate(model.targets) if name == target]
+        terms = [model.terms[i] for i in mine]
+        if len(phi) < ROWS_PER_TERM * len(mine):
+            raise ValueError(
+                f"too little data for {target}': {len(phi)} rows for {len(mine)} candidate terms, "
+                f"the last of which is `{terms[-1].text}`; at least {ROWS_PER_TERM} rows a term "
+                "are needed"
+            )
+        size, rate_size = (
+            np.sqrt((phi[:, mine] ** 2).mean(0)),
+            float(np.sqrt((rate[:, j] ** 2).mean())),
+        )
+        scaled = phi[:, mine] / size
+        pivoted: Any = scipy.linalg.qr(scaled, mode="economic", pivoting=True)
+        _, R, order = pivoted
+        if abs(R[-1, -1]) < DEPENDENT * abs(R[0, 0]):
+            raise ValueError(
+                f"column `{terms[order[-1]].text}` of {target}' is a combination of the other "
+                "columns in these data; leave it out, or excite the system more richly"
+            )
+        out[target] = Regression(terms, scaled, rate[:, j] / rate_size, size, rate_size)
     scale = np.max([np.abs(one[:, : len(states)]).max(0) for one in data], axis=0)
     return Problem(out, states, tuple(inputs), scale, tuple(records))
 
 
-def _regression(
-    target: str, terms: Sequence[Term], phi: np.ndarray, rate: np.ndarray
-) -> Regression:
-    if len(phi) < ROWS_PER_TERM * len(terms):
-        raise ValueError(
-            f"too little data for {target}': {len(phi)} rows for {len(terms)} candidate terms, the "
-            f"last of which is `{terms[-1].text}`; at least {ROWS_PER_TERM} rows a term are needed"
-        )
-    size, rate_size = np.sqrt((phi**2).mean(0)), np.sqrt((rate**2).mean())
-    pivoted: Any = scipy.linalg.qr(phi / size, mode="economic", pivoting=True)
-    _, R, order = pivoted
-    if abs(R[-1, -1]) < DEPENDENT * abs(R[0, 0]):
-        raise ValueError(
-            f"column `{terms[order[-1]].text}` of {target}' is a combination of the other columns "
-            "in these data; leave it out, or excite the system more richly"
-        )
-    return Regression(list(terms), phi / size, rate / rate_size, rate_size / size)
-
-
 class Equation(NamedTuple):
-    """(term, coefficient) pairs of one rate in SI units, the threshold at which they were found,
-    and intervals of the coefficients from an ensemble."""
+    """(term, coefficient) pairs of one rate in SI units, and intervals of the coefficients from an
+    ensemble."""
 
     pairs: list[tuple[Term, float]]
-    threshold: float
     intervals: list[tuple[float, float]]
-
-    @property
-    def texts(self) -> tuple[str, ...]:
-        return tuple(term.text for term, _ in self.pairs)
 
 
 def solve(problem: Problem, target: str, recipe: Recipe) -> Equation:
     """The sparse equation of one state at the recipe's threshold, without terms whose coefficient
     is zero."""
-    pysindy, rows = needed("pysindy", "reduced"), problem.regressions[target]
-    optimizer: Any = pysindy.STLSQ(threshold=recipe.threshold, alpha=1e-10)
-    if recipe.models:
-        optimizer = pysindy.EnsembleOptimizer(optimizer, bagging=True, n_models=recipe.models)
-    with _quiet_pysindy():
-        optimizer.fit(rows.columns, rows.rate)
-    values, intervals = np.ravel(optimizer.coef_) * rows.unit, []
+    rows, optimizer = problem.regressions[target], _optimizer(recipe)
+    with _quiet_pysindy(recipe.seed):
+        optimizer.fit(rows.columns, rows.rate[:, None])
+    unit = rows.rate_size / rows.column_size
+    values, intervals = np.asarray(optimizer.coef_).ravel() * unit, []
     kept = np.flatnonzero(values)
     if recipe.models:
-        members = np.array([np.ravel(member) for member in optimizer.coef_list]) * rows.unit
-        intervals = [(float(a), float(b)) for a, b in np.percentile(members, (5, 95), 0).T[kept]]
-    return Equation([(rows.terms[i], float(values[i])) for i in kept], recipe.threshold, intervals)
+        members = np.array([np.ravel(member) for member in optimizer.coef_list]) * unit
+        low, high = np.percentile(members, (5, 95), axis=0)
+        intervals = [(float(low[i]), float(high[i])) for i in kept]
+    return Equation([(rows.terms[i], float(values[i])) for i in kept], intervals)
 
 
 def build(
@@ -195,7 +194,7 @@ def build(
     intervals = [interval for equation in equations.values() for interval in equation.intervals]
     return ReducedModel(
         problem.states, problem.inputs,
-        {name: rate for name, rate in KINEMATICS.items() if name in problem.states},
+        {k: v for k, v in KINEMATICS.items() if k in problem.states},
         {target: equation.pairs for target, equation in equations.items()}, feedback=feedback,
         scale=problem.scale, intervals=intervals or None,
     )  # fmt: skip
@@ -210,10 +209,14 @@ def fit(
     `GROSS` standard deviations, where `feedback` is not the law of the record's effort, and where
     coefficients contradict mechanics.
     """
-    equations = {target: solve(problem, target, recipe) for target in problem.regressions}
-    model = build(problem, equations, feedback)
+    model = build(
+        problem,
+        {target: solve(problem, target, recipe) for target in problem.regressions},
+        feedback,
+    )
     scores = [score(model, one) for one in problem.records]
-    _warn_of_faults(model, problem.records, scores, problem.records)
+    if not _warn_of_misses(model, problem.records, scores):
+        _warn_of_mechanics(model, problem.records)
     return model
 
 
@@ -263,8 +266,11 @@ class Score(Shown):
 
 def rollout_of(model: ReducedModel, on: Record) -> Rollout:
     """Rollout of the model from the record's first sample, with the record's inputs."""
-    states = on.columns(model.states)
-    return model.rollout(on.t, states[0], on.columns(model.outer), scale=np.abs(states).max(0))
+    inputs, states = (
+        on.columns(model.outer) if model.outer else np.empty((len(on.t), 0)),
+        on.columns(model.states),
+    )
+    return model.rollout(on.t, states[0], inputs, scale=np.abs(states).max(0))
 
 
 def score(model: ReducedModel, on: Record) -> Score:
@@ -272,51 +278,54 @@ def score(model: ReducedModel, on: Record) -> Score:
     out, exact = rollout_of(model, on), on.columns(model.states)
     error = np.sqrt(((out.y - exact) ** 2).mean(0))
     error = np.where(np.isfinite(error), error, np.inf)
-    over_range = dict(zip(model.states, (error / np.ptp(exact, axis=0)).tolist()))
-    over_deviation = dict(zip(model.states, (error / exact.std(0)).tolist()))
+    over_range, over_deviation = (
+        dict(zip(model.states, (error / size).tolist()))
+        for size in (np.ptp(exact, axis=0), exact.std(0))
+    )
     return Score(over_range, over_deviation, out)
 
 
-def _other_laws(model: ReducedModel, on: Record) -> list[str]:
-    """Inputs of the record that have another control law than the model's feedback."""
-    out = []
+def _warn_of_misses(
+    model: ReducedModel, records: Sequence[Record], scores: Sequence[Score]
+) -> bool:
+    """Warn of the record with the worst rollout, with the remedy, if it is a gross miss or has
+    another control law. Returns whether it does."""
+    misses = [max(one.over_deviation.values()) for one in scores]
+    i = int(np.argmax(misses))
+    on, out = records[i], scores[i]
+    state = max(out.over_deviation, key=out.over_deviation.__getitem__)
+    miss = (
+        f"misses it: the error of {state} is {misses[i]:.3g} of its standard deviations"
+        if out.rollout.diverged_at is None
+        else str(out.rollout)
+    )
+    wrong = []
     for name, law in model.feedback.items():
         if name in on.series:
             error = on.columns(list(law)) @ list(law.values()) - on.series[name]
             if np.sqrt((error**2).mean()) > LAW_OFF * on.series[name].std():
-                largest = amount(float(np.abs(error).max()), UNITS.get(name, name))
-                out.append(f"{name} off by {largest}")
-    return out
-
-
-def _miss(model: ReducedModel, records: Sequence[Record], scores: Sequence[Score]) -> str:
-    """Message on the record with the worst rollout, with the remedy, if that is a gross miss or has
-    another control law; empty else."""
-    misses = [max(one.over_deviation.values()) for one in scores]
-    i = int(np.argmax(misses))
-    other_laws, found = _other_laws(model, records[i]), scores[i]
-    if misses[i] <= GROSS and not other_laws:
-        return ""
-    miss = str(found.rollout)
-    if found.rollout.diverged_at is None:
-        state = max(found.over_deviation, key=found.over_deviation.__getitem__)
-        miss = f"misses it: the error of {state} is {misses[i]:.3g} of its standard deviations"
+                wrong.append(f"{name} off by {amount(float(np.abs(error).max()), symbol(name)[1])}")
+    if misses[i] <= GROSS and not wrong:
+        return False
     if "F_x" in model.outer:
         remedy = (
             "give `feedback`, the law that makes F_x: under a recorded F_x nothing holds the "
             "position, and it drifts"
         )
-    elif other_laws:
+    elif wrong:
         remedy = (
-            f"its `feedback` makes {', '.join(other_laws)}: give the gains of the rig, on the "
+            f"its `feedback` makes {', '.join(wrong)}: give the gains of the rig, on the "
             "coordinate that its loop measures, and count x_d from where this one starts"
         )
     else:
         remedy = (
-            "take small taps of a settled grasp, sampled every 0.25 ms, that begin at rest, and no "
-            f"coarse samples of a large motion; here a sample is {1e3 * records[i].step:.3g} ms"
+            "take small taps of a settled grasp, sampled every 0.25 ms, that begin at rest, and "
+            f"no coarse samples of a large motion; here a sample is {1e3 * on.step:.3g} ms"
         )
-    return f"the reduced model is not to be trusted: rolled out on record {i}, it {miss}; {remedy}"
+    warn(
+        f"the reduced model is not to be trusted: rolled out on record {i}, it {miss}; {remedy}",
+    )
+    return True
 
 
 def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
@@ -327,11 +336,12 @@ def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
     masses = [one.mass for one in records if one.mass is not None]
     rates = {rate: name for name, rate in KINEMATICS.items()}
     curved = {
-        (target, tuple(term.form.items()))
-        for target, term in zip(model.targets, model.terms) if not term.linear
+        (target, tuple(factor.form.items()))
+        for target, term in zip(model.targets, model.terms)
+        for factor in term.factors if not term.linear
     }  # fmt: skip
     for target, term, value in zip(model.targets, model.terms, model.coefficients.tolist()):
-        form = dict(term.form) if term.linear else {}
+        form = dict(term.factors[0].form) if term.linear else {}
         if form.keys() == {"F_x"} and target == "v_Br" and masses:
             right = 1 / float(np.mean(masses))
             if abs(value / right - 1) > MASS_OFF:
@@ -348,18 +358,12 @@ def contradictions(model: ReducedModel, records: Sequence[Record]) -> list[str]:
     return out
 
 
-def _warn_of_faults(
-    model: ReducedModel, on: Sequence[Record], scores: Sequence[Score], fitted: Sequence[Record]
-) -> None:
-    """Warn of a rollout that misses one of the records `on`, or of coefficients that contradict
-    mechanics."""
-    if miss := _miss(model, on, scores):
-        warn(miss)
-    elif wrong := contradictions(model, fitted):
+def _warn_of_mechanics(model: ReducedModel, records: Sequence[Record]) -> None:
+    if wrong := contradictions(model, records):
         warn(
             f"the reduced model contradicts mechanics: {'; '.join(wrong)}. Its coefficients are "
             "not those of the rig, although it may predict well: kick disc and bracket at the "
-            "start of the taps, sample them every 0.25 ms, and keep them to some micrometres"
+            "start of the taps, sample them every 0.25 ms, and keep them to some micrometres",
         )
 
 
@@ -375,48 +379,67 @@ class Choice:
 
 def choose(
     problem: Problem, validation: Sequence[Record], recipe: Recipe, thresholds: Sequence[float],
-    feedback: Mapping[str, Mapping[str, float]] | None = None, *, each: bool = True,
+    feedback: Mapping[str, Mapping[str, float]] | None = None, *, slack: float = 1.1,
+    each: bool = True,
 ) -> Choice:  # fmt: skip
     """The fit with the fewest terms among those whose rollouts of the validation records come
-    within `SLACK` of the best.
+    within `slack` of the best.
 
     Every equation has its own threshold (all combinations that differ in their terms are rolled
     out), or all the same with `each` off, for models that are slow to roll out. The error of a
     combination is the mean over the records of the states' worst NRMSE. Warns as `fit` does, of the
     validation records. Raises `ValueError`, with the time, when all rollouts diverge.
     """
-    recipes = [replace(recipe, threshold=threshold) for threshold in thresholds]
-    options = [
-        {target: solve(problem, target, one) for target in problem.regressions} for one in recipes
-    ]
-    if each:
-        distinct = [
-            list({one[target].texts: one[target] for one in reversed(options)}.values())
-            for target in problem.regressions
-        ]
-        options = [dict(zip(problem.regressions, chosen)) for chosen in product(*distinct)]
-    largest = [np.abs(one.columns(problem.states)).max(0) for one in validation]
-    problem = replace(problem, scale=np.max([problem.scale, *largest], axis=0))
-    models = [build(problem, option, feedback) for option in options]
-    scores = [[score(model, one) for one in validation] for model in models]
-    tried = [
-        {
-            "thresholds": {target: float(one.threshold) for target, one in option.items()},
-            "terms": len(model.terms),
-            "nrmse": float(np.mean([one.worst for one in found])),
-            "diverged": [str(one.rollout) for one in found if one.rollout.diverged_at is not None],
+    fits: dict[str, dict[tuple[str, ...], tuple[float, Equation]]] = {
+        target: {} for target in problem.regressions
+    }
+    levels: dict[float, dict[str, Equation]] = {}
+    for threshold in thresholds:
+        levels[threshold] = {
+            target: solve(problem, target, replace(recipe, threshold=threshold)) for target in fits
         }
-        for option, model, found in zip(options, models, scores)
-    ]
+        for target, equation in levels[threshold].items():
+            fits[target].setdefault(
+                tuple(term.text for term, _ in equation.pairs), (threshold, equation)
+            )
+    if each:
+        options = [
+            dict(zip(fits, chosen)) for chosen in product(*(one.values() for one in fits.values()))
+        ]
+    else:
+        options = [{k: (threshold, x) for k, x in one.items()} for threshold, one in levels.items()]
+    scale = np.max(
+        [problem.scale, *(np.abs(one.columns(problem.states)).max(0) for one in validation)], axis=0
+    )
+    problem, tried, models, every, last = replace(problem, scale=scale), [], [], [], ""
+    for option in options:
+        model = build(
+            problem, {target: equation for target, (_, equation) in option.items()}, feedback
+        )
+        scores = [score(model, one) for one in validation]
+        diverged = [str(one.rollout) for one in scores if one.rollout.diverged_at is not None]
+        last = diverged[0] if diverged else last
+        models.append(model)
+        every.append(scores)
+        tried.append(
+            {
+                "thresholds": {
+                    target: float(threshold) for target, (threshold, _) in option.items()
+                },
+                "terms": len(model.terms),
+                "nrmse": float(np.mean([one.worst for one in scores])),
+                "diverged": diverged,
+            }
+        )
     best = min(row["nrmse"] for row in tried)
     if not np.isfinite(best):
         raise ValueError(
-            "no threshold gives a model whose rollouts stay bounded: the last one "
-            f"{tried[-1]['diverged'][0]}"
+            f"no threshold gives a model whose rollouts stay bounded: the last one {last}"
         )
-    good = [i for i, row in enumerate(tried) if row["nrmse"] <= SLACK * best]
+    good = [i for i, row in enumerate(tried) if row["nrmse"] <= slack * best]
     chosen = min(good, key=lambda i: (tried[i]["terms"], tried[i]["nrmse"]))
-    _warn_of_faults(models[chosen], validation, scores[chosen], problem.records)
+    if not _warn_of_misses(models[chosen], validation, every[chosen]):
+        _warn_of_mechanics(models[chosen], problem.records)
     return Choice(models[chosen], chosen, tried)
 
 
@@ -444,7 +467,7 @@ def _weak(
         starts = [(one, i) for one in series for i in range(0, len(one) - length + 1, length - 1)]
         return [pysindy.AxesArray(one[i : i + length], axes) for one, i in starts]
 
-    with _quiet_pysindy():
+    with _quiet_pysindy(recipe.seed):
         library = pysindy.WeakPDELibrary(
             function_library=pysindy.IdentityLibrary(),
             spatiotemporal_grid=step * np.arange(length), K=recipe.domains, H_xt=[recipe.width],
@@ -457,12 +480,22 @@ def _weak(
     )
 
 
+def _optimizer(recipe: Recipe) -> Any:
+    pysindy = needed("pysindy", "reduced")
+    one: Any = pysindy.STLSQ(threshold=recipe.threshold, alpha=1e-10)
+    return (
+        pysindy.EnsembleOptimizer(one, bagging=True, n_models=recipe.models)
+        if recipe.models
+        else one
+    )
+
+
 @contextlib.contextmanager
-def _quiet_pysindy() -> Iterator[None]:
+def _quiet_pysindy(seed: int) -> Iterator[None]:
     """Seed numpy's global generator, from which pysindy draws, and restore it; silence pysindy's
     warnings."""
     before = np.random.get_state()  # noqa: NPY002
-    np.random.seed(0)  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="pysindy")

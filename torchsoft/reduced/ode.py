@@ -1,6 +1,5 @@
-"""Small ordinary differential equations y' = S y + C phi(y, u) as text, torch module, and fast
-rollout. Every candidate term phi is a linear combination of states y and inputs u, or a tanh of
-one.
+"""Small ordinary differential equations y' = S y + C phi(y, u): text, torch module, and fast
+rollout.
 
 One list of terms defines the equations in text and LaTeX, the right-hand side for torchdiffeq, and
 the compiled rollout. A linear model is rolled out by an exact recursion, any other by an L-stable
@@ -8,11 +7,11 @@ step: scipy's stiff solvers call Python at every step and cost more than the ful
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from time import perf_counter
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -24,11 +23,13 @@ from torchsoft.codegen import compile_law
 from torchsoft.display import Shown
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 
-UNITS = {
-    "x_C": "m", "theta": "rad", "x_Br": "m", "v_C": "m/s", "omega": "rad/s", "v_Br": "m/s",
-    "F_x": "N", "x_d": "m", "x_d_dot": "m/s",
+SYMBOLS = {
+    "x_C": ("x_C", "m"), "theta": (r"\theta", "rad"), "x_Br": ("x_{Br}", "m"),
+    "v_C": (r"\dot x_C", "m/s"), "omega": (r"\dot\theta", "rad/s"),
+    "v_Br": (r"\dot x_{Br}", "m/s"), "F_x": ("F_x", "N"), "x_d": ("x_d", "m"),
+    "x_d_dot": (r"\dot x_d", "m/s"),
 }  # fmt: skip
-"""Units of the variables of a reduced model."""
+"""LaTeX and unit of the variables of a reduced model."""
 
 BEYOND = 100.0
 """Largest state of a rollout, over the states' scale; beyond, it has diverged."""
@@ -43,52 +44,97 @@ HALVINGS = 8
 """Most halvings of the step of a rollout."""
 
 
+def symbol(name: str) -> tuple[str, str]:
+    """LaTeX and unit of a variable; the name itself where there is no such channel."""
+    return SYMBOLS.get(name, (name, name))
+
+
+class Factor(NamedTuple):
+    """shape(form / scale), with a linear combination `form` of variables by name."""
+
+    form: Mapping[str, float]
+    shape: Literal["linear", "tanh", "abs"] = "linear"
+    scale: float = 1.0
+
+
 @dataclass(frozen=True)
 class Term:
-    """A candidate term with its formula as text and its unit: a linear combination `form` of
-    variables by name, or tanh(form / saturation) where it has one."""
+    """A candidate term, the product of its factors, with its formula as text and its unit."""
 
     text: str
     unit: str
-    form: Mapping[str, float]
-    saturation: float | None = None
+    factors: tuple[Factor, ...]
+
+    @property
+    def latex(self) -> str:
+        """The formula with the symbols of its variables."""
+        return re.sub(
+            r"tanh|\w+", lambda m: r"\tanh" if m[0] == "tanh" else symbol(m[0])[0], self.text
+        )
 
     @property
     def linear(self) -> bool:
-        return self.saturation is None
-
-    @property
-    def slope(self) -> dict[str, float]:
-        """The form over the saturation: the term itself where its value is small."""
-        scale = 1.0 if self.saturation is None else self.saturation
-        return {name: weight / scale for name, weight in self.form.items()}
+        return len(self.factors) == 1 and self.factors[0].shape == "linear"
 
 
 class Table(NamedTuple):
-    """Terms as tensors: forms (terms, variables) in units of the saturations, and which terms
-    saturate (terms,)."""
+    """Terms as tensors: forms (terms * factors, variables), and masks of the factors that are a
+    tanh or a modulus (terms, factors)."""
 
     forms: Tensor
-    saturates: Tensor
+    tanh: Tensor
+    modulus: Tensor
 
-    @classmethod
-    def of(cls, terms: Sequence[Term], variables: Sequence[str]) -> Self:
-        """Raises `ValueError` for a term of a variable that is not among `variables`."""
-        forms = torch.zeros(len(terms), len(variables), dtype=torch.float64)
-        for i, term in enumerate(terms):
-            for name, weight in term.slope.items():
-                if name not in variables:
-                    known = ", ".join(variables)
+
+def tabulate(terms: Sequence[Term], variables: Sequence[str]) -> Table:
+    """Terms as tensors over `variables` and the constant "1". Raises `ValueError` for an unknown
+    variable."""
+    names, most = [*variables, "1"], max((len(term.factors) for term in terms), default=1)
+    forms = np.zeros((len(terms), most, len(names)))
+    shapes = np.full((len(terms), most), "linear", dtype=object)
+    forms[:, :, -1] = 1.0  # a factor that is not there is one
+    for i, term in enumerate(terms):
+        for j, factor in enumerate(term.factors):
+            forms[i, j] = 0.0
+            shapes[i, j] = factor.shape
+            for name, weight in factor.form.items():
+                if name not in names:
                     raise ValueError(
-                        f"term `{term.text}` needs the variable {name!r}; known: {known}"
+                        f"term `{term.text}` needs the variable {name!r}; known: {', '.join(names)}"
                     )
-                forms[i, variables.index(name)] = weight
-        return cls(forms, torch.tensor([not term.linear for term in terms], dtype=torch.bool))
+                forms[i, j, names.index(name)] = weight / factor.scale
+    arrays = (
+        forms.reshape(-1, len(names)),
+        np.asarray(shapes == "tanh"),
+        np.asarray(shapes == "abs"),
+    )
+    return Table(*map(torch.from_numpy, arrays))
 
-    def values(self, variables: Tensor) -> Tensor:
-        """The terms (..., terms) of variables (..., variables)."""
-        values = variables @ self.forms.mT
-        return torch.where(self.saturates, values.tanh(), values)
+
+def features(z: Tensor, table: Table) -> Tensor:
+    """phi (..., terms) of the variables z (..., variables + 1)."""
+    factor = (z @ table.forms.mT).reshape(*z.shape[:-1], *table.tanh.shape)
+    return torch.where(
+        table.tanh, factor.tanh(), torch.where(table.modulus, factor.abs(), factor)
+    ).prod(-1)
+
+
+class Held(nn.Module):
+    """Inputs u (T, inputs) sampled at t (T,) [s], interpolated linearly."""
+
+    t: Tensor
+    u: Tensor
+
+    def __init__(self, t: Tensor, u: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("t", t)
+        self.register_buffer("u", u)
+
+    def forward(self, t: Tensor | float) -> Tensor:
+        when = torch.as_tensor(t, dtype=self.t.dtype)
+        i = torch.searchsorted(self.t, when.detach()).clamp(1, len(self.t) - 1)
+        fraction = (when - self.t[i - 1]) / (self.t[i] - self.t[i - 1])
+        return torch.lerp(self.u[i - 1], self.u[i], fraction.clamp(0.0, 1.0))
 
 
 @dataclass(frozen=True, repr=False)
@@ -111,13 +157,9 @@ class Rollout(Shown):
         )
 
 
-def double(values: Any) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def selection(names: Sequence[str], known: Sequence[str]) -> Tensor:
-    """(names, known): a one in every row, in the column of its name."""
-    return torch.eye(len(known), dtype=torch.float64)[[known.index(name) for name in names]]
+def indices(places: Sequence[tuple[int, int]]) -> tuple[Tensor, ...] | None:
+    """Places (row, column) of a matrix, as `index_put` takes them; None if there are none."""
+    return tuple(torch.tensor(one, dtype=torch.long) for one in zip(*places)) or None
 
 
 class ReducedModel(Shown, nn.Module):
@@ -127,9 +169,9 @@ class ReducedModel(Shown, nn.Module):
     states, inputs: names. kinematics: which state is the rate of which, as in {"x_C": "v_C"}.
     equations: for every other state the (term, coefficient) pairs of its rate, SI units. feedback:
     for inputs that a control law makes, its gains on states and on further inputs, {"F_x": {"x_d":
-    K, "x_C": -K}}; `signal` then gives those further inputs, the `outer` ones. Coefficients and
-    gains are `nn.Parameter`s. scale (states,): sizes that belong to the states, for judging
-    divergence. intervals: for every term in order its (low, high), if an ensemble has found them.
+    K, "x_C": -K}}; `signal` then gives those further inputs. Coefficients and gains are
+    `nn.Parameter`s. scale (states,): sizes that belong to the states, for judging divergence.
+    intervals: for every term in order its (low, high), if an ensemble has found them.
     """
 
     def __init__(
@@ -147,23 +189,34 @@ class ReducedModel(Shown, nn.Module):
                 "every state needs one equation, but these have none or are no states: "
                 f"{sorted(missing)}"
             )
-        self.feedback = {name: dict(law) for name, law in (feedback or {}).items()}
-        laws = [(name, *gain) for name, law in self.feedback.items() for gain in law.items()]
-        outer = [name for name in inputs if name not in self.feedback]
-        outer += [name for _, name, _ in laws if name not in self.states]
-        self.outer = tuple(dict.fromkeys(outer))
-        pairs = [(target, *pair) for target, listed in equations.items() for pair in listed]
-        self.targets = [target for target, _, _ in pairs]
-        self.terms = [term for _, term, _ in pairs]
-        self.coefficients = nn.Parameter(double([value for _, _, value in pairs]))
-        self.gains = nn.Parameter(double([gain for _, _, gain in laws]))
-        self.scale = np.ones(len(states)) if scale is None else np.asarray(scale, dtype=float)
+        self.targets = [target for target, pairs in equations.items() for _ in pairs]
+        self.terms = [term for pairs in equations.values() for term, _ in pairs]
+        values = [value for pairs in equations.values() for _, value in pairs]
+        self.coefficients = nn.Parameter(torch.tensor(values, dtype=torch.float64))
         self.intervals = None if intervals is None else [(float(a), float(b)) for a, b in intervals]
-        self.signal: Callable[[Tensor | float], Tensor] | None = None
-        self._table = Table.of(self.terms, (*self.states, *self.inputs))
-        self._rate_of = selection(self.targets, self.states)
-        self._made = selection([name for name, _, _ in laws], self.inputs)
-        self._used = selection([name for _, name, _ in laws], (*self.states, *self.outer))
+        self.feedback = {name: dict(law) for name, law in (feedback or {}).items()}
+        made = [name for law in self.feedback.values() for name in law if name not in self.states]
+        self.outer = tuple(
+            dict.fromkeys([name for name in inputs if name not in self.feedback] + made)
+        )
+        self.gains = nn.Parameter(
+            torch.tensor(
+                [gain for law in self.feedback.values() for gain in law.values()],
+                dtype=torch.float64,
+            )
+        )
+        self.scale = np.asarray(
+            scale if scale is not None else np.ones(len(self.states)), dtype=float
+        )
+        self.signal: nn.Module | None = None
+        self._table = tabulate(self.terms, (*self.states, *self.inputs))
+        entries = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
+        self._entries = indices(entries)
+        law = [
+            (self.inputs.index(name), [*self.states, *self.outer].index(other))
+            for name, gains in self.feedback.items() for other in gains
+        ]  # fmt: skip
+        self._law = indices(law)
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         rows = [tuple(line.split(" = ", 1)) for line in self.text()]
@@ -195,15 +248,18 @@ class ReducedModel(Shown, nn.Module):
     def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
         """S (states, states), C (states, terms) and the control law's K (inputs, states + outer
         inputs)."""
-        S = torch.zeros(len(self.states), len(self.states), dtype=torch.float64)
+        n, m = len(self.states), len(self.inputs)
+        S = torch.zeros(n, n, dtype=torch.float64)
         for name, rate in self.kinematics.items():
             S[self.states.index(name), self.states.index(rate)] = 1.0
-        K = torch.zeros(len(self.inputs), self._used.shape[1], dtype=torch.float64)
+        C = torch.zeros(n, len(self.terms), dtype=torch.float64)
+        if self._entries is not None:
+            C = C.index_put(self._entries, self.coefficients)
+        K = torch.zeros(m, n + len(self.outer), dtype=torch.float64)
         for i, name in enumerate(self.inputs):
             if name in self.outer:
-                K[i, len(self.states) + self.outer.index(name)] = 1.0
-        C = self._rate_of.mT * self.coefficients
-        return S, C, K + (self._made.mT * self.gains) @ self._used
+                K[i, n + self.outer.index(name)] = 1.0
+        return S, C, K if self._law is None else K.index_put(self._law, self.gains)
 
     def forward(self, t: Tensor | float, y: Tensor) -> Tensor:
         """dy/dt, shaped like y (..., states). Raises `ValueError` when the model has inputs but no
@@ -212,27 +268,31 @@ class ReducedModel(Shown, nn.Module):
         if self.outer:
             if self.signal is None:
                 raise ValueError(
-                    f"set `signal` to a function of t that gives {', '.join(self.outer)} (inputs,)"
+                    f"set `signal` to a module that gives {', '.join(self.outer)} at t, such as "
+                    "`Held`"
                 )
             w = self.signal(t).expand(*y.shape[:-1], -1)
         return self.rates(torch.cat((y, w), -1))
 
     def rates(self, yw: Tensor) -> Tensor:
         """dy/dt (..., states) from states and outer inputs (..., states + outer)."""
-        return self._rates(yw, *self.matrices())
+        return _rates(yw, self._table, *self.matrices())
 
-    def _rates(self, yw: Tensor, S: Tensor, C: Tensor, K: Tensor) -> Tensor:
-        y = yw[..., : len(S)]
-        return y @ S.mT + self._table.values(torch.cat((y, yw @ K.mT), -1)) @ C.mT
+    def phi(self, yu: np.ndarray) -> np.ndarray:
+        """The terms (T, terms) at states and inputs (T, states + inputs)."""
+        return features(
+            torch.from_numpy(np.column_stack((yu, np.ones(len(yu))))), self._table
+        ).numpy()
 
     def state_space(self) -> tuple[np.ndarray, np.ndarray]:
-        """A (states, states) and B (states, outer) of y' = A y + B u. Raises `ValueError` unless
-        linear."""
+        """A (states, states) and B (states, outer + 1) of y' = A y + B (u, 1). Raises `ValueError`
+        unless linear."""
         if not self.linear:
             raise ValueError("the model has terms that are not linear; it has no A and B")
         n, size = len(self.states), len(self.states) + len(self.outer)
-        slopes = self.rates(torch.eye(size, dtype=torch.float64)).detach().numpy().T
-        return slopes[:, :n], slopes[:, n:]
+        f = self.rates(torch.eye(size + 1, size, dtype=torch.float64).roll(1, 0)).detach().numpy()
+        slopes = (f[1:] - f[0]).T
+        return slopes[:, :n], np.column_stack((slopes[:, n:], f[0]))
 
     def rollout(
         self, t: np.ndarray, y0: np.ndarray, u: np.ndarray, *, scale: np.ndarray | None = None
@@ -244,8 +304,11 @@ class ReducedModel(Shown, nn.Module):
         rollout that goes `BEYOND` times `scale` (states,), the model's by default, has diverged: it
         is NaN from that time on.
         """
-        t, y0 = np.asarray(t, float), np.asarray(y0, float)
-        u = np.asarray(u, float).reshape(len(t), -1)
+        t, y0, u = (
+            np.asarray(t, float),
+            np.asarray(y0, float),
+            np.asarray(u, float).reshape(len(t), -1),
+        )
         if u.shape[1] != len(self.outer) or y0.shape != (len(self.states),):
             raise ValueError(
                 f"`y0` must hold {', '.join(self.states)} and `u` one column each for "
@@ -255,11 +318,13 @@ class ReducedModel(Shown, nn.Module):
         began, limit = perf_counter(), BEYOND * size
         if self.linear and len(t) > 2 and np.allclose(np.diff(t), t[1] - t[0], rtol=1e-6, atol=0):
             with np.errstate(over="ignore", invalid="ignore"):
-                y = linear_rollout(*self.state_space(), t[1] - t[0], y0, u)
+                y = linear_rollout(
+                    *self.state_space(), t[1] - t[0], y0, np.column_stack((u, np.ones(len(t))))
+                )
         else:
-            matrices = [matrix.detach() for matrix in self.matrices()]
+            parts = [part.detach() for part in self.matrices()]
             law = compile_law(
-                lambda yw, _: self._rates(yw, *matrices),
+                lambda x, _: _rates(x, self._table, *parts),
                 torch.ones(len(y0) + u.shape[1]).double(), {}, differentiated=len(y0),
             )  # fmt: skip
             y = nonlinear_rollout(law.value, law.linearise, t, y0, u, limit, size)
@@ -272,27 +337,58 @@ class ReducedModel(Shown, nn.Module):
         """One equation a line, in SI units."""
         lines = [f"{name}' = {rate}" for name, rate in self.kinematics.items()]
         for target, pairs in self.equations().items():
-            parts = (
+            body = " ".join(
                 f"{'+-'[value < 0]} {abs(value):.4g} {_bracketed(term.text)}"
                 for term, value in pairs
             )
-            lines.append(f"{target}' = {' '.join(parts).removeprefix('+ ') or '0'}")
+            lines.append(f"{target}' = {body.removeprefix('+ ') or '0'}")
         return lines
+
+    def latex(self) -> str:
+        """The equations of the velocities as an `aligned` block."""
+        rows = []
+        for target, pairs in self.equations().items():
+            body = " ".join(
+                f"{'+-'[value < 0]} {_power(abs(value))}\\,{_bracketed(term.latex)}"
+                for term, value in pairs
+            )
+            rows.append(
+                rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {body.removeprefix('+ ') or '0'}"
+            )
+        return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def coefficient_table(self) -> list[dict[str, Any]]:
         """Every coefficient with its unit and, from an ensemble, its interval."""
-        intervals, values = self.intervals or [None] * len(self.terms), self.coefficients.tolist()
-        return [
-            {
-                "equation": target, "term": term.text, "value": value,
-                "unit": f"{UNITS.get(target, target)}/s per {term.unit}", "interval": interval,
-            }
-            for target, term, value, interval in zip(self.targets, self.terms, values, intervals)
-        ]  # fmt: skip
+        rows, intervals = [], self.intervals or [None] * len(self.terms)
+        for target, term, value, interval in zip(
+            self.targets, self.terms, self.coefficients.tolist(), intervals
+        ):
+            unit = f"{symbol(target)[1]}/s per {term.unit}"
+            rows.append(
+                {
+                    "equation": target,
+                    "term": term.text,
+                    "value": value,
+                    "unit": unit,
+                    "interval": interval,
+                }
+            )
+        return rows
+
+
+def _rates(yw: Tensor, table: Table, S: Tensor, C: Tensor, K: Tensor) -> Tensor:
+    y = yw[..., : len(S)]
+    z = torch.cat((y, yw @ K.mT, torch.ones_like(yw[..., :1])), -1)
+    return y @ S.mT + features(z, table) @ C.mT
 
 
 def _bracketed(text: str) -> str:
     return f"({text})" if " + " in text or " - " in text else text
+
+
+def _power(value: float) -> str:
+    mantissa, _, exponent = f"{value:.4g}".partition("e")
+    return rf"{mantissa}\cdot 10^{{{int(exponent)}}}" if exponent else mantissa
 
 
 def linear_rollout(
@@ -322,19 +418,29 @@ def recursion(F, f, x0):
 
 
 def nonlinear_rollout(
-    value: int, linearise: int, t: np.ndarray, y0: np.ndarray, w: np.ndarray, limit: np.ndarray,
+    value: int,
+    linearise: int,
+    t: np.ndarray,
+    y0: np.ndarray,
+    w: np.ndarray,
+    limit: np.ndarray,
     scale: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """y (T, states) at t (T,) [s], NaN once it is beyond `limit` (states,); the step is halved
     until the solution converges.
 
     value, linearise: addresses of the compiled rates of (y, w), differentiated by y.
     """
-    stepped: Any = partial(_rosenbrock, value, linearise, t, y0, w, limit)
+
+    def stepped(pieces: int) -> np.ndarray:
+        step: Any = _rosenbrock
+        return step(value, linearise, t, y0, w, limit, pieces)
+
     y = stepped(1)
     for halving in range(1, HALVINGS + 1):
         coarse, y = y, stepped(2**halving)
-        if (np.abs(y - coarse) <= TOLERANCE * scale).all():
+        error = np.abs(y - coarse) / scale
+        if np.isfinite(y).all() and np.isfinite(coarse).all() and error.max() <= TOLERANCE:
             break
         if halving >= 3 and np.isnan(y[-1, 0]) and np.isnan(coarse[-1, 0]):
             break  # it diverges at either step
@@ -346,8 +452,14 @@ def _rosenbrock(value, linearise, t, y0, w, limit, pieces):
     n = len(y0)
     out = np.full((len(t), n), np.nan)
     out[0] = y0
-    y, f, later, none = y0.copy(), np.empty(n), np.empty(n), np.empty(0)
-    J, one = np.empty((n, n)), np.eye(n)
+    y, f, later, J, one, none = (
+        y0.copy(),
+        np.empty(n),
+        np.empty(n),
+        np.empty((n, n)),
+        np.eye(n),
+        np.empty(0),
+    )
     for k in range(len(t) - 1):
         h, rise = (t[k + 1] - t[k]) / pieces, (w[k + 1] - w[k]) / pieces
         for piece in range(pieces):

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchsoft.display import Shown, amount, suggestion
-from torchsoft.reduced.ode import UNITS
+from torchsoft.reduced.ode import symbol
 from torchsoft.solve.trajectory import Trajectory
 
 STATES = ("x_C", "theta", "x_Br", "v_C", "omega", "v_Br")
@@ -20,7 +20,7 @@ CHANNELS = {
     "theta": ("theta_C",), "v_C": ("v_x_C", "v_x"), "omega": ("omega_C",), "v_Br": ("v_x_Br",),
     "F_x": ("effort_x",),
 }  # fmt: skip
-"""Other names of series in a dataset of rigs/paper.toml."""
+"""Other names of series in a dataset of rigs/paper.toml, of this version or an older one."""
 
 EVEN = 1e-6
 """Largest difference between equal steps, over their size."""
@@ -63,7 +63,7 @@ class Record(Shown):
             f"{1e3 * self.step:.4g} ms"
         )
         return title, [
-            (name, f"{x.min():.4g} to {amount(float(x.max()), UNITS.get(name, name))}")
+            (name, f"{x.min():.4g} to {amount(float(x.max()), symbol(name)[1])}")
             for name, x in self.series.items()
         ]
 
@@ -78,7 +78,7 @@ class Record(Shown):
             raise ValueError(
                 f"the record has no series {', '.join(lacking)}; it has {', '.join(self.series)}"
             )
-        return np.array([self.series[name] for name in names]).reshape(len(names), len(self.t)).T
+        return np.column_stack([self.series[name] for name in names])
 
 
 def record(

@@ -17,7 +17,7 @@ are small differences of large positions, which is why they, and not the positio
 
 from collections.abc import Mapping, Sequence
 
-from torchsoft.reduced.ode import UNITS, Term
+from torchsoft.reduced.ode import Factor, Term, symbol
 from torchsoft.reduced.records import KINEMATICS
 
 Candidates = Mapping[str, Sequence[Term]]
@@ -28,12 +28,12 @@ def slip(text: str, **form: float) -> tuple[Term, Term]:
     """The term of a linear combination of positions [m], and the term of its rate."""
     rates = {KINEMATICS[name]: value for name, value in form.items()}
     rate_text = text.replace("x_C", "v_C").replace("x_Br", "v_Br").replace("theta", "omega")
-    return Term(text, "m", form), Term(rate_text, "m/s", rates)
+    return Term(text, "m", (Factor(form),)), Term(rate_text, "m/s", (Factor(rates),))
 
 
 def variable(name: str) -> Term:
     """The term of a variable itself."""
-    return Term(name, UNITS.get(name, name), {name: 1.0})
+    return Term(name, symbol(name)[1], (Factor({name: 1.0}),))
 
 
 def slips(r: float) -> dict[str, tuple[Term, Term]]:
@@ -68,7 +68,7 @@ def friction(r: float, speed: float) -> dict[str, list[Term]]:
     """Saturating candidates tanh(s' / speed) of the slips below and above, with a small `speed`
     [m/s]."""
     lower, upper = (
-        Term(f"tanh(({rate.text})/{speed:g})", "1", rate.form, speed)
+        Term(f"tanh(({rate.text})/{speed:g})", "1", (Factor(rate.factors[0].form, "tanh", speed),))
         for rate in (slips(r)[side][1] for side in ("lower", "upper"))
     )
     return {"v_C": [lower, upper], "omega": [lower, upper], "v_Br": [upper]}
