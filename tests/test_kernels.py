@@ -88,14 +88,14 @@ def test_objects_are_named_after_all_that_is_compiled_and_the_processor(
         objects.load("run")
 
 
-def full(handle: int) -> None:
+def full(*_: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize("why", ["a file is there", "the disk is full"])
 def test_where_nothing_can_be_kept_one_line_says_so(folder, monkeypatch, capsys, why):
     if why == "the disk is full":
-        monkeypatch.setattr(os, "fsync", full)
+        monkeypatch.setattr(Path, "replace", full)
     else:
         folder.write_text("a file")
     kept()
