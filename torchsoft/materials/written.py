@@ -13,11 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchsoft.files import finite, save_text, write_json
-from torchsoft.materials.energies import EnergyFit, stretches
+from torchsoft.materials.energies import PullFit, stretches
 from torchsoft.materials.fit import Fit
 from torchsoft.materials.measured import Spectrum
-from torchsoft.materials.modulus import Modulus
-from torchsoft.physics.hyperelastic import KINDS
 from torchsoft.physics.validity import check_numbers, sound
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, new_figure, save
 from torchsoft.plot.scene import INK
@@ -37,7 +35,7 @@ UNITS = {
 FILES = ("material.toml", "summary.json", "fit.png")
 """Files that are written."""
 
-Found = Fit | Modulus | EnergyFit
+Found = Fit | PullFit
 """A material fitted to a test."""
 
 
@@ -48,7 +46,7 @@ def write(
     those of the command. Each file appears whole or not at all. Raises `ValueError` for
     coefficients that no material has."""
     try:
-        material = KINDS[found.kind](**found.table(), **assumed)
+        material = found.material(**assumed)
         check_numbers(material)
         sound(material)
     except ValueError as error:
@@ -138,15 +136,10 @@ def drawn(found: Found) -> Figure:
     return figure
 
 
-def draw_stress(data: Axes, left: Axes, found: Modulus | EnergyFit) -> None:
+def draw_stress(data: Axes, left: Axes, found: PullFit) -> None:
     """Nominal stress of every table and of the fit, and their differences: over the stretch, or
     over 1 + the amount of shear."""
-    pulls, curves = (
-        (found.pulls, found.fitted)
-        if isinstance(found, EnergyFit)
-        else ([found.measured], [found.fitted])
-    )
-    for number, (pull, curve) in enumerate(zip(pulls, curves)):
+    for number, (pull, curve) in enumerate(zip(found.pulls, found.fitted)):
         x, colour = stretches(pull) + (pull.test == "shear"), f"C{number}"
         label = f"{pull.test}, {len(x)} rows"
         data.plot(x, MPA * pull.stress, ".", color=colour, ms=4, label=label)
