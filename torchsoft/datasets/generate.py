@@ -25,6 +25,7 @@ from torchsoft.cost import Cost, rig_row, rig_step, span, steps_per_second
 from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, folder, read_bytes
+from torchsoft.datasets.schema import energies, surfaces
 from torchsoft.datasets.subject import Row, Subject, Task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.parallel import executor, local_processes, single_threaded
@@ -46,7 +47,7 @@ def points(config: Config) -> NDArray[np.floating]:
     A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to
     its size.
     """
-    dimensions, rng = config.subject.drawn, np.random.default_rng(config.seed)
+    dimensions, rng = config.subject.dimensions, np.random.default_rng(config.seed)
     if config.method == "latin_hypercube":
         return qmc.LatinHypercube(dimensions, rng=rng).random(config.trajectories)
     power = int(np.ceil(np.log2(config.trajectories)))
@@ -85,15 +86,15 @@ def simulate_task(config: Config, task: Task) -> Row:
 @torch.no_grad()
 def series(subject: Subject, rig: Rig, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
-    out: Row = {name: run[name].numpy() for name in subject.signals}
-    for pad, touching in subject.surfaces.items() if subject.config.nodal else ():
+    out: Row = {name: run[name].numpy() for name in subject.channels}
+    for pad, touching in surfaces(subject.template).items() if subject.config.nodal else ():
         for name in touching:
             out[f"normal_force_{name}"] = run.force[name][..., 0].numpy()
             out[f"friction_force_{name}"] = run.force[name][..., 1].numpy()
             depth = rig.penetration(name, run.state)
             out[f"contact_{name}"] = (depth > 0).numpy().astype(np.uint8)
         out[f"displacement_{pad}"] = (rig.pads[pad].spread @ run.displacement[pad]).numpy()
-    for kind, (_, parts) in subject.energies.items():
+    for kind, (_, parts) in energies(subject.template).items():
         known = run.energy if kind == "stored" else getattr(run, kind)
         out[f"{kind}_energy"] = np.stack([known[part].numpy() for part in parts], -1)
     out["injected_energy"], out["energy_residual"] = (
@@ -124,10 +125,6 @@ PATIENCE = 60.0
 
 SURE = 2.0
 """Half width of the estimated range of times, in standard errors of the mean."""
-
-
-BAR = "{l_bar}{bar}| {n:.1f}/{total:.1f}{unit} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
-"""What a bar in simulated seconds says."""
 
 
 class Log:
@@ -184,7 +181,7 @@ def cost(
     shard = 2 * kept * min(
         config.trajectories_per_shard, config.trajectories
     ) + config.samples * rig_row(subject.template)
-    design = 8 * 2 * config.trajectories * subject.drawn / 2**30
+    design = 8 * 2 * config.trajectories * subject.dimensions / 2**30
     return Cost(
         steps=count * steps,
         seconds=count * most / at_once,
@@ -241,15 +238,14 @@ class Serial(Executor):
 def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
     """Simulate and write one shard. Returns how many of its trajectories are finished and how many
     of those simulated here failed, (0, 0) where another process makes the shard."""
-    config, rows = store.config, list[dict[str, Any]]()
-    with store.claim(shard) as simulated, single_threaded():
-        if simulated is None:
+    config = store.config
+    with store.claim(shard) as mine, single_threaded():
+        if not mine:
             return 0, 0
         if store.finished(shard):  # by another process, since it was submitted
             return len(config.rows(shard)), 0
-        for i, u in zip(config.rows(shard), design, strict=True):
-            rows.append(simulate_task(config, config.subject.task(i, u)))
-            simulated()
+        tasks = zip(config.rows(shard), design, strict=True)
+        rows = [simulate_task(config, config.subject.task(i, u)) for i, u in tasks]
         store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
 
@@ -267,13 +263,12 @@ def generate(
     mine = part.shards(config)
     store, design = open_or_create(url, config), points(config)
     left, failed = [shard for shard in store.unfinished() if shard in mine][::-1], 0
-    running = dict[Future[tuple[int, int]], int]()
-    total = sum(len(config.rows(shard)) for shard in mine)
-    finished = total - sum(len(config.rows(shard)) for shard in left)
-    each, terminal = config.duration, sys.stderr.isatty()
+    running = set[Future[tuple[int, int]]]()
+    of = lambda shards: sum(len(config.rows(shard)) for shard in shards)
+    terminal = sys.stderr.isatty()
     with tqdm(
-        total=total * each, initial=finished * each, unit=" simulated s", bar_format=BAR,
-        disable=not progress, file=None if terminal else Log(), smoothing=0.05,
+        total=of(mine), initial=of(mine) - of(left), unit=" trajectories", disable=not progress,
+        file=None if terminal else Log(), smoothing=0.05,
         mininterval=0.1 if terminal else 30.0,  # [s]
     ) as bar:  # fmt: skip
         try:
@@ -281,15 +276,13 @@ def generate(
                 while left and len(running) < 3 * max(workers, 1):
                     here = config.rows(shard := left.pop())
                     some = design[here.start : here.stop]
-                    running[executor.submit(run_shard, store, shard, some)] = shard
-                done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+                    running.add(executor.submit(run_shard, store, shard, some))
+                done, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
-                    count, bad = future.result()
-                    finished, failed = finished + count, failed + bad
-                    del running[future]
-                bar.set_postfix_str(f"{failed} failed", refresh=False)
-                simulated = finished + sum(map(store.simulated, running.values()))
-                bar.update(max(simulated * each - bar.n, 0.0))
+                    finished, bad = future.result()
+                    failed += bad
+                    bar.set_postfix_str(f"{failed} failed", refresh=False)
+                    bar.update(finished)
         finally:
             for future in running:
                 future.cancel()
