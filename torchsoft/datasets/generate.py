@@ -165,65 +165,66 @@ def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
     return [shard for shard in part.shards(config) if shard not in finished]
 
 
-def cost(
-    config: Config, workers: int, count: int | None = None,
-    each: tuple[float, float, float] | None = None,
-) -> Cost:  # fmt: skip
-    """Cost of `count` trajectories, by default all, on `workers` workers. `each` is the least and
-    the longest time [s] of one trajectory and its steps, by default those of `usual`."""
-    subject = config.subject
-    count = config.trajectories if count is None else count
+class Each(NamedTuple):
+    """One trajectory: its least and longest time [s], and its steps."""
+
+    least: float
+    longest: float
+    steps: float
+
+
+def cost(config: Config, workers: int, each: Each | None = None) -> Cost:
+    """Cost of the whole set on `workers` workers, by default by experience."""
+    subject, count = config.subject, config.trajectories
     at_once = max(min(workers, config.shards), 1)
-    least, most, steps = usual(config) if each is None else each
-    kept = sum(  # of one trajectory [GiB]
-        v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in config.subject.variables.values()
-    )
-    shard = 2 * kept * min(
-        config.trajectories_per_shard, config.trajectories
-    ) + config.samples * rig_row(subject.template)
-    design = 8 * 2 * config.trajectories * subject.dimensions / 2**30
+    one = usual(config) if each is None else each
+    arrays = subject.variables.values()
+    kept = sum(v.kept.itemsize * math.prod(v.shape[1:]) for v in arrays) / 2**30  # [GiB]
+    rows = 2 * kept * min(config.trajectories_per_shard, count)
+    shard = rows + config.samples * rig_row(subject.template)
+    design = 8 * 2 * count * subject.dimensions / 2**30
     return Cost(
-        steps=count * steps,
-        seconds=count * most / at_once,
-        least=count * least / at_once,
+        steps=count * one.steps,
+        seconds=count * one.longest / at_once,
+        least=count * one.least / at_once,
         memory=design + shard * at_once,
         disk=kept * count,
     )
 
 
-def usual(config: Config) -> tuple[float, float, float]:
-    """Time [s] of a trajectory, twice, and its steps by experience, on the high side."""
+def usual(config: Config) -> Each:
+    """A trajectory by experience, on the high side."""
     subject = config.subject
-    seconds, step = config.duration, subject.steps.get("step")
+    duration, step = config.duration, subject.steps.get("step")
     if step is not None:
-        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
+        steps = duration / config.sample_interval * math.ceil(config.sample_interval / step)
     else:  # an output between two steps takes half the time of a step
         rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
-        steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
-    return (seconds := steps * rig_step(subject.template) + STATICS), seconds, steps
+        steps = duration * steps_per_second(rtol) + 0.5 * config.samples
+    seconds = steps * rig_step(subject.template) + STATICS
+    return Each(seconds, seconds, steps)
 
 
-def measured(config: Config) -> tuple[float, float, float]:
-    """Least and longest time [s] and steps of a trajectory, from the first trajectories of the set.
-    One run before them loads the kernels; the times are of the processor, which other programs
-    hardly change."""
-    design, times, steps = points(config), list[float](), 0
+def measured(config: Config) -> Each:
+    """A trajectory by the first ones of the set. One run before them loads the kernels; the times
+    are of the processor, which other programs hardly change."""
+    design, times, steps = points(config), list[float](), list[int]()
     with single_threaded():
         for i in (0, *range(TRIED)):
             began = time.thread_time()
-            row = simulate_task(config, config.subject.task(i, design[i]))
-            steps += row["steps"] if times else 0
+            steps.append(simulate_task(config, config.subject.task(i, design[i]))["steps"])
             times.append(time.thread_time() - began)
     mean, error = statistics.mean(times[1:]), SURE * statistics.stdev(times[1:]) / TRIED**0.5
-    return max(mean - error, 0.0), mean + error, steps / TRIED
+    return Each(max(mean - error, 0.0), mean + error, statistics.mean(steps[1:]))
 
 
 def estimate(config: Config, url: str, workers: int, part: Part = WHOLE) -> Cost:
     """Cost of the unfinished shards of a part; a few trajectories are timed where there are
     many."""
     count = sum(len(config.rows(shard)) for shard in unfinished(config, url, part))
-    tried = count >= MANY and (TRIED + 1) * usual(config)[1] < PATIENCE
-    return cost(config, workers, count, measured(config) if tried else None)
+    tried = count >= MANY and (TRIED + 1) * usual(config).longest < PATIENCE
+    whole = cost(config, workers, measured(config) if tried else None)
+    return whole.part(count / config.trajectories)
 
 
 class Serial(Executor):

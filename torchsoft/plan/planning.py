@@ -4,7 +4,6 @@ import time as clock
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.metadata import version
 from typing import Any, Literal
 
@@ -20,7 +19,8 @@ from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.plan.problem import Evaluation, Evaluator, Free, Term, Terms, Variables
-from torchsoft.plan.search import SLACK, Search, Stopped, Visit
+from torchsoft.plan.search import SLACK, Criterion, Search, Stopped, Visit, adam
+from torchsoft.plan.sqp import slsqp
 from torchsoft.solve.simulate import Start, started
 from torchsoft.solve.trajectory import Trajectory
 
@@ -94,8 +94,8 @@ def plan(
     y0: Numbers | Start, reference: Reference | None = None,
     over: Mapping[str, Numbers] | None = None,
     robust: Robust = "mean", method: Method = "slsqp", iterations: int = 50, rate: float = 0.02,
-    starts: int = 1, change: float | None = None, seconds: float = float("inf"),
-    rtol: float = RTOL, threads: int | None = None, seed: int = 0, progress: bool = False,
+    starts: int = 1, seconds: float = float("inf"), rtol: float = RTOL, seed: int = 0,
+    progress: bool = False,
 ) -> Plan:  # fmt: skip
     """Choose the free variables of a rig so that its run from y0 (size,) over the times t (T,) [s]
     reaches all targets within all limits. A `y0` that is a function of the rig, such as
@@ -105,9 +105,8 @@ def plan(
     least and largest value (infinite ones are allowed). `objective` (a number, which is lowered),
     `targets` (errors over a tolerance, which are brought to zero) and `limits` (excess over a
     scale, which is kept from being positive) are functions in torch of a `Trajectory`, such as
-    `Target` and `Limit`, by name. `change` weighs half the squared change of the variables, in
-    units of the speed or range allowed: by default 1 without an objective, so that the plan is the
-    one nearest to the motion given, else 0.
+    `Target` and `Limit`, by name. Without an objective the plan is the one nearest to the motion
+    given, by half the squared change of the variables in units of the speed or range allowed.
 
     `over` holds draws of uncertain parameters by name (draws, ...), y0 their starts (draws, size)
     if these differ, the first draw being the nominal one. With `robust` "mean" the mean error of
@@ -137,19 +136,22 @@ def plan(
     followed = rig.reference if reference is None else reference
     variables = Variables(rig, followed, free, float(t[-1]))
     terms = Terms(objective, targets or {}, limits or {})
-    evaluator = Evaluator(rig, t, variables, terms, y0, drawn, rtol, threads)
-    weight = (1.0 if objective is None else 0.0) if change is None else change
+    evaluator = Evaluator(rig, t, variables, terms, y0, drawn, rtol)
+    change = 1.0 if objective is None else 0.0
     notices, checked = list[str](), None
     with tqdm(desc="plan", unit=" evaluations", disable=hidden(progress)) as bar:
-        search = Search(evaluator, robust, weight, seconds, bar)
+        criterion = Criterion(variables, robust == "worst", change)
+        search = Search(evaluator, criterion, seconds, bar)
         try:
             search.begin(starts, seed)
-            go = search.slsqp if method == "slsqp" else partial(search.adam, rate=rate)
-            go(search.found.z, iterations)
+            if method == "slsqp":
+                slsqp(search, search.found.z, iterations)
+            else:
+                adam(search, search.found.z, iterations, rate)
             checked = evaluator.evaluate(search.found.z, CHECK * rtol, gradient=False)
             if method == "slsqp" and not kept(checked)[:1].all():
                 search.refine(POLISH * rtol)
-                search.slsqp(search.found.z, iterations)
+                slsqp(search, search.found.z, iterations)
         except KeyboardInterrupt:
             if search.best is None:
                 raise
@@ -163,8 +165,8 @@ def plan(
     return finished(search, checked, rig, notices, {
         "torchsoft": version("torchsoft"), "method": method, "robust": robust,
         "free": {k: tuple(v) if isinstance(v, tuple) else v.model_dump() for k, v in free.items()},
-        "draws": evaluator.draws, "iterations": iterations, "starts": starts, "change": weight,
-        "rtol": rtol, "seed": seed,
+        "draws": evaluator.draws, "iterations": iterations, "starts": starts, "rtol": rtol,
+        "seed": seed,
     })  # fmt: skip
 
 
@@ -224,7 +226,7 @@ def finished(
     start = started(planned, start, "none") if callable(start) else start
     reference = evaluator.variables.reference(now, start.reference)
     planned.reference = reference
-    combined = evaluation.value.max() if search.robust == "worst" else evaluation.value.mean()
+    combined = evaluation.value.max() if search.criterion.worst else evaluation.value.mean()
     return Plan(
         rig=planned, reference=reference, parameters=parameters, trajectory=run,
         value=float(combined),
