@@ -22,7 +22,6 @@ test-newest:
 	$(NEWEST) tests/newest.py $(NEWEST)
 
 test-hostile: $(STAMP)
-	rm -rf out/hostile
 	$(BIN)/python -m pytest -m slow --dist worksteal tests/hostile --timeout 1800
 
 lint: $(STAMP)

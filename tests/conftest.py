@@ -4,14 +4,12 @@ import gc
 from collections.abc import Mapping
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor, nn
 
 from torchsoft import (
     Body,
     BuiltRig,
-    Profile,
     Reference,
     Rig,
     RigFile,
@@ -114,20 +112,6 @@ def waves(x: float, y: float, band: tuple[float, float]) -> tuple[dict[str, Any]
 def rest(rig: Rig, x: float = 60e-3) -> Tensor:
     """The paper's disc at rest on the lower pad, the upper one just touching it."""
     return rig.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": "touch"})
-
-
-def manipulate(model: Rig, force: float, **motions: nn.Module) -> Tensor:
-    """The paper's start at rest, after the model was given the paper's motion, with a force [N]
-    fed forward; or other motions."""
-    y0 = rest(model).detach()
-    top = float(model.unpack(y0).pose["bracket"][1])
-    own = {
-        "x_d": Profile([0.0, 10.0, 15.0, 25.0], [60e-3, 40e-3, 40e-3, 60e-3]),
-        "y_d": Profile([0.0, 0.375], [top, GRASPED]),
-        "F_ff": Profile([0.0, 0.375], [0.0, -force]),
-    }
-    model.reference = Reference(**own | motions)
-    return y0
 
 
 def press(rig: Rig, height: float = GRASPED, x: float = 60e-3) -> Tensor:
@@ -241,16 +225,6 @@ def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
     )
 
 
-class Exp(nn.Module):
-    """A positive parameter by its logarithm."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x.exp()
-
-    def right_inverse(self, x: Tensor) -> Tensor:
-        return x.log()
-
-
 def pytest_collection_finish() -> None:
     """Keep modules out of garbage collections, which are a twentieth of the time else."""
     gc.collect()
@@ -264,8 +238,3 @@ def listed(given: Any) -> Any:
     if isinstance(given, list):
         return [*map(listed, given)]
     return given.tolist() if isinstance(given, Tensor) else given
-
-
-@pytest.fixture(params=["massless", "inertial"])
-def fidelity(request):
-    return request.param

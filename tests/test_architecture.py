@@ -141,17 +141,6 @@ def test_folders_know_only_what_they_need():
             assert kernels <= called, name
 
 
-@pytest.mark.parametrize(
-    "folder", ["solve", "physics", "sysid", "datasets", "plan", "envs", "plot", "reduced"]
-)
-def test_no_rig_is_special(folder):
-    """Whatever is known of the paper's rig stands in its file."""
-    parts = r"|(\b|_)(disc|bracket)\b" if folder == "solve" else ""
-    words = re.compile(r"paper's rig|SoftGrasp|torchsoft\.paper|steel_on_rubber" + parts)
-    for path in (ROOT / folder).rglob("*.py"):
-        assert not words.findall(path.read_text(encoding="utf-8")), path
-
-
 def test_calls_keep_house_rules():
     """Bars are for terminals, since a log would hold a carriage return for every step; warnings
     point to the caller; text names its encoding, whatever the terminal's is."""

@@ -91,7 +91,7 @@ def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path):
 
 
 def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path):
-    path, content = tmp_path / "file", bytes(range(256))
+    path, content = tmp_path / "file", bytes(range(32))
     path.write_bytes(content)
     seal(path)
     whole = path.read_bytes()

@@ -326,48 +326,34 @@ def test_the_ratio_of_times_counts_for_branches_and_inertia_allows_none():
 def pressed(nu: float, finer: int) -> float:
     """Force [N] of the lower pad on the paper's disc, held 0.4 mm deep in it."""
     rubber = {"kind": "neo_hookean", "E": 7.5e5, "nu": nu, "tau": 0.01, "depth": 0.044}
-    mesh = {"elements_x": 30 * finer, "elements_y": 2 * finer, "length": 0.06}
+    mesh = {"elements_x": 15 * finer, "elements_y": 2 * finer, "length": 0.03}
     changes = {f"pads.L.{name}": value for name, value in mesh.items()}
     changes |= {"materials.rubber": rubber, "laws.steel_on_rubber.K_n": 4e6}
-    changes |= {"pads.L.origin": [0.03, 0.0]}
+    changes |= {"pads.L.origin": [0.045, 0.0]}
     rig = still(changes)
-    with torch.no_grad():
-        y = rig.state(
-            disc={"x": 60e-3, "y": 4.59e-3 + 19.37e-3 - 0.4e-3}, bracket={"x": 60e-3, "y": 1.0}
-        )
-        return float(rig.evaluate(0.0, rig.unpack(y)).interfaces["L"].law.force[:, 0].sum())
+    y = rig.state(disc={"x": 60e-3, "y": 23.56e-3}, bracket={"x": 60e-3, "y": 1.0})
+    return float(rig.evaluate(0.0, rig.unpack(y)).interfaces["L"].law.force[:, 0].detach().sum())
 
 
 def test_nearly_incompressible_pads_do_not_lock():
     assert 0.94 < pressed(0.499, 1) / pressed(0.499, 2) < 1.0
 
 
-ELASTIC = {"kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044}
-RELAXING = ELASTIC | {"moduli": [4.5e5], "times": [0.05]}
+RUBBERY = {"kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044}
+RELAXING = RUBBERY | {"moduli": [4.5e5], "times": [0.05]}
 COARSE = {
-    "pads.L.elements_x": 60, "pads.U.elements_x": 60, "pads.L.elements_y": 2,
-    "pads.U.elements_y": 2,
+    "pad.elements_x": 30, "pad.elements_y": 2, "materials.rubber": RELAXING,
     "outputs": {"duration": 0.2, "interval": 5e-3, "snapshots": [0.0], "figures": False},
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=[ELASTIC, RELAXING], ids=["elastic", "relaxing"])
-def rubber(request):
-    return request.param
-
-
 @pytest.fixture(scope="module")
-def grasp(rubber):
-    return paper(COARSE | {"materials.rubber": rubber})
+def run():
+    return paper(COARSE).run(rtol=1e-5)
 
 
-@pytest.fixture(scope="module")
-def run(grasp):
-    return grasp.run(rtol=1e-5)
-
-
-def test_the_ledger_closes_at_the_tolerance(grasp, run):
-    loose = grasp.run(rtol=1e-3)
+def test_the_ledger_closes_at_the_tolerance(run):
+    loose = paper(COARSE).run(rtol=1e-3)
     assert run.energy_residual_rel < 2e-5
     assert run.energy_residual_rel < 0.2 * loose.energy_residual_rel
     assert float(run.dissipated["pad_L"].diff().min()) >= 0
@@ -382,19 +368,18 @@ def test_branches_rest_at_the_start_and_follow(run):
         assert float((u - v).abs().max()) > 1e-5
 
 
-def test_a_run_that_starts_in_equilibrium_stays_there(rubber):
-    held = {"materials.rubber": rubber, "motion.y_d": {"kind": "hold", "value": 49.99e-3}}
-    built = paper(COARSE | held)
+def test_a_run_that_starts_in_equilibrium_stays_there():
+    built = paper(COARSE | {"motion.y_d": {"kind": "hold", "value": 49.99e-3}})
     kept = simulate(built.rig, f64(0.0, 0.01, 0.02), y0=built.y0, rtol=1e-6)
     assert float((kept["y_C"] - kept["y_C"][0]).abs().max()) < 2e-7
 
 
-def test_a_run_is_kept_in_files_and_shown(rubber, run, tmp_path):
+def test_a_run_is_kept_in_files_and_shown(run, tmp_path):
     run.save(tmp_path / "run.nc")
     loaded = Trajectory.load(tmp_path / "run.nc")
     assert torch.equal(loaded.y, run.y)
     pad = loaded.setup.pads["L"]
-    assert pad.energy == {"rho": 1100.0, **rubber}
+    assert pad.energy == {"rho": 1100.0, **RELAXING}
     u = run.displacement["L"][-1].numpy()
     assert pad.stress(pad.displacement(u)).min() < -5e4
     assert 0.05 < pad.largest_strain(u) < 0.5

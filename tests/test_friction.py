@@ -167,35 +167,62 @@ def test_forces_and_rates_are_those_worked_out_by_hand(row):
         assert float(getattr(got, name)) == pytest.approx(value, rel=1e-12, abs=1e-15), name
 
 
-@pytest.mark.parametrize("ageing", [0.0, 0.005, 0.1])
-def test_the_slip_rate_solves_the_elements_equation(ageing):
-    """R V + mu(V) F_N = E at the end of a stage, mu_s being 0.6 + ageing ln(1 + age / t_0); V = 0
-    below the strength at rest; dV/dE = 1 / (R - d(mu F_N)/dV). Over many orders of magnitude."""
-    random, mu_s, mu_k, v_s, D_c, t_0 = np.random.default_rng(0), 0.6, 0.5, 5e-3, 20e-6, 1e-3
+MU_0, A, B, D_C, V_0 = 0.6, 0.012, 0.02, 20e-6, 1e-3
+FALL, V_S, T_0 = 0.1, 5e-3, 1e-3
+
+
+def ageing(strengthening: float) -> tuple[Any, ...]:
+    """A slip law, its coefficient of the slip rate and of the age after it, that of points at rest,
+    and the fall of friction with the slip rate [s/m] that a dashpot has to balance."""
+    strength = lambda age: MU_0 + strengthening * torch.log1p(age / T_0)
+    moving = lambda V, age: MU_0 - FALL + (strength(age) - MU_0 + FALL) / (1 + V / V_S)
+    fall = lambda age, h: (strength(age) - MU_0 + FALL) / V_S + h * strengthening / D_C
+    return AgeingSlip(MU_0, MU_0 - FALL, V_S, strengthening, D_C, T_0), moving, strength, fall
+
+
+def evolving() -> tuple[Any, ...]:
+    def moving(V: torch.Tensor, age: torch.Tensor) -> torch.Tensor:
+        """a asinh(V / (2 V_0) exp((mu_0 + b ln(V_0 age / D_c)) / a))."""
+        x = torch.log(V / (2 * V_0)) + (MU_0 + B * torch.log(V_0 * age / D_C)) / A
+        return A * torch.where(x > 20, x + math.log(2), torch.asinh(torch.exp(x.clamp(max=20))))
+
+    law = RateAndState(MU_0, A, B, D_C, V_0)
+    return law, moving, torch.zeros_like, lambda age, h: h * (B - A) / D_C
+
+
+@pytest.mark.parametrize("made", [ageing(0.0), ageing(0.005), ageing(0.1), evolving()])
+def test_the_slip_rate_solves_the_elements_equation(made):
+    """R V + mu F_N = E at the end of a stage; V = 0 below the strength at rest; dV/dE =
+    1 / (R + d(mu F_N)/dV). Over many orders of magnitude."""
+    friction, moving, strength, fall = made
+    random = np.random.default_rng(0)
     E, F_N, dashpot, h, age = torch.from_numpy(
         10 ** random.uniform([[-6], [-5], [-1], [-7], [-5]], [[2], [1], [3], [-2], [3]], (5, 20000))
     )
-    falls = mu_s - mu_k + ageing * torch.log1p((age + h) / t_0)
-    dashpot = dashpot + (falls / v_s + h * ageing / D_c) * F_N
-    friction = AgeingSlip(mu_s, mu_k, v_s, ageing, D_c, t_0)
+    dashpot = dashpot + fall(age + h, h) * F_N
     V, rate = friction(E.requires_grad_(), F_N, dashpot, age[:, None], h)
     (by_E,) = torch.autograd.grad(V.sum(), E)
     E, V, aged = E.detach(), V.detach().requires_grad_(), (age + h * rate[:, 0]).detach()
     slips = (V > 0).detach()
-    assert aged == pytest.approx(((age + h) / (1 + h * V / D_c)).detach(), rel=1e-9)
-    older = torch.log1p((age + h) / (1 + h * V / D_c) / t_0)
-    force = (mu_k + (mu_s + ageing * older - mu_k) / (1 + V / v_s)) * F_N
-    (slope,) = torch.autograd.grad(force.sum(), V)
+    assert torch.equal(slips, strength(age + h) * F_N < E)
+    assert int(slips.sum()) > 5000
+    after = (age + h) / (1 + h * V / D_C)
+    assert aged.numpy() == pytest.approx(after.detach().numpy(), rel=1e-9)
+    force = moving(V, after) * F_N
+    (slope,) = torch.autograd.grad(force[slips].sum(), V)
     left = ((dashpot * V + force) / E - 1).detach()
     assert float(left[slips].abs().max()) < 1e-9
     expected = (1 / (dashpot + slope)).detach()[slips]
     assert by_E[slips].numpy() == pytest.approx(expected.numpy(), rel=1e-8)
     assert by_E[~slips].count_nonzero() == 0
-    strength = mu_s + ageing * torch.log1p((age + h) / t_0)
-    assert torch.equal(slips, strength * F_N < E)
-    assert 5000 < int(slips.sum()) < 19000
-    if ageing == 0:
-        assert torch.equal(SmoothSlip(mu_s, mu_k, v_s)(E, F_N, dashpot), V)
+
+
+def test_laws_are_smooth_slip_without_ageing_and_a_dashpot_without_load():
+    E, F_N, R = f64(10.0, 3.0), f64(2.0, 5.0), f64(300.0, 400.0)
+    aged = AgeingSlip(0.6, 0.5, 5e-3, 0.0)(E, F_N, R, f64(1.0, 2.0)[:, None], 1e-3)[0]
+    assert torch.equal(SmoothSlip(0.6, 0.5, 5e-3)(E, F_N, R), aged)
+    free = evolving()[0](E, 0 * F_N, R, f64(1.0, 2.0)[:, None], 1e-3)[0]
+    assert free.tolist() == pytest.approx((E / R).tolist(), rel=1e-15)
 
 
 def test_static_friction_at_the_start_is_that_of_the_age_there():

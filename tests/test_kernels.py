@@ -1,6 +1,7 @@
 """Object files of the kernels: named after what they are made from, checked before they are used,
 made again where they are missing; and the tables that kernels take."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -87,12 +88,21 @@ def test_objects_are_named_after_all_that_is_compiled_and_the_processor(
         objects.load("run")
 
 
-def test_where_nothing_can_be_kept_one_line_says_so(folder, capsys):
-    folder.write_text("a file")
+def full(handle: int) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("why", ["a file is there", "the disk is full"])
+def test_where_nothing_can_be_kept_one_line_says_so(folder, monkeypatch, capsys, why):
+    if why == "the disk is full":
+        monkeypatch.setattr(os, "fsync", full)
+    else:
+        folder.write_text("a file")
     kept()
     kept()
     (told,) = capsys.readouterr().err.splitlines()
     assert f"compiled kernels cannot be kept in {folder}" in told
+    assert not [*folder.glob("*")]
 
 
 def test_a_second_process_waits_for_the_first_and_takes_its_kernels(folder, monkeypatch, capsys):

@@ -258,7 +258,6 @@ def part(name: str, make: Callable[[], nn.Module], *by: str) -> Any:
         part("material", lambda: Rubber(**RUBBER, tau=0.01), "material of `P`.*by `tau` are"),
         part("material", lambda: Gel(lambda c, x: c.detach() * x**2), "by `c` are"),
         part("material", lambda: Gel(lambda c, x: c * x.detach() * x), r"F_xx \(a stress\).*`c`"),
-        part("material", lambda: Gel(lambda c, x: c * x**2)),
         part("signal", lambda: Swing(lambda a: a.detach()), "by `signals.x_d.amplitude` are"),
         part("signal", lambda: Swing(Tensor.item), "by `signals.x_d.amplitude` are"),
         part("signal", lambda: Swing(lambda a: a)),

@@ -316,15 +316,6 @@ def test_a_body_held_upright_although_its_pad_would_turn_it_is_warned_about():
         RigFile.ready("drop").override(tilted).build()
 
 
-def test_a_long_box_rests_on_its_whole_side():
-    model = still(COARSE, shape=RoundedBox(30e-3, 5e-3, 1e-3))
-    state = model.unpack(rest(model).detach())
-    x = model.pads["L"].positions[:, 0] - state.pose["disc"][0]
-    assert torch.equal(model.penetration("L", state) > 0, x.abs() < 29.5e-3)
-    weight = float(model.bodies["disc"].mass.detach()) * 9.81
-    assert float(state.pads["L"][0, :, 1].sum()) == pytest.approx(-weight, rel=1e-9)
-
-
 ECCENTRIC = RigFile.ready("drop").override({
     "bodies.ellipse.shape": {"kind": "circle", "radius": 19e-3}, "bodies.ellipse.centre_y": -4e-3,
     "bodies.ellipse.mass": 0.4, "bodies.ellipse.inertia": 8e-5,
@@ -337,25 +328,14 @@ ECCENTRIC = RigFile.ready("drop").override({
 
 
 def test_an_eccentric_disc_rocks_like_a_pendulum():
-    """Its period, and the derivatives of a run with respect to the centre of mass."""
-    built = ECCENTRIC.build()
-    run = built.run(rtol=1e-5, gradient="discrete")
-    theta, t = run["theta_ellipse"].detach().numpy(), run.t.numpy()
+    run = ECCENTRIC.build().run(rtol=1e-5)
+    theta, t = run["theta_ellipse"].numpy(), run.t.numpy()
     down = np.flatnonzero((theta[:-1] > 0) & (theta[1:] <= 0))
     part = theta[down] / (theta[down] - theta[down + 1])
     period = np.diff(t[down] + (t[down + 1] - t[down]) * part)
     m, e, radius, J, g = 0.4, 4e-3, 19e-3, 8e-5, 9.81
     expected = TAU * np.sqrt((J + m * (radius - e) ** 2) / (m * g * e))
     assert period == pytest.approx(expected, rel=0.01)
-    values = [built.rig.parameter(f"bodies.ellipse.centre_{axis}") for axis in "xy"]
-    for value, slope in zip(values, torch.autograd.grad(run["theta_ellipse"][40], values)):
-        ends = []
-        for h in (-1e-9, 1e-9):
-            with torch.no_grad():
-                value += h
-                ends.append(float(built.run(knots=run.knots)["theta_ellipse"][40]))
-                value -= h
-        assert float(slope) == pytest.approx((ends[1] - ends[0]) / 2e-9, rel=1e-6)
 
 
 def test_a_centre_of_mass_without_a_shape_is_rejected():

@@ -7,7 +7,6 @@ import torch
 from conftest import (
     COARSE,
     PAPER,
-    Exp,
     coarse,
     excited,
     f64,
@@ -26,7 +25,6 @@ from torchsoft import (
     Profile,
     Rig,
     SimulationFailed,
-    hold,
     simulate,
 )
 from torchsoft.rigs.excite import Excitation
@@ -35,6 +33,16 @@ from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.simulate import SharedStart
 
 T = times(0.02, 11)
+
+
+class Exp(nn.Module):
+    """A positive parameter by its logarithm."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.exp()
+
+    def right_inverse(self, x: Tensor) -> Tensor:
+        return x.log()
 
 
 def rolled(model: Rig, **options: object):
@@ -69,6 +77,7 @@ def test_what_is_saved_is_what_ran():
 NAMES = {
     "pads.L.material.E": 0.8e6, "contacts.L.law.K_n": 1e5, "bodies.disc.shape.radius": 19.4e-3,
     "actuators.x.law.Kp": 1e5, "contacts.L.law.friction.mu_s": 0.3, "bodies.disc.mass": 0.5,
+    "contacts.L.law.K_t": 1e5, "actuators.y.law.Kp": 1e5,
 }  # fmt: skip
 
 
@@ -93,50 +102,29 @@ def test_gradients_reach_parameters_however_they_are_put_in():
             for name, value in NAMES.items() if model is not called else ():
                 model.get_parameter(name).fill_(value)
     theta = Simulated(plain)(y0)
-    parts = [plain.contacts["L"].law.K_t, plain.actuators["y"].law.Kp]
-    leaves = [*map(plain.get_parameter, NAMES), *parts]
-    *expected, by_K_t, by_K_98 = torch.autograd.grad(theta, leaves)
-    assert all(float(x) != 0 for x in (*expected, by_K_t, by_K_98))
+    expected = torch.autograd.grad(theta, [*map(plain.get_parameter, NAMES)])
+    assert all(float(x) != 0 for x in expected)
 
     put = {f"model.{name}": f64(value)[0].requires_grad_() for name, value in NAMES.items()}
     other = torch.func.functional_call(Simulated(called), put, (y0,))
     assert torch.equal(theta, other)
     assert all(map(torch.equal, torch.autograd.grad(other, list(put.values())), expected))
 
+    logs = []
     for name in NAMES:
         owner, _, last = name.rpartition(".")
-        parametrize.register_parametrization(logarithmic.get_submodule(owner), last, Exp())
-    logs = [
-        logarithmic.get_submodule(name.rpartition(".")[0])
-        .parametrizations[name.rpartition(".")[2]].original for name in NAMES
-    ]  # fmt: skip
+        part = logarithmic.get_submodule(owner)
+        parametrize.register_parametrization(part, last, Exp())
+        logs.append(part.parametrizations[last].original)
     got = torch.stack(torch.autograd.grad(Simulated(logarithmic)(y0), logs))
     values = f64(*NAMES.values())
     torch.testing.assert_close(got, torch.stack(expected) * values, rtol=1e-7, atol=0)
 
     law = tied.contacts["L"].law
-    for model in (plain, tied):
-        with torch.no_grad():
-            for part in (model.contacts["L"].law.K_t, model.actuators["y"].law.Kp):
-                part.fill_(1e5)
     law.K_t = tied.actuators["y"].law.Kp = law.K_n
-    leaves = [plain.contacts["L"].law.K_n, *parts]
-    alone = torch.autograd.grad(Simulated(plain)(y0), leaves)
+    alone = [by for by, name in zip(expected, NAMES) if name.endswith(("K_n", "K_t", "y.law.Kp"))]
     (together,) = torch.autograd.grad(Simulated(tied)(y0), law.K_n)
     assert float(together) == pytest.approx(float(sum(alone)), rel=1e-9)
-
-
-def test_changes_after_a_run_do_not_change_its_gradient():
-    """Between run and backward: another reference, knots moved and parameters set in place."""
-    model = coarse()
-    run = rolled(model, gradient="discrete")
-    wanted = [model.parameter(name) for name in ("pad.E", "contact.K_t", "control.R_80")]
-    before = torch.autograd.grad(run["theta"][-1], wanted, retain_graph=True)
-    with torch.no_grad():
-        model.reference["x_d"].values += 1e-3
-    model.reference = hold(x_d=0.03, y_d=0.07, F_ff=9.0)
-    model.contacts["L"].law.K_n.data = f64(5e5)[0]
-    assert all(map(torch.equal, before, torch.autograd.grad(run["theta"][-1], wanted)))
 
 
 @pytest.mark.parametrize("when", ["computed", "integrate"])

@@ -5,7 +5,7 @@ import pytest
 import torch
 from conftest import COARSE, coarse, f64, grasped, paper, times, towards
 from torch import Tensor, nn
-from torchdiffeq import odeint, odeint_adjoint
+from torchdiffeq import odeint
 
 from torchsoft import SimulationFailed, Trajectory, simulate
 from torchsoft.physics.motion import Profile, Sampled
@@ -147,13 +147,8 @@ def test_what_a_signal_raises_is_raised():
 
 def test_torchdiffeqs_tolerances_are_the_steppers():
     model, t = coarse(), times(0.02, 4)
-    y0, grads = grasped(model, (0.03, 0.0)), []
+    y0 = grasped(model, (0.03, 0.0))
     exact = simulate(model, t, y0=y0, rtol=1e-8).y
-    for solve in (odeint, odeint_adjoint):
-        model.zero_grad()
-        y = solve(model, y0, t, method="sdirk2", rtol=1e-4, atol=1e-5)
-        off = (y - exact)[:, model.layout.slices["pose", "disc"]].detach()
-        assert float(off.abs().max()) < 1e-6
-        y[1:].square().sum().backward()
-        grads.append(float(model.parameter("contact.K_t").grad))
-    assert grads[0] == pytest.approx(grads[1], rel=1e-7)
+    y = odeint(model, y0, t, method="sdirk2", rtol=1e-4, atol=1e-5)
+    off = (y - exact)[:, model.layout.slices["pose", "disc"]].detach()
+    assert float(off.abs().max()) < 1e-6

@@ -4,7 +4,6 @@ import importlib
 import subprocess
 import sys
 from contextlib import nullcontext
-from typing import Any
 
 import pytest
 import torch
@@ -28,24 +27,9 @@ def test_an_import_leaves_torchdiffeq_alone_and_pysindy_for_later():
 
 @pytest.fixture
 def foreign_solver():
-    """torchdiffeq with a solver of its own under the name, and the stepper registered after it."""
-
-    class Euler:
-        def __init__(self, func: Any, y0: torch.Tensor, *_: object, **options: object) -> None:
-            self.func, self.y0 = func, y0
-
-        def integrate(self, t: torch.Tensor) -> torch.Tensor:
-            rows = [self.y0]
-            for i in range(1, len(t)):
-                rows.append(rows[-1] + (t[i] - t[i - 1]) * self.func(t[i - 1], rows[-1]))
-            return torch.stack(rows)
-
-        @classmethod
-        def valid_callbacks(cls) -> set[str]:
-            return set()
-
+    """torchdiffeq with another solver under the name, and the stepper registered after it."""
     before = SOLVERS[METHOD]
-    SOLVERS[METHOD] = Euler
+    SOLVERS[METHOD] = SOLVERS["euler"]
     register_method()
     register_method()
     yield
@@ -66,38 +50,43 @@ def test_torchdiffeq_runs_the_stepper(foreign_solver):
         assert torch.equal(found, simulate(model, t, y0=start, step=2e-3).y)
 
 
-@pytest.mark.parametrize("verb", [odeint, odeint_adjoint])
-def test_decreasing_times_are_rejected_or_warned_of(verb):
-    model = coarse()
+def test_decreasing_times_are_rejected_or_warned_of():
+    model = coarse(pad__elements_x=30)
     y0 = grasped(model, (0.01, 0.0))
-    with pytest.raises(ValueError, match=r"`t` must increase strictly.*\[0.5, 0.48\]"):
-        verb(model, y0, f64(0.5, 0.48, 0.46), method=METHOD)
-    model, how = coarse(pad__elements_x=30), {"method": "rk4", "options": {"step_size": 5e-6}}
-    y0 = grasped(model, (0.01, 0.0))
+    for verb in (odeint, odeint_adjoint):
+        with pytest.raises(ValueError, match=r"`t` must increase strictly.*\[0.5, 0.48\]"):
+            verb(model, y0, f64(0.5, 0.48, 0.46), method=METHOD)
     with torch.no_grad(), pytest.warns(UserWarning, match="backwards.*use increasing times"):
-        verb(model, y0, f64(4e-5, 0.0), **how)
+        odeint(model, y0, f64(4e-5, 0.0), method="rk4", options={"step_size": 5e-6})
 
 
-def test_odeint_adjoint_equals_odeint():
+@pytest.mark.parametrize(
+    ("given", "rounding"),
+    [
+        ({"options": {"step_size": 2e-3, "tolerance": 1e-10}}, 1e-13),
+        ({"rtol": 1e-4, "atol": 1e-5}, 1e-9),
+    ],
+    ids=["step", "tolerances"],
+)
+def test_odeint_adjoint_equals_odeint(given, rounding):
     """Interval by interval, for a batch of two, every parameter and the initial states: the same
-    but for the order of sums, whose terms cancel."""
+    but for the order of sums, whose terms cancel, and the steps of each interval."""
     model, found = coarse(), []
     y0 = grasped(model, (0.02, 0.0))
     y0 = torch.stack((y0, 1.0001 * y0))
     for verb in (odeint, odeint_adjoint):
         model.zero_grad(set_to_none=True)
         start, t = y0.clone().requires_grad_(), f64(0.3, 0.31, 0.325, 0.34)
-        options = {"step_size": 2e-3, "tolerance": 1e-10}
-        state = model.unpack(verb(model, start, t, method=METHOD, options=options))
+        state = model.unpack(verb(model, start, t, method=METHOD, **given))
         x, theta = state.pose["disc"][..., 0], state.pose["disc"][..., 2]
         (1e3 * x * t[:, None] + theta + state.velocity["bracket"][..., 1]).sum().backward()
         known = [p for p in model.parameters() if p.grad is not None]
         found.append([start.grad, *(p.grad * p.detach() for p in known)])
     (by_y0, *bars), (again, *others) = found
-    assert float((by_y0 - again).abs().max()) < 1e-11 * float(by_y0.abs().max())
+    assert float((by_y0 - again).abs().max()) < 1e2 * rounding * float(by_y0.abs().max())
     largest = max(float(bar.abs().max()) for bar in bars)
     for bar, other in zip(bars, others, strict=True):
-        assert float((bar - other).abs().max()) <= 1e-13 * largest
+        assert float((bar - other).abs().max()) <= rounding * largest
 
 
 def test_odeint_adjoint_of_a_forgotten_run_says_so():

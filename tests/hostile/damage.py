@@ -6,8 +6,10 @@ import math
 import os
 import pickle
 from collections.abc import Callable, Iterator
+from functools import reduce
 from hashlib import sha256
 from io import BytesIO
+from operator import getitem
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,19 +43,19 @@ class Victim(NamedTuple):
     def content(self) -> bytes:
         return self.path.read_bytes()
 
-    def place(self, length: int = 0) -> int:
-        return int(self.rng.integers(max(len(self.content) - length, 1)))
+    @property
+    def place(self) -> int:
+        return int(self.rng.integers(len(self.content) + 1))
 
 
 Damages = dict[str, Callable[[Victim], bytes | None]]
 """By what is done: the new content, or None where the file was changed already."""
 
 
-def flipped(content: bytes, rng: np.random.Generator, bits: int) -> bytes:
-    out = bytearray(content)
-    for at in rng.choice(8 * len(out), bits, replace=False):
-        out[at // 8] ^= 1 << at % 8
-    return bytes(out)
+def flipped(content: bytes, rng: np.random.Generator) -> bytes:
+    """With one bit changed."""
+    at = int(rng.integers(8 * len(content)))
+    return content[: at // 8] + bytes([content[at // 8] ^ 1 << at % 8]) + content[at // 8 + 1 :]
 
 
 def archive(**arrays: Any) -> bytes:
@@ -69,14 +71,14 @@ def objects(trap: Trap) -> bytes:
     return archive(kind=np.asarray("Prediction"), t=held)
 
 
-def linked(v: Victim, target: Path) -> None:
-    v.path.unlink()
-    v.path.symlink_to(target)
+def replaced(by: Callable[[Path], object]) -> Callable[[Victim], None]:
+    """The file is gone, and `by` makes something else in its place."""
 
+    def change(v: Victim) -> None:
+        v.path.unlink()
+        by(v.path)
 
-def unlinked(v: Victim, then: Callable[[Path], object] = bool) -> None:
-    v.path.unlink()
-    then(v.path)
+    return change
 
 
 def exchanged(v: Victim) -> bytes:
@@ -85,40 +87,9 @@ def exchanged(v: Victim) -> bytes:
     return other
 
 
-BYTES: Damages = {
-    "a bit": lambda v: flipped(v.content, v.rng, 1),
-    "a bit of the beginning": lambda v: flipped(v.content[:32], v.rng, 1) + v.content[32:],
-    "ones": lambda v: b"\x01" * 64 + v.content[64:],
-    "all noise": lambda v: v.rng.bytes(len(v.content)),
-    "cut": lambda v: v.content[: v.place()],
-    "empty": lambda v: b"",
-    "longer": lambda v: v.content + v.rng.bytes(int(v.rng.integers(1, 5000))),
-    "text": lambda v: b"t [s], x_C [mm]\n0, 1\n",
-}
-PLANTED: Damages = {
-    "a pickle": lambda v: pickle.dumps(v.trap),
-    "a sealed pickle within an archive": lambda v: v.seal(objects(v.trap)),
-    "a sealed beginning of HDF5": lambda v: v.seal(b"\x89HDF\r\n\x1a\n"),
-    "a sealed archive of others": lambda v: v.seal(archive(kind=np.asarray("Trap"), x=np.zeros(2))),
-}
-GONE: Damages = {
-    "gone": unlinked,
-    "a folder": lambda v: unlinked(v, Path.mkdir),
-}
-FOREIGN: Damages = {
-    "another's": lambda v: v.other.read_bytes(),
-    "exchanged": exchanged,
-}
-SPECIAL: Damages = {
-    "a pipe": lambda v: unlinked(v, os.mkfifo),
-    "a link to another's": lambda v: linked(v, v.other),
-    "a link to itself": lambda v: linked(v, v.path),
-}
-
-
 def inserted(v: Victim) -> bytes:
     """Bytes that do not belong there."""
-    at = int(v.rng.integers(len(v.content) + 1))
+    at = v.place
     return v.content[:at] + ODD[v.rng.integers(len(ODD))] + v.content[at:]
 
 
@@ -129,18 +100,41 @@ ODD = (
 
 
 def encoded(v: Victim) -> bytes:
-    """In another encoding, with a mark of its order, or with other ends of lines."""
-    text, coding = v.content.decode(), CODINGS[v.rng.integers(len(CODINGS))]
-    return text.replace("\n", coding[1]).encode(coding[0])
+    """In another encoding, or with other ends of lines."""
+    coding, end = CODINGS[v.rng.integers(len(CODINGS))]
+    return v.content.decode().replace("\n", end).encode(coding)
 
 
 CODINGS = (
     ("utf-16", "\n"), ("utf-32", "\n"), ("utf-8-sig", "\n"), ("utf-8", "\r\n"), ("utf-8", "\r"),
     ("latin-1", "# \xb5\n"),
 )  # fmt: skip
-TEXT: Damages = {
-    "inserted": inserted,
-    "another encoding": encoded,
+
+BYTES: Damages = {
+    "a bit": lambda v: flipped(v.content, v.rng),
+    "a bit of the beginning": lambda v: flipped(v.content[:32], v.rng) + v.content[32:],
+    "ones": lambda v: b"\x01" * 64 + v.content[64:],
+    "all noise": lambda v: v.rng.bytes(len(v.content)),
+    "cut": lambda v: v.content[: v.place],
+    "empty": lambda v: b"",
+    "longer": lambda v: v.content + v.rng.bytes(int(v.rng.integers(1, 5000))),
+    "text": lambda v: b"t [s], x_C [mm]\n0, 1\n",
+}
+TEXT: Damages = BYTES | {"inserted": inserted, "another encoding": encoded}
+PLANTED: Damages = {
+    "a pickle": lambda v: pickle.dumps(v.trap),
+    "a sealed pickle within an archive": lambda v: v.seal(objects(v.trap)),
+    "a sealed beginning of HDF5": lambda v: v.seal(b"\x89HDF\r\n\x1a\n"),
+    "a sealed archive of others": lambda v: v.seal(archive(kind=np.asarray("Trap"), x=np.zeros(2))),
+}
+FOREIGN: Damages = {
+    "another's": lambda v: v.other.read_bytes(),
+    "exchanged": exchanged,
+}
+GONE: Damages = {"gone": replaced(bool), "a folder": replaced(Path.mkdir)}
+SPECIAL: Damages = {
+    "a pipe": replaced(os.mkfifo),
+    "a link to itself": replaced(lambda path: path.symlink_to(path)),
 }
 
 
@@ -155,9 +149,6 @@ def forged(name: bytes, content: bytes) -> bytes:
     return sha256(name + content).digest() + content
 
 
-TEXTS = [*TEXT.values(), *BYTES.values()]
-
-
 # trees
 # ----------------------------------------------------------------------
 
@@ -169,11 +160,15 @@ VALUES = (
 """For the place of any other."""
 
 CHANGES = {
-    "value": 0.45, "scale": 0.25, "swap": 0.08, "delete": 0.07, "misspell": 0.1, "nest": 0.05
+    "value": 0.45, "scale": 0.25, "another's": 0.08, "delete": 0.07, "misspell": 0.1, "nest": 0.05
 }  # fmt: skip
 """What becomes of a leaf of a tree, with its probability."""
 
 Place = tuple[str | int, ...]
+
+
+def number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 class Mutant(NamedTuple):
@@ -188,11 +183,10 @@ class Mutant(NamedTuple):
     @property
     def no_number(self) -> bool:
         """Whether a number was replaced by what is none."""
-        number = isinstance(self.old, int | float) and not isinstance(self.old, bool)
-        return number and isinstance(self.new, bool | str | list | dict)
+        return number(self.old) and isinstance(self.new, bool | str | list | dict)
 
     def named(self, text: str) -> bool:
-        """Whether a refusal names the changed place, by its last name, or the place in a table of
+        """Whether a rejection names the changed place, by its last name, or the place in a table of
         measurements that it contradicts; a range or a table is named by itself."""
         names = [part for part in self.place if isinstance(part, str)]
         if names and names[-1] not in ("kind", "low", "high"):
@@ -210,38 +204,27 @@ def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
         yield place, tree
 
 
-def put(tree: Any, place: Place, value: Any) -> Any:
-    """Set a value in a tree; the table that holds it."""
-    for key in place[:-1]:
-        tree = tree[key]
-    tree[place[-1]] = value
-    return tree
-
-
 def mutant(tree: Any, rng: np.random.Generator) -> Mutant:
     """A copy of a tree with one of `CHANGES`."""
     tree = copy.deepcopy(tree)
     places = list(leaves(tree))
-    (place, old), (other, value) = (places[rng.integers(len(places))] for _ in range(2))
-    kind, new = (
-        rng.choice(list(CHANGES), p=list(CHANGES.values())),
-        VALUES[rng.integers(len(VALUES))],
-    )
-    if kind == "swap":
-        put(tree, place, value)
-        put(tree, other, old)
-        return Mutant(tree)
-    if kind in ("delete", "misspell") and isinstance(place[-1], str):
-        table = put(tree, place, old)
-        del table[place[-1]]
+    (place, old), (_, other) = (places[i] for i in rng.integers(len(places), size=2))
+    kind, last = rng.choice([*CHANGES], p=[*CHANGES.values()]), place[-1]
+    table = reduce(getitem, place[:-1], tree)
+    if kind in ("delete", "misspell") and isinstance(last, str):
+        del table[last]
         if kind == "misspell":
-            table[place[-1] + str(rng.choice(["x", "_", " ", "é", ".E"]))] = old
+            table[last + str(rng.choice(["x", "_", " ", "é", ".E"]))] = old
         return Mutant(tree)
+    if kind == "another's":
+        table[last] = other
+        return Mutant(tree)
+    new = VALUES[rng.integers(len(VALUES))]
     if kind == "nest":
-        new = {str(place[-1]): old}
-    elif kind == "scale" and isinstance(old, int | float) and not isinstance(old, bool):
+        new = {str(last): old}
+    elif kind == "scale" and number(old):
         new = type(old)(old * float(10.0 ** rng.uniform(-12, 12) * rng.choice([1, 1, 1, -1])))
-    put(tree, place, new)
+    table[last] = new
     return Mutant(tree, place, old, new)
 
 
@@ -262,10 +245,10 @@ def document(tree: dict[str, Any]) -> str:
     return "".join(f"{toml(name)} = {toml(value)}\n" for name, value in tree.items())
 
 
-def written(path: Path, tree: Any, way: str, number: int, rng: np.random.Generator) -> Mutant:
+def written(path: Path, tree: Any, way: str, rng: np.random.Generator) -> Mutant:
     """Write a tree to a file with one of its values changed, or (`way` "text") its text damaged."""
-    changed = mutant(tree, rng) if way == "values" else Mutant(tree, new=number)
+    changed = mutant(tree, rng) if way == "values" else Mutant(tree)
     path.write_text(document(changed.tree), encoding="utf-8")
     if way == "text":
-        damage(TEXTS[number % len(TEXTS)], Victim(path, rng))
+        damage(rng.choice([*TEXT.values()]), Victim(path, rng))
     return changed

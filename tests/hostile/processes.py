@@ -17,15 +17,11 @@ from typing import Any
 import pytest
 
 import torchsoft
-from torchsoft.solve.kernel import objects
 
 ROOT = Path(torchsoft.__file__).parents[1]
 
 DIED = 9
 """Exit status of a process that died where it was told to."""
-
-USER = 23456
-"""Of no name, home or rights."""
 
 CHANGES = {
     "os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate",
@@ -100,32 +96,32 @@ def performed(
     done: list[str] = []
     report = folder.with_suffix(".operations")
 
-    def inside(path: Any) -> bool:
+    def tick(operation: str, path: Any) -> bool:
+        """Count an operation; whether it is the last."""
         named = isinstance(path, str | bytes | os.PathLike)
-        return named and os.fsdecode(path).startswith(str(folder))
-
-    def tick(operation: str) -> bool:
+        if not named or not os.fsdecode(path).startswith(str(folder)):
+            return False
         done.append(operation)
         return len(done) - 1 == last
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         opened = event == "open" and isinstance(arguments[2], int)
         writes = opened and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
-        if (writes or event in CHANGES) and inside(arguments[0]) and tick(event):
+        if (writes or event in CHANGES) and tick(event, arguments[0]):
             os._exit(DIED)
 
     def watched() -> None:
         flush, opened = os.fsync, io.open
 
         def fsync(handle: int) -> None:
-            if inside(os.readlink(f"/proc/self/fd/{handle}")) and tick("os.fsync"):
+            if tick("os.fsync", os.readlink(f"/proc/self/fd/{handle}")):
                 os._exit(DIED)
             flush(handle)
 
         def torn(file: Any, mode: str = "r", *others: Any, **more: Any) -> Any:
             got = opened(file, mode, *others, **more)
-            writes = inside(file) and set(mode) & set("wax+")
-            return Torn(got, lambda: tick("half a write")) if writes else got
+            writes = set(mode) & set("wax+")
+            return Torn(got, lambda: tick("half a write", file)) if writes else got
 
         os.fsync = fsync
         io.open = builtins.open = torn
@@ -170,8 +166,7 @@ def difference(folder: Path, expected: dict[str, bytes | None]) -> str:
 def restore(folder: Path, source: Path) -> None:
     """Make `folder` a copy of `source`."""
     shutil.rmtree(folder, ignore_errors=True)
-    if source.exists():
-        shutil.copytree(source, folder)
+    shutil.copytree(source, folder)
 
 
 # new starts
@@ -190,29 +185,13 @@ def execute(*arguments: str) -> None:
     os.execve(sys.executable, [sys.executable, *arguments], environment())
 
 
-def start(
-    *arguments: str, user: int | None = None, cwd: Path = Path("/"), **changes: Any
-) -> tuple[int, str, str]:
+def start(*arguments: str, user: int | None = None, **changes: Any) -> tuple[int, str, str]:
     """Exit status and both outputs of a new Python; as another user if one is given, who may read
     everything and write nothing."""
     rights = ["--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search"]
     switch = ["setpriv", f"--reuid={user}", f"--regid={user}", "--clear-groups", *rights]
     done = subprocess.run(
-        [*(switch if user is not None else []), sys.executable, *arguments], check=False, cwd=cwd,
+        [*(switch if user is not None else []), sys.executable, *arguments], check=False, cwd="/",
         capture_output=True, stdin=subprocess.DEVNULL, timeout=600, env=environment(**changes),
     )  # fmt: skip
     return done.returncode, *(x.decode("utf-8", "replace") for x in (done.stdout, done.stderr))
-
-
-# an object that stands for a kernel's, for trials in which nothing is run
-# ----------------------------------------------------------------------
-
-CODE = bytes(range(250)) * 24
-
-
-def kernel() -> tuple[bool, bool]:
-    """Whether the object of a kernel is right, and whether it was found; else it is kept."""
-    found = objects.found("tiny")
-    if found is None:
-        objects.keep("tiny", objects.level(), CODE)
-    return found in (None, CODE), found is not None

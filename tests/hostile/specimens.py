@@ -2,6 +2,7 @@
 
 import csv
 import io
+import tomllib
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -10,7 +11,7 @@ import torch
 from conftest import PAPER, excited, rest, still, stroked
 
 from hostile.processes import ROOT
-from torchsoft import Trajectory, simulate
+from torchsoft import RigFile, Trajectory, simulate
 from torchsoft.datasets import generate as generation
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import Serial, generate, simulate_task
@@ -61,6 +62,59 @@ def roll(_=0):
 """A program that can roll the disc, to the bit."""
 
 ROLL = ROLLING + "print(json.dumps(roll()))\n"
+
+MOTIONS = """
+[[motion]]
+kind = "hold"
+value = 60e-3
+[[motion]]
+kind = "profile"
+times = [0.4, 1.0]
+values = [0.0, 5e-3]
+offset = "start"
+[[motion]]
+kind = "strokes"
+travel = 5e-3
+stroke_time = 0.2
+since = 0.4
+until = 0.9
+[[motion]]
+kind = "spline"
+times = [0.0, 0.5, 1.0]
+values = [60e-3, 62e-3, 61e-3]
+[[motion]]
+kind = "sines"
+components = [{ amplitude = 1e-3, frequency = 2.0, phase = 0.3 }]
+since = 0.4
+[[motion]]
+kind = "multi_sine"
+amplitude = 1e-3
+band = [0.5, 8.0]
+components = 3
+seed = 1
+since = 0.4
+[[motion]]
+kind = "chirp"
+amplitude = 1e-3
+first = 0.3
+last = 8.0
+since = 0.4
+"""
+
+
+def coarse(name: str) -> RigFile:
+    """A ready rig on coarse meshes."""
+    file = RigFile.ready(name)
+    return file.override(pads={name: {"elements_x": 20, "elements_y": 1} for name in file.pads})
+
+
+def rigs() -> list[dict[str, Any]]:
+    """Ready rigs, and the paper's, moved along its pads in every way."""
+    files = [coarse(name) for name in ("paper", "light_grasp", "two_fingers", "drop")]
+    short = files[0].override(outputs={"duration": 1.0, "snapshots": []})
+    files += [short.override({"motion.x_d": way}) for way in tomllib.loads(MOTIONS)["motion"]]
+    return [file.model_dump(mode="json", exclude_unset=True) for file in files]
+
 
 Table = list[list[str]]
 

@@ -23,7 +23,7 @@ from hostile.damage import (
     damage,
     forged,
 )
-from hostile.processes import ended, fork, restore, tree
+from hostile.processes import ended, fork, restore
 from hostile.specimens import dataset, make, problem, run
 from hostile.trial import LIMIT, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
@@ -32,7 +32,7 @@ from torchsoft.datasets.files import StoreError
 from torchsoft.files import SEAL
 from torchsoft.rigs import RigFile
 from torchsoft.solve.formats import load
-from torchsoft.sysid import IdentificationResult, Problem, identify
+from torchsoft.sysid import identify
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.measured import vocabulary
 from torchsoft.sysid.result import load_answer
@@ -40,77 +40,54 @@ from torchsoft.sysid.result import load_answer
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::zarr.errors.ZarrUserWarning")]
 
 RTOL = 1e-3
-Make = pytest.TempPathFactory
 
 
 class Specimen(NamedTuple):
     """A folder of sound files; what is wrong with a copy of it in which a file was damaged, empty
-    if nothing is; how a content is sealed for a file; and damages beyond those to bytes."""
+    if nothing is; how a content is sealed for a file; and what may happen to one."""
 
     sound: Path
-    wrong: Callable[[Path, str], str]
+    wrong: Callable[[Path], str]
     seal: Callable[[Path, bytes], bytes] = lambda path, content: content
-    damages: Damages = FOREIGN
+    damages: Damages = BYTES | GONE | FOREIGN
 
 
 def misread(read: Callable[[], bool], name: str = "") -> str:
-    """What is wrong with how a file is read: neither refused in a sentence, nor as it was."""
+    """What is wrong with how a file is read: neither rejected in a sentence, nor as it was."""
     try:
         return "" if read() else "other values were read"
-    except (ValueError, OSError, StoreError) as refusal:
-        fine = sentence(str(refusal)) and name in str(refusal)
-        return "" if fine else f"not one sentence with the file's name: {refusal}"
+    except (ValueError, OSError, StoreError) as error:
+        fine = sentence(str(error)) and name in str(error)
+        return "" if fine else f"not one sentence with the file's name: {error}"
 
 
 # identifications
 # ----------------------------------------------------------------------
 
 
-class Identified(NamedTuple):
-    """An identification, its answer, and the folder that its runs are kept in."""
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """The runs of an identification, which gives the same answer after any damage to them."""
+    recorded, sound = problem(), tmp_path_factory.mktemp("checkpoint") / "runs"
+    numbers = lambda answer: (answer.x, answer.estimates, answer.covariance, answer.residuals)
+    truth = repr(numbers(identify(recorded, rtol=RTOL, checkpoint=sound)))
 
-    problem: Problem
-    answer: IdentificationResult
-    folder: Path
+    def wrong(path: Path) -> str:
+        again = repr(numbers(identify(recorded, rtol=RTOL, checkpoint=path.parent)))
+        return "" if again == truth and path.is_file() else f"another answer: {again}"
+
+    seal = lambda path, content: forged(bytes.fromhex(path.stem), content)
+    replaceable = {kind: how for kind, how in GONE.items() if kind != "a folder"}
+    return Specimen(sound, wrong, seal, BYTES | replaceable | PLANTED | FOREIGN | SPECIAL)
 
 
 @pytest.fixture(scope="module")
-def identified(tmp_path_factory):
-    recorded, folder = problem(), tmp_path_factory.mktemp("checkpoint") / "runs"
-    return Identified(recorded, identify(recorded, rtol=RTOL, checkpoint=folder), folder)
-
-
-@pytest.fixture(scope="module")
-def answer(identified, tmp_path_factory):
-    sound, truth = tmp_path_factory.mktemp("answer"), identified.answer.to_json()
-    identified.answer.save(sound / "answer.json")
-    read = lambda path: load_answer(path).to_json() == truth
-    wrong = lambda path, kind: misread(partial(read, path), path.name)
-    return Specimen(sound, wrong, damages=PLANTED | SPECIAL)
-
-
-@pytest.mark.filterwarnings("ignore:the checkpoint")
-def test_the_answer_keeps_its_bits(identified, tally, tmp_path):
-    """Whatever happened to however many files, and afterwards every file is whole again."""
-    line, folder = tally("identifications resumed from damaged checkpoints"), tmp_path / "runs"
-    kinds, trap = BYTES | GONE | PLANTED | FOREIGN | SPECIAL, Trap(tmp_path / "executed")
-    kinds.pop("a folder")
-    sound = tree(identified.folder)
-    names = sorted(name for name in sound if name.endswith(".run"))
-    data = lambda answer: (answer.x, answer.estimates, answer.covariance, answer.residuals)
-    for number in range(count(24)):
-        rng = random("resumed", number)
-        restore(folder, identified.folder)
-        for name in rng.permutation(names)[: 1 + number % len(names)].tolist():
-            path, other = folder / name, identified.folder / str(rng.choice(names))
-            seal = partial(forged, bytes.fromhex(path.stem))
-            copy = tmp_path / "other.run"
-            copy.write_bytes(other.read_bytes())
-            damage(kinds[str(rng.choice([*kinds]))], Victim(path, rng, copy, trap, seal))
-        again = identify(identified.problem, rtol=RTOL, checkpoint=folder)
-        held = repr(data(again)) == repr(data(identified.answer)) and not trap.path.exists()
-        whole = {*tree(folder)} >= {*names} and all((folder / name).is_file() for name in names)
-        line.held(held and whole, f"{number}: {data(again)}")
+def answer(tmp_path_factory):
+    sound, found = tmp_path_factory.mktemp("answer"), identify(problem(), rtol=RTOL)
+    found.save(sound / "answer.json")
+    same = lambda path: load_answer(path).to_json() == found.to_json()
+    wrong = lambda path: misread(partial(same, path), path.name)
+    return Specimen(sound, wrong, damages=BYTES | GONE | PLANTED | SPECIAL)
 
 
 # datasets and trajectories
@@ -134,10 +111,10 @@ def generated(tmp_path_factory):
     data, truth = open_dataset(str(place / "sound")).load(), windows(place / "sound")
     assert findings(place / "sound") == []
 
-    def wrong(path: Path, kind: str) -> str:
+    def wrong(path: Path) -> str:
         root = next(folder for folder in path.parents if folder.name == "copy")
         found = findings(root)
-        noticed = "" if found and all(map(sentence, found)) else f"findings: {found}"
+        noticed = "" if found and all(map(sentence, found)) else f"found: {found}"
         same = lambda: data.identical(open_dataset(str(root)).load()) and windows(root) == truth
         return noticed + misread(same)
 
@@ -171,15 +148,16 @@ def trajectory(tmp_path_factory):
     run().save(sound / "run.nc")
     truth = load(sound / "run.nc")
     assert set(read_table(sound / "run.nc", (), KNOWN).values) >= {"t", "x_d", "x_C", "effort_y"}
-    wrong = lambda path, kind: misread_table(path, truth)
+    wrong = lambda path: misread_table(path, truth)
     seal = lambda path, content: content + sha256(content).hexdigest().encode() + SEAL
-    return Specimen(sound, wrong, seal, PLANTED | SPECIAL)
+    return Specimen(sound, wrong, seal, BYTES | GONE | PLANTED | SPECIAL)
 
 
 # all
 # ----------------------------------------------------------------------
 
 FILES: dict[str, tuple[str, str, int]] = {
+    "runs of an identification": ("checkpoint", "*.run", 24),
     "answers": ("answer", "*.json", 200),
     "trajectory files": ("trajectory", "*.nc", 1400),
     "metadata of a dataset": ("generated", "**/*.json", 280),
@@ -189,26 +167,27 @@ FILES: dict[str, tuple[str, str, int]] = {
 """Kinds of files: the specimen, the pattern of names, and how often one is damaged."""
 
 
+@pytest.mark.filterwarnings("ignore:the checkpoint")
 @pytest.mark.parametrize("files", FILES)
 def test_a_damaged_file_is_noticed(files, request, tmp_path, tally):
+    """Runs of an identification are made again."""
     fixture, pattern, number = FILES[files]
     specimen: Specimen = request.getfixturevalue(fixture)
-    line, copy, trap = tally(f"damaged {files}"), tmp_path / "copy", Trap(tmp_path / "executed")
-    damages = BYTES | GONE | specimen.damages
+    copy, trap = tmp_path / "copy", Trap(tmp_path / "executed")
     for trial in range(count(number)):
         rng = random(files, trial)
         restore(copy, specimen.sound)
         paths = [path for path in sorted(copy.glob(pattern)) if path.is_file()]
         path = paths[rng.integers(len(paths))]
         others = [other for other in paths if other.read_bytes() != path.read_bytes()]
-        kind = [*damages][trial % len(damages)]
+        kind = [*specimen.damages][trial % len(specimen.damages)]
         if not others and kind in FOREIGN:
             kind = "a bit"
         other = others[rng.integers(len(others))] if others else path
-        damage(damages[kind], Victim(path, rng, other, trap, partial(specimen.seal, path)))
+        damage(specimen.damages[kind], Victim(path, rng, other, trap, partial(specimen.seal, path)))
 
-        def judged(path: Path = path, kind: str = kind) -> None:
-            assert not (wrong := specimen.wrong(path, kind)), wrong
+        def judged(path: Path = path) -> None:
+            assert not (wrong := specimen.wrong(path)), wrong
             assert not trap.path.exists(), "executed"
 
-        line.call(f"{trial}, {kind}, {path.name}", judged, ())
+        tally.call(f"{trial}, {kind}, {path.name}", judged, ())

@@ -1,5 +1,5 @@
 """Mutated configurations, identification files and tables of measurements: accepted and then
-finite, or refused in a sentence that names the field, or file, row and column."""
+finite, or rejected in a sentence that names the field, or file, row and column."""
 
 import tomllib
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import torch
 
 from hostile.damage import Mutant, document, written
 from hostile.processes import ROOT
-from hostile.specimens import cells, csv_text
+from hostile.specimens import cells, csv_text, rigs
 from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft import RigFile, simulate
 from torchsoft.cost import Costly, agree
@@ -30,24 +30,21 @@ pytestmark = pytest.mark.slow
 SMALL = 1e-3
 """Meshes whose stiffness takes more memory than this [GiB] are not built here."""
 
-COARSE = {"elements_x": 20, "elements_y": 1}
 BRIEFLY = torch.tensor([0.0, 2e-3, 6e-3], dtype=torch.float64)
-
-Lines = Callable[[str], Tally]
 
 
 def attack(
-    line: Tally, changed: Mutant, make: Callable[[], Any], follow: Callable[[Any], Any] | None
+    tally: Tally, changed: Mutant, read: Callable[[], Any], use: Callable[[Any], None] | None
 ) -> Any:
-    """Count one input; what is made of it, or None where it was refused. `follow` raises
-    `AssertionError` for what is accepted and is nonsense, and may refuse with a sentence too."""
-    shown = f"{line.kind} {changed.place} = {changed.new!r:.60}"
-    made = line.call(shown, make, blamed=changed.named)
+    """Count one input; what is made of it, or None where it was rejected. `use` raises
+    `AssertionError` for what is accepted and is nonsense, and may reject it with a sentence too."""
+    shown = f"{changed.place} = {changed.new!r:.60}"
+    made = tally.call(shown, read, blamed=changed.named)
     if made is not None and changed.no_number:
-        line.held(False, f"{shown}: accepted in the place of a number")
-    elif made is not None and follow:
-        later = partial(follow, made)
-        line.call(f"{shown}, later", later, (ValueError, RuntimeError), limit=6 * LIMIT)
+        tally.held(False, f"{shown}: accepted in the place of a number")
+    elif made is not None and use:
+        later = partial(use, made)
+        tally.call(f"{shown}, used", later, (ValueError, RuntimeError), limit=6 * LIMIT)
     return made
 
 
@@ -57,58 +54,6 @@ def finite(*tensors: torch.Tensor) -> None:
 
 # configurations
 # ----------------------------------------------------------------------
-
-MOTIONS = """
-[[motion]]
-kind = "hold"
-value = 60e-3
-[[motion]]
-kind = "profile"
-times = [0.4, 1.0]
-values = [0.0, 5e-3]
-offset = "start"
-[[motion]]
-kind = "strokes"
-travel = 5e-3
-stroke_time = 0.2
-since = 0.4
-until = 0.9
-[[motion]]
-kind = "spline"
-times = [0.0, 0.5, 1.0]
-values = [60e-3, 62e-3, 61e-3]
-[[motion]]
-kind = "sines"
-components = [{ amplitude = 1e-3, frequency = 2.0, phase = 0.3 }]
-since = 0.4
-[[motion]]
-kind = "multi_sine"
-amplitude = 1e-3
-band = [0.5, 8.0]
-components = 3
-seed = 1
-since = 0.4
-[[motion]]
-kind = "chirp"
-amplitude = 1e-3
-first = 0.3
-last = 8.0
-since = 0.4
-"""
-
-
-def coarse(name: str) -> RigFile:
-    """A ready rig on coarse meshes."""
-    file = RigFile.ready(name)
-    return file.override(pads=dict.fromkeys(file.pads, COARSE))
-
-
-def rigs() -> list[dict[str, Any]]:
-    """Ready rigs, and the paper's, moved along its pads in every way."""
-    files = [coarse(name) for name in ("paper", "light_grasp", "two_fingers", "drop")]
-    short = files[0].override(outputs={"duration": 1.0, "snapshots": []})
-    files += [short.override({"motion.x_d": way}) for way in tomllib.loads(MOTIONS)["motion"]]
-    return [file.model_dump(mode="json", exclude_unset=True) for file in files]
 
 
 def datasets() -> list[dict[str, Any]]:
@@ -155,22 +100,21 @@ KINDS: dict[str, tuple[Any, Callable[[], list[dict[str, Any]]], int, Callable[[A
     "rig files": (RigFile, rigs, 8000, run_briefly),
     "dataset configurations": (Config, datasets, 4000, design_briefly),
 }
-"""What reads a configuration, valid ones, how many mutants, and how every third of the accepted is
-followed."""
+"""What reads a configuration, valid ones, how many mutants, and what every third of the accepted is
+used for."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("way", "share"), [("values", 1.0), ("text", 0.25)])
 def test_a_mutated_table_is_finite_or_rejected_by_its_field(kind, way, share, tally, tmp_path):
     """With one value changed, or its text damaged."""
-    table, valid, number, follow = KINDS[kind]
-    line, rng, trees = tally(f"{kind}: {way}"), random(kind + way), valid()
-    path = tmp_path / "mutant.toml"
+    table, valid, number, use = KINDS[kind]
+    rng, trees, path = random(kind + way), valid(), tmp_path / "mutant.toml"
     assert all(map(table.model_validate, trees))
+    read = partial(from_toml, path, table.model_validate)
     for i in range(count(share * number)):
-        changed = written(path, trees[i % len(trees)], way, i, rng)
-        read = partial(from_toml, path, table.model_validate)
-        attack(line, changed, read, follow if i % 3 == 0 else None)
+        changed = written(path, trees[i % len(trees)], way, rng)
+        attack(tally, changed, read, use if i % 3 == 0 else None)
 
 
 # identifications
@@ -251,12 +195,8 @@ nu = 0.45
 tau = 10e-3
 depth = 44e-3
 """
-"""What a file may state; and what takes longer, a recording that begins in motion and competing
+"""What a file may state; and what takes longer, a recording that starts in motion and competing
 laws."""
-
-
-def identification(slow: bool) -> dict[str, Any]:
-    return {"rig": "paper"} | tomllib.loads(STATED + SLOW if slow else STATED)
 
 
 def run_once(case: measured.Case) -> None:
@@ -275,23 +215,18 @@ def run_once(case: measured.Case) -> None:
     assert out.failed or (np.isfinite(out.r).all() and np.isfinite(out.J).all()), "not finite"
 
 
-@pytest.fixture
-def folder(tmp_path):
+@pytest.mark.parametrize(("way", "number"), [("values", 4000), ("text", 1000)])
+def test_a_mutated_identification_is_finite_or_rejected_by_its_field(way, number, tmp_path, tally):
     table = cells()
     parts = {"data": table, "third": table, "second": [row[:5] + row[6:10] for row in table]}
     parts["force"] = [[row[0], *row[10:12], "Temp [K]"] for row in table]
     for name, rows in parts.items():
         (tmp_path / f"{name}.csv").write_text(csv_text(rows), encoding="utf-8")
-    (tmp_path / "rig.toml").write_text(document(identification(True)), encoding="utf-8")
-    return tmp_path
-
-
-@pytest.mark.parametrize(("way", "number"), [("values", 4000), ("text", 1000)])
-def test_a_mutated_identification(way, number, folder, tally):
-    line, rng, path = tally(f"identifications: {way}"), random(way), folder / "rig.toml"
-    load = partial(measured.load, [folder / "data.csv"], path)
-    trees = identification(False), identification(True)
-    assert attack(line, Mutant(), load, run_once)
+    quick, slow = ({"rig": "paper"} | tomllib.loads(text) for text in (STATED, STATED + SLOW))
+    rng, path = random(way), tmp_path / "rig.toml"
+    path.write_text(document(slow), encoding="utf-8")
+    load = partial(measured.load, [tmp_path / "data.csv"], path)
+    assert attack(tally, Mutant(), load, run_once)
     for i in range(count(number)):
-        changed = written(path, trees[i % 10 == 5], way, i, rng)
-        attack(line, changed, load, run_once if i % 10 == 0 else None)
+        changed = written(path, slow if i % 10 == 5 else quick, way, rng)
+        attack(tally, changed, load, run_once if i % 10 == 0 else None)

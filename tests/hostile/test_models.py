@@ -1,46 +1,41 @@
 """Random models, and models in many threads: a run is finite and its energies balance or it warns
 that they do not, or it fails in one sentence, in time; and threads give the bits of runs alone."""
 
+import copy
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import partial, reduce
+from operator import getitem
 from threading import Barrier
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, coarse, grasp, still, times
+from conftest import COARSE, grasped, still, times, towards
 from torch import Tensor
 
+from hostile.damage import leaves
+from hostile.specimens import rigs
 from hostile.trial import count, random
 from torchsoft import (
     BuiltRig,
     Ellipse,
     NoEquilibrium,
     Profile,
-    Reference,
+    RigFile,
     RoundedBox,
     SimulationFailed,
-    excite,
     simulate,
 )
-from torchsoft.rigs.excite import Excitation
 from torchsoft.solve.diagnostics import NEGLIGIBLE, RESIDUAL
 from torchsoft.solve.gradients import GradientFailed
 
 pytestmark = pytest.mark.slow
 
-REFUSALS = ValueError, SimulationFailed, NoEquilibrium, GradientFailed, NotImplementedError
+REJECTIONS = ValueError, SimulationFailed, NoEquilibrium, GradientFailed, NotImplementedError
 WILD = 0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e308, -1e5
-FRICTION = "laws.steel_on_rubber.friction"
-CHOICES: dict[str, Any] = {
-    "pad.elements_x": range(8, 33), "pad.elements_y": (1, 2, 3), "contact.points": (0, 1, 2),
-    "pad.inertial": (False, False, True), "pads.L.bonded_sides": (False, False, True),
-}  # fmt: skip
-SIZES = ("length", "height", "radius", "origin", "elements_x", "elements_y", "x", "theta", "nu")
-"""Values that leave no rig if they are changed much, or at all."""
 grad = partial(torch.autograd.grad, allow_unused=True, materialize_grads=True)
 
 
@@ -56,31 +51,32 @@ def build(rng: np.random.Generator) -> BuiltRig:
     decades = float(rng.choice([0.1, 0.5, 1.0, 3.0]))
     near = lambda value, decades=decades: float(value * 10 ** rng.uniform(-decades, decades))
     some = lambda *options: options[rng.integers(len(options))]
-    values: dict[str, Any] = {
-        name: near(row["value"])
-        for name, row in PAPER.table().items()
-        if isinstance(row["value"], float) and name.rpartition(".")[2] not in SIZES
-        and rng.random() < 0.4
-    }  # fmt: skip
-    values |= {name: some(*choices) for name, choices in CHOICES.items()}
-    values["pad.nu"] = float(rng.uniform(-0.9, 0.499))
-    values["contact.mu_k"] = values.get(f"{FRICTION}.mu_s", 0.8) * rng.uniform(0.3, 1.0)
-    sines = {"kind": "multi_sine", "band": (5.0, 40.0), "seed": int(rng.integers(99))}
-    roll, press = some(
-        ({"kind": "strokes", "travel": near(5e-3), "stroke_time": 0.05}, None),
-        (sines | {"amplitude": near(2e-3)}, sines | {"amplitude": 2e-4}),
-        ({"kind": "chirp", "first": 2.0, "last": 30.0, "amplitude": near(1e-3)}, None),
-    )
-    motion = Excitation(roll, press, duration=0.45, depth=near(1e-3, 0.5), grasp=0.06, since=0.08)
-    file = excite(PAPER.override(values), motion, senses=some("disc", None))
-    r, rubber = file.bodies["disc"].shape.radius, file.materials["rubber"]
-    shape = some(None, None, Ellipse(near(r, 0.05), near(r, 0.05)), RoundedBox(r, r, 0.6 * r))
-    parts = {FRICTION: some(None, None, law(3)), "bodies.disc.shape": shape}
-    if rng.random() < 1 / 6:
-        own = rubber.model_dump(include={"E", "nu", "rho", "tau", "depth"}, exclude_unset=True)
-        solid = {"kind": "standard_linear_solid", "E_instant": rubber.E * rng.uniform(0.9, 4.0)}
-        file = file.override({"materials.rubber": own | solid})
-    built = file.build({name: part for name, part in parts.items() if part is not None})
+    tree = copy.deepcopy(some(*rigs()))
+    for group in ("materials", "laws", "actuators"):
+        for place, value in leaves(tree.get(group, {})):
+            if isinstance(value, float) and place[-1] != "nu" and rng.random() < 0.4:
+                reduce(getitem, place[:-1], tree[group])[place[-1]] = near(value)
+    for material in tree["materials"].values():
+        material["nu"] = float(rng.uniform(-0.9, 0.499))
+        if material["kind"] == "kelvin_voigt" and rng.random() < 1 / 6:
+            E = material["E"] * rng.uniform(0.9, 4.0)
+            material |= {"kind": "standard_linear_solid", "E_instant": E}
+    for pad in (pad for pad in tree["pads"].values() if "elements_x" in pad):
+        pad |= {
+            "elements_x": some(*range(8, 33)), "elements_y": some(1, 2, 3),
+            "points": some(0, 1, 2), "inertial": some(False, False, True),
+            "bonded_sides": some(False, False, True),
+        }  # fmt: skip
+    parts: dict[str, Any] = {}
+    for name, contact_law in tree["laws"].items():
+        friction = contact_law["friction"]
+        friction["mu_k"] = friction["mu_s"] * rng.uniform(0.3, 1.0)
+        parts |= some({}, {}, {f"laws.{name}.friction": law(3)})
+    for name, body in tree["bodies"].items():
+        if r := body.get("shape", {}).get("radius"):
+            oval, box = Ellipse(near(r, 0.05), near(r, 0.05)), RoundedBox(r, r, 0.6 * r)
+            parts |= some({}, {}, *({f"bodies.{name}.shape": one} for one in (oval, box)))
+    built = RigFile.from_tree(tree).build(parts)
     if rng.random() < 0.15:
         scalars = [x for x in built.rig.parameters() if x.ndim == 0]
         some(*scalars).data.fill_(float(rng.choice(WILD)))
@@ -108,20 +104,20 @@ def run_randomly(rng: np.random.Generator) -> bool:
     warned = any("do not balance" in text for text in texts)
     assert residual <= RESIDUAL or warned, f"energy residual {residual:.3g} without a warning"
     if rng.random() < 0.1:
-        leaves = [p for p in model.parameters() if p.requires_grad]
+        wanted = [p for p in model.parameters() if p.requires_grad]
         again = simulate(model, t[:5], y0=y0, gradient="discrete", **how)
-        gradients = grad(again["x_C"][-1], leaves)
+        gradients = grad(again.y[-1].sum(), wanted)
         assert all(bool(torch.isfinite(g).all()) for g in gradients), "a gradient is not finite"
     return True
 
 
 @pytest.mark.timeout(1800)
 def test_random_models_run_or_say_why_not(tally):
-    line, ran = tally("random models"), 0
+    ran = 0
     for number in range(count(1000)):
         run = partial(run_randomly, random("models", number))
-        ran += bool(line.call(f"model {number}", run, REFUSALS, limit=30.0))
-    assert ran >= 0.3 * line.tried, f"only {ran} of {line.tried} models ran"
+        ran += bool(tally.call(f"model {number}", run, REJECTIONS, limit=30.0))
+    assert ran >= 0.3 * tally.tried, f"only {ran} of {tally.tried} models ran"
 
 
 T, THREADS = times(6e-3, 4), 8
@@ -132,25 +128,25 @@ T, THREADS = times(6e-3, 4), 8
 def test_threads_give_the_bits_of_runs_alone(number, runs, tally):
     """Eight threads that start at once, of which two share a model, round after round; with laws
     that all meet for the first time."""
-    line, base = tally(f"threads, {runs} runs each"), COARSE | {"pad.elements_x": 24}
+    mesh = {"pad.elements_x": 24}
     for round in range(count(number)):
         models = [
-            coarse(pad__elements_x=24), coarse(pad__elements_x=24, pad__inertial=True),
-            coarse(pad__elements_x=24, contact__points=2), still(base, friction=law(round)),
+            still(COARSE | mesh | own, **part)
+            for own, part in (
+                ({}, {}), ({"pad.inertial": True}, {}), ({"contact.points": 2}, {}),
+                ({}, {"friction": law(round)}),
+            )
         ]  # fmt: skip
-        starts, barrier = [grasp(model, (0.05, 0.0)) for model in models], Barrier(THREADS)
+        starts, barrier = [grasped(model, (0.05, 0.0)) for model in models], Barrier(THREADS)
 
         def run(thread: int, i: int, models: Any = models, starts: Any = starts) -> list[Tensor]:
             """States, forces and derivatives."""
-            model, (y0, held) = models[thread % 4], starts[thread % 4]
-            x = Profile([0.0, 6e-3], [0.06, 0.06 + 2e-5 * ((thread + i) % 5)])
-            how = {"y0": y0, "reference": Reference(x_d=x, y_d=held["y_d"], F_ff=held["F_ff"])}
-            if i % 4 == 3:
-                run = simulate(model, T, **how, gradient="forward", wrt=["pad.E", "contact.K_n"])
-                return [run.y, run.force["L"], run.sensitivities]
-            run = simulate(model, T, **how, gradient="discrete")
-            leaves = [p for p in model.parameters() if p.requires_grad]
-            slopes = grad(run["theta"][-1] + 1e2 * run["x_C"][-1], leaves)
+            model, y0 = models[thread % 4], starts[thread % 4]
+            x_d = Profile([0.0, 6e-3], [0.06, 0.06 + 2e-5 * ((thread + i) % 5)])
+            how: dict[str, Any] = {"gradient": "discrete", "reference": towards(model, x_d)}
+            run = simulate(model, T, y0=y0, **how)
+            wanted = [p for p in model.parameters() if p.requires_grad]
+            slopes = grad(run["theta"][-1] + 1e2 * run["x_C"][-1], wanted)
             return [run.y.detach(), run.force["L"].detach(), *slopes]
 
         def work(thread: int, barrier: Barrier = barrier, run: Any = run) -> list[list[Tensor]]:
@@ -161,4 +157,4 @@ def test_threads_give_the_bits_of_runs_alone(number, runs, tally):
             results = [*pool.map(work, range(THREADS))]
         for thread, found in enumerate(results):
             same = [all(map(torch.equal, one, run(thread, i))) for i, one in enumerate(found)]
-            line.held(all(same), f"round {round}, thread {thread}: other bits in {same}")
+            tally.held(all(same), f"round {round}, thread {thread}: other bits in {same}")

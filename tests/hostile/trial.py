@@ -1,18 +1,17 @@
 """Counts of the hostile trial: how many attacks, at random from which seed, and those that did not
 hold.
 
-`HOSTILE_SCALE` (1 by default) multiplies every count, `HOSTILE_SEED` (0) begins every random
-choice, and `HOSTILE_OUT` (out/hostile) is the folder of the table.
+`HOSTILE_SCALE` (1 by default) multiplies every count, and `HOSTILE_SEED` (0) starts every random
+choice.
 """
 
-import json
 import os
 import signal
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,10 @@ import torch
 
 SCALE = float(os.environ.get("HOSTILE_SCALE", "1"))
 SEED = int(os.environ.get("HOSTILE_SEED", "0"))
-TABLE = Path(os.environ.get("HOSTILE_OUT", "out/hostile"))
 LIMIT = 20.0
 """Most processor time [s] that one call may take, so that nothing hangs."""
+ATTACKS = "attacks"
+"""Under this name a test reports how many attacks it tried, and how many did not hold."""
 
 
 class Late(BaseException):
@@ -47,11 +47,10 @@ def in_time(limit: float = LIMIT) -> Iterator[None]:
 
 
 class Tally:
-    """A line of the table: how many attacks, and a text for each that did not hold."""
+    """How many attacks a test tried, and a text for each that did not hold."""
 
-    def __init__(self, kind: str) -> None:
-        self.kind, self.tried = kind, 0
-        self.broken: list[str] = []
+    def __init__(self) -> None:
+        self.tried, self.broken = 0, list[str]()
 
     def held(self, holds: bool, otherwise: str = "") -> None:
         """Count one attack."""
@@ -60,23 +59,20 @@ class Tally:
             self.broken.append(otherwise[:2000])
 
     def call(
-        self,
-        attack: str,
-        function: Callable[[], Any],
-        refusals: tuple[type[Exception], ...] = (ValueError, OSError),
-        blamed: Callable[[str], bool] = bool,
-        limit: float = LIMIT,
-    ) -> Any:
-        """Result of one call, which must return in time or be refused with one of `refusals`, in a
-        sentence that names what is `blamed`; None where refused."""
+        self, attack: str, function: Callable[[], Any],
+        rejections: tuple[type[Exception], ...] = (ValueError, OSError),
+        blamed: Callable[[str], bool] = bool, limit: float = LIMIT,
+    ) -> Any:  # fmt: skip
+        """Result of one call, which must return in time or be rejected with one of `rejections`, in
+        a sentence that names what is `blamed`; None where rejected."""
         try:
             with in_time(limit), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 result = function()
-        except refusals as refusal:
-            raw = isinstance(refusal, np.linalg.LinAlgError | torch.linalg.LinAlgError)
-            right = sentence(str(refusal)) and not raw and blamed(str(refusal))
-            self.held(right, f"{attack}: no sentence with the field's name: {refusal!r}")
+        except rejections as error:
+            raw = isinstance(error, np.linalg.LinAlgError | torch.linalg.LinAlgError)
+            right = sentence(str(error)) and not raw and blamed(str(error))
+            self.held(right, f"{attack}: no sentence with the field's name: {error!r}")
         except (Exception, Late) as error:
             self.held(False, f"{attack}: {''.join(traceback.format_exception(error))[-1500:]}")
         else:
@@ -86,7 +82,7 @@ class Tally:
 
 
 def sentence(text: str) -> bool:
-    """Whether a refusal is one sentence of this project's."""
+    """Whether the text of a rejection is one sentence of this project's."""
     foreign = "\n" in text or "Traceback" in text or "validation error" in text
     return 0 < len(text) < 2000 and not foreign
 
@@ -102,31 +98,19 @@ def random(name: str, number: int = 0) -> np.random.Generator:
 
 
 @pytest.fixture
-def tally():
-    """`tally("kind")` begins a line of the table; the test fails if anything in it did not hold."""
-    lines: list[Tally] = []
-
-    def begin(kind: str) -> Tally:
-        lines.append(Tally(kind))
-        return lines[-1]
-
-    yield begin
-    TABLE.mkdir(parents=True, exist_ok=True)
-    for line in lines:
-        name = "".join(c if c.isalnum() else "_" for c in line.kind)
-        (TABLE / f"{name}.json").write_text(json.dumps(vars(line), indent=1))
-    broken = [text for line in lines for text in line.broken]
-    assert all(line.tried for line in lines), "nothing was tried"
-    assert not broken, f"{len(broken)} did not hold, the first: {broken[0]}"
+def tally(record_property):
+    """Counts the attacks of a test, which fails if any of them did not hold."""
+    made = Tally()
+    yield made
+    record_property(ATTACKS, (made.tried, len(made.broken)))
+    assert made.tried, "nothing was tried"
+    assert not made.broken, f"{len(made.broken)} did not hold, the first: {made.broken[0]}"
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """The table of what was tried, of every process."""
-    if files := sorted(TABLE.glob("*.json")):
-        terminalreporter.write_sep("-", "hostile trial")
-    for file in files:
-        line = json.loads(file.read_text())
-        tried, broken = line["tried"], len(line["broken"])
-        terminalreporter.write_line(
-            f"{line['kind']:<60} tried {tried:>6}  held {tried - broken:>6}  not held {broken:>4}"
-        )
+    """A line for every test that counts attacks."""
+    for report in chain.from_iterable(terminalreporter.stats.values()):
+        for name, value in getattr(report, "user_properties", ()):
+            if name == ATTACKS:
+                line = f"{report.nodeid}: tried {value[0]}, not held {value[1]}"
+                terminalreporter.write_line(line)

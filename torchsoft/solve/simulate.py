@@ -294,16 +294,14 @@ def _check_wanted(
     gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool, touch: Sequence[str]
 ) -> None:
     """Raises `ValueError` for an unknown route, and for arguments of another route."""
-    if gradient not in get_args(Route):
+    if not isinstance(gradient, str) or gradient not in get_args(Route):
         raise ValueError(
             f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}"
         )
-    if (
-        isinstance(wrt, str)
-        or not isinstance(wrt, Sequence)
-        or not all(isinstance(name, str) for name in wrt)
-    ):
-        raise ValueError(f"`wrt` must be a list of parameters' names, but is {type(wrt).__name__}")
+    for name, given in (("wrt", wrt), ("touch", touch)):
+        listed = isinstance(given, list | tuple) and all(isinstance(x, str) for x in given)
+        if not listed:
+            raise ValueError(f"`{name}` must be a list of names, but is {given!r}")
     if wrt and gradient != "forward":
         raise ValueError("`wrt` names the parameters of gradient='forward', and of that only")
     if gradient == "forward" and not wrt and dy0 is None:
@@ -326,8 +324,6 @@ def _channels_of_touch(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
     known = Touch(rig)
     if not names:
         return ()
-    if isinstance(names, str):
-        raise ValueError(f"`touch` must be a list of channels' names, but is {names!r}")
     for name in (expanded := known.expanded(names)):
         if name not in known:
             raise ValueError(f"`touch` names {name!r}, but channels of touch are {known.shown}")
