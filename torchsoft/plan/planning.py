@@ -198,34 +198,20 @@ def finished(
         evaluation = search.found
     assert evaluation.batch is not None
     run = next(one for one in evaluation.batch.trajectories if one is not None)
-    names = evaluator.terms.labels(run)
     errors, excess = (
-        {name: torch.from_numpy(column) for name, column in zip(those, values.T)}
-        for those, values in zip(names, (evaluation.errors, evaluation.excess))
+        {name: torch.from_numpy(column) for name, column in zip(names, values.T)}
+        for names, values in zip(
+            evaluator.terms.labels(run), (evaluation.errors, evaluation.excess)
+        )
     )
-    reasons: list[str] = []
-    if not held[0]:
-        reasons += [
-            f"{name} is {float(e[0]):+.3g} tolerances off"
-            for name, e in errors.items()
-            if abs(float(e[0])) > 1
-        ]
-        reasons += [
-            f"{name} is exceeded by {float(e[0]):.2%}"
-            for name, e in excess.items()
-            if float(e[0]) > SLACK
-        ]
-        reasons += [*search.evaluator.variables.active(z), *slips(run)]
-        reasons += [f"further on a run fails: {reason}" for reason in search.failures[-1:]]
-    now, start = torch.from_numpy(z), evaluator.starts[0]
-    parameters = evaluator.variables.parameters(now)
-    planned = deepcopy(rig)
+    reasons = [] if held[0] else [*misses(errors, excess), *obstacles(search, run)]
+    variables, now = evaluator.variables, torch.from_numpy(z)
+    planned, parameters, start = deepcopy(rig), variables.parameters(now), evaluator.starts[0]
     with torch.no_grad():
         for name, value in parameters.items():
             planned.parameter(name).copy_(value)
     start = started(planned, start, "none") if callable(start) else start
-    reference = evaluator.variables.reference(now, start.reference)
-    planned.reference = reference
+    planned.reference = reference = variables.reference(now, start.reference)
     combined = evaluation.value.max() if search.criterion.worst else evaluation.value.mean()
     return Plan(
         rig=planned, reference=reference, parameters=parameters, trajectory=run,
@@ -237,6 +223,25 @@ def finished(
             "checked_rtol": rtol,
         },
     )  # fmt: skip
+
+
+def misses(errors: Mapping[str, Tensor], excess: Mapping[str, Tensor]) -> list[str]:
+    """Sentences on targets and limits that the first draw misses."""
+    off = {name: float(e[0]) for name, e in errors.items() if abs(float(e[0])) > 1}
+    over = {name: float(e[0]) for name, e in excess.items() if float(e[0]) > SLACK}
+    return [
+        *(f"{name} is {error:+.3g} tolerances off" for name, error in off.items()),
+        *(f"{name} is exceeded by {part:.2%}" for name, part in over.items()),
+    ]
+
+
+def obstacles(search: Search, run: Trajectory) -> list[str]:
+    """What holds the best plan of a search back: active bounds, slip, and a run that fails."""
+    return [
+        *search.evaluator.variables.active(search.found.z),
+        *slips(run),
+        *(f"further on a run fails: {reason}" for reason in search.failures[-1:]),
+    ]
 
 
 def slips(run: Trajectory) -> list[str]:
