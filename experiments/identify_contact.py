@@ -135,13 +135,14 @@ def main(config: Config) -> None:
                 checkpoint=runs, progress=not config.smoke,
             )  # fmt: skip
             forget(runs)
-            print(f"\n{name}, start {seed}", found.table(), *found.notices, sep="\n")
+            print(f"\n{name}, start {seed}", found.table(), *found.findings, sep="\n")
             if name == "noisy":
                 report(found, stated, config.out / "report.html")
             rows = judged(found, truth)
             cases.append({
                 "case": name, "start": seed, "parameters": rows, "chi2": found.chi2,
-                "heldout_nrmse": found.heldout, "notices": found.notices, **found.cost,
+                "heldout_nrmse": found.heldout, "findings": [*map(str, found.findings)],
+                **found.cost,
             })  # fmt: skip
             cells += [
                 (f"{name}, {seed}", parameter, one["truth"], f"{one['estimate']:.4g}",

@@ -1,4 +1,4 @@
-"""Problems whose residuals are a formula, so that profiles and posteriors are known exactly."""
+"""Problems whose residuals are a formula, so that profiles and densities are known exactly."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 from torchsoft.sysid.fit import Fit, Stage
 from torchsoft.sysid.prediction import FailedRun
-from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Coordinate, Coordinates, Prior
 
@@ -58,12 +58,10 @@ class ClosedForm:
             else Residuals(r + np.inf, J, {"data": FailedRun(WALL, 0.1)})
         )
 
-    def misfit(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any) -> Any:
-        runner.gradients += 1
-        at = self.residuals(runner, x, which, steps, free)
-        return (
-            (np.inf, np.nan * x, at.failed) if at.failed else (0.5 * at.r @ at.r, at.r @ at.J, {})
-        )
+    log_density, log_density_and_gradient = (
+        Problem.log_density, Problem.log_density_and_gradient,
+    )  # fmt: skip
+    _log_density = Problem._log_density
 
 
 def optimum(
@@ -72,4 +70,4 @@ def optimum(
     """At the coordinates x, of which the names in `free` are fitted, by default all."""
     labels = problem.coordinates.labels if free is None else free
     stage, runner = Stage("optimum", tuple(problem.names), labels, 1e-4), Runner((), workers)
-    return Fit(problem, runner, np.array(x, float), stage, variance=variance).begun()
+    return Fit(problem, runner, np.array(x, float), stage, variance=variance).evaluated()

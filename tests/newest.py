@@ -14,7 +14,7 @@ VERSIONS = """
 from importlib.metadata import distributions
 print(*sorted(f"{one.name} {one.version}" for one in distributions() if "nvidia" not in one.name))
 """
-EXTRAS = "reduced,datasets,posterior,export,learn"
+EXTRAS = "reduced,datasets,export,learn"
 GRADIENT = """
 import torch
 from torchsoft import RigFile

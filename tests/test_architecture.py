@@ -33,10 +33,11 @@ FLOWS = {
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
+        sentences
         initial_state recording unknowns noise prediction runs assumptions problem first_samples
         synthetic fit plan prechecks
         residual_tests colour refits assumption_tests new_fits sensitivity suspects estimate
-        result profile posterior identification compare
+        result profile conclusion identification compare
         planner columns configuration measured design figures report .
     """,
     "testing": "energy laws gradients .",
@@ -45,7 +46,7 @@ FLOWS = {
         fields places parts control motion outputs schema naming geometry initial built assembly
         build excite written recorded findings check goal run .
     """,
-    "cli": "results rigs plan identify design material dataset reduce plot .",
+    "cli": "results rigs plan identify profile design material dataset reduce plot .",
     "solve.kernel": """
         table arrays objects . invoke linear sources contacts condensed nodal pads domain stage step
         run adjoint tangent build

@@ -71,7 +71,7 @@ def test_neither_an_import_nor_help_waits_for_torch(code):
 
 COMMANDS = (
     "", "init", "check", "run", "plot", "plan", "reduce", "design", "rehearse", "identify",
-    "explain", "material fit", "material presets", "dataset make", "dataset check",
+    "explain", "profile", "material fit", "material presets", "dataset make", "dataset check",
     "dataset export",
 )  # fmt: skip
 
@@ -211,6 +211,19 @@ def test_it_writes_answer_and_page(answered):
     assert line in page
 
 
+def test_profiles_are_those_of_the_answer(answered, capsys):
+    folder, (_, *files) = answered
+    out, found = folder / "profile", answer(folder / "out")
+    options = ["--answer", str(folder / "out" / "answer.json"), "--of", "contact.K_n"]
+    assert main(["profile", *files, *options, "--out", str(out), "--no-progress"]) == 0
+    (one,) = json.loads((out / "profile.json").read_text())
+    (stated,) = (e for e in found["estimates"] if e["name"] == one["label"])
+    assert one["label"] == "laws.steel_on_rubber.K_n"
+    assert one["best"] == pytest.approx(stated["last"])
+    assert one["wald95"] == pytest.approx(stated["ci95"], rel=0.05)
+    assert "written to" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_options_come_before_the_configuration(answered, capsys):
     folder, command = answered
@@ -230,8 +243,8 @@ def test_a_recording_that_looks_wrong_is_rejected_with_the_way_on(folder, capsys
     recorded(folder / "data.csv", 62, F_y=(-1.0, 0.0))
     assert identify() == 2
     message = capsys.readouterr().err
-    assert "recording `data`: effort_y looks as if its sign were opposite: " in message
-    assert message.endswith('; if it is so, say acknowledged = ["sign of effort_y"]\n')
+    assert "Recording `data`: the sign of effort_y looks opposite." in message
+    assert message.endswith('If it is right, say acknowledged = ["sign of effort_y"]\n')
     assert not (folder / "out" / "answer.json").exists()
 
 

@@ -142,7 +142,7 @@ def test_identification_follows_the_start_and_its_set_points():
     samples = {name: (built.t.numpy(), built.t.numpy()) for name in ("y_bracket", "effort_y")}
     made = Recording("bench", built.rig, samples, Standing.built(built, 0.0))
     at = 0.5e6
-    found = predict(made.begin(), {E: at}, Grid(built.t, 0), [E], 1e-6)
+    found = predict(made.run_context(), {E: at}, Grid(built.t, 0), [E], 1e-6)
     knots = torch.from_numpy(found.knots)
     expected, high, low = (anew({E: at * by}, file, knots=knots) for by in (1, 1 + 1e-4, 1 - 1e-4))
     for name in samples:

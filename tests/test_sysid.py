@@ -23,7 +23,7 @@ from torchsoft.sysid import (
     identify,
     record,
 )
-from torchsoft.sysid.fit import Fit, descend, gauss_newton
+from torchsoft.sysid.fit import Fit, gauss_newton
 from torchsoft.sysid.plan import default_plan, jacobian_error, run_plan, run_stage
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
@@ -80,10 +80,10 @@ def fit(
 
 def check_derivatives(
     problem: Problem, x: np.ndarray, rtol: float, near: float, h: float = 1e-5,
-    adjoint: float = 1e-8, only: Sequence[str] = (), runner: Runner | None = None,
+    only: Sequence[str] = (), runner: Runner | None = None,
 ) -> None:  # fmt: skip
-    """Columns of the Jacobian, or only some of them, against central differences, of `near` [1];
-    the gradient of the adjoint against the Jacobian's. A larger h [1] passes kinks of contact."""
+    """Columns of the Jacobian, or only some of them, against central differences, of `near` [1]. A
+    larger h [1] passes kinks of contact."""
     free, which = problem.coordinates.free, problem.names
     runner = runner or Runner(problem.recordings)
     chosen = problem.residuals(runner, x, which, rtol)
@@ -98,12 +98,6 @@ def check_derivatives(
         )
         slope = (ahead - behind) / (2 * h)
         assert np.linalg.norm(at.J[:, i] - slope) < near * np.linalg.norm(slope), label
-    loss, gradient, failed = problem.misfit(runner, x, which, steps, free)
-    assert not failed
-    assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
-    np.testing.assert_allclose(
-        gradient, at.J.T @ at.r, rtol=adjoint, atol=adjoint * np.abs(gradient).max()
-    )
 
 
 @pytest.mark.parametrize("inertial", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -137,10 +131,10 @@ def test_a_fit_reports_what_its_runs_warn_of_once_at_its_end():
     law = {"kind": "coulomb", "mu_s": 0.3, "mu_k": 0.2}
     file = BASE.override({"laws.steel_on_rubber.friction": law})
     data = record("short", excited(SHORT, file), {E: 0.9e6}, SENSORS, rtol=1e-4)
-    notices = fit(data, {E: Unknown()}, tightenings=0).notices
-    jumps = [one for one in notices if "leaves such jumps out" in one]
+    findings = map(str, fit(data, {E: Unknown()}, tightenings=0).findings)
+    jumps = [text for text in findings if "leaves such jumps out" in text]
     assert jumps
-    assert all(one.startswith("the run of recording `short`: contact `") for one in jumps)
+    assert all(text.startswith("The run of recording `short`: contact `") for text in jumps)
 
 
 @pytest.mark.slow
@@ -151,7 +145,8 @@ def test_a_misfit_far_above_the_noise_is_not_refined(short):
     wavy = replace(short, samples=short.samples | {"x_C": (t, y + 5e-4 * np.sin(50 * t))})
     answer = fit(wavy, {E: Unknown(nominal=7e5)})
     assert {stage["rtol"] for stage in answer.stages} == {1e-3}
-    assert any("steps were checked and not made finer" in one for one in answer.notices)
+    codes = {one.code: one.severity for one in answer.findings}
+    assert (codes["larger"], codes["steps-not-refined"]) == ("error", "note")
     content = json.loads(answer.to_json())
     squares = [one.stated**2 for one in answer.residuals]
     assert content["chi2"] == pytest.approx(np.mean(squares), rel=0.05)
@@ -168,7 +163,8 @@ def test_what_the_data_do_not_determine_has_no_value():
     assert unseen.value is unseen.ci95 is None
     assert seen.identifiable
     assert seen.ci95[0] < BASE.materials["rubber"].E < seen.ci95[1]
-    assert any(MU_K in notice for notice in answer.notices)
+    weak = [one.facts["estimate"] for one in answer.findings if one.code == "not-identifiable"]
+    assert weak == [MU_K]
     assert not answer.directions[-1].identifiable
     assert MU_K in answer.directions[-1].components
     row = next(e for e in json.loads(answer.to_json())["estimates"] if e["name"] == MU_K)
@@ -204,14 +200,14 @@ def test_a_tolerance_too_coarse_for_the_data_is_reported_and_tightened():
     hard = Excitation(*waves(4e-3, 2e-4, (10, 40)), duration=0.55, grasp=0.15, since=0.2)
     data = record("hard", excited(hard, BASE), {}, SENSORS, rtol=1e-6, noise=0.0)
     coarse = fit(data, {E: Unknown(), TAU: Unknown()}, 3e-2, tightenings=0)
-    assert any("rtol = 0.03 is too coarse" in one and "rtol = 0.003" in one
-               for one in coarse.notices)  # fmt: skip
+    found = next(one for one in coarse.findings if one.code == "steps-too-coarse")
+    assert (found.facts["rtol"], found.facts["finer"]) == pytest.approx((0.03, 0.003))
     worst = max(coarse.estimates, key=lambda e: abs(e.step_bias_sd))
     error = lambda answer: np.log(answer[worst.name].last / BASE.table()[worst.name]["value"])
     assert abs(error(coarse)) > worst.relative_sd  # so the notice is needed
     assert abs(worst.step_bias_sd) > 0.5
     better = fit(data, {E: Unknown(), TAU: Unknown()}, 3e-2)
-    assert not any("too coarse" in notice for notice in better.notices)
+    assert not any(one.code == "steps-too-coarse" for one in better.findings)
     assert better.made_by["rtol"] < 3e-2
     assert abs(error(better)) < 0.2 * abs(error(coarse))
 
@@ -225,22 +221,11 @@ def test_a_fit_without_headway_ends_early_and_reports_it(level, stalls):
     near the noise."""
     rough = lambda x: np.array([level, x[0] + 2.0 * np.abs(np.sin(40 * x[0])), 0.3 * x[1]])
     end = gauss_newton(optimum(ClosedForm(rough, 2), 2.0, 3.0), tolerance=1e-9)
-    assert end.stalled == bool(end.notices) == stalls
+    assert end.stalled == bool(end.findings) == stalls
     assert not end.converged
     assert end.evaluations < 10 if stalls else end.evaluations == 30
     assert end.chi2 == pytest.approx(float(np.mean(rough(end.x) ** 2)))
-    assert not stalls or "no headway: over 6 evaluations" in end.notices[0]
-
-
-def test_the_adjoint_route_ends_where_gauss_newton_does():
-    bent = ClosedForm(lambda x: [x[0] - 0.5, np.sinh(x[1]) - x[0], 0.1 * x[1]], 2)
-    begin = optimum(bent, 0, 0)
-    newton = gauss_newton(begin)
-    descent = descend(begin._replace(method="lbfgs"), evaluations=40)
-    np.testing.assert_allclose(descent.x, newton.x, atol=2e-3)
-    adam = descend(newton._replace(method="adam"), evaluations=2)
-    assert adam.evaluations == 2
-    assert adam.chi2 <= newton.chi2 + 1e-9
+    assert not stalls or "over 6 evaluations" in str(end.findings[0])
 
 
 @pytest.mark.parametrize(("most", "ends"), [(1.0, (0.0615, 1.0)), (4.0, (-1.0, 2.2))])
@@ -281,7 +266,7 @@ def test_a_stage_that_cannot_start_ends_the_plan_or_starts_where_the_plan_did():
     end = run_plan(begin, [first, finer])
     assert [stage["name"] for stage in end.stages] == ["one"]
     assert end.x == pytest.approx([1.0, 0.0])
-    assert "the fit ended by rtol = 0.001: by a finer tolerance" in end.notices[0]
+    assert [one.code for one in end.findings] == ["stage-failed"]
     other = [first, replace(finer, free=("p1",))]
     end = run_plan(begin, other)
     assert [stage["name"] for stage in end.stages] == ["one", "two"]
@@ -369,8 +354,6 @@ def test_a_problem_without_unknowns_or_a_plan_that_contradicts_its_options_is_re
     problem = Problem([short], SENSORS, {E: Unknown()})
     with pytest.raises(ValueError, match="`starts` and `rtol` are those of the default plan"):
         identify(problem, starts=3, plan=[])
-    with pytest.raises(ValueError, match="for loss = 'huber' take method = 'gauss_newton'"):
-        identify(problem, loss="huber", method="lbfgs")
 
 
 SAMPLES = np.linspace(0.0, 0.1, 5)

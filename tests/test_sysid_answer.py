@@ -44,6 +44,7 @@ from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.report import report, traces
 from torchsoft.sysid.result import ChannelNoise, checksum, recorded_rigs, schema
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 
 SCHEMA = Path(__file__).parents[1] / "docs" / "answer.schema.json"
 PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
@@ -98,11 +99,13 @@ def full(result):
         harmless, name="b", stated="the disc weighs 1 kg", moves={E: -4.2}, gain=99.0,
         favoured=-3.1, suspected=True,
     )  # fmt: skip
+    other = replace(harmless, name="d", stated="the disc is round", favoured=5.0)
     lost = replace(
         harmless, name="c", kind="law", stated="slip is smooth", unchecked="a run failed"
     )
     return replace(
-        result, assumptions=[harmless, heavy, lost], noise=[ChannelNoise("effort_y", NOISE, [])],
+        result, assumptions=[harmless, heavy, lost, other],
+        noise=[ChannelNoise("effort_y", NOISE, [])],
         combinations=[Combination({E: 1.0, K_N: -0.5}, {E: 0.3, K_N: 0.4}, 0.02)],
         command="torchsoft identify '<a>.csv' rig.toml --out out",
     )  # fmt: skip
@@ -119,30 +122,29 @@ def path(full, tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("stated", "doubts", "verdict", "says"),
+    ("severities", "verdict", "says"),
     [
-        (1.0, [], "holds", "^4 of 6 parameters identifiable, "),
-        (1.0, ["x"], "doubtful", "^The model is doubtful, a note below .* if it holds, 4 of 6 "),
-        (29.0, [], "does not explain", r"effort_y are 29 times the stated noise \(χ² = 200\)"),
+        (("note",), "holds", "^The model holds. 4 of 6 parameters identifiable, "),
+        (("warning", "note"), "doubtful", "^The model is doubtful: .* If it holds: 4 of 6 "),
+        (("error", "warning"), "does not explain", "^The model does not explain the data"),
     ],
 )
-def test_the_first_line_is_the_verdict(result, stated, doubts, verdict, says):
-    """By the noise that sensors state, whatever colour was found."""
-    residuals = [
-        replace(one, stated=stated if one.channel == "effort_y" else 1.0)
-        for one in result.residuals
-    ]
-    chi2 = 200.0 if stated > 1 else result.chi2
-    answer = replace(result, residuals=residuals, chi2=chi2, doubts=doubts)
-    assert answer.verdict == json.loads(answer.to_json())["verdict"] == verdict
+def test_the_verdict_is_that_of_the_gravest_finding_and_the_first_line(
+    result, severities, verdict, says
+):
+    findings = [Finding("not-converged", severity) for severity in severities]
+    answer = replace(result, findings=findings)
+    content = json.loads(answer.to_json())
+    assert answer.verdict == content["verdict"] == verdict
+    assert [one["text"] for one in content["findings"]] == [str(one) for one in findings]
     assert re.search(says, answer.headline)
-    assert answer.table().startswith(answer.headline[:40])
-    assert ("identifiable" in answer.headline) == (stated == 1.0)
+    assert answer.table().startswith(answer.headline)
 
 
 def test_a_prediction_with_values_of_its_own_names_them(result):
     value = result.recorded("held").identified[R_N]
-    assert any("`held` is predicted" in text and f"{value:.3g}" in text for text in result.notices)
+    (found,) = (one for one in result.findings if one.code == "heldout-unidentified")
+    assert found.facts == {"recording": "held", "values": {R_N: value}}
 
 
 @pytest.mark.filterwarnings("ignore:not identifiable")
@@ -233,7 +235,7 @@ def test_what_is_saved_comes_back_and_is_what_the_published_schema_says(full, pa
         assert not answer.rigs
     assert isnan(answer.chi2)
     assert answer.noise == whole.noise
-    began = load_answer(path).recordings[1].began
+    began = load_answer(path).recordings[1].initial
     assert began == {"start.disc.x": full["start.disc.x"].last}
 
 
@@ -253,7 +255,7 @@ def forge(content: dict[str, Any]) -> None:
 DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "a digit": (lambda c: c["estimates"][1].update(last=1.25), "is damaged"),
     "no checksum": (lambda c: c.pop("checksum"), "is damaged"),
-    "another form": (lambda c: c.update(schema="torchsoft-answer-9"), "'torchsoft-answer-9'"),
+    "another form": (lambda c: c.update(schema="torchsoft-answer-10"), "'torchsoft-answer-10'"),
     "an old one": (lambda c: c.pop("schema"), "identify again"),
     "forged": (forge, r"\.x\.\d+ should be a valid number, not '0'"),
 }
@@ -432,9 +434,10 @@ def test_the_page_holds_what_the_answer_holds(page, full):
 
 
 def test_warnings_come_first_then_parameters_starts_and_sensors(page, full):
-    assert full.notices
+    assert full.findings
     order = [
-        *(f"\n{notice}\n" for notice in full.notices), "\nEstimates\n", f"\n{E}\n", f"\n{V_S}\n",
+        *(f"\n{one.severity}: {one}\n" for one in full.findings),
+        "\nEstimates\n", f"\n{E}\n", f"\n{V_S}\n",
         f"\n{R_N}\n{HOSTILE}\n", f"\n{R_N}\nshallow\n", "\nstart.disc.x\nshallow\n",
         "\nbias of y_Br\n",
     ]  # fmt: skip
@@ -444,9 +447,12 @@ def test_warnings_come_first_then_parameters_starts_and_sensors(page, full):
 
 def test_assumptions_that_matter_stand_open_and_others_are_folded(page):
     folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
-    assert page.text.index(f"\n−4.2 sd of {E}\nyes −3.1 ± 1.2 %: the sum of squares ") < folded
+    assert (
+        page.text.index(f"\n−4.2 sd of {E}\n−3.1 ± 1.2 %\nsuspected: lowers the sum of ") < folded
+    )
     assert page.text.index("\nnot checked: a run failed\n") < folded
-    assert page.text.index(f"\n<b> is so\nit were not\n+0.1 sd of {E}\nno: +0.3 ± 1.2 %\n") > folded
+    assert page.text.index(f"\n<b> is so\nit were not\n+0.1 sd of {E}\n+0.3 ± 1.2 %\n") > folded
+    assert "\n+5 ± 1.2 %\ndiffers by more than chance; other suspects explain more\n" in page.text
 
 
 def test_traces_are_those_of_the_model_and_whitened_by_its_noise(problem, result, full):
@@ -488,15 +494,14 @@ def test_a_lost_recording_is_named(problem, result, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Runner, "run", losing)
     monkeypatch.setattr(sections, "png", lambda figure: "")
-    answer = replace(result, notices=[], contributions=result.contributions[:1])
+    answer = replace(result, findings=[])
     page = written(answer, problem, tmp_path)
     alts = " ".join(str(attributes.get("alt")) for _, attributes in page.tags)
     assert "Could not be simulated: it < went" in page.text
     assert f"y_Br of {HOSTILE}" in alts
     assert "y_Br of held" not in alts
-    assert "nothing to warn of" in page.text
-    for heading in ("Contribution of each recording", "Assumptions"):
-        assert f"\n{heading}\n" not in page.text  # where there is nothing to report
+    assert "The fit converged, residuals are white" in page.text
+    assert "\nAssumptions\n" not in page.text  # where there is nothing to report
 
 
 def test_no_text_of_a_picture_is_cut_or_overlaps(full):

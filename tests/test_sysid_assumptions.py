@@ -13,10 +13,10 @@ from conftest import COARSE, PAPER, RUBBER, dry, excited, stroked
 from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Reference, Rig
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.assumptions import AMOUNTS, assumptions
-from torchsoft.sysid.prediction import Frozen, Prediction, Readout, Signals, Term, lagged, predict
+from torchsoft.sysid.prediction import Prediction, Readout, Signals, Term, lagged, predict
 from torchsoft.sysid.problem import DIFFERENCE
 from torchsoft.sysid.recording import Grid, extended
-from torchsoft.sysid.refits import assuming, begun
+from torchsoft.sysid.refits import assuming, start_under
 from torchsoft.sysid.runs import Runner
 
 E, MU_K = "materials.rubber.E", "laws.steel_on_rubber.friction.mu_k"
@@ -26,7 +26,7 @@ STROKES = stroked(travel=8e-3, stroke_time=0.15, duration=0.4, grasp=0.15, since
 
 
 def run_of(recording: Recording, derived: bool = False, /) -> Prediction:
-    return predict(recording.begin(), {}, recording.grid(True), (), 1e-6)
+    return predict(recording.run_context(), {}, recording.grid(True), (), 1e-6)
 
 
 def variation(recording: Recording, name: str, sensors: dict[str, Sensor] | None = None) -> Any:
@@ -64,13 +64,13 @@ def test_a_recording_starts_where_its_rig_does():
     """Also a body that presses another, by a depth, onto a pad that gives way."""
     built = excited(STROKES, PAPER.override(COARSE))
     stated = record("strokes", built, {}, SENSORS, rtol=1e-3)
-    poses = [built.rig.unpack(y).pose for y in (stated.begin().y0({}), built.y0)]
+    poses = [built.rig.unpack(y).pose for y in (stated.run_context().y0({}), built.y0)]
     for body in ("disc", "bracket"):
         np.testing.assert_allclose(*(one[body].detach() for one in poses), atol=1e-9)
     unsure = replace(stated, start=stated.start._replace(position_sd={"disc.x": 1e-3}))
     place = torch.tensor(60.4e-3, dtype=torch.float64)
-    begun = built.rig.unpack(unsure.begin().y0({"start.disc.x": place})).pose
-    assert begun["disc"][0].item() == pytest.approx(60.4e-3, abs=1e-12)
+    initial = built.rig.unpack(unsure.run_context().y0({"start.disc.x": place})).pose
+    assert initial["disc"][0].item() == pytest.approx(60.4e-3, abs=1e-12)
 
 
 @pytest.mark.parametrize("c", [(2e-3, 0.0), (0.0, -1e-3)])
@@ -96,8 +96,8 @@ def test_a_controller_that_is_late_pushes_behind_a_low_pass(parameter, late):
     """The y loop has a feed-forward of its own beside it."""
     made = extended(strokes(), [parameter])
     torch.nn.init.constant_(made.rig.parameter(parameter), 5e-4)
-    fine = torch.arange(made.begins, 0.4, 1e-4, dtype=torch.float64)
-    at = predict(made.begin(), {}, Grid(fine, 0), (), 1e-6)
+    fine = torch.arange(made.run_start, 0.4, 1e-4, dtype=torch.float64)
+    at = predict(made.run_context(), {}, Grid(fine, 0), (), 1e-6)
     named = dict(zip(made.channels, at.signals.T))
     for name, actuator in made.rig.actuators.items():
         signals = made.rig.reference(torch.from_numpy(at.t), actuator.reads).numpy()
@@ -234,7 +234,7 @@ def test_amounts_of_variations_are_coordinates_with_differences_as_derivatives()
     c, which, start = other.coordinates, problem.names, problem.coordinates.start
     assert c.labels == (E, *(one.name for one in chosen))
     base = problem.residuals(runner, start, which, 1e-4)
-    x = begun(other, chosen, {E: start[0]})
+    x = start_under(other, chosen, {E: start[0]})
     at = other.residuals(other.runner(runner), x, which, base.steps, c.free)
     np.testing.assert_allclose(at.r, base.r, atol=1e-6)
     thicker = varied(data, "height of pads", DIFFERENCE)
@@ -320,32 +320,10 @@ def test_a_number_that_recordings_state_otherwise_is_varied_in_each():
 
 
 def changed(recording: Recording, name: str, value: float) -> Rig:
-    rig = recording.begin().rig
+    rig = recording.run_context().rig
     with torch.no_grad():
         rig.parameter(name).fill_(value)
     return rig
-
-
-# Numbers that drift along a recording
-
-
-def test_a_number_that_drifts_changes_along_the_samples():
-    """Before them it is as stated; after them, where all is at rest, that of a softer pad, but for
-    the friction on the way."""
-    held = replace(strokes(), start=strokes().start._replace(followed={}))  # the same set-points
-    whole, grid = run_of(held), held.grid(True)
-    as_stated, pieces, softer, soft = (
-        predict(replace(held, drifts=drifts).begin(), at, grid, (), Frozen(whole.knots)).signals
-        for drifts, at in (
-            ({}, {}), ({E: 0.0}, {}), ({E: -0.1}, {}), ({}, {E: 0.9 * held.parameters[E]})
-        )
-    )  # fmt: skip
-    np.testing.assert_allclose(pieces, as_stated, atol=1e-8)
-    assert (softer[whole.t < 0.0] == as_stated[whole.t < 0.0]).all()
-    y = strokes().channels.index("effort_y")
-    fallen = soft[-1, y] / as_stated[-1, y] - 1
-    assert fallen < -0.05
-    assert softer[-1, y] / as_stated[-1, y] - 1 == pytest.approx(fallen, rel=0.03)
 
 
 @pytest.mark.slow
@@ -358,8 +336,8 @@ def test_linear_pads_at_finite_strain_are_those_of_a_neo_hookean_file():
     again = {one.name for one in assumptions([made], {E}, SENSORS)}
     assert "finite strain" not in again
     grid = made.grid(False)
-    one, other = (predict(r.begin(), {E: 0.8e6}, grid, (), 1e-3) for r in (made, built))
+    one, other = (predict(r.run_context(), {E: 0.8e6}, grid, (), 1e-3) for r in (made, built))
     assert (one.signals == other.signals).all()
-    linear = predict(strokes().begin(), {E: 0.8e6}, grid, (), 1e-3)
+    linear = predict(strokes().run_context(), {E: 0.8e6}, grid, (), 1e-3)
     y = strokes().channels.index("effort_y")
     assert one.signals[-1, y] / linear.signals[-1, y] > 1.03

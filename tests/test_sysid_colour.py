@@ -49,17 +49,18 @@ def test_intervals_hold_under_coloured_noise_which_is_named_unless_it_was_declar
     own = problem(coloured, colour)
     stage = Stage("all", own.names, (E, K_N), 1e-4)
     answer = identify(own, plan=[stage], assumptions="trusted", tightenings=0)
-    white = np.linalg.inv(fisher(own, answer))
-    assert {one.channel for one in answer.noise} == set(SENSORS)
+    assert {one.channel for one in answer.noise} == (set(SENSORS) if colour == "ar" else set())
     for one in answer.noise:
         assert one.model.order in (1, 2)
         assert one.tried[0].order == 0
         assert min(one.tried, key=lambda score: score.bic).order == one.model.order
-    said = [notice for notice in answer.notices if "coloured in x_ball (order" in notice]
+    said = [str(one) for one in answer.findings if one.code == "colour"]
     assert len(said) == (colour == "white")
+    assert all("coloured in x_ball (order" in text for text in said)
+    assert answer.verdict == "holds"
     for name, truth in TRUTH.items():
         assert abs(np.log(answer[name].last / truth)) < 3 * answer[name].relative_sd, name
-    assert answer[E].relative_sd > 1.3 * white[0, 0] ** 0.5
+    assert answer[E].relative_sd > 1.3 * np.linalg.inv(fisher(own, answer))[0, 0] ** 0.5
 
 
 def fisher(own: Problem, answer: IdentificationResult) -> np.ndarray:
@@ -69,8 +70,7 @@ def fisher(own: Problem, answer: IdentificationResult) -> np.ndarray:
     return J.T @ J
 
 
-def test_residuals_and_the_adjoint_agree_on_coloured_noise(coloured):
-    """Rows whitened at once, and again from other noise; the gradient of half their squares."""
+def test_residuals_are_whitened_at_once_and_again_from_other_noise(coloured):
     gaps = {
         c: (np.delete(t, slice(20, 30)), np.delete(y, slice(20, 30)))
         for c, (t, y) in coloured.samples.items()
@@ -86,7 +86,3 @@ def test_residuals_and_the_adjoint_agree_on_coloured_noise(coloured):
     back = rewhitened(plain, other, parts(noisy, other.r, which))
     for a, b in ((again.r, other.r), (again.J, other.J), (back.r, one.r), (back.J, one.J)):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
-    loss, gradient, failed = noisy.misfit(runner, x, which, steps, free)
-    assert not failed
-    assert loss == pytest.approx(0.5 * other.r @ other.r, rel=1e-12)
-    np.testing.assert_allclose(gradient, other.J.T @ other.r, rtol=1e-8)

@@ -102,5 +102,5 @@ def test_recordings_of_other_laws_have_other_fingerprints(jerks, tmp_path):
     assert len(set(prints)) == len(laws)
     assert prints == [given(jerks, law).fingerprint for law in laws]
     there = pickle.loads(pickle.dumps(jerks))
-    assert isinstance(there.begin().rig.contacts["L"].law.friction, Viscous)
+    assert isinstance(there.run_context().rig.contacts["L"].law.friction, Viscous)
     assert there.fingerprint == jerks.fingerprint

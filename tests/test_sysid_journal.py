@@ -13,7 +13,7 @@ import pytest
 from hostile.damage import BYTES, PLANTED, Trap, Victim, archive, damage, forged
 
 from torchsoft.sysid import runs
-from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction
+from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction
 from torchsoft.sysid.runs import CHECKPOINT, Job, Journal, Runner, decoded, encoded, forget
 
 ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
@@ -25,7 +25,6 @@ RESULTS = {
     "prediction": PREDICTION,
     "without derivatives": PREDICTION._replace(derivatives=None, knots=None),
     "nothing": Prediction(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 0))),
-    "infinite misfit": Misfit(float("inf"), ODD, -ODD[None]),
     "failed": FailedRun("the disc was lost at t = 0.1 s: µ_s, 'quoted'", float("nan")),
 }
 RUN, OTHER = ("run", 1.0), ("run", 1.0000000000000002)
@@ -44,7 +43,11 @@ def same(a: Any, b: Any) -> bool:
 
 def recording(fingerprint: str = "a") -> Any:
     return SimpleNamespace(
-        fingerprint=fingerprint, beginning="", duration=1.0, begin=lambda: None, rig=None
+        fingerprint=fingerprint,
+        start_fingerprint="",
+        duration=1.0,
+        run_context=lambda: None,
+        rig=None,
     )
 
 
@@ -124,7 +127,7 @@ def test_finished_runs_are_kept_at_an_interruption(tmp_path, monkeypatch, count)
     jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(4)]
     running = threading.Barrier(count)
 
-    def made(recording: Any, begun: Any, job: Job, start: Any) -> Prediction:
+    def made(recording: Any, context: Any, job: Job, start: Any) -> Prediction:
         if job in jobs[:count]:
             running.wait()
         if job is jobs[count - 1]:

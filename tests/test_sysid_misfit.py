@@ -1,7 +1,6 @@
 """What a fit leaves: no false alarms where model and noise are right, and for each fault the
 sentence that names it."""
 
-import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,17 +8,16 @@ import pytest
 from scipy import signal, stats
 from test_sysid_noise import made
 
-from torchsoft.sysid.colour import colour_notices, colours, correlation
-from torchsoft.sysid.fit import Colour
+from torchsoft.sysid.colour import colour_findings, colours, correlation
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import (
     LEVEL,
     Part,
-    Verdict,
+    ResidualTest,
     autocorrelation,
     holm,
     judge_residuals,
-    residual_notices,
+    residual_findings,
     whiteness,
 )
 
@@ -39,7 +37,7 @@ class Case:
     fault: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     scale: float = 1.0
 
-    def judged(self, robust: bool = False) -> list[Verdict]:
+    def judged(self, robust: bool = False) -> list[ResidualTest]:
         parts, r, J = self.fitted()
         return judge_residuals(parts, r, J, robust=robust)
 
@@ -76,8 +74,13 @@ class Case:
         return parts, y - J @ x, J
 
 
-def alarms(verdicts: list[Verdict], test: str) -> list[Verdict]:
+def alarms(verdicts: list[ResidualTest], test: str) -> list[ResidualTest]:
     return [f for f in verdicts if f.alarming and f.test == test]
+
+
+def said(tests: list[ResidualTest]) -> dict[str, str]:
+    """Findings in words, by code."""
+    return {one.code: str(one) for one in residual_findings(tests)}
 
 
 def reading(case: Case, where: tuple[str, str]) -> np.ndarray:
@@ -111,7 +114,7 @@ def test_the_level_is_judged_by_how_many_samples_there_are():
     (overall,) = [f for f in alarms(many, "level") if f.recording is None]
     assert overall.p < 1e-9
     assert overall.size == pytest.approx(1.058, abs=0.02)
-    assert "residuals are larger than the noise" in residual_notices(many)["larger"]
+    assert "Residuals are larger than the stated noise" in said(many)["larger"]
     assert not alarms(few, "level")
 
 
@@ -119,8 +122,8 @@ def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well():
     rng, where = np.random.default_rng(5), ("run 1", "theta_C")
     loud = Case(1, fault={where: 0.9 * rng.standard_normal(400)}).judged()
     assert [(f.recording, f.channel) for f in alarms(loud, "level") if f.recording] == [where]
-    assert "theta_C of `run 1` 1.27 times" in residual_notices(loud)["larger"]
-    quiet = residual_notices(Case(1, scale=0.4).judged())
+    assert "theta_C of `run 1` 1.27 times" in said(loud)["larger"]
+    quiet = said(Case(1, scale=0.4).judged())
     assert [*quiet] == ["smaller"]  # its pattern is not judged
 
 
@@ -146,7 +149,7 @@ def test_what_follows_the_motion_is_named(kind, words):
     found = Case(2, fault={where: 0.5 * fault / (fault.std() or 1.0)}).judged()
     named = alarms(found, "motion")
     assert {(f.recording, f.channel) for f in named} == {where}
-    assert any(f"most like {words}" in notice for notice in residual_notices(found).values())
+    assert any(f"most like {words}" in notice for notice in said(found).values())
 
 
 def test_colour_is_noticed_found_allowed_for_and_named():
@@ -159,11 +162,11 @@ def test_colour_is_noticed_found_allowed_for_and_named():
     for fit in found.values():
         assert fit.noise.sd >= 1 - 1e-12
         assert 0.5 < correlation(fit.noise) < 0.7
-    (sentence,) = colour_notices(found, Colour())
+    (sentence,) = map(str, colour_findings(found))
     words = f"order 1, neighbouring samples correlate by {correlation(found['x_C'].noise):.2f}"
     assert f"x_C ({words})" in sentence
-    assert not colour_notices({}, Colour())
-    assert not residual_notices(Case(3, noise=noise, assumed=found["theta_C"].noise).judged())
+    assert not colour_findings({})
+    assert not residual_findings(Case(3, noise=noise, assumed=found["theta_C"].noise).judged())
 
 
 def test_white_noise_is_hardly_ever_called_coloured():
@@ -183,14 +186,15 @@ def test_channels_that_err_together_are_named():
     common = np.random.default_rng(9).standard_normal(300)
     fault = {("run 0", "x_C"): 0.6 * common, ("run 0", "effort_x"): -0.6 * common}
     (found,) = alarms(Case(4, fault=fault).judged(), "channels")
-    assert "x_C and effort_x of `run 0` (correlation -0." in found.words
+    assert found.facts["channels"] == "x_C and effort_x"
+    assert found.size < -0.3
 
 
 def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss():
     spike, many = np.where(np.arange(300) == 100, 9.0, 0.0), 8.0 * (np.arange(300) % 12 == 0)
     (found,) = alarms(Case(4, fault={("run 0", "theta_C"): spike}).judged(), "outliers")
-    assert "theta_C of `run 0` (the largest" in found.words
-    assert f"t = {100 * H:g} s" in found.words
+    assert (found.recording, found.channel) == ("run 0", "theta_C")
+    assert found.facts["time"] == pytest.approx(100 * H)
     case = Case(4, fault={("run 0", "theta_C"): many})
     assert alarms(case.judged(), "level")
     robust = case.judged(robust=True)
@@ -207,11 +211,10 @@ def test_a_misfit_that_begins_at_a_certain_time_is_named_with_that_time(robust):
     judged = lambda fault: Case(4, fault={("run 0", "theta_C"): fault}).judged(robust=robust)
     verdicts = judged(wave * (k >= 240))
     (found,) = alarms(verdicts, "onset")
-    time = float(re.findall(r"t = (\S+) s", found.words)[0])
-    assert time == pytest.approx(240 * H, abs=2 * H)
+    assert found.facts["time"] == pytest.approx(240 * H, abs=2 * H)
     assert found.size == pytest.approx((1 + 18) ** 0.5, rel=0.15)
     assert not alarms(verdicts, "outliers")
-    assert "the misfit begins in `run 0` at t = " in residual_notices(verdicts)["onset"]
+    assert "The misfit starts in `run 0` at t = " in said(verdicts)["onset"]
     for other in (wave, 30.0 * (k >= 295)):
         assert not alarms(judged(other), "onset")
 
@@ -236,15 +239,20 @@ def test_a_prior_that_the_data_contradict_is_named(far):
     z = far / np.hypot(0.05, np.linalg.inv(J.T @ J)[0, 0] ** 0.5)  # the fit without it is at zero
     (one,) = [v for v in verdicts if v.test == "priors"]
     assert one.size == pytest.approx(z, rel=1e-6, abs=1e-9)
-    said = "\n".join(residual_notices(verdicts).values())
-    assert one.alarming == ("contradict what was known before, E by" in said) == (far > 0)
+    assert (
+        one.alarming
+        == ("contradict the prior of E by" in said(verdicts).get("priors", ""))
+        == (far > 0)
+    )
     unseen = np.concatenate((J * [0, 1, 1, 1], np.eye(4)[:1]))  # by the data
     assert not alarms(judge_residuals(parts, np.append(r, 0.0), unseen, priors=["E"]), "priors")
 
 
 def test_holm_by_hand():
     p = (0.01, 0.04, 0.03, 0.005)
-    adjusted = [f.adjusted for f in holm([Verdict("level", None, None, one, 1.0, "") for one in p])]
+    adjusted = [
+        f.adjusted for f in holm([ResidualTest("level", None, None, one, 1.0) for one in p])
+    ]
     np.testing.assert_allclose(adjusted, [0.03, 0.06, 0.06, 0.02])
     assert LEVEL == 0.01
 

@@ -239,16 +239,16 @@ def test_a_grasp_in_mid_air_reports_that_its_poses_must_be_measured():
     built = coarse(outputs={"duration": 2.0, "snapshots": []}).build()
     made = record("lift", built, TRUTH, sensors, seed=3)
     late = {c: (t[t >= 0.8], y[t >= 0.8]) for c, (t, y) in made.samples.items()}
-    begun = estimate_initial_state(replace(made, samples=late), sensors)
-    problem = Problem([begun], sensors, {name: Unknown() for name in TRUTH})
+    made = estimate_initial_state(replace(made, samples=late), sensors)
+    problem = Problem([made], sensors, {name: Unknown() for name in TRUTH})
     result = identify(problem, assumptions="trusted")
     for name, value in TRUTH.items():
         assert result[name].value == pytest.approx(value, rel=4 * result[name].relative_sd)
     assert not result.converged
     assert len(result.stages) <= 7
-    (notice,) = result.notices
-    assert re.search(r"not smooth in .*start\.right\.x", notice)
-    assert "measure every coordinate of the bodies when the recording begins" in notice
+    (found,) = result.findings
+    assert re.search(r"not smooth in .*start\.right\.x", str(found))
+    assert "Measure every coordinate of the bodies when the recording starts" in str(found)
 
 
 def test_a_body_rests_where_the_parameters_let_it_rest(folder):

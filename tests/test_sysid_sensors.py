@@ -85,7 +85,7 @@ def remembered(tmp_path_factory):
 
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_fault_reads_as_its_closed_form_and_has_its_derivatives(dense, strokes, remembered, kind):
-    """By differences and by the adjoint; its neutral value leaves the reading as it is."""
+    """By differences; its neutral value leaves the reading as it is."""
     channel, unit, size, reading = READINGS[kind]
     plain = Sensor(noise=NOISE[channel])
     faulty = plain.model_copy(update={kind: 2 * size})

@@ -226,7 +226,7 @@ CASES: dict[str, Callable[[Config], Case]] = {
 
 def judged(truth: Mapping[str, float], found: list[IdentificationResult]) -> dict[str, Any]:
     """Of all seeds of a case: by unknown, errors of its logarithm over their predicted standard
-    deviations, and how many intervals hold; notices by their first words."""
+    deviations, and how many intervals hold; findings by their code."""
     parameters = {}
     for name, value in truth.items():
         every = [result[name] for result in found]
@@ -238,7 +238,7 @@ def judged(truth: Mapping[str, float], found: list[IdentificationResult]) -> dic
             "inside": inside, "ci95": [own.low, own.high], "mean": float(np.mean(errors)),
             "sd": float(np.std(errors, ddof=1)), "errors": errors,
         }  # fmt: skip
-    notices = Counter(" ".join(n.split()[:6]) for result in found for n in result.notices)
+    notices = Counter(one.code for result in found for one in result.findings)
     return {"notices": notices, "parameters": parameters}
 
 

@@ -300,18 +300,19 @@ class Repetition(NamedTuple):
         return abs(self.off.get(self.worst, 0.0)) > OFF and not self.covered(case)
 
 
-CONTRADICTED = "the data contradict that ", "the data contradict one of "
+CAUSES = "cause", "causes", "rivals"
+UNSETTLED = {"rivals", "far", "likeliest", "no-suspect"}
+RISKS = {"undetectable", "exact", "undetectable-others", "hinted"}
+"""Codes of findings: that name causes, that ask for refits, and on what the data would not show."""
 
 
 def false_causes(case: Case, result: IdentificationResult) -> list[str]:
     """Sentences of a cause, or of several, without the true one."""
-    right = [one.stated for one in result.assumptions if is_right(case, one.name)]
     return [
-        text
-        for text in result.notices
-        if text.startswith(CONTRADICTED)
-        and not is_right(case, text)
-        and not any(stated in text for stated in right)
+        str(one)
+        for one in result.findings
+        if one.code in CAUSES
+        and not any(is_right(case, suspect["name"]) for suspect in one.facts["cases"])
     ]
 
 
@@ -346,7 +347,7 @@ def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Rep
     try:
         one = case.problem(made, seed)
         result, identify_s = timed(lambda: identify(one, **how))
-        if config.explain and result.made_by["candidates"]:
+        if config.explain and {one.code for one in result.findings} & UNSETTLED:
             result, explain_s = timed(lambda: explain(one, **how))
     except (Unreachable, ValueError) as error:
         if not case.rejected:
@@ -357,10 +358,12 @@ def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Rep
         e.name: float(np.log(e.value / TRUTH[e.name]) / e.relative_sd)
         for e in result.estimates if e.value is not None
     }  # fmt: skip
-    named = {one.name: one.odds for one in result.assumptions if one.odds > LIKELY}
+    named = {one.name: one.score for one in result.assumptions if one.score > LIKELY}
+    unseen = [str(one) for one in result.findings if one.code in RISKS]
+    notices = [str(one) for one in result.findings if one.code not in RISKS]
     return Repetition(
-        off, named, false_causes(case, result), result.verdict, result.notices,
-        list(result.unseen), identify_s, explain_s,
+        off, named, false_causes(case, result), result.verdict, notices,
+        unseen, identify_s, explain_s,
     )  # fmt: skip
 
 

@@ -167,7 +167,6 @@ colour = "white"
 rtol = 1e-3
 starts = 1
 loss = "linear"
-method = "gauss_newton"
 workers = 1
 seed = 0
 [[recordings]]

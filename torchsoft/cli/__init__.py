@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 
-from torchsoft.cli import dataset, design, identify, material, plan, plot, reduce, rigs
+from torchsoft.cli import dataset, design, identify, material, plan, plot, profile, reduce, rigs
 from torchsoft.cli.results import failed, open_streams, say
 
 GRACE = 1.5
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"torchsoft {version('torchsoft')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (rigs, plan, identify, design, material, dataset, reduce, plot):
+    for group in (rigs, plan, identify, profile, design, material, dataset, reduce, plot):
         group.add_commands(commands)
     for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
         if isinstance(stream, io.TextIOWrapper):

@@ -117,7 +117,7 @@ def identify(options: argparse.Namespace) -> int:
                 fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
             )
             problems, heldout = list(case.laws.values()) or [case.problem], case.config.heldout
-            priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
+            priced = (fit.rtol, fit.starts, fit.workers, heldout)
             expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
             if stated is None:
@@ -129,7 +129,8 @@ def identify(options: argparse.Namespace) -> int:
             result = replace(result, command=options.command)
             result.save(options.out / "answer.json")
             written, verdict = [options.out / "answer.json"], ""
-            if not result.made_by["untried"]:  # interrupted, nobody waits for pictures
+            interrupted = any(one.code == "interrupted" for one in result.findings)
+            if not interrupted:  # else nobody waits for pictures
                 written.append(options.out / "report.html")
                 report(result, case.problem, written[-1], checkpoint=unfinished)
                 verdict = compared(case, fit, options, unfinished) if case.laws else ""
@@ -144,14 +145,14 @@ def identify(options: argparse.Namespace) -> int:
         )
         return 130
     say(result.table())
-    for notice in result.notices:
-        say(f"note: {notice}")
+    for finding in result.findings:
+        say(f"{finding.severity}: {finding}")
     if verdict:
         say(verdict)
-    if result.made_by["untried"]:
+    if interrupted:
         say(f"\ninterrupted; the same command continues with what is in {unfinished}", error=True)
     say(f"fitted in {result.cost['wall_s']:.0f} s; written to {' and '.join(map(str, written))}")
-    return 130 if result.made_by["untried"] else 0
+    return 130 if interrupted else 0
 
 
 def compared(case: Any, fit: Any, options: argparse.Namespace, unfinished: Path) -> str:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from torchsoft.sysid.assumptions import AMOUNTS, Assumption, Variation
 from torchsoft.sysid.fit import Fit, shift, standard_deviations
-from torchsoft.sysid.plan import settle
+from torchsoft.sysid.plan import refine_steps
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import EVIDENT, NEARLY, REDUNDANT, across, pursuit
-from torchsoft.sysid.residual_tests import Verdict, judge_residuals, parts, systematic
+from torchsoft.sysid.residual_tests import ResidualTest, judge_residuals, parts, systematic
+from torchsoft.sysid.sentences import SUSPECT, case
 from torchsoft.tables import Number
 
 PATTERN = 0.5
@@ -58,7 +59,7 @@ class AssumptionTest(Assumption):
     none. With `refitted` the result is that of a new fit, else it is to first order. `unchecked` is
     the reason of a missing test. `value` is the favoured value of the `parameter`, `under` are the
     estimates at the favoured amplitude, by label. `suspected` is whether the data favour the
-    variation, `passed` whether residuals under it pass the tests of a fit, and `odds` its share of
+    variation, `passed` whether residuals under it pass the tests of a fit, and `score` its share of
     the evidence among all suspects that do. `detectable` is the least amount [unit] that the data
     would show.
     """
@@ -74,7 +75,7 @@ class AssumptionTest(Assumption):
     unchecked: str = ""
     value: Number = float("nan")
     under: dict[str, Number] = field(default_factory=dict)
-    odds: Number = 0.0
+    score: Number = 0.0
     suspected: bool | None = None
     passed: bool = False
     detectable: Number = float("inf")
@@ -101,30 +102,15 @@ class AssumptionTest(Assumption):
         )
 
     @property
-    def falls(self) -> str:
-        """The fall of the sum of squares, as the end of a sentence."""
-        return (
-            f"falls by {self.gain:.0f} in a new fit"
-            if self.refitted
-            else f"would fall by {self.gain:.0f}"
-        )
-
-    @property
-    def found(self) -> str:
-        """The variation that fits best, as the end of a sentence."""
+    def case(self) -> dict[str, Any]:
+        """Its facts as a case of a finding: the value, or the amount, that the data favour."""
         if self.kind == "several":
-            return self.otherwise
-        amount = f"{self.favoured:+.3g} {self.unit}".rstrip()
-        if self.parameter and self.unit == "%":
-            return (
-                f" with {self.parameter} = {self.value:.6g} ({amount}, +- {self.favoured_sd:.2g})"
-            )
-        if self.parameter:
-            sd = self.favoured_sd * self.step / self.amount
-            return f" with {self.parameter} = {self.value:.4g} +- {sd:.2g} {self.unit}".rstrip()
-        if self.kind in ("known", "sensor"):
-            return f" if {self.otherwise} ({amount} fit best, +- {self.favoured_sd:.2g})"
-        return f" if {self.otherwise}"
+            return {"name": self.otherwise}
+        if self.kind not in ("known", "sensor"):
+            return {"name": self.name}
+        out = {"name": self.name, "favoured": self.favoured, "sd": self.favoured_sd}
+        relative = self.parameter and self.unit == "%"
+        return out | {"unit": self.unit} | ({"value": self.value} if relative else {})
 
     @property
     def impact(self) -> tuple[str, float, float]:
@@ -194,7 +180,7 @@ class Judge:
         """Part of a sum of squares that is above the noise."""
         return left - self.dof
 
-    def alarms(self, r: Array, J: Array) -> list[Verdict]:
+    def alarms(self, r: Array, J: Array) -> list[ResidualTest]:
         """What a wrong model would leave in residuals r (m,) with their Jacobian J (m, n)."""
         left = parts(self.end.problem, r, self.end.which)
         return systematic(judge_residuals(left, r, J, robust=self.end.loss != "linear"))
@@ -317,7 +303,7 @@ class Judge:
             unit="",
             refitted=refitted,
             stated=" and ".join(one.stated for one in found),
-            otherwise=" and".join(one.found for one in found),
+            otherwise=" and ".join(case(SUSPECT, one.case) for one in found),
         )
 
     def alone(
@@ -349,17 +335,17 @@ class Judge:
             passed=not self.alarms(again.at.r, again.J),
         )
 
-    def at_rest(self, again: Again, as_stated: Fit) -> AssumptionTest:
+    def refined(self, again: Again, as_stated: Fit) -> AssumptionTest:
         """Test by a repeated fit that goes on until its steps do not matter, as that of the
         parameters did; without estimates where it does not come to rest."""
-        fit = settle(again.fit, TIGHTENINGS if again.fit.loss == "linear" else 0)
+        fit = refine_steps(again.fit, TIGHTENINGS if again.fit.loss == "linear" else 0)
         found = self.fit(again._replace(fit=fit), as_stated)
         found = found if found.refitted else self.fit(again, as_stated)
         return found if fit.converged else replace(found, under={})
 
     def besides(
         self, best: AssumptionTest, checks: Sequence[AssumptionTest]
-    ) -> tuple[tuple[AssumptionTest, ...], list[Verdict], list[Verdict]]:
+    ) -> tuple[tuple[AssumptionTest, ...], list[ResidualTest], list[ResidualTest]]:
         """Tests to first order of effects besides one suspect, at most `BESIDES`, each beside those
         before it; the alarms of residuals under the suspect alone, and under all of them."""
         out: list[AssumptionTest] = []

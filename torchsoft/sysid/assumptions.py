@@ -135,7 +135,7 @@ def assumptions(
     identified parameters and coordinates of starts, and labels of faults of the `sensors`."""
     first = recordings[0]
     out = [*numerical(first), *of_motion(first), *of_laws(first), *of_places(first, unknown)]
-    out += [*of_pads(first), *of_drifts(first), *of_actuators(first)]
+    out += [*of_pads(first), *of_actuators(first)]
     for name, value in first.parameters.items():
         if name in unknown or value == 0.0 or name.startswith("start.") or "fixed" in name:
             continue
@@ -276,25 +276,6 @@ def of_pads(recording: Recording) -> Iterator[Variation]:
             f"tilt of the pad {name}", "known", f"the pad {name} lies at the angle stated",
             "it were turned anticlockwise", 1e3 * TILT, "mrad",
             vary=lambda r, mrad, run, name=name: tilted(r, name, 1e-3 * mrad),
-        )  # fmt: skip
-
-
-def of_drifts(recording: Recording) -> Iterator[Variation]:
-    """Moduli and friction that change along a recording, as by warming or wear."""
-    groups = dict[str, list[str]]()
-    for name in recording.parameters:
-        part, _, last = name.rpartition(".")
-        if last == "E":
-            groups[name] = [name]
-        elif last in ("mu_s", "mu_k"):
-            groups.setdefault(part, []).append(name)
-    for name, numbers in groups.items():
-        yield Variation(
-            f"drift of {name}", "known", f"{name} stays what it is",
-            "it grew along a recording", 100 * KNOWN, "%",
-            vary=lambda r, part, run, numbers=numbers: replace(
-                r, drifts={**r.drifts, **dict.fromkeys(numbers, 1e-2 * part)}
-            ),
         )  # fmt: skip
 
 
@@ -608,8 +589,8 @@ FIXED_POINT, CLOSE = 6, 3e-3
 more. To first order in a fault once is exact."""
 
 
-def settled(now: Array, before: Array | None) -> bool:
-    """Whether forces (..., G) have settled."""
+def forces_converged(now: Array, before: Array | None) -> bool:
+    """Whether forces (..., G) have converged."""
     return before is not None and float(np.abs(now - before).max()) <= CLOSE * np.abs(now).max()
 
 
@@ -665,7 +646,7 @@ def off_centre(
         moment = c[:, 0] * free[:, 1] - c[:, 1] * free[:, 0]
         loads = np.column_stack((force, moment))
         made = with_loads(recording, at.t, body, loads)
-        if settled(loads, before):
+        if forces_converged(loads, before):
             break
     return made
 

@@ -1,4 +1,4 @@
-"""Coloured noise that residuals show, and fits that allow for it."""
+"""Coloured noise: declared colour enters the fit, undeclared colour widens the intervals."""
 
 import time as clock
 from collections.abc import Mapping, Sequence
@@ -7,62 +7,40 @@ import numpy as np
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.fit import Colour, Fit, chord
+from torchsoft.sysid.fit import Fit, chord
 from torchsoft.sysid.noise import Autoregression, NoiseFit, fit_noise
 from torchsoft.sysid.plan import iterated
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.residual_tests import FAINT, LEVEL, Part, named, parts
+from torchsoft.sysid.residual_tests import FAINT, LEVEL, Part, parts
+from torchsoft.sysid.sentences import Finding
 
 ROUNDS = 2
 """Most estimates of the noise: from the residuals of the fit, and from those of the fit with that
 noise."""
 
 
-WORSE = 4.0
-"""Sum of squared residuals, over that of the fit with the noise as stated, above which undeclared
-colour is a misfit of the model and no noise."""
-
-
-def allow_for_colour(fit: Fit, undeclared: bool = True) -> Fit:
-    """Estimate the noise from a fit's residuals, and continue the fit with it, on its steps, while
-    its coordinates move: with a new Jacobian first, then with the last one.
-
-    Nothing changes where all noise is white. Without `undeclared`, only declared colour is
-    estimated, and that of other channels stays as it is in the problem; so it does where undeclared
-    colour would let the fit go to a misfit `WORSE` times as large, which no sensor makes.
-    """
-    given = {} if undeclared else fit.problem.noise
-    stated = fit.colour.stated or fit
-    for number in range(ROUNDS):
-        began, problem = clock.perf_counter(), fit.problem
-        now, declared = parts(problem, fit.at.r, fit.which), declared_colour(problem)
-        found = colours(now, fit.J, declared)
-        if not undeclared:
-            found = {channel: found[channel] for channel in declared if channel in found}
-        fit = fit._replace(colour=Colour(found, stated))
+def allow_for_colour(fit: Fit) -> Fit:
+    """Estimate declared colour from a fit's residuals, and continue the fit with it, on its steps,
+    while its coordinates move: with a new Jacobian first, then with the last one. Nothing changes
+    where no sensor declares colour."""
+    declared = declared_colour(fit.problem)
+    for number in range(ROUNDS if declared else 0):
+        started, problem = clock.perf_counter(), fit.problem
+        now = parts(problem, fit.at.r, fit.which)
+        every = colours(now, fit.J, declared)
+        found = {channel: every[channel] for channel in declared if channel in every}
+        fit = fit._replace(colour=found)
         if not found and not problem.noise:
             break
-        problem = problem.with_noise(given | {name: one.noise for name, one in found.items()})
+        noise = {**problem.noise, **{name: one.noise for name, one in found.items()}}
+        problem = problem.with_noise(noise)
         fit = fit._replace(problem=problem, at=rewhitened(problem, fit.at, now))
-        if fit.settled:
+        if fit.step_is_small:
             break
         fit = chord(fit) if number > 0 and fit.loss == "linear" else iterated(fit)
-        fit = fit.noted("with the noise that was found", began)
-        if undeclared and growth(fit) > WORSE:
-            return without_colour(fit)
+        fit = fit.noted("with the noise that was found", started)
     return fit
-
-
-def without_colour(fit: Fit) -> Fit:
-    """The fit as it was before its noise was estimated, with declared colour only: undeclared
-    colour made its misfit worse."""
-    before = fit.colour.stated or fit
-    before = before._replace(stages=fit.stages, stage=fit.stage, notify=fit.notify)
-    kept = allow_for_colour(before, undeclared=False)
-    return kept._replace(
-        colour=kept.colour._replace(refused=undeclared_colour(fit), worse=growth(fit))
-    )
 
 
 def declared_colour(problem: Problem) -> list[str]:
@@ -71,31 +49,21 @@ def declared_colour(problem: Problem) -> list[str]:
 
 
 def undeclared_colour(fit: Fit) -> dict[str, NoiseFit]:
-    """Noise of channels whose sensors declare none."""
-    declared = declared_colour(fit.problem)
-    return {channel: one for channel, one in fit.colour.found.items() if channel not in declared}
+    """Colour of a fit's residuals, by channel, in channels that the fit takes for white."""
+    found = colours(parts(fit.problem, fit.at.r, fit.which), fit.J)
+    known = {*declared_colour(fit.problem), *fit.problem.noise}
+    return {channel: one for channel, one in found.items() if channel not in known}
 
 
-def growth(fit: Fit) -> float:
-    """Sum of squared residuals, over the stated noise, in channels of undeclared colour, over that
-    of the fit before its noise was estimated."""
-    own = undeclared_colour(fit)
-
-    def misfit(one: Fit) -> float:
-        now = parts(one.problem, one.at.r, one.which)
-        return sum(float(part.raw @ part.raw) for part in now if part.channel in own)
-
-    return misfit(fit) / max(misfit(fit.colour.stated or fit), 1e-300)
-
-
-def spread(J: Array, C: Array, left: Sequence[Part], refused: Mapping[str, NoiseFit]) -> Array:
-    """What errors of `refused` colour in some channels add to the covariance C (n, n) of a fit that
-    took them for white, J (m, n): C J' K J C less its white part."""
+def spread(J: Array, C: Array, left: Sequence[Part], undeclared: Mapping[str, NoiseFit]) -> Array:
+    """Addition to the covariance C (n, n) of a fit with the Jacobian J (m, n) that takes
+    `undeclared` colour for white noise: C J' K J C with the covariance K of that noise, less its
+    white part (the sandwich covariance)."""
     extra = np.zeros_like(C)
     for part in left:
-        if part.channel in refused:
+        if part.channel in undeclared:
             own = J[part.rows]
-            W = refused[part.channel].noise.whitener(part.t)
+            W = undeclared[part.channel].noise.whitener(part.t)
             moved = spsolve_triangular(W.T.tocsr(), own, lower=False)
             extra += moved.T @ moved - own.T @ own
     return C @ extra @ C
@@ -123,8 +91,8 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
 
     White noise is rejected by a likelihood-ratio test, at `LEVEL` for all channels and orders
     together; for `declared` channels by the Bayesian information criterion alone. The noise is at
-    least as large as stated. That of channels with saturated samples stays white: colour of their
-    residuals is a verdict, with its sentence.
+    least as large as stated. That of channels with saturated samples stays white: the test of
+    whiteness reports colour of their residuals.
     """
     Q, out = np.linalg.qr(J)[0], {}
     channels = list(dict.fromkeys(part.channel for part in parts))
@@ -146,27 +114,13 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
     return out
 
 
-def colour_notices(undeclared: Mapping[str, NoiseFit], colour: Colour) -> list[str]:
-    """Sentences on colour that was refused, and on undeclared colour, which intervals allow for."""
-    out = list[str]()
-    if colour.refused:
-        out.append(
-            f"what the fit left is coloured in {named(list(colour.refused))}; taken for noise, "
-            f"that would move the estimates to {colour.worse:.2g} times the sum of squares, which "
-            "is a misfit of the model and no noise: the estimates are those of white noise, and "
-            "intervals count the misfit as if it were the sensor's"
-        )
-    if names := [
-        f"{channel} (order {one.noise.order}, neighbouring samples correlate by "
-        f"{correlation(one.noise):.2f})"
-        for channel, one in undeclared.items()
-    ]:
-        out.append(
-            f"what the fit left is coloured in {named(names)}, which nobody has declared: "
-            "intervals allow for it as noise, but a wrong model leaves such residuals too; where "
-            "it is the sensor, declare its `colour`"
-        )
-    return out
+def colour_findings(undeclared: Mapping[str, NoiseFit]) -> list[Finding]:
+    """A finding on undeclared colour, for which intervals allow."""
+    cases = [
+        {"channel": name, "order": one.noise.order, "correlation": correlation(one.noise)}
+        for name, one in undeclared.items()
+    ]
+    return [Finding("colour", "note", {"cases": cases})] if cases else []
 
 
 def correlation(noise: Autoregression) -> float:

@@ -135,7 +135,7 @@ class Tables:
         }
 
     @property
-    def begin(self) -> float:
+    def first_time(self) -> float:
         """When the first sample was taken [s]."""
         columns = {name: self.columns[name] for name in self.known.measured if name in self}
         measured = [t[np.isfinite(y)] for t, y in columns.values()]

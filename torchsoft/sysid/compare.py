@@ -34,7 +34,7 @@ from scipy.sparse.linalg import spsolve_triangular
 from torchsoft.display import suggestion
 from torchsoft.files import write_json
 from torchsoft.parallel import single_threaded
-from torchsoft.sysid.colour import allow_for_colour, declared_colour
+from torchsoft.sysid.colour import allow_for_colour
 from torchsoft.sysid.fit import Fit, Stage, Unreachable
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
@@ -45,9 +45,10 @@ from torchsoft.sysid.residual_tests import (
     Part,
     judge_residuals,
     parts,
-    residual_notices,
+    residual_findings,
 )
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 
 # Result of a comparison
 
@@ -67,10 +68,10 @@ Outcome = Literal["law", "cannot tell", "none fits"]
 @dataclass(frozen=True)
 class LawFit:
     """Results of one law: the number of its parameters, the log likelihood of the fitted samples in
-    SI units, the reduced chi-squared with its p-value, information criteria, Akaike weight (of
-    AICc), and the log density per sample of held-out recordings, with the p-value of their sum of
+    SI units, the reduced chi-squared with its p-value, the Bayesian information criterion, and the
+    log density per sample of held-out recordings, with the p-value of their sum of
     squares. `numerical` is the change of the log likelihood by a tenth of the tolerance; `left` has
-    sentences on deviations of the residuals from the stated noise, by the tests of
+    findings on deviations of the residuals from the stated noise, by the tests of
     `torchsoft.sysid.residual_tests`, and `patterned` is whether residuals follow the motion."""
 
     name: str
@@ -79,15 +80,12 @@ class LawFit:
     log_likelihood: float
     chi2: float
     p: float
-    aic: float
-    aicc: float
     bic: float
-    weight: float
     heldout: float | None
     heldout_p: float | None
     numerical: float
     converged: bool
-    left: list[str]
+    left: list[Finding]
     patterned: bool
 
     @property
@@ -179,14 +177,13 @@ class Comparison:
 
     def table(self) -> str:
         """A line for each law, with differences from the best."""
-        head = ("law", "k", "log L", "chi2", "dAIC", "dAICc", "dBIC", "weight", "held out")
-        rows = ["{:20s} {:>3s} {:>11s} {:>7s} {:>9s} {:>9s} {:>9s} {:>7s} {:>9s}".format(*head)]
-        least = {key: min(getattr(one, key) for one in self.laws) for key in ("aic", "aicc", "bic")}
+        head = ("law", "k", "log L", "chi2", "dBIC", "held out")
+        rows = ["{:20s} {:>3s} {:>11s} {:>7s} {:>9s} {:>9s}".format(*head)]
+        least = min(one.bic for one in self.laws)
         for one in self.laws:
             own = f"{one.name:20s} {one.parameters:3d} {one.log_likelihood:11.1f} {one.chi2:7.3f}"
-            delta = " ".join(f"{getattr(one, key) - least[key]:9.1f}" for key in least)
             density = "" if one.heldout is None else f" {one.heldout:9.3f}"
-            rows.append(f"{own} {delta} {one.weight:7.3f}{density}")
+            rows.append(f"{own} {one.bic - least:9.1f}{density}")
         return "\n".join(rows)
 
 
@@ -217,8 +214,8 @@ def judged(laws: list[LawFit], against: list[Versus]) -> tuple[Outcome, str | No
             f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard "
             "deviations"
         )
-    sentences += [f"But beware: {sentence}" for sentence in best.left]
-    return "law", best.name, ". ".join(sentences) + "."
+    verdict = " ".join([". ".join(sentences) + ".", *map(str, best.left)])
+    return "law", best.name, verdict
 
 
 def listed(names: list[str]) -> str:
@@ -290,7 +287,7 @@ class Evidence:
         at = self._at(which, FINER * fit.rtol, True)
         J = at.J[:, free]
         self.fitted = density(problem, which, at.r[:m])
-        self.verdicts = judge_residuals(self.fitted.parts, at.r, J)
+        self.tests = judge_residuals(self.fitted.parts, at.r, J)
         self.numerical = abs(0.5 * float(usual @ usual - self.fitted.r @ self.fitted.r))
         self.dof, self.heldout = max(self.fitted.samples - int(free.sum()), 1), None
         if heldout:
@@ -421,12 +418,12 @@ def compare(
     for name, problem in laws.items():
         own = folders.get(name)
         runner = Runner(problem.recordings, workers, Path(own) if own is not None else None)
-        begin = Fit(problem, runner, problem.coordinates.start, progress=progress)
+        start = Fit(problem, runner, problem.coordinates.start, progress=progress)
         try:
             plan = (plans or {}).get(name)
             if plan is None:
                 plan = default_plan(problem, runner, rtol, which, starts)
-            evidence[name] = Evidence(name, fitted(name, begin, which, plan), heldout)
+            evidence[name] = Evidence(name, fitted(name, start, which, plan), heldout)
         except Unreachable as error:
             raise ValueError(f"the law `{name}` cannot follow the recordings: {error}") from None
     best = max(evidence, key=lambda name: evidence[name].total)
@@ -486,15 +483,15 @@ def same_reference(one: Recording, other: Recording) -> bool:
     )
 
 
-def fitted(name: str, begin: Fit, which: Sequence[str], plan: Sequence[Stage]) -> Fit:
+def fitted(name: str, start: Fit, which: Sequence[str], plan: Sequence[Stage]) -> Fit:
     """A law at the end of its plan, with its noise estimated where sensors declare colour. Raises
     `Unreachable`."""
     if not plan or list(plan[-1].recordings) != list(which):
         raise ValueError(f"the last stage of the plan of `{name}` must fit {', '.join(which)}")
-    fit = run_plan(begin, plan, label=f"{name} ")
+    fit = run_plan(start, plan, label=f"{name} ")
     if fit.failure is not None:  # laws are compared by the same tolerance
         raise fit.failure
-    return allow_for_colour(fit, undeclared=False) if declared_colour(fit.problem) else fit
+    return allow_for_colour(fit)
 
 
 def refitted(law: Fit, best: Fit) -> Fit | None:
@@ -537,41 +534,27 @@ def versus(best: Evidence, other: Evidence) -> Versus:
 
 
 def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
-    """Results of every law, with its information criteria."""
-    k = np.array([one.parameters for one in evidence.values()])
-    n, deviance = (
-        len(next(iter(evidence.values())).fitted.r),
-        np.array([-2 * e.fitted.log for e in evidence.values()]),
-    )
-    aic, bic = deviance + 2 * k, deviance + k * np.log(n)
-    aicc = aic + 2 * k * (k + 1) / np.maximum(n - k - 1, 1)
-    weight = np.exp(-0.5 * (aicc - aicc.min()))
+    """Results of every law."""
     out = []
-    for i, (name, one) in enumerate(evidence.items()):
-        square, held, c = (
-            float(one.fitted.r @ one.fitted.r),
-            one.heldout,
-            one.fit.problem.coordinates,
-        )
+    for name, one in evidence.items():
+        square, held = float(one.fitted.r @ one.fitted.r), one.heldout
+        c, k, n = one.fit.problem.coordinates, one.parameters, len(one.fitted.r)
         found = zip(c.all, one.fit.x, one.fit.free)
         out.append(
             LawFit(
                 name,
-                int(k[i]),
+                k,
                 {a.label: a.to_value(x) for a, x, free in found if free},
                 one.fitted.log,
                 square / one.dof,
                 float(stats.chi2.sf(square, one.dof)),
-                float(aic[i]),
-                float(aicc[i]),
-                float(bic[i]),
-                float(weight[i] / weight.sum()),
+                k * float(np.log(n)) - 2 * one.fitted.log,
                 None if held is None else held.log / len(held.r),
                 None if held is None else held.p,
                 one.numerical,
                 one.fit.converged,
-                [*residual_notices(one.verdicts).values()],
-                any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
+                residual_findings(one.tests),
+                any(test.alarming and test.test == "motion" for test in one.tests),
             )
         )
     return out

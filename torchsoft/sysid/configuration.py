@@ -62,7 +62,7 @@ class Moving(Table):
     given: dict[Name, Known] = Field(default_factory=dict)
 
 
-Beginning = Annotated[Rest | Moving, Field(discriminator="kind")]
+StartTable = Annotated[Rest | Moving, Field(discriminator="kind")]
 
 
 class Column(Table):
@@ -87,7 +87,7 @@ class Entry(Table):
     file: File | None = None
     files: Annotated[tuple[File, ...], LISTED] = ()
     settings: dict[str, Any] = Field(default_factory=dict)
-    start: Beginning | None = None
+    start: StartTable | None = None
 
     @model_validator(mode="after")
     def _is_named(self) -> "Entry":
@@ -162,7 +162,7 @@ class Config(Table):
     sensors: dict[str, Sensor]
     columns: dict[Name, Column] = Field(default_factory=dict)
     settings: dict[str, Any] = Field(default_factory=dict)
-    start: Beginning = Rest()
+    start: StartTable = Rest()
     fit: Settings = Field(default_factory=lambda: Settings.model_validate({}))
     recordings: Annotated[tuple[Entry, ...], LISTED] = ()
     compare: dict[Name, Law] = Field(default_factory=dict)

@@ -23,7 +23,7 @@ from torchsoft.rigs.excite import excite
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid.configuration import Beginning, Config, Entry, Rest
+from torchsoft.sysid.configuration import Config, Entry, Rest, StartTable
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.measured import vocabulary
 from torchsoft.sysid.planner import PRICE, RTOL, DesignEvaluation, Optimality, Planner, Range
@@ -193,7 +193,7 @@ def design(
     x, recording = problem.coordinates.start, problem.recordings[problem.names.index(plan)]
     if not bounds:
         raise ValueError("`bounds` names no signal whose knots may move")
-    began = clock.perf_counter()
+    started = clock.perf_counter()
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
     planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
     try:
@@ -256,7 +256,7 @@ def design(
             "rtol": rtol,
             "seed": seed,
             **planner.cost,
-            "wall_s": clock.perf_counter() - began,
+            "wall_s": clock.perf_counter() - started,
         },
     )
 
@@ -275,7 +275,7 @@ def planned(
     built: BuiltRig,
     name: str,
     rtol: float,
-    start: Beginning | None = None,
+    start: StartTable | None = None,
     **options: Any,
 ) -> Recording:
     """A planned recording of a file's rig, `built`, by a configuration, from a run with the

@@ -1,5 +1,4 @@
-"""Estimates with intervals, identifiability, residuals by channel, and contributions of
-recordings."""
+"""Estimates with intervals, identifiability, and residuals by channel."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -9,7 +8,7 @@ import numpy as np
 from pydantic import Field
 from scipy import stats
 
-from torchsoft.sysid.fit import Fit, fisher
+from torchsoft.sysid.fit import Fit
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
@@ -226,46 +225,4 @@ def residual_channels(fit: Fit) -> list[ChannelResiduals]:
         rms, stated = (float(np.sqrt(np.mean(rows**2))) for rows in (r, part.raw))
         white = whiteness(r, orders.get(part.channel, 0))
         out.append(ChannelResiduals(part.recording, part.channel, rms, *white, stated))
-    return out
-
-
-# Contributions of recordings and priors to the estimates
-
-
-@dataclass(frozen=True)
-class Contribution:
-    """Information of one recording, or of the priors (`source` is None then): its share in each
-    estimate by label, where the shares of all sources add up to 1, and the factor on the standard
-    deviation without it, None where the others do not determine the estimate."""
-
-    source: str | None
-    shares: dict[str, float]
-    without: dict[str, float | None]
-
-
-def contributions(fit: Fit) -> list[Contribution]:
-    """Contributions of the fitted recordings, then of the priors."""
-    rows, at, J = dict[str | None, slice](), 0, fit.J
-    for name in (name for name in fit.problem.names if name in fit.which):
-        rows[name] = slice(at, at + fit.problem.samples([name]))
-        at = rows[name].stop
-    if at < len(J):
-        rows[None] = slice(at, len(J))
-    C, slopes = fit.covariance, {one.label: one.slope[fit.free] for one in quantities(fit)}
-    sd = {label: float(np.sqrt(g @ C @ g)) for label, g in slopes.items()}
-    parts = {
-        name: {label: float(np.sum((J[own] @ (C @ g)) ** 2)) for label, g in slopes.items()}
-        for name, own in rows.items()
-    }
-    total = {label: max(sum(part[label] for part in parts.values()), 1e-300) for label in slopes}
-    out = []
-    for name, own in rows.items():
-        left = fisher(np.delete(J, own, 0))[0] if len(rows) > 1 else None
-        without: dict[str, float | None] = dict.fromkeys(slopes)
-        for label, g in slopes.items():
-            alone = float(np.sqrt(g @ left @ g)) if left is not None else np.inf
-            if alone < IDENTIFIABLE and sd[label] > 0:
-                without[label] = alone / sd[label]
-        shares = {label: parts[name][label] / total[label] for label in slopes}
-        out.append(Contribution(name, shares, without))
     return out

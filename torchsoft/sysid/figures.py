@@ -1,8 +1,8 @@
-"""Pictures of an identification: estimates, the Fisher spectrum, correlations, residuals."""
+"""Pictures of an identification: estimates, residuals, and designed motions."""
 
 import re
 from collections.abc import Sequence
-from textwrap import fill, shorten
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,17 +13,15 @@ from matplotlib.ticker import (
     FixedLocator,
     FuncFormatter,
     MaxNLocator,
-    NullFormatter,
     NullLocator,
 )
 
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
 from torchsoft.sysid.design import Design
-from torchsoft.sysid.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
+from torchsoft.sysid.estimate import ChannelResiduals, Direction, Estimate
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import LAGS, autocorrelation
-from torchsoft.sysid.result import IdentificationResult
 from torchsoft.tables import plain
 
 SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
@@ -130,76 +128,6 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"× {v:g}"))
     axes.grid(False, axis="y")
-    return figure
-
-
-@rc_context(STYLE)
-def correlation_figure(result: IdentificationResult) -> Figure:
-    """The correlation matrix of the coordinates."""
-    n, C = len(result.labels), np.array(result.correlation, float)
-    figure = Figure(figsize=(WIDTH, max(2.2, 0.7 + 0.42 * n)), layout="constrained")
-    axes = figure.subplots()
-    image = axes.imshow(C, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    names = [literal(label, NAME) for label in result.labels]
-    axes.set_xticks(range(n), [str(i + 1) for i in range(n)])
-    axes.set_yticks(range(n), [f"{name}   {i + 1}" for i, name in enumerate(names)])
-    axes.tick_params(length=0, labelsize=9 if n <= 8 else 8)
-    axes.grid(False)
-    axes.spines[:].set_visible(False)
-    for i in range(n if n <= 8 else 0):
-        for j in range(n):
-            dark = abs(C[i, j]) > 0.6
-            axes.text(
-                j,
-                i,
-                f"{C[i, j]:.2f}".replace("-", "−"),
-                ha="center",
-                va="center",
-                fontsize=8 if n <= 6 else 6.5,
-                color="white" if dark else "#1d2329",
-            )
-    figure.colorbar(image, ax=axes, shrink=0.75, ticks=[-1, 0, 1])
-    return figure
-
-
-@rc_context(STYLE)
-def spectrum_figure(result: IdentificationResult) -> Figure:
-    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar;
-    orange: not identifiable."""
-    n = len(result.directions)
-    figure = Figure(figsize=(WIDTH, 1.0 + 0.5 * n), layout="constrained")
-    axes = figure.subplots()
-    sds = [d.sd for d in result.directions]
-    low, high = (
-        10 ** np.floor(np.log10(min(*sds, 0.1))),
-        10 ** np.ceil(np.log10(max(*sds, 2 * IDENTIFIABLE))),
-    )
-    for row, d in enumerate(result.directions):
-        axes.barh(row + 0.18, d.sd, height=0.3, left=0, color=ACTUAL if d.identifiable else OTHER)
-        text = literal(shorten(direction_name(d), 60, placeholder=" …")) + (
-            "" if d.identifiable else ": not identifiable"
-        )
-        axes.text(
-            0.01,
-            row - 0.17,
-            text,
-            transform=axes.get_yaxis_transform(),
-            va="center",
-            fontsize=9,
-            color="#1d2329" if d.identifiable else "#a34400",
-            bbox={"fc": "white", "ec": "none", "pad": 0.8},
-        )
-    axes.axvline(IDENTIFIABLE, color="#1d2329", lw=1, ls=(0, (4, 2)))
-    axes.set_xscale("log")
-    axes.set(
-        xlim=(low, high),
-        ylim=(n - 0.4, -0.6),
-        xlabel="standard deviation (1 is a factor of e); dashed: identifiable below it",
-    )
-    axes.set_yticks([])
-    axes.spines["left"].set_visible(False)
-    axes.grid(False)
-    axes.xaxis.set_minor_formatter(NullFormatter())
     return figure
 
 

@@ -122,14 +122,14 @@ def measured(
         if sensors[channel].misalignment > 0:
             beside, _ = partner(rig, channel)
             other = float(np.abs(early[beside][1]).max()) if beside in early else np.inf
-        fits = beginning(f"`{channel}` of {owner}", *early[channel], sensors[channel], other)
+        fits = first_value(f"`{channel}` of {owner}", *early[channel], sensors[channel], other)
         for end, fit in zip((name, names[k + count]) if k < count else (name,), fits):
             if end not in found or fit[1] < found[end][1]:
                 found[end] = fit
     return {name: fit for name, fit in found.items() if np.isfinite(fit[1])}
 
 
-def beginning(
+def first_value(
     subject: str, t: Array, y: Array, sensor: Sensor, other: float
 ) -> tuple[Normal, Normal]:
     """Value and rate at t = 0 of a channel, by a polynomial through the samples y (k,) at t (k,)

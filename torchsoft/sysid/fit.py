@@ -1,5 +1,5 @@
-"""Least squares on frozen steps: Gauss-Newton with exact sensitivities, descent with the adjoint,
-covariance and robust losses."""
+"""Least squares on frozen steps: Gauss-Newton with exact sensitivities, covariance, and robust
+losses."""
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
@@ -9,14 +9,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, lsq_linear, minimize
+from scipy.optimize import least_squares, lsq_linear
 
-from torchsoft.plan.search import ProjectedAdam
 from torchsoft.sysid.noise import NoiseFit
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
 from torchsoft.sysid.recording import Array, Mask
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 from torchsoft.sysid.unknowns import Coordinate
 
 
@@ -132,16 +132,17 @@ def rounded(direction: Array, C: Array) -> Array:
 # Robust losses and their covariance
 
 
-Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
+Loss = Literal["linear", "soft_l1", "huber"]
 
 REACH: dict[Loss, float] = {
     "linear": 1.0,
     "soft_l1": 1.287,
     "huber": 1.345,
-    "cauchy": 2.385,
-    "arctan": 2.571,
 }
 """Tuning constant c of every loss, at which it has the `EFFICIENCY` under Gaussian noise."""
+
+ROUNDED = 1e-12
+"""Mean slope of a loss's influence below which it is zero: every residual counts as an outlier."""
 
 EFFICIENCY = 0.95
 """Variance of the least-squares estimate over that of the robust one, under Gaussian noise."""
@@ -161,10 +162,6 @@ def rho(loss: Loss, z: Array) -> Array:
             return np.stack(
                 (np.where(near, z, 2 * root - 1), 1 / root, np.where(near, 0.0, -0.5 / root**3))
             )
-        case "cauchy":
-            return np.stack((np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2))
-        case "arctan":
-            return np.stack((np.arctan(z), 1 / (1 + z**2), -2 * z / (1 + z**2) ** 2))
 
 
 def robust_loss_except_priors(loss: Loss, priors: int) -> Callable[[Array], Array]:
@@ -198,7 +195,7 @@ def covariance(
         float(np.mean(first + 2 * z * second)),
         float(np.sum((first * own) ** 2)) / max(len(own) - n, 1),
     )
-    if slope <= 0:
+    if slope <= ROUNDED:
         raise ValueError(
             f"the loss `{loss}` holds on to nothing: most residuals count as outliers; state more "
             "noise, or take another loss"
@@ -208,10 +205,8 @@ def covariance(
     return inverse @ (max(power, least) * J[:m].T @ J[:m] + J[m:].T @ J[m:]) @ inverse
 
 
-# A fit, from its begin to its end
+# A fit, from its start to its end
 
-
-Method = Literal["gauss_newton", "lbfgs", "adam"]
 
 Notify = Callable[[float], None]
 """Called with chi2 after every evaluation."""
@@ -221,7 +216,7 @@ def silent(chi2: float) -> None:
     """Notify nobody."""
 
 
-SETTLED = 0.2
+SMALL_STEP = 0.2
 """Largest remaining move of a coordinate, in standard deviations, at which a fit has ended."""
 
 
@@ -232,11 +227,11 @@ part, and the chi2 up to which any fall counts."""
 
 class Unreachable(RuntimeError):
     """The model cannot follow a recording at the start of a fit; `failed` has reason and time by
-    recording, `findings` the doubts about the recordings themselves."""
+    recording, `findings` what looks wrong with the recordings themselves."""
 
-    def __init__(self, failed: dict[str, FailedRun], findings: Sequence[str] = ()) -> None:
+    def __init__(self, failed: dict[str, FailedRun], findings: Sequence[Finding] = ()) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in failed.items())
-        behind = f"; what may be behind it: {'; '.join(findings)}" if findings else ""
+        behind = f". It may be caused by this: {' '.join(map(str, findings))}" if findings else ""
         super().__init__(f"the model cannot reach the data from this start: {reasons}{behind}")
         self.failed, self.findings = failed, tuple(findings)
 
@@ -262,17 +257,6 @@ class Stage:
     scanned: tuple[tuple[str, tuple[float, ...]], ...] = ()
     starts: int = 1
     spread: float = 3.0
-
-
-class Colour(NamedTuple):
-    """Noise of a fit: by channel what was `found`, with the scores of every order, and the fit
-    before, with the noise as `stated`; `refused` is colour that would explain a misfit away that is
-    larger by `worse` [1]."""
-
-    found: Mapping[str, NoiseFit] = MappingProxyType({})
-    stated: "Fit | None" = None
-    refused: Mapping[str, NoiseFit] = MappingProxyType({})
-    worse: float = 1.0
 
 
 NOTHING = Residuals(np.zeros(0), np.zeros((0, 0)), {})
@@ -301,9 +285,9 @@ class Fit(NamedTuple):
     the noise.
 
     `stages` are the result's entries on the fits up to this one; `failure` is the error of a stage
-    that could not begin at its end; `colour` is the noise that was estimated from its residuals,
-    `check` that of its steps. `variance` is the factor on the stated variance of the noise;
-    `progress` whether bars are shown.
+    that could not start at its end; `colour` is declared noise, estimated from its residuals, by
+    channel; `check` is that of its steps. `variance` is the factor on the stated variance of the
+    noise; `progress` whether bars are shown.
     """
 
     problem: Problem
@@ -312,7 +296,6 @@ class Fit(NamedTuple):
     stage: Stage = Stage("", (), (), float("nan"))
     at: Residuals = NOTHING
     loss: Loss = "linear"
-    method: Method = "gauss_newton"
     notify: Notify = silent
     progress: bool = False
     evaluations: int = 0
@@ -320,7 +303,7 @@ class Fit(NamedTuple):
     stalled: bool = False
     stages: tuple[dict[str, Any], ...] = ()
     failure: Unreachable | None = None
-    colour: Colour = Colour()
+    colour: Mapping[str, NoiseFit] = MappingProxyType({})
     check: Check = Check()
     variance: float = 1.0
 
@@ -419,22 +402,14 @@ class Fit(NamedTuple):
             self.free if jacobian else None,
         )
 
-    def begun(self, x: Array | None = None, jacobian: bool = True) -> "Fit":
+    def evaluated(self, x: Array | None = None) -> "Fit":
         """The fit at x (n,), on the steps that its tolerance chooses there. Raises `Unreachable`
         where x cannot be simulated."""
         x = self.x if x is None else x
-        at = self.residuals(x, self.rtol, jacobian)
+        at = self.residuals(x, self.rtol, jacobian=True)
         if at.failed:
             raise Unreachable(at.failed)
         return self._replace(x=x, at=at)
-
-    def misfit(self, x: Array) -> tuple[float, Array, dict[str, FailedRun]]:
-        """|r|^2 / 2 at x (n,) on the fit's steps with its gradient by the fitted coordinates, by
-        the adjoint; infinite where a run fails."""
-        value, gradient, failed = self.problem.misfit(
-            self.runner, x, self.which, self.at.steps, self.free
-        )
-        return value, gradient[self.free], failed
 
     def step_effect(self, x: Array) -> float:
         """Change of |r|^2 at x (n,) by steps chosen there, in place of the fit's; NaN where a run
@@ -456,13 +431,13 @@ class Fit(NamedTuple):
         return np.asarray(lsq_linear(R, -Q.T @ r, (np.minimum(low, 0.0), np.maximum(high, 0.0))).x)
 
     @property
-    def settled(self) -> bool:
-        """Whether the Gauss-Newton step is below `SETTLED` standard deviations for all fitted
+    def step_is_small(self) -> bool:
+        """Whether the Gauss-Newton step is below `SMALL_STEP` standard deviations for all fitted
         coordinates."""
-        return bool((np.abs(self.newton_step()) <= SETTLED * self.sd).all())
+        return bool((np.abs(self.newton_step()) <= SMALL_STEP * self.sd).all())
 
-    def noted(self, name: str, began: float) -> "Fit":
-        """The fit with the result's entry on it, which `began` on the clock [s]."""
+    def noted(self, name: str, started: float) -> "Fit":
+        """The fit with the result's entry on it, which `started` on the clock [s]."""
         entry = {
             "name": name,
             "recordings": [*self.which],
@@ -471,29 +446,24 @@ class Fit(NamedTuple):
             "evaluations": self.evaluations,
             "chi2": self.chi2,
             "converged": self.converged,
-            "wall_s": clock.perf_counter() - began,
+            "wall_s": clock.perf_counter() - started,
         }
         return self._replace(stages=(*self.stages, entry))
 
     @property
-    def notices(self) -> list[str]:
-        """Sentences where the fit made no headway, and where a finer stage could not begin."""
-        out = []
+    def findings(self) -> list[Finding]:
+        """Whether the fit stalled far above the noise, or a finer stage could not start."""
+        out = list[Finding]()
         if self.stalled:
-            out.append(
-                f"the fit made no headway: over {HEADWAY} evaluations chi2 fell by less than "
-                f"{LITTLE:.0%}, to {self.chi2:.3g}, which is far above the noise, and there it "
-                "ended: the model lacks something that these data show"
-            )
+            facts = {"evaluations": HEADWAY, "part": LITTLE, "chi2": self.chi2}
+            out.append(Finding("stalled", "note", facts))
         if self.failure is not None:
-            out.append(
-                f"the fit ended by rtol = {self.rtol:g}: by a finer tolerance {self.failure}; the "
-                "model may lack something that drives its parameters to where it has no solution"
-            )
+            facts = {"rtol": self.rtol, "reason": str(self.failure)}
+            out.append(Finding("stage-failed", "note", facts))
         return out
 
 
-# Gauss-Newton and gradient descent
+# Gauss-Newton
 
 
 class Stalled(Exception):
@@ -571,10 +541,10 @@ def gauss_newton(
 def chord(fit: Fit, rounds: int = 5) -> Fit:
     """Chord iteration of a fit whose residuals are on the steps of `fit.at`, and whose Jacobian,
     which is kept, may be on others. A round costs a run, not a Jacobian. It ends where every
-    coordinate would move by less than `SETTLED` standard deviations, a run fails, or the misfit
+    coordinate would move by less than `SMALL_STEP` standard deviations, a run fails, or the misfit
     grows."""
     count = 0
-    while not (converged := fit.settled) and count < rounds:
+    while not (converged := fit.step_is_small) and count < rounds:
         trial = fit.place(fit.x[fit.free] + fit.newton_step())
         there, count = fit.residuals(trial), count + 1
         if there.failed or there.r @ there.r > fit.at.r @ fit.at.r:
@@ -582,39 +552,3 @@ def chord(fit: Fit, rounds: int = 5) -> Fit:
         fit = fit._replace(x=trial, at=there._replace(J=fit.at.J))
         fit.notify(fit.chi2)
     return fit._replace(evaluations=count, converged=converged, stalled=False)
-
-
-def descend(fit: Fit, evaluations: int = 100, rate: float = 0.05) -> Fit:
-    """scipy's L-BFGS-B, or Adam (learning `rate`) projected on the bounds, by the fit's `method`,
-    on the misfit on its steps; the best point visited.
-
-    For many unknowns: a gradient costs less than one run more, however many there are. For a
-    handful `gauss_newton` needs far fewer runs. Raises `Unreachable` where the start cannot be
-    simulated.
-    """
-    low, high = fit.bounds
-    samples, best, count = fit.problem.samples(fit.which), (np.inf, fit.x), 0
-
-    def slope(z: Array) -> tuple[float, Array]:
-        nonlocal best, count
-        now = fit.place(z)
-        value, gradient, failed = fit.misfit(now)
-        if failed and count == 0:
-            raise Unreachable(failed)
-        count += 1
-        if value < best[0]:
-            best = value, now
-        fit.notify(2 * value / samples)
-        return min(value / samples, 1e9), np.nan_to_num(gradient) / samples
-
-    start = np.clip(fit.x[fit.free], low, high)
-    if fit.method == "lbfgs":
-        options = {"maxfun": evaluations, "maxcor": 20, "ftol": 1e-12, "gtol": 1e-9}
-        bounds = list(zip(low, high))
-        minimize(slope, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    else:
-        adam = ProjectedAdam(start, lambda z: np.clip(z, low, high), (0.9, 0.999))
-        for _ in range(evaluations):
-            adam.step(slope(adam.z)[1], rate)
-    at = fit.residuals(best[1], jacobian=True)
-    return fit._replace(x=best[1], at=at, evaluations=count, converged=count < evaluations)

@@ -59,7 +59,7 @@ class StartCoordinate(NamedTuple):
     sd: float
 
 
-Begin = Callable[[Mapping[str, Tensor]], Tensor]
+InitialState = Callable[[Mapping[str, Tensor]], Tensor]
 """The state (size,) at the beginning for values of the start's coordinates by name, differentiable
 in these and in the parameters of the rig that it was made for."""
 
@@ -76,7 +76,7 @@ class Start(Protocol):
         """Unknown coordinates. Raises `ValueError` for a rig that cannot begin so."""
         ...
 
-    def begin(self, rig: Rig, samples: Samples) -> Begin:
+    def initial_state(self, rig: Rig, samples: Samples) -> InitialState:
         """The state as a function, for a rig that has the nominal parameters now and may be given
         others later."""
         ...
@@ -165,7 +165,7 @@ class Standing(NamedTuple):
         body, axis = coordinate.split(".")
         return self.bodies[body][0][COORDINATES.index(axis)]
 
-    def begin(self, rig: Rig, samples: Samples) -> Begin:
+    def initial_state(self, rig: Rig, samples: Samples) -> InitialState:
         at = min(float(t[0]) for t, _ in samples.values()) - self.lead
         given, velocity = (
             {name: torch.tensor(one[k], dtype=torch.float64) for name, one in self.bodies.items()}
@@ -201,7 +201,7 @@ class Known(NamedTuple):
         rig.layout.check(self.y0)
         return ()
 
-    def begin(self, rig: Rig, samples: Samples) -> Begin:
+    def initial_state(self, rig: Rig, samples: Samples) -> InitialState:
         return lambda values: self.y0
 
     def __repr__(self) -> str:
@@ -309,7 +309,7 @@ class MovingStart(NamedTuple):
         warn_of_memory(rig, self.lead)
         return tuple(StartCoordinate(*one) for one in out if one[2] > 0)
 
-    def begin(self, rig: Rig, samples: Samples) -> Begin:
+    def initial_state(self, rig: Rig, samples: Samples) -> InitialState:
         at = min(float(t[0]) for t, _ in samples.values()) - self.lead
         signals, basis = rig.follow(at).detach(), {}
         for name, contact in rig.contacts.items():

@@ -25,7 +25,15 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.columns import Tables, Vocabulary, read_tables
-from torchsoft.sysid.configuration import Beginning, Column, Config, Entry, Law, Moving, read_config
+from torchsoft.sysid.configuration import (
+    Column,
+    Config,
+    Entry,
+    Law,
+    Moving,
+    StartTable,
+    read_config,
+)
 from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing
@@ -58,7 +66,7 @@ ASIDE = {"m": 3e-4, "rad": 0.05}
 """Largest distance [m, rad] of the first set-point from the file's: a pushed body must not press
 already."""
 
-BEGINNING, CREEP = 10e-3, 20e-3
+EARLY, CREEP = 10e-3, 20e-3
 """Time [s] from the first sample during which coordinates may not exceed a speed [m/s] besides that
 of the file: a body put down on a pad still settles."""
 
@@ -118,7 +126,7 @@ def measured_samples(
 
 
 def rig_recording(
-    file: RigFile, tables: Tables, name: str, sensors: Mapping[str, Sensor], start: Beginning
+    file: RigFile, tables: Tables, name: str, sensors: Mapping[str, Sensor], start: StartTable
 ) -> Recording:
     """The recording that tables hold, of the rig of a file. Raises `ValueError` naming row and
     column, or the file's field."""
@@ -129,12 +137,12 @@ def rig_recording(
     check_plausible(rig, rig.unpack(y0), tables)
     rig.reference = followed(tables, rig)
     if isinstance(start, Moving):
-        begins = Standing.of(rig, y0)
+        initial = Standing.of(rig, y0)
     else:
-        begins = Standing.built(built, start.lead, start.position_sd)
-        mine = {name: one for name, one in begins.followed.items() if name not in tables}
-        begins = begins._replace(followed=mine)
-    made = Recording(name, rig, measured_samples(tables, sensors), begins)
+        initial = Standing.built(built, start.lead, start.position_sd)
+        mine = {name: one for name, one in initial.followed.items() if name not in tables}
+        initial = initial._replace(followed=mine)
+    made = Recording(name, rig, measured_samples(tables, sensors), initial)
     if not isinstance(start, Moving):
         check_start(made, y0, own, tables, sensors)
         return made
@@ -164,7 +172,7 @@ def check_plausible(rig: Rig, state: State, tables: Tables) -> None:
             )
 
 
-def check_clock(file: RigFile, rig: Rig, tables: Tables, start: Beginning) -> None:
+def check_clock(file: RigFile, rig: Rig, tables: Tables, start: StartTable) -> None:
     """Raises `ValueError` naming row and column for times outside the file's own motions, where a
     signal has no column, and for a recording at rest that begins after their start."""
     own = [signal for signal in rig.signals if signal not in tables]
@@ -190,7 +198,7 @@ def check_start(
 ) -> None:
     """Raises `ValueError` naming row and column for a recording that does not begin at rest, with
     coordinates and set-points where the rig file says; `own` are the file's motions."""
-    rig, start, first = made.rig, made.start, tables.begin
+    rig, start, first = made.rig, made.start, tables.first_time
     assert isinstance(start, Standing)
     with torch.no_grad():
         signals = rig.follow(first)
@@ -210,7 +218,7 @@ def check_start(
     smallest = min(body.shape.size() for body in rig.bodies.values() if body.shape is not None)
     for name, (t, column) in tables.columns.items():
         unit, rows = tables.known.units[name], np.flatnonzero(np.isfinite(column))
-        late = name in made.samples and made.samples[name][0][0] > first + BEGINNING
+        late = name in made.samples and made.samples[name][0][0] > first + EARLY
         if not len(rows) or late or not unit.startswith(("m", "rad")):
             continue
         t, y, table, sensor = t[rows], column[rows], tables.of(name), sensors.get(name)
@@ -226,7 +234,7 @@ def check_start(
                 f"the rig file at {place:.5g} {unit}; {question([*others])}"
                 + ("is its sign opposite?" if opposite else f"say so there, {WAY_OUT}")
             )
-        early = (t <= first + BEGINNING) | (np.arange(len(t)) < 2)
+        early = (t <= first + EARLY) | (np.arange(len(t)) < 2)
         fastest = (speed + rush * (t - first + start.lead)) / (smallest if "rad" in unit else 1.0)
         size, most = np.abs(y - y[0]), fastest * (t - t[0]) + noise
         if unit.endswith("/s"):
@@ -249,7 +257,7 @@ def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[f
     """Largest speed [m/s] at the first sample by the rig file, with its start in `state` and its
     motions; and acceleration [m/s2] of a body that nothing holds."""
     rig, lead = made.rig, made.start.lead
-    around = torch.linspace(-lead, BEGINNING, 51, dtype=torch.float64)
+    around = torch.linspace(-lead, EARLY, 51, dtype=torch.float64)
     with torch.no_grad():
         rates = [
             own(around, (name,))[..., 1].abs().max().item()
@@ -285,21 +293,19 @@ def cost(
     starts: int,
     workers: int,
     heldout: tuple[str, ...] = (),
-    method: str = "gauss_newton",
 ) -> Cost:
     """Cost of `default_plan` where every stage takes all its evaluations, and of the checks before
-    and after it; descents on the adjoint take more of them, and memory for a matrix that
-    interpolates between the rows."""
+    and after it."""
     fitted = [r for r in problem.recordings if r.name not in heldout]
     slowest = min(fitted, key=lambda r: r.speed)
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
     loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
 
-    descent, steps, seconds = method != "gauss_newton", 0.0, list[float]()
+    steps, seconds = 0.0, list[float]()
     for recording in fitted:
         first = starts * FIRST if recording is slowest else 0
         stages = [(first + ALL, loose), (FREE, usual), (LAST if rtol < usual else 0, rtol)]
-        runs = [((4 if descent else 1) * number, by, True) for number, by in stages]
+        runs = [(number, by, True) for number, by in stages]
         runs += [(1, loose, False), (1, FINER * rtol, False), (CHECKED, usual, False)]
         mine = [
             c
@@ -313,10 +319,7 @@ def cost(
             step = rig_step(recording.rig, max(len(mine), 1) if differentiated else 0)
             steps += number * length
             seconds[-1] += number * (length * step + RUN)
-    matrix = 3 * 8 / 2**30 if descent else 0.0
-    memory = sorted(
-        rows[r.name] * (rig_row(r.rig) + matrix * rows[r.name]) for r in problem.recordings
-    )
+    memory = sorted(rows[r.name] * rig_row(r.rig) for r in problem.recordings)
     at_once = max(1, min(workers, len(fitted)))
     return Cost(
         steps=steps,

@@ -223,10 +223,10 @@ class NewFits:
         """Repeat the fit with some suspects at once, from its end or from one `near`."""
         name, linear = named(some), [self.checks[one.name] for one in some]
         tried = [one.within(test.favoured) for one, test in zip(some, linear)]
-        begin, enough = near or self.short.get(name), self.judge.explained_chi2
+        start, enough = near or self.short.get(name), self.judge.explained_chi2
         anew = near is None and not self.enough  # a second start is to find a cause
         most = TRIALS if self.enough else REFITS
-        if (fit := refit(self.end, tried, begin, enough, anew, most)) is None:
+        if (fit := refit(self.end, tried, start, enough, anew, most)) is None:
             return
         again = Again(name, tried, linear, fit)
         found = self.judge.fit(again, as_stated)
@@ -295,7 +295,7 @@ class NewFits:
             needed = checks[name].passed and not any(checks[one].passed for one in done)
             if checks[name].left <= most or needed:
                 self.say(f"new fit with another {name}, by finer steps")
-                checks[name] = self.judge.at_rest(self.judge.ends[name], as_stated)
+                checks[name] = self.judge.refined(self.judge.ends[name], as_stated)
                 done.append(name)
 
     def likeliest(self) -> list[str]:

@@ -193,8 +193,8 @@ def pasts(grid: NDArray[np.int_], p: int) -> NDArray[np.int_]:
     """For samples at grid points `grid` (m,), index (m,) of the first one needed to predict each
     from its past. Samples before p consecutive ones do not matter."""
     i = np.arange(len(grid))
-    begins = np.concatenate(([True], np.diff(grid) != 1))
-    run = i - np.maximum.accumulate(np.where(begins, i, 0)) + 1  # samples in a row, up to this one
+    starts = np.concatenate(([True], np.diff(grid) != 1))
+    run = i - np.maximum.accumulate(np.where(starts, i, 0)) + 1  # samples in a row, up to this one
     last = np.maximum.accumulate(np.where(run >= p, i - p + 1, 0))
     return np.maximum(np.concatenate(([0], last[:-1])), i - MEMORY)
 

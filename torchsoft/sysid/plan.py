@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import qmc
@@ -19,13 +20,12 @@ from tqdm import tqdm
 
 from torchsoft.display import hidden
 from torchsoft.sysid.fit import (
-    SETTLED,
+    SMALL_STEP,
     Check,
     Fit,
     Stage,
     Unreachable,
     chord,
-    descend,
     fisher,
     gauss_newton,
     shift,
@@ -150,19 +150,19 @@ def shown(label: str, work: Callable[[Fit], Fit], fit: Fit) -> Fit:
         return work(fit._replace(notify=notify))._replace(notify=silent)
 
 
-def run_plan(begin: Fit, plan: Sequence[Stage], *, seed: int = 0, label: str = "") -> Fit:
+def run_plan(start: Fit, plan: Sequence[Stage], *, seed: int = 0, label: str = "") -> Fit:
     """Fit stage after stage, each from the end of the one before; the end of the last that could
-    begin.
+    start.
 
     A stage that cannot be simulated where the one before it ended, and repeats it by a finer
-    tolerance, ends the plan as `Fit.failure`; any other starts again from the begin. Raises
+    tolerance, ends the plan as `Fit.failure`; any other starts again from the start. Raises
     `Unreachable` where it cannot be simulated there, and `ValueError` for a plan without stages.
     """
     if not plan:
         raise ValueError("`plan` has no stages")
-    end = begin
+    end = start
     for number, stage in enumerate(plan):
-        began, title = clock.perf_counter(), f"{label}{number + 1}/{len(plan)} {stage.name}"
+        started, title = clock.perf_counter(), f"{label}{number + 1}/{len(plan)} {stage.name}"
         work = partial(run_stage, seed=seed + number)
         try:
             fit = shown(title, work, end._replace(stage=stage))
@@ -171,13 +171,13 @@ def run_plan(begin: Fit, plan: Sequence[Stage], *, seed: int = 0, label: str = "
                 raise
             if (stage.recordings, stage.free) == (end.which, end.stage.free):
                 return end._replace(failure=failure)
-            fit = shown(title, work, begin._replace(stage=stage, stages=end.stages))
-        end = fit.noted(stage.name, began)
+            fit = shown(title, work, start._replace(stage=stage, stages=end.stages))
+        end = fit.noted(stage.name, started)
     return end
 
 
 def continued(fit: Fit, *plan: Stage) -> Fit | None:
-    """The end of a plan from a fit; None where it cannot begin there."""
+    """The end of a plan from a fit; None where it cannot start there."""
     with suppress(Unreachable):
         return run_plan(fit, plan)
     return None
@@ -200,7 +200,7 @@ def run_stage(fit: Fit, seed: int) -> Fit:
     fits, failures = list[Fit](), list[Unreachable]()
     for start in (x, *sobol(fit._replace(x=x), seed)):
         try:
-            fits.append(iterated(fit.begun(start, fit.method == "gauss_newton")))
+            fits.append(iterated(fit.evaluated(start)))
         except Unreachable as error:
             failures.append(error)
     if not fits:
@@ -209,10 +209,8 @@ def run_stage(fit: Fit, seed: int) -> Fit:
 
 
 def iterated(fit: Fit) -> Fit:
-    """The fit of its stage by its method, on its steps."""
-    if fit.method == "gauss_newton":
-        return gauss_newton(fit, fit.stage.evaluations, fit.stage.tolerance)
-    return descend(fit, 4 * fit.stage.evaluations)
+    """The fit of its stage, on its steps."""
+    return gauss_newton(fit, fit.stage.evaluations, fit.stage.tolerance)
 
 
 def scan(fit: Fit, i: int, values: Sequence[float]) -> Array:
@@ -291,62 +289,85 @@ def jacobian_error(J: Array, exact: Array) -> float:
     return float(np.linalg.norm((J - exact) @ steps, axis=0).max(initial=0.0))
 
 
-def settle(fit: Fit, tightenings: int) -> Fit:
+def continued_on(fit: Fit, steps: Residuals, name: str) -> Fit:
+    """The fit, continued on other steps from the residuals on them, with new Jacobians where the
+    last one does not suffice; the same fit where no coordinate moves."""
+    started, end = clock.perf_counter(), chord(fit._replace(at=steps._replace(J=fit.at.J)))
+    if not end.converged:
+        end = gauss_newton(end, REFITS, EXACT, anew=True)
+    return end.noted(name, started) if (end.x != fit.x).any() else fit
+
+
+class StepEffect(NamedTuple):
+    """Effect of finer steps on a fit: the shift of every coordinate (n,), its size and that by
+    steps chosen anew, in standard deviations, and the error of the Jacobian."""
+
+    bias: Array
+    finer: float
+    anew: float
+    jacobian_error: float
+
+    @property
+    def small(self) -> bool:
+        """Whether the tolerance is fine enough."""
+        return self.finer <= STEP_BIAS and self.jacobian_error <= JACOBIAN_ERROR
+
+
+def step_effect(fit: Fit, fresh: Residuals, finer: Residuals) -> StepEffect:
+    """Effect of steps chosen anew, and of those at a tenth of the tolerance."""
+    J, bias = finer.J[:, fit.free], np.zeros(len(fit.x))
+    sd, bias[fit.free] = standard_deviations(J), shift(J, finer.r - fit.at.r)
+    anew = float((np.abs(shift(J, fresh.r - fit.at.r)) / sd).max())
+    return StepEffect(
+        bias, float((np.abs(bias[fit.free]) / sd).max()), anew, jacobian_error(fit.J, J)
+    )
+
+
+def rough_coordinates(end: Fit) -> tuple[str, ...]:
+    """Coordinates that would still move, the largest move first."""
+    moves = np.abs(end.newton_step()) / end.sd
+    order = np.argsort(-moves)[: int(np.sum(moves > SMALL_STEP))]
+    return tuple(end.labels[i] for i in order)
+
+
+def refine_steps(fit: Fit, tightenings: int) -> Fit:
     """Continue a fit with its Jacobian and a few runs: on steps chosen anew until they do not
     matter, and with a tighter tolerance, at most `tightenings` times, where a tenth of it shifts an
     estimate by more than `STEP_BIAS` or shows an error of the Jacobian above `JACOBIAN_ERROR`, or
-    where steps keep the fit from settling. With no tightenings the steps are kept, and only
+    where steps keep the fit from converging. With no tightenings the steps are kept, and only
     checked.
 
     At the end residuals are those on steps that the tolerance chooses there, where these can be
     run, and the Jacobian is that of the check. It has converged if with steps chosen anew no
-    coordinate would move by more than `SETTLED` standard deviations (where steps are only checked,
-    if it had before).
+    coordinate would move by more than `SMALL_STEP` standard deviations (where steps are only
+    checked, if it had before).
     """
-    left, rounds, free = tightenings, ROUNDS if tightenings else 0, fit.free
-    began, by = clock.perf_counter(), fit.rtol
-
-    def along(start: Residuals) -> bool:
-        """Fit on other steps from residuals on them, with new Jacobians where the last one does not
-        suffice; returns whether the coordinates changed."""
-        nonlocal fit, rounds, left, began, by
-        end = chord(fit._replace(at=start._replace(J=fit.at.J)))
-        if not end.converged:
-            end = gauss_newton(end, REFITS, EXACT, anew=True)
-        if end.stalled:
-            rounds = left = 0
-        if further := bool((end.x != fit.x).any()):
-            name = "steps chosen anew" if end.rtol == by else "tighter tolerance"
-            fit = end.noted(name, began)
-            began, by = clock.perf_counter(), fit.rtol
-        return further
-
+    left, rounds = tightenings, ROUNDS if tightenings else 0
     while True:
         fresh = fit.residuals(steps=fit.rtol)
         if fresh.failed:
             return fit._replace(converged=False, check=Check(fit.rtol, fit.at))
         end = fit._replace(at=fresh._replace(J=fit.at.J))
-        end = end._replace(converged=end.settled if tightenings else fit.converged)
+        end = end._replace(converged=end.step_is_small if tightenings else fit.converged)
         if rounds and not end.converged:
             rounds -= 1
-            if along(fresh):
+            moved = continued_on(fit, fresh, "steps chosen anew")
+            if moved is not fit:
+                fit, rounds, left = moved, *((0, 0) if moved.stalled else (rounds, left))
                 continue
         finer = fit.residuals(steps=FINER * fit.rtol, jacobian=True)
         if finer.failed:
             return end._replace(check=Check(fit.rtol, end.at))
-        J, bias = finer.J[:, free], np.zeros(len(fit.x))
-        error = jacobian_error(fit.J, J)
-        bias[free], sd = shift(J, finer.r - fit.at.r), standard_deviations(J)
-        anew = np.abs(shift(J, fresh.r - fit.at.r)) / sd
-        shifts, rough = np.abs(bias[free]) / sd, tuple[str, ...]()
+        effect, rough = step_effect(fit, fresh, finer), tuple[str, ...]()
+        error = effect.jacobian_error
         fit, end = (one._replace(at=one.at._replace(J=finer.J)) for one in (fit, end))
-        if not end.converged and tightenings and max(anew.max(), shifts.max()) <= SETTLED:
-            moves = np.abs(end.newton_step()) / sd
-            order = np.argsort(-moves)[: int(np.sum(moves > SETTLED))]
-            rough = tuple(fit.labels[i] for i in order)
-        elif left and not (end.converged and shifts.max() <= STEP_BIAS and error <= JACOBIAN_ERROR):
-            left, rounds, fit = left - 1, ROUNDS, fit.by(FINER * fit.rtol)
-            if along(finer):
+        if not end.converged and tightenings and max(effect.anew, effect.finer) <= SMALL_STEP:
+            rough = rough_coordinates(end)
+        elif left and not (end.converged and effect.small):
+            left, rounds, tighter = left - 1, ROUNDS, fit.by(FINER * fit.rtol)
+            moved = continued_on(tighter, finer, "tighter tolerance")
+            if moved is not tighter:
+                fit, rounds, left = moved, *((0, 0) if moved.stalled else (rounds, left))
                 continue
             error = 0.0
-        return end._replace(check=Check(end.rtol, finer, bias, error, rough))
+        return end._replace(check=Check(end.rtol, finer, effect.bias, error, rough))

@@ -204,11 +204,11 @@ class Planner:
         return self._known[x.tobytes()]
 
     @contextmanager
-    def _begun(self) -> Iterator[RunContext]:
+    def _context(self) -> Iterator[RunContext]:
         """A copy of the recording's rig, ready to run, which is discarded if a run fails."""
-        begun = self._idle.pop() if self._idle else self.recording.begin()
-        yield begun
-        self._idle.append(begun)
+        context = self._idle.pop() if self._idle else self.recording.run_context()
+        yield context
+        self._idle.append(context)
 
     def run(
         self, z: Array, x: Array, steps: Steps, free: Mask | None
@@ -218,9 +218,9 @@ class Planner:
         p = self.problem
         by_name = {self.recording.name: steps} if isinstance(steps, Frozen) else steps
         (job,) = p.jobs(x, [self.recording.name], by_name, free)
-        with self._begun() as begun:
-            begun.rig.reference = self.moves.reference(torch.from_numpy(z))
-            run = predict(begun, job.values, self.grid, job.names, steps)
+        with self._context() as context:
+            context.rig.reference = self.moves.reference(torch.from_numpy(z))
+            run = predict(context, job.values, self.grid, job.names, steps)
         self.cost["runs"] += 1
         return p.gather(x, [job], [run]), run
 
@@ -326,14 +326,14 @@ class Planner:
         """Gradient by z of the signals of the run at x, weighted with `weights` (G, channels).
         Raises `SimulationFailed`."""
         variables = torch.tensor(z, requires_grad=True)
-        with self._begun() as begun:
-            begun.rig.reference = self.moves.reference(variables)
-            y0 = prepared(begun, self.problem.values(x, self.k), ())[0].detach()
+        with self._context() as context:
+            context.rig.reference = self.moves.reference(variables)
+            y0 = prepared(context, self.problem.values(x, self.k), ())[0].detach()
             run = unjudged(
-                begun.rig,
+                context.rig,
                 self.grid.t,
                 y0=y0,
-                reference=reference_from(begun.rig, begun.start, begun.rig.unpack(y0).pose),
+                reference=reference_from(context.rig, context.start, context.rig.unpack(y0).pose),
                 gradient="discrete",
                 **choice(steps),
             )
@@ -347,7 +347,10 @@ class Planner:
         out, at = np.zeros(signals.values.shape), 0
         for channel, one in self.problem.readouts(x, self.k).items():
             t, measured = self.recording.samples[channel]
-            out = out + one.adjoint(signals, t, measured, w[at : at + len(t)])[1]
+            _, weight = one.residuals(one.expected(signals, t)[0], measured)
+            v, noise = w[at : at + len(t)], self.problem.noise.get(channel)
+            v = v if noise is None else noise.whitener(t).T @ v
+            out = out + one.pulled_back(signals, t, weight * v)
             at += len(t)
         return out
 

@@ -1,14 +1,13 @@
-"""Checks of recordings against their rig before any fit: set-points, control loops, signs and
-units.
+"""Checks of recordings against their rig before any fit: set-points, controllers, signs, units.
 
-Signs and units of channels are compared with a run at the start's parameters. The measured
-coordinate of a loop is recognised by the body that follows the set-point. The mean recorded force
-of an actuator is compared with its known law at the measured coordinates.
+Signs and units of channels are compared with a run at the start's parameters. The mean recorded
+force of an actuator is compared with its known law at the measured coordinates.
 """
 
 import math
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +15,9 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
-from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.names import effort_channel
-from torchsoft.physics.parts import COORDINATES, Actuator
+from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.plan import LOOSE
@@ -27,25 +25,22 @@ from torchsoft.sysid.prediction import Prediction, Readout, Signals
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 from torchsoft.sysid.unknowns import Sensor
 from torchsoft.tables import shown
 
 # Checks of recorded set-points: their spacing in time, and the agreement of rates with values.
 #
 # A recorded signal is known at its rows only, with a cubic between them. The error of the cubic
-# is estimated from cubics through every second and every fourth row, whose larger errors show its
-# order. It is stated by its effect: the error of the set-point over the noise of that
-# coordinate's sensor, and that of the effort over the noise of the force.
+# is estimated from that of the cubic through every second row, and from that with other rates, of a
+# spline through the values. It is stated by its effect: the error of the set-point over the noise
+# of that coordinate's sensor, and that of the effort over the noise of the force.
 
 
-def found(code: str, recording: Recording, message: str, grave: bool = False) -> Diagnostic:
-    """A diagnostic on one recording, an error if it is `grave`."""
-    return Diagnostic(
-        "error" if grave else "warning",
-        recording.name,
-        f"recording `{recording.name}`: {message}",
-        code,
-    )
+def found(code: str, name: str, recording: Recording, grave: bool = False, **facts: Any) -> Finding:
+    """A finding on one recording, an error if it is `grave`; `name` is what a user acknowledges."""
+    facts = {"name": name, "recording": recording.name} | facts
+    return Finding(code, "error" if grave else "warning", facts)
 
 
 def channel(rig: Rig, name: str) -> str:
@@ -58,12 +53,12 @@ NOTICED = 0.2
 """Error between rows, over a sensor's noise, above which a warning is given: residuals would be off
 by it everywhere."""
 
-HOPELESS, ORDERLESS = 100.0, 1.0
-"""Error between rows, over a sensor's noise, that makes a fit worthless, if its order of
-convergence is at most the second number."""
+HOPELESS = 100.0
+"""Error between rows, over a sensor's noise, that makes a fit worthless."""
 
-ORDERS = (0.5, 4.0)
-"""Least and largest credible order of convergence; a cubic through exact values has the largest."""
+ORDER = 3.0
+"""Order by which the error of a cubic falls with the distance of its rows, where the curve has
+bends between them; 4 where it is smooth."""
 
 PARTS = (0.0, 0.25, 0.5, 0.75)
 """Positions between rows at which signals are compared."""
@@ -74,12 +69,11 @@ known to half of it."""
 
 
 class Gap(NamedTuple):
-    """Error between rows: rms [SI], over the noise of a channel, and its order of convergence."""
+    """Error between rows: rms [SI], and over the noise of a channel."""
 
     channel: str
     error: float
     noises: float
-    order: float
 
 
 def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
@@ -95,14 +89,6 @@ def is_derived(signal: Sampled) -> bool:
     return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
 
 
-def extrapolated(by: Mapping[int, Tensor]) -> tuple[float, float]:
-    """RMS error of a quantity with every row, by Richardson extrapolation from every second and
-    fourth row, and the observed order."""
-    half, quarter = (float((by[2 * k] - by[k]).square().mean().sqrt()) for k in (1, 2))
-    order = float(np.clip(np.log2(max(quarter, 1e-300) / max(half, 1e-300)), *ORDERS))
-    return half / (2**order - 1), order
-
-
 def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
     """Errors between rows of an actuator's set-point, in the channels with sensors."""
     rig, out = recording.rig, []
@@ -113,16 +99,18 @@ def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list
     feed = rig.reference[actuator.feed_forward] if actuator.feed_forward else None
     t, derived = signal.times, is_derived(signal)
     inside = torch.cat([t[:-1] + part * t.diff() for part in PARTS]).sort().values
-    inside = inside[inside <= t[4 * ((len(t) - 1) // 4)]]
+    inside = inside[inside <= t[2 * ((len(t) - 1) // 2)]]
     x, v = signal(inside)
-    places, efforts = {}, {}
-    for every in (1, 2, 4):
-        places[every], rate = cubic(signal, every, derived)(inside)
-        efforts[every] = demanded(actuator, feed, every, inside, places[every], rate, x, v)
+    places, efforts = list[Tensor](), list[Tensor]()
+    for every, without_rates in ((1, derived), (2, derived), (1, True)):
+        place, rate = cubic(signal, every, without_rates)(inside)
+        places.append(place)
+        efforts.append(demanded(actuator, feed, every, inside, place, rate, x, v))
     for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
         if own in sensors and own in recording.samples:
-            error, order = extrapolated(by)
-            out.append(Gap(own, error, error / sensors[own].sd, order))
+            sparser, other_rates = (float((one - by[0]).square().mean().sqrt()) for one in by[1:])
+            error = max(sparser / (2**ORDER - 1), other_rates)
+            out.append(Gap(own, error, error / sensors[own].sd))
     return out
 
 
@@ -143,8 +131,8 @@ def demanded(
     return actuator(torch.stack((place, rate, *more, x, v), -1))
 
 
-def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
-    """Diagnostics on the set-points of a recording. For controllers of several coordinates only
+def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
+    """Findings on the set-points of a recording. For controllers of several coordinates only
     rates are tested here."""
     rig = recording.rig
     recorded = {
@@ -164,43 +152,33 @@ def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> It
 
 def sparse_finding(
     recording: Recording, sensors: Mapping[str, Sensor], name: str
-) -> Diagnostic | None:
-    """Diagnostic on set-points that are too far apart in time."""
+) -> Finding | None:
+    """Finding on set-points that are too far apart in time."""
     gap_list = gaps(recording, sensors, name)
     if not gap_list or (worst := max(gap_list, key=lambda gap: gap.noises)).noises <= NOTICED:
         return None
     setpoint = recording.rig.actuators[name].setpoint
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
-    apart = float(signal.times.diff().max())
-    enough = apart * (NOTICED / worst.noises) ** (1 / worst.order)
-    rates = f", and its rate is not known (no column {setpoint}_dot)" if is_derived(signal) else ""
-    if worst.order <= ORDERS[0] and not is_derived(signal):  # closer rows would not help
-        text = (
-            f"values and rates of {setpoint} disagree however close the rows are, by "
-            f"{worst.noises:.2g} times the noise of {worst.channel}: is a clock, or a unit of "
-            "time, a little off?"
-        )
-        return found(f"rate of {setpoint}", recording, text, worst.noises > HOPELESS)
-    size = (
-        f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise "
-        f"of {worst.channel}"
-    )
-    text = (
-        f"set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
-        f"{rates}: what they leave open between them makes {size}; give them every "
-        f"{1e3 * enough:.2g} ms"
-    )
+    apart = 1e3 * float(signal.times.diff().max())
     return found(
+        "set-points",
         f"set-points {setpoint}",
         recording,
-        text,
-        grave=worst.noises > HOPELESS and worst.order <= ORDERLESS,
+        worst.noises > HOPELESS,
+        setpoint=setpoint,
+        apart=apart,
+        error=worst.error,
+        unit=recording.units[worst.channel],
+        noises=worst.noises,
+        channel=worst.channel,
+        enough=apart * (NOTICED / worst.noises) ** (1 / ORDER),
+        **{"lacking" if is_derived(signal) else "given": f"{setpoint}_dot"},
     )
 
 
-def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
-    """Diagnostic on rates unlike those of the values."""
+def other_rate(recording: Recording, setpoint: str) -> Finding | None:
+    """Finding on rates unlike those of the values."""
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
     times, values = signal.times, signal.values.detach()
@@ -215,52 +193,40 @@ def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
     ):
         return None
     factor = float(given @ own) / max(float(own @ own), 1e-300)
-    looks = "its sign looks opposite" if factor < 0 else f"it is {factor:.3g} times that"
-    text = (
-        f"{setpoint}_dot is not the rate of {setpoint}: it differs by {off:.3g} rms from that "
-        f"of a spline through it, {size:.3g}; {looks}"
-    )
-    return found(f"rate of {setpoint}", recording, text, grave=True)
+    looks = {"opposite" if factor < 0 else "factor": factor}
+    name = f"rate of {setpoint}"
+    return found("rate", name, recording, True, setpoint=setpoint, off=off, size=size, **looks)
 
 
 # Signs, units, loops and noise
 
 
-def together(every: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """One diagnostic for each code: the first, with the names of the other recordings."""
-    out: list[Diagnostic] = []
-    for code in dict.fromkeys(one.code for one in every):
-        first, *others = sorted(
-            (one for one in every if one.code == code), key=lambda one: one.severity
-        )
-        names = ", ".join(
-            f"`{name}`"
-            for name in dict.fromkeys(one.where for one in others)
-            if name != first.where
-        )
-        out.append(
-            first._replace(message=first.message + (f"; so it is in {names}" if names else ""))
-        )
+def together(every: Sequence[Finding]) -> list[Finding]:
+    """One finding for each name: the gravest, with the names of the other recordings."""
+    out = list[Finding]()
+    for name in dict.fromkeys(one.facts["name"] for one in every):
+        mine = [one for one in every if one.facts["name"] == name]
+        first, *others = sorted(mine, key=lambda one: one.severity)
+        alike = dict.fromkeys(one.facts["recording"] for one in others)
+        alike.pop(first.facts["recording"], None)
+        more = {"others_alike": [f"`{one}`" for one in alike]} if alike else {}
+        out.append(replace(first, facts=first.facts | more))
     return out
 
 
-def accepted(every: Sequence[Diagnostic], acknowledged: Sequence[str]) -> list[str]:
-    """Messages of warnings, and of acknowledged errors. Raises `ValueError` for other errors, and
-    for an acknowledged code without a finding."""
-    codes = dict.fromkeys(one.code for one in every)
-    if strange := [code for code in acknowledged if code not in codes]:
-        there = f"what was found is {', '.join(codes)}" if codes else "nothing looks wrong"
+def accepted(every: Sequence[Finding], acknowledged: Sequence[str]) -> list[Finding]:
+    """Findings on recordings, those that are acknowledged as notes. Raises `ValueError` for other
+    errors, and for an acknowledged name without a finding."""
+    names = dict.fromkeys(one.facts["name"] for one in every)
+    if strange := [name for name in acknowledged if name not in names]:
+        there = f"the findings are {', '.join(names)}" if names else "nothing looks wrong"
         raise ValueError(
-            f"acknowledged: nothing was found that is called {shown(strange[0])}, so leave it out; "
-            f"{there}"
+            f"acknowledged: there is no finding {shown(strange[0])}, so leave it out; {there}"
         )
     for one in every:
-        if one.severity == "error" and one.code not in acknowledged:
-            raise ValueError(f'{one.message}; if it is so, say acknowledged = ["{one.code}"]')
-    return [
-        f"{one.message} (acknowledged)" if one.code in acknowledged else one.message
-        for one in every
-    ]
+        if one.severity == "error" and one.facts["name"] not in acknowledged:
+            raise ValueError(f'{one} If it is right, say acknowledged = ["{one.facts["name"]}"]')
+    return [replace(one, severity="note") for one in every]
 
 
 MISTAKEN = {
@@ -300,8 +266,8 @@ def comparable(recording: Recording, sensors: Mapping[str, Sensor], name: str) -
 
 def controller_findings(
     recording: Recording, sensors: Mapping[str, Sensor], unknown: Collection[str] = ()
-) -> Iterator[Diagnostic]:
-    """Diagnostics on forces whose mean differs from their controller's, where no sensor of the
+) -> Iterator[Finding]:
+    """Findings on forces whose mean differs from their controller's, where no sensor of the
     force or of its coordinates has a fault to be estimated, and no gain is among the `unknown`
     parameters."""
     rig = recording.rig
@@ -310,13 +276,9 @@ def controller_findings(
         force, *others = every = [channel(rig, one) for one in (name, *actuator.measures)]
         lacking = [one for one in every if not comparable(recording, sensors, one)]
         if lacking and force not in lacking and not actuator.is_loop:
-            yield Diagnostic(
-                "note",
-                recording.name,
-                f"recording `{recording.name}`: {force} is not compared "
-                f"with its controller, since {lacking[0]} is not recorded",
-                f"controller of {force}",
-            )
+            name = f"controller of {force}"
+            one = found("not-compared", name, recording, force=force, lacking=lacking[0])
+            yield replace(one, severity="note")
         faults = [(s.bias, s.delay, s.gain, s.drift) for s in map(sensors.get, every) if s]
         if lacking or np.any(faults) or any(id(p) in tensors for p in actuator.parameters()):
             continue
@@ -342,14 +304,9 @@ def controller_findings(
         off = float(np.mean(apart))
         if abs(off) <= 2 * sum(noise) ** 0.5 + ROUGH * float(np.sqrt(np.mean(F**2))):
             continue
-        ask = "are its gains, units, zeros and set-points right?"
-        if feed:
-            ask = f"was a force fed forward that {feed} does not have?"
-        text = (
-            f"{force} is {off:+.3g} {actuator.effort_unit} more, on the average, than the "
-            f"controller gives: {ask}"
-        )
-        yield found(feed or f"loop of {force}", recording, text)
+        ask = {"feed": feed} if feed else {"loop": f"the actuator {name}"}
+        more: dict[str, Any] = {"force": force, "off": off, "unit": actuator.effort_unit} | ask
+        yield found("controller", feed or f"loop of {force}", recording, **more)
 
 
 def shift_of_start(
@@ -381,19 +338,13 @@ explanation."""
 NEAR = math.log(4.0)
 """Largest difference of the logarithm of such a factor from that of confused units."""
 
-SAME, APART = 0.1, 0.3
-"""Largest relative difference of a coordinate that follows a set-point, and least one of a
-coordinate that does not."""
-
 Expected = Mapping[str, tuple[Readout, Signals]]
 """Readouts of a run, with its signals, by channel."""
 
 
-def precheck(
-    problem: Problem, runner: Runner, which: Sequence[str] | None = None
-) -> list[Diagnostic]:
-    """Diagnostics on some recordings of a problem, by default all: one for each code."""
-    every, x = list[Diagnostic](), problem.coordinates.start
+def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
+    """Findings on some recordings of a problem, by default all: one for each name."""
+    every, x = list[Finding](), problem.coordinates.start
     which = problem.names if which is None else which
     unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
     jobs = problem.jobs(x, which, LOOSE, None)
@@ -415,13 +366,12 @@ def findings(
     sensors: Mapping[str, Sensor],
     expected: Expected,
     unknown: Collection[str] = (),
-) -> list[Diagnostic]:
-    """Diagnostics on one recording, compared with the readouts `expected` of a run from the start,
+) -> list[Finding]:
+    """Findings on one recording, compared with the readouts `expected` of a run from the start,
     if there is one; `unknown` are the names of unknown parameters. A recording with an error is not
     compared with the run."""
     every = [*setpoint_findings(recording, sensors), *noisy(recording, sensors)]
     every += rounded(recording, sensors)
-    every += another_body(recording, sensors, expected)
     for more in (
         against_run(recording, sensors, expected),
         controller_findings(recording, sensors, unknown),
@@ -440,7 +390,7 @@ ENOUGH, WIDTH = 10, 0.5
 """Samples of a channel whose range, over their noise, is not smaller than that by chance."""
 
 
-def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
+def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
     """Noise that is stated so large that samples could not be as near to each other as they are."""
     for name, sensor in sensors.items():
         y = recording.samples[name][1] if name in recording.samples else np.zeros(0)
@@ -448,26 +398,21 @@ def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagn
             continue
         unit = recording.units[name]
         if np.ptp(y) == 0 and sensor.resolution < sensor.noise and not sensor.saturated(y).any():
-            yield constant(recording, name, f"its noise is stated as {sensor.noise:.3g} {unit}")
+            yield constant(recording, name, noise=sensor.noise)
         elif 0 < np.ptp(y) < WIDTH * sensor.noise:
-            text = (
-                f"the noise of {name} is stated as {sensor.noise:.3g} {unit}, but all of its "
-                f"samples are within {np.ptp(y):.3g} {unit}: is it in the right unit?"
-            )
-            yield found(f"noise of {name}", recording, text, grave=True)
+            facts = {"noise": sensor.noise, "range": float(np.ptp(y)), "unit": unit}
+            yield found("noise", f"noise of {name}", recording, True, channel=name, **facts)
 
 
-def constant(recording: Recording, name: str, contradiction: str) -> Diagnostic:
-    """Diagnostic on a channel whose samples are all equal, with what contradicts that."""
-    y = recording.samples[name][1]
-    text = (
-        f"{name} is constant, {y[0]:.6g} {recording.units[name]} in all of its {len(y)} samples, "
-        f"but {contradiction}: was it recorded? Leave out its sensor, or correct the column"
-    )
-    return found(f"constant {name}", recording, text, grave=True)
+def constant(recording: Recording, name: str, **contradiction: float) -> Finding:
+    """Finding on a channel whose samples are all equal, with what contradicts that: the stated
+    `noise`, or the motion of a `run`."""
+    y, unit = recording.samples[name][1], recording.units[name]
+    facts = {"channel": name, "value": float(y[0]), "unit": unit, "samples": len(y)}
+    return found("constant", f"constant {name}", recording, True, **facts, **contradiction)
 
 
-def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
+def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
     """Warnings on quantised readings whose steps the stated noise and resolution omit."""
     for name, sensor in sensors.items():
         if name not in recording.samples:
@@ -477,11 +422,8 @@ def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Dia
         if not COARSE * max(sensor.noise, sensor.resolution) < q < math.inf:
             continue
         if np.abs(apart / q - np.round(apart / q)).max() < 1e-3:
-            text = (
-                f"{name} comes in steps of {q:.3g} {recording.units[name]}, "
-                f"{q / sensor.noise:.2g} times its noise: say so by its `resolution`"
-            )
-            yield found(f"resolution of {name}", recording, text)
+            facts = {"step": q, "unit": recording.units[name], "ratio": q / sensor.noise}
+            yield found("resolution", f"resolution of {name}", recording, channel=name, **facts)
 
 
 def unsaturated(
@@ -495,8 +437,8 @@ def unsaturated(
 
 def against_run(
     recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
-) -> Iterator[Diagnostic]:
-    """Diagnostics on channels whose sign or unit contradicts the run."""
+) -> Iterator[Finding]:
+    """Findings on channels whose sign or unit contradicts the run."""
     for name, (one, signals) in expected.items():
         (t, y), noise = unsaturated(recording, sensors, name), sensors[name].sd
         if len(t) < 2 * MOVES:
@@ -506,94 +448,22 @@ def against_run(
         if max(measured, run) < MOVES * noise:
             continue
         if measured == 0:
-            moves = f"a run with the parameters of the start moves it by {run:.3g} rms"
-            yield constant(recording, name, moves)
+            yield constant(recording, name, run=run)
             continue
         ratio = measured / max(run, 1e-300)
         if not 1 / LARGER < ratio < LARGER and run > 0:
-            text = (
-                f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the "
-                "start"
-            )
             known = [
                 (abs(math.log(ratio / factor)), confusion)
                 for factor, confusion in confusions(recording.units[name])
             ]
             distance, confusion = min(known, default=(math.inf, ""))
             if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
-                yield found(f"unit of {name}", recording, f"{text}: {confusion}?", grave=True)
+                more = {"channel": name, "ratio": ratio, "confusion": confusion}
+                yield found("unit", f"unit of {name}", recording, True, **more)
             else:
-                yield found(
-                    f"size of {name}",
-                    recording,
-                    f"{text}: is its unit right, and are these parameters?",
-                )
+                yield found("size", f"size of {name}", recording, channel=name, ratio=ratio)
         elif min(measured, run) >= MOVES * noise:
             alike = float(np.mean((y - y.mean()) * (p - p.mean()))) / (measured * run)
             if alike < OPPOSITE:
-                text = (
-                    f"{name} looks as if its sign were opposite: its correlation with a run from "
-                    f"the start is {alike:.2f}"
-                )
-                yield found(f"sign of {name}", recording, text, grave=True)
-
-
-def another_body(
-    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
-) -> Iterator[Diagnostic]:
-    """Diagnostics on set-points that another body follows than the measured one, or that the
-    measured body follows in the run only."""
-    rig = recording.rig
-    movable = {
-        f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes
-    }
-    for loop, actuator in rig.loops.items():
-        body, _, axis = actuator.measured.partition(".")
-        own, setpoint = channel(rig, actuator.measured), actuator.setpoint
-        mine, run = (apart(recording, sensors, setpoint, own, by) for by in (None, expected))
-        others = [name for name in rig.bodies if name != body and f"{name}.{axis}" in movable]
-        for other in others:
-            alternative = channel(rig, f"{other}.{axis}")
-            other_data, other_run = (
-                apart(recording, sensors, setpoint, alternative, by) for by in (None, expected)
-            )
-            near = any(part is not None and part < APART for part in (mine, other_run))
-            if other_data is not None and other_data < SAME and not near:
-                evidence = f"{alternative} follows it to {other_data:.1%} of its motion"
-            elif (
-                mine is not None
-                and mine > APART
-                and other_data is None
-                and (run is None or run < SAME)
-                and len(others) == 1
-            ):
-                evidence = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
-            else:
-                continue
-            remedy = f' (say measures = "{other}.{axis}" of the actuator {loop})'
-            code = f"what {setpoint} is of"
-            text = (
-                f"{setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
-                f"or are {own} and {alternative} exchanged? ({evidence})"
-            )
-            yield found(code, recording, text, grave=True)
-
-
-def apart(
-    recording: Recording,
-    sensors: Mapping[str, Sensor],
-    setpoint: str,
-    name: str,
-    expected: Expected | None,
-) -> float | None:
-    """RMS difference of a channel, measured or expected, from a set-point, over the motion of the
-    set-point; None without samples, or where the set-point hardly moves."""
-    if name not in (recording.samples.keys() & sensors.keys() if expected is None else expected):
-        return None
-    t, y = unsaturated(recording, sensors, name)
-    if expected is not None:
-        one, signals = expected[name]
-        y = one.expected(signals, t)[0]
-    values = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
-    moved = float(np.std(values))
-    return float(np.std(values - y)) / moved if moved > MOVES * sensors[name].sd else None
+                more = {"channel": name, "correlation": alike}
+                yield found("sign", f"sign of {name}", recording, True, **more)

@@ -1,9 +1,8 @@
 """Predicted signals of a recording, and the readings of its sensors."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +21,7 @@ from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import unjudged
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid.initial_state import PREFIX, reference_from
-from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.recording import REACH, SAME, Array, Grid, RunContext
+from torchsoft.sysid.recording import REACH, Array, Grid, RunContext
 from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
 
 
@@ -65,7 +63,6 @@ class Readout:
     clock: float = 0.0
     lag: float = 0.0
     backlash: float = 0.0
-    colour: Autoregression | None = None
 
     def quantity(self, signals: Signals, values: Array) -> Array:
         """The measured quantity (G, ...) on the grid, from values (G, channels, ...)."""
@@ -145,22 +142,6 @@ class Readout:
                 back = held @ slope(t, np.eye(len(t)), one.order)
                 out[:, signals.names.index(one.channel)] += one.factor * back
         return out
-
-    def adjoint(
-        self, signals: Signals, times: Array, measured: Array, w: Array | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Whitened residuals (k,), and derivatives of w' r, with w (k,) by default r itself, by the
-        channels (G, channels) and by the nuisances."""
-        y, _, by = self.expected(signals, times)
-        r, v = self.residuals(y, measured)
-        if self.colour is None:
-            v = v * (r if w is None else w)
-        else:
-            W = self.colour.whitener(times)
-            r = W @ r
-            v = v * (W.T @ (r if w is None else w))
-        on_nuisances = [v @ by[kind] if kind in by else 0.0 for kind in NUISANCES]
-        return r, self.pulled_back(signals, times, v), np.array(on_nuisances)
 
     def own_times(self, times: Array) -> Array:
         """Times (k,) [s] of the readings that the sensor stamps with `times`."""
@@ -255,11 +236,9 @@ def readout(
     sensor: Sensor,
     values: Mapping[Nuisance, float],
     span: tuple[float, float],
-    colour: Autoregression | None = None,
 ) -> Readout:
     """The readout of a sensor with the nuisances' `values`, in a recording over the times `span`
-    [s], with noise of a `colour`. Raises `ValueError` for a nuisance that the channel cannot
-    have."""
+    [s]. Raises `ValueError` for a nuisance that the channel cannot have."""
     at = {kind: values.get(kind, float(kind == "gain")) for kind in NUISANCES}
     c, s = np.cos(at["misalignment"]), np.sin(at["misalignment"])
     if sensor.misalignment > 0:
@@ -291,11 +270,10 @@ def readout(
         at["clock"],
         at["lag"],
         at["backlash"],
-        colour,
     )
 
 
-# Runs: signals with derivatives, or the misfit with its gradient
+# Runs: signals with derivatives
 
 
 TOLERANCE = 1e-8
@@ -330,25 +308,11 @@ class Prediction(NamedTuple):
     step: float = 0.0
 
 
-class Misfit(NamedTuple):
-    """Half the sum of squared residuals of one recording, and its derivatives by the run's
-    parameters (n,) and by every channel's nuisances (channels, nuisances)."""
-
-    loss: float
-    parameters: Array
-    nuisances: Array
-
-
 class FailedRun(NamedTuple):
     """A failed run: reason and time [s]."""
 
     reason: str
     time: float
-
-
-Judge = Callable[[Signals], tuple[float, Array, Array]]
-"""Half the sum of squared residuals of a run's signals, and its derivatives by the signals (G,
-channels) and by the nuisances."""
 
 
 @torch.no_grad()
@@ -361,11 +325,11 @@ def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
 
 
 def prepared(
-    begun: RunContext, values: Mapping[str, float], names: Sequence[str]
+    context: RunContext, values: Mapping[str, float], names: Sequence[str]
 ) -> tuple[Tensor, list[Tensor]]:
     """Set the rig's parameters, and make its initial state y0 (size,), differentiable by `names`,
     whose tensors are returned, too."""
-    set_parameters(begun.rig, values)
+    set_parameters(context.rig, values)
     at = {
         name: torch.tensor(value, dtype=torch.float64, requires_grad=name in names)
         for name, value in values.items()
@@ -373,8 +337,8 @@ def prepared(
     }
     parameters = tuple(name for name in names if name not in at)
     assert tuple(names[: len(parameters)]) == parameters
-    inputs = [*map(begun.rig.parameter, parameters), *(at[name] for name in names if name in at)]
-    return begun.y0(at), inputs
+    inputs = [*map(context.rig.parameter, parameters), *(at[name] for name in names if name in at)]
+    return context.y0(at), inputs
 
 
 def derivatives(
@@ -420,16 +384,16 @@ def choice(steps: Steps) -> dict[str, Any]:
 
 
 def initial_state(
-    begun: RunContext, values: Mapping[str, float], names: Sequence[str]
+    context: RunContext, values: Mapping[str, float], names: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
     """Initial state y0 (size,) of a run, and its derivatives (size, n) by `names`. Raises
     `SimulationFailed`."""
-    y0, inputs = prepared(begun, values, names)
+    y0, inputs = prepared(context, values, names)
     return y0.detach(), torch.from_numpy(directions(y0, inputs))
 
 
 def predict(
-    begun: RunContext,
+    context: RunContext,
     values: Mapping[str, float],
     grid: Grid,
     names: Sequence[str],
@@ -438,17 +402,15 @@ def predict(
 ) -> Prediction:
     """Signals on the grid, and their derivatives by `names`, if any. `start` is the
     `initial_state`, if known. Raises `SimulationFailed`."""
-    rig, keys = begun.rig, begun.channels
-    y0, dy0 = start or initial_state(begun, values, names)
+    rig, keys = context.rig, context.channels
+    y0, dy0 = start or initial_state(context, values, names)
     set_parameters(rig, values)
     touch = [key for key in keys if key not in measurable(rig)] if names else ()
     wrt = tuple(name for name in names if not name.startswith(PREFIX))
     places = [y0.new_zeros(()).requires_grad_() for _ in names[len(wrt) :]]  # of the start
     leaves = [*map(rig.parameter, wrt), *places]
     along = torch.stack([x - x.detach() for x in leaves]) if leaves else y0.new_zeros(0)
-    reference = reference_from(rig, begun.start, rig.unpack(y0 + dy0 @ along).pose)
-    if begun.drift.changes:
-        return drifting(begun, grid, names, steps, y0, dy0, wrt, touch, reference, places)
+    reference = reference_from(rig, context.start, rig.unpack(y0 + dy0 @ along).pose)
     out = unjudged(
         rig,
         grid.t,
@@ -474,82 +436,11 @@ def predict(
 
 
 def run_doubts(
-    begun: RunContext, values: Mapping[str, float], grid: Grid, steps: Steps
+    context: RunContext, values: Mapping[str, float], grid: Grid, steps: Steps
 ) -> list[str]:
     """Warnings of the run at the end of a fit, which those on the way to it do not give. Raises
     `SimulationFailed`."""
-    y0, _ = prepared(begun, values, ())
-    reference = reference_from(begun.rig, begun.start, begun.rig.unpack(y0.detach()).pose)
-    run = unjudged(begun.rig, grid.t, y0=y0.detach(), reference=reference, **choice(steps))
-    return list(doubts(run, begun.rig, differentiated=True).values())
-
-
-PIECES = 24
-"""Pieces of a run, along each of which a number that drifts is held at its value in the middle."""
-
-
-def drifting(
-    begun: RunContext, grid: Grid, names: Sequence[str], steps: Steps, y: Tensor, dy: Tensor,
-    wrt: Sequence[str], touch: Sequence[str], reference: Reference, places: Sequence[Tensor],
-) -> Prediction:  # fmt: skip
-    """`predict` from the state y (size,) with derivatives dy (size, n), of a run whose rig drifts:
-    piece after piece, by the frozen steps, or by those that a tolerance chooses without drift."""
-    rig, keys, drift, t = begun.rig, begun.channels, begun.drift, grid.t.numpy()
-    if not isinstance(steps, Frozen):
-        chosen = unjudged(rig, grid.t, y0=y, reference=reference, **choice(steps))
-        steps = Frozen(chosen.knots.numpy())
-    knots, stated = steps.knots, {name: rig.parameter(name).item() for name in drift.changes}
-    ends = np.searchsorted(knots, np.linspace(drift.first, drift.last, PIECES + 1)[1:-1])
-    values, slopes = list[Array](), list[Array]()
-    for first, last in pairwise(np.unique([0, *ends, len(knots) - 1]).tolist()):
-        middle = 0.5 * float(knots[first] + knots[last])
-        set_parameters(rig, {k: value * drift.factor(k, middle) for k, value in stated.items()})
-        scale = np.array([drift.factor(name, middle) for name in names])
-        end = t[-1] if last == len(knots) - 1 else knots[last]
-        own = t[(t > knots[first] + SAME) & (t <= end + SAME)]
-        between = [knots[first], *own, *([] if own.size and end - own[-1] <= SAME else [end])]
-        out = unjudged(
-            rig, between, y0=y, reference=reference, gradient="forward" if names else "none",
-            wrt=wrt, dy0=dy / torch.from_numpy(scale) if names else None, touch=touch, more=places,
-            **choice(Frozen(knots[first : last + 1])),
-        )  # fmt: skip
-        rows = np.isin(out.t.numpy(), t if first == 0 else own)
-        values.append(out.together(*keys).detach().numpy()[rows])
-        y = out.y[-1].detach()
-        if out.sensitivities is not None:
-            slopes.append(derivatives(rig, out, keys, reference, places)[rows] * scale)
-            dy = out.sensitivities[-1] * torch.from_numpy(scale)
-    set_parameters(rig, stated)
-    rows = slice(grid.early, None)
-    by = np.concatenate(slopes)[rows] if names else None
-    return Prediction(t[rows], np.concatenate(values)[rows], by, knots)
-
-
-def misfit(
-    begun: RunContext,
-    values: Mapping[str, float],
-    grid: Grid,
-    names: Sequence[str],
-    steps: Steps,
-    judge: Judge,
-) -> Misfit:
-    """The misfit by `judge`, with its gradient by `names`, by the discrete adjoint. Raises
-    `SimulationFailed`."""
-    if begun.drift.changes:
-        made = predict(begun, values, grid, names, steps)
-        loss, weights, nuisances = judge(Signals(made.t, begun.channels, made.signals, None))
-        by = np.einsum("gc,gcn->n", weights, np.array(made.derivatives))
-        return Misfit(loss, by, nuisances)
-    y0, inputs = prepared(begun, values, names)
-    reference = reference_from(begun.rig, begun.start, begun.rig.unpack(y0).pose)
-    out = unjudged(
-        begun.rig, grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps)
-    )
-    keys, rows = begun.channels, slice(grid.early, None)
-    signals = out.together(*keys)[rows]
-    loss, weights, nuisances = judge(
-        Signals(grid.t[rows].numpy(), keys, signals.detach().numpy(), None)
-    )
-    gradient = torch.autograd.grad(signals, inputs, torch.from_numpy(weights), allow_unused=True)
-    by = np.array([0.0 if g is None else float(g) for g in gradient])
-    return Misfit(loss, by, nuisances)
+    y0, _ = prepared(context, values, ())
+    reference = reference_from(context.rig, context.start, context.rig.unpack(y0.detach()).pose)
+    run = unjudged(context.rig, grid.t, y0=y0.detach(), reference=reference, **choice(steps))
+    return list(doubts(run, context.rig, differentiated=True).values())

@@ -26,7 +26,6 @@ from torchsoft.sysid.prediction import (
 from torchsoft.sysid.recording import Array, Mask, Recording, extended
 from torchsoft.sysid.runs import Job, Runner, Vary
 from torchsoft.sysid.unknowns import (
-    NUISANCES,
     Coordinates,
     Nuisance,
     Sensor,
@@ -39,6 +38,9 @@ from torchsoft.tables import line
 
 StepsByName = float | Mapping[str, Frozen]
 """Steps of runs: a relative tolerance that chooses them, or frozen ones by recording."""
+
+DENSE = 1e-5
+"""Relative tolerance that chooses the steps of a density."""
 
 
 class Residuals(NamedTuple):
@@ -274,8 +276,7 @@ class Problem(Shown):
         for _, channel, sensor in self.measured([recording.name]):
             at = self.coordinates.nuisances(x, channel, recording.name)
             values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
-            noise = self.noise.get(channel)
-            out[channel] = readout(recording.rig, channel, sensor, values, span, noise)
+            out[channel] = readout(recording.rig, channel, sensor, values, span)
         return out
 
     def unit(self, channel: str) -> str:
@@ -288,7 +289,6 @@ class Problem(Shown):
         which: Sequence[str],
         steps: StepsByName,
         free: Mask | None,
-        adjoint: bool = False,
     ) -> list[Job]:
         """One run for each recording; with `free`, differentiated by the parameters that depend on
         free coordinates (n,)."""
@@ -305,9 +305,8 @@ class Problem(Shown):
             if free is not None:
                 moved = (c.jacobian(x, recording.name, values)[:, free] != 0).any(1)
                 names = tuple(name for name, moves in zip(c.names, moved) if moves)
-            judged = tuple(self.readouts(x, k).values()) if adjoint else None
             mine = steps[recording.name] if isinstance(steps, Mapping) else steps
-            out.append(Job(k, values, names, mine, self.interpolated, judged, varied))
+            out.append(Job(k, values, names, mine, self.interpolated, varied))
         return out
 
     def residuals(
@@ -408,32 +407,34 @@ class Problem(Shown):
             y, slopes, by = one.expected(signals, t)
             yield Reading(channel, t, measured, y, slopes, by, *one.residuals(y, measured))
 
-    def misfit(
-        self,
-        runner: Runner,
-        x: Array,
-        which: Sequence[str],
-        steps: StepsByName,
-        free: Mask,
-    ) -> tuple[float, Array, dict[str, FailedRun]]:
-        """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a
-        run fails."""
-        c, jobs = self.coordinates, self.jobs(x, which, steps, free, adjoint=True)
-        total, gradient, failed = 0.0, np.zeros(len(x)), {}
-        for job, got in zip(jobs, runner.run(jobs)):
-            name = self.recordings[job.recording].name
-            if isinstance(got, FailedRun):
-                failed[name] = got
-                continue
-            rows = [c.names.index(n) for n in job.names]
-            total, gradient = (
-                total + got.loss,
-                gradient + got.parameters @ c.jacobian(x, name, job.values)[rows],
-            )
-            for one, row in zip(self.readouts(x, job.recording), got.nuisances):
-                for kind, (_, at) in c.nuisances(x, one, name).items():
-                    gradient[at] += row[NUISANCES.index(kind)] * c.all[at].slope(x[at])
-        if failed:
-            return np.inf, np.full(len(x), np.nan), failed
-        r, J = self._priors(x)
-        return total + 0.5 * float(r @ r), np.where(free, gradient + r @ J, 0.0), {}
+    def log_density(
+        self, x: Array, steps: StepsByName = DENSE, runner: Runner | None = None
+    ) -> float:
+        """Logarithm of the posterior density of the coordinates x (n,), up to a constant: that of
+        the samples and of the priors. Coordinates without a prior are uniform within their bounds.
+
+        The same frozen `steps` at every x make it smooth. Minus infinity beyond the bounds, and
+        where a run fails.
+        """
+        return self._log_density(x, steps, runner, None)[0]
+
+    def log_density_and_gradient(
+        self, x: Array, steps: StepsByName = DENSE, runner: Runner | None = None
+    ) -> tuple[float, Array]:
+        """The `log_density` at x (n,), and its exact gradient (n,) with respect to the free
+        coordinates: zero for the others, NaN where the density is zero."""
+        return self._log_density(x, steps, runner, self.coordinates.free)
+
+    def _log_density(
+        self, x: Array, steps: StepsByName, runner: Runner | None, free: Mask | None
+    ) -> tuple[float, Array]:
+        (low, high), nowhere = self.coordinates.bounds, (-np.inf, np.full(len(x), np.nan))
+        if (x < low).any() or (x > high).any():
+            return nowhere
+        which = list(steps) if isinstance(steps, Mapping) else self.names
+        at = self.residuals(runner or Runner(self.recordings), x, which, steps, free)
+        if at.failed:
+            return nowhere
+        volume, by = self.coordinates.log_prior_volume(x)
+        value, gradient = volume - 0.5 * float(at.r @ at.r), by - at.J.T @ at.r
+        return value, gradient if free is None else np.where(free, gradient, 0.0)

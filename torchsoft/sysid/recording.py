@@ -22,7 +22,7 @@ from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import Touch
-from torchsoft.sysid.initial_state import Begin, Start, StartCoordinate
+from torchsoft.sysid.initial_state import InitialState, Start, StartCoordinate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,28 +39,13 @@ SAME = 1e-9
 """Difference [s] below which two times are equal."""
 
 
-class Drift(NamedTuple):
-    """Relative changes of numbers of a rig from `first` to `last` [s], linear between them."""
-
-    changes: Mapping[str, float]
-    first: float
-    last: float
-
-    def factor(self, name: str, t: float) -> float:
-        """Value of a number at a time [s] over that at the beginning."""
-        part = (t - self.first) / (self.last - self.first)
-        return 1 + self.changes.get(name, 0.0) * min(max(part, 0.0), 1.0)
-
-
 class RunContext(NamedTuple):
-    """Context of a run: its own copy of the rig, the initial state, the recorded channels, and
-    what drifts."""
+    """Context of a run: its own copy of the rig, the initial state, and the recorded channels."""
 
     rig: Rig
     start: Start
-    y0: Begin
+    y0: InitialState
     channels: tuple[str, ...]
-    drift: Drift
 
 
 class Grid(NamedTuple):
@@ -77,16 +62,15 @@ class Recording:
     `rig` has the known parameters, nominal values of the unknown ones, the laws, and the reference
     that the run followed; runs use copies of it. `samples` holds times (k,) [s] and values (k,) by
     channel, each with its own times; channels are those of `measurable`, and those of touch.
-    `start` is the start of the run. Numbers of the rig in `drifts` change along the samples, by a
-    part of what they are. Those in `tied` follow from runs, with their derivatives (n,) by the
-    parameters of a run. `dataclasses.replace` makes variants, such as one with another law.
+    `start` is the start of the run. Parameters in `tied` follow from runs, with their derivatives
+    (n,) with respect to the parameters of a run. `dataclasses.replace` makes variants, such as one
+    with another law.
     """
 
     name: str
     rig: Rig = field(repr=False)
     samples: dict[str, tuple[Array, Array]] = field(repr=False)
     start: Start
-    drifts: Mapping[str, float] = field(default_factory=dict, repr=False)
     tied: Mapping[str, Array] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -135,8 +119,8 @@ class Recording:
         return every[np.append(True, np.diff(every) > SAME)]
 
     @property
-    def begins(self) -> float:
-        """Begin of the run [s]."""
+    def run_start(self) -> float:
+        """InitialState of the run [s]."""
         return float(self.times[0] - self.start.lead)
 
     @property
@@ -175,14 +159,13 @@ class Recording:
         numbers = {name: float(value.detach()) for name, value in scalars.items()}
         return numbers | {c.name: c.mean for c in self.start_coordinates}
 
-    def begin(self) -> RunContext:
+    def run_context(self) -> RunContext:
         """A copy of the rig, and the start of its runs."""
         rig = deepcopy(self.rig)
         for name, value in rig.named_parameters():
             value.requires_grad_(not name.startswith("reference."))
-        drift = Drift(self.drifts, *self.times[[0, -1]].tolist())
-        begin = self.start.begin(rig, self.samples)
-        return RunContext(rig, self.start, begin, self.channels, drift)
+        initial = self.start.initial_state(rig, self.samples)
+        return RunContext(rig, self.start, initial, self.channels)
 
     def on_a_grid(self, interpolated: bool) -> bool:
         """Whether to simulate a regular grid, every `BETWEEN`, in place of the samples' own times:
@@ -196,26 +179,26 @@ class Recording:
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
-        begin = self.begins
-        early = int(t[0] - begin > SAME)
-        return Grid(torch.from_numpy(np.append([begin] * early, t)), early)
+        start = self.run_start
+        early = int(t[0] - start > SAME)
+        return Grid(torch.from_numpy(np.append([start] * early, t)), early)
 
     @cached_property
-    def beginning(self) -> str:
+    def start_fingerprint(self) -> str:
         """Checksum of everything that determines the initial state, besides the unknowns."""
-        signals = self.rig.follow(self.begins).detach().numpy().tobytes()
+        signals = self.rig.follow(self.run_start).detach().numpy().tobytes()
         return sha256(identity(self.rig) + signals + repr(self.start).encode()).hexdigest()
 
     @cached_property
     def fingerprint(self) -> str:
         """Checksum of everything that determines a run or a residual of this recording."""
-        t = torch.from_numpy(np.linspace(self.begins, self.times[-1], 2000))
+        t = torch.from_numpy(np.linspace(self.run_start, self.times[-1], 2000))
         signals = self.rig.follow(t).detach().numpy().tobytes()
         measured = b"".join(
             k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items())
         )
         return sha256(
-            identity(self.rig) + signals + measured + repr((self.start, self.drifts)).encode()
+            identity(self.rig) + signals + measured + repr(self.start).encode()
         ).hexdigest()
 
 

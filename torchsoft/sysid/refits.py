@@ -65,7 +65,7 @@ def far_off(end: Fit) -> bool:
 
 def assuming(problem: Problem, some: Sequence[Variation], free: bool) -> Problem:
     """The problem with assumptions as more coordinates, `free` or held at what is stated; a law or
-    a constant of the computation is held and, as by `begun`, otherwise. Raises `ValueError` for one
+    a numerical setting is held and, as by `start_under`, otherwise. Raises `ValueError` for one
     that cannot be."""
     unknowns, sensors, held = dict(problem.unknowns), dict(problem.sensors), set(problem.held)
     longest = max(1.0, *(recording.duration for recording in problem.recordings))
@@ -90,11 +90,11 @@ def assuming(problem: Problem, some: Sequence[Variation], free: bool) -> Problem
     return Problem(problem.recordings, sensors, unknowns, problem.noise, more, held)
 
 
-def begun(problem: Problem, some: Sequence[Variation], at: Mapping[str, float]) -> Array:
+def start_under(problem: Problem, some: Sequence[Variation], at: Mapping[str, float]) -> Array:
     """Coordinates (n,) of a problem under assumptions from those `at`, by label: laws and constants
     of the computation are otherwise, numbers as stated."""
     c = problem.coordinates
-    x = c.begun(at)
+    x = c.with_known(at)
     for one in some:
         if one.kind in ("numerical", "law"):
             i = c.labels.index(one.label)
@@ -143,7 +143,7 @@ def exact_columns(end: Fit, taken: Sequence[Variation]) -> tuple[list[Column], A
     c = wide.coordinates
     own = [c.labels.index(label) for label in end.labels]
     free = np.isin(c.labels, [*end.labels, *(one.label for one in mine)])
-    x = c.begun(end.by_label)
+    x = c.with_known(end.by_label)
     at = wide.residuals(wide.runner(end.runner), x, end.which, end.at.steps, free)
     if at.failed:
         return [], None
@@ -171,7 +171,7 @@ def difference(end: Fit, one: Variation) -> tuple[Array | None, str]:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
     other = assuming(end.problem, [one], free=False)
     c = other.coordinates
-    x, i = c.begun(end.by_label), c.labels.index(one.label)
+    x, i = c.with_known(end.by_label), c.labels.index(one.label)
     part = 1.0 if one.one_sided or one.kind in ("numerical", "law") else DIFFERENCE
     x[i] = c.all[i].to_x(part * one.amount)
     got = other.residuals(other.runner(end.runner), x, end.which, end.at.steps)
@@ -229,7 +229,7 @@ def unit(d: Array) -> Array:
 
 
 def under(end: Fit, other: Problem, x: Array) -> Fit:
-    """The begin at x (n,) of the fit of a problem under assumptions, with the coordinates of the
+    """The start at x (n,) of the fit of a problem under assumptions, with the coordinates of the
     fit that has ended, and its own."""
     known, c = end.by_label, other.coordinates
     free = [
@@ -258,10 +258,10 @@ def joint_fit(end: Fit, suspects: Sequence[Variation], enough: float) -> Fit | N
     if other is end.problem:
         return None
     c, fits = other.coordinates, list[Fit]()
-    for x in (c.begun(end.by_label), c.start):
-        begin = under(end, other, x)
-        rough = replace(begin.stage, name="joint, roughly", rtol=LOOSE, evaluations=ALL)
-        fit = continued(begin, rough)
+    for x in (c.with_known(end.by_label), c.start):
+        start = under(end, other, x)
+        rough = replace(start.stage, name="joint, roughly", rtol=LOOSE, evaluations=ALL)
+        fit = continued(start, rough)
         fits += [fit] if fit is not None else []
         if fits and fits[-1].square <= enough:
             break
@@ -337,19 +337,19 @@ def fewest(effects: Mapping[str, Array], r: Array, enough: float) -> list[str]:
 def first_step(end: Fit, one: Variation) -> Fit | None:
     """The fit with an assumption varied, one step from the end of the fit, by the tolerance
     `LOOSE`: the best of some `PARTS` of the Gauss-Newton step, or of one of length 1 where that is
-    longer. None where it cannot begin."""
+    longer. None where it cannot start."""
     try:
         other = assuming(end.problem, [one], free=True)
-        begin = under(end, other, begun(other, [one], end.by_label))
-        begin = begin.by(max(LOOSE, end.rtol)).begun(begin.within_bounds(begin.x))
+        start = under(end, other, start_under(other, [one], end.by_label))
+        start = start.by(max(LOOSE, end.rtol)).evaluated(start.within_bounds(start.x))
     except (ValueError, Unreachable):
         return None
-    step, fits = begin.newton_step(), [begin]
+    step, fits = start.newton_step(), [start]
     step /= max(1.0, float(np.linalg.norm(step)))
     for part in PARTS:
-        x = begin.place(begin.x[begin.free] + part * step)
-        at = begin.residuals(x)
-        fits += [] if at.failed else [begin._replace(x=x, at=at)]
+        x = start.place(start.x[start.free] + part * step)
+        at = start.residuals(x)
+        fits += [] if at.failed else [start._replace(x=x, at=at)]
     return min(fits, key=lambda fit: fit.square)
 
 
@@ -369,7 +369,7 @@ def refit(
     evaluations: int = REFITS,
 ) -> Fit | None:
     """The fit with some assumptions varied, or with all as stated, on its own steps, by so many
-    `evaluations` at most; None where it cannot begin.
+    `evaluations` at most; None where it cannot start.
 
     It starts at the end of one `near`, or of the fit where that fails; ratios at a bound are
     scanned again over their whole range. Under what is costly it is fitted by the tolerance `LOOSE`
@@ -381,29 +381,29 @@ def refit(
         other = assuming(end.problem, tried, free=True)
     except ValueError:
         return None
-    c, fit, begin = other.coordinates, None, end
+    c, fit, start = other.coordinates, None, end
     for there in filter(None, (near, end)):
-        begin = under(end, other, begun(other, tried, end.by_label | there.by_label))
-        stuck = [one for one in c.within(begin.free & c.at_bound(begin.x)) if one.ratio_to]
+        start = under(end, other, start_under(other, tried, end.by_label | there.by_label))
+        stuck = [one for one in c.within(start.free & c.at_bound(start.x)) if one.ratio_to]
         scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-        stage = replace(begin.stage, scanned=scans, evaluations=evaluations)
+        stage = replace(start.stage, scanned=scans, evaluations=evaluations)
         if any(one.costly for one in tried):
             plain = under(end, end.problem, end.x)
             stated, rough = (
                 continued(one, replace(own, rtol=max(LOOSE, end.rtol)))
-                for one, own in ((plain, plain.stage), (begin, stage))
+                for one, own in ((plain, plain.stage), (start, stage))
             )
             if rough is None or (stated is not None and rough.square >= stated.square):
                 return rough
-            begin = begin._replace(x=rough.x)
-        if (fit := continued(begin, stage)) is not None:
+            start = start._replace(x=rough.x)
+        if (fit := continued(start, stage)) is not None:
             break
     fits, explains = [fit], fit is not None and fit.square <= enough
     if anew and any(one.kind != "sensor" for one in tried) and far_off(end) and not explains:
         with suppress(Unreachable):
-            plan = default_plan(other, begin.runner, end.rtol, end.which)
-            if set(plan[-1].free) == set(begin.stage.free):
-                fits.append(continued(begin._replace(x=begun(other, tried, {})), *plan))
+            plan = default_plan(other, start.runner, end.rtol, end.which)
+            if set(plan[-1].free) == set(start.stage.free):
+                fits.append(continued(start._replace(x=start_under(other, tried, {})), *plan))
     done = [fit for fit in fits if fit is not None]
     if not tried and not done:  # it stays where it ended
         return end._replace(at=end.at._replace(J=end.check.finer.J), converged=False)

@@ -3,7 +3,6 @@ this module the data."""
 
 import base64
 import io
-import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,13 +13,12 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from torchsoft.files import save_text
+from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.figures import (
     Trace,
-    correlation_figure,
     direction_name,
     estimates_figure,
-    spectrum_figure,
     trace_figure,
 )
 from torchsoft.sysid.noise import Autoregression
@@ -28,7 +26,7 @@ from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.result import IdentificationResult
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.suspects import MOVED
+from torchsoft.sysid.suspects import CONTRADICTED, MOVED
 from torchsoft.tables import plain
 
 PAGES = Environment(
@@ -127,20 +125,6 @@ def prior(e: Estimate) -> Cell:
     return "", f"{grouped(e.prior.median)} {sd}"
 
 
-def contributions(result: IdentificationResult) -> list[list[str]]:
-    """Share of each recording in each parameter, and the factor on the standard deviation without
-    it."""
-    rows = []
-    for e in (e for e in result.estimates if e.identifiable and e.kind == "parameter"):
-        cells = [e.label]
-        for one in result.contributions:
-            factor = one.without[e.label]
-            least = "only here" if factor is None else f"× {factor:.2f}"
-            cells.append(f"{100 * one.shares[e.label]:.0f} % ({least})")
-        rows.append(cells)
-    return rows
-
-
 def correlations(result: IdentificationResult) -> str:
     """Strong correlations in words."""
     C, labels = result.correlation, result.labels
@@ -159,22 +143,29 @@ def assumptions(result: IdentificationResult) -> dict[str, list[list[Cell]]]:
     moving, harmless = list[list[Cell]](), list[list[Cell]]()
     for one in sorted(result.assumptions, key=lambda one: -abs(one.most_moved[1])):
         label, move = one.most_moved
-        amount, measured = "", one.kind in ("known", "sensor")
+        favoured, found = "", favour(one)
         if np.isfinite(one.favoured_sd) and not one.unchecked and one.kind != "several":
-            by = one.unit if measured else "of that"
-            amount = f" {signed(one.favoured)} ± {grouped(one.favoured_sd, 2)} {by}".rstrip()
-        asks: Cell = f"no:{amount}" if amount else "they cannot tell"
-        if one.suspected:
-            cause = "" if one.passed else ", but is not the cause"
-            asks = "weak", f"yes{amount}: the sum of squares {one.falls}{cause}"
-        if one.unchecked:
-            asks = "weak", f"not checked: {one.unchecked}"
+            by = one.unit if one.kind in ("known", "sensor") else "of that"
+            favoured = f"{signed(one.favoured)} ± {grouped(one.favoured_sd, 2)} {by}".strip()
         moved = ("", f"{signed(move)} sd of {label}" if label else "")
-        matters = one.suspected or abs(move) > MOVED or one.unchecked
-        seen = f"{grouped(one.detectable, 2)} {one.unit}".rstrip() if measured else ""
-        seen = seen if np.isfinite(one.detectable) else ""
-        (moving if matters else harmless).append([one.stated, one.otherwise, moved, asks, seen])
+        seen = f"{grouped(one.detectable, 2)} {one.unit}".strip()
+        seen = seen if np.isfinite(one.detectable) and one.kind in ("known", "sensor") else ""
+        row = [one.stated, one.otherwise, moved, favoured, ("weak" if found else "", found), seen]
+        (moving if found or abs(move) > MOVED else harmless).append(row)
     return {"moving": moving, "harmless": harmless}
+
+
+def favour(one: AssumptionTest) -> str:
+    """Conclusion of the test of an assumption; empty where the data agree with it."""
+    if one.unchecked:
+        return f"not checked: {one.unchecked}"
+    if one.suspected:
+        how = "in a refit" if one.refitted else "by a score test"
+        cause = "" if one.passed else ", but others are left"
+        return f"suspected: lowers the sum of squares by {one.gain:.0f} {how}{cause}"
+    if one.kind in ("known", "sensor") and abs(one.favoured) > CONTRADICTED * one.favoured_sd:
+        return "differs by more than chance; other suspects explain more"
+    return ""
 
 
 def noise_of(model: Autoregression | None) -> str:
@@ -259,7 +250,6 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
     counts = {
         "simulations": "simulations",
         "jacobians": "Jacobians",
-        "gradients": "gradients",
         "remembered": "of them read from the checkpoint",
     }
     return PAGES.get_template("report.html").render(
@@ -271,7 +261,7 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
         traces=traces,
         moved=MOVED,
         fitted=", ".join(one.name for one in result.recordings if one.fitted),
-        notices=list(dict.fromkeys(result.notices)),
+        findings=[(one.severity, str(one)) for one in result.findings],
         estimates=estimates(result),
         estimates_figure=estimates_figure(parameters),
         ratios=[
@@ -281,18 +271,9 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             for e in parameters
             if e.start
         ],
-        contributions=contributions(result) if len(result.contributions) > 1 else [],
-        sources=[one.source or "priors" for one in result.contributions],
         combined=[
             *(one.sentence for one in result.combinations),
             *(f"{name} may change without a trace in the data" for name in weak),
-        ],
-        spectrum_figure=spectrum_figure(result),
-        correlation_figure=correlation_figure(result),
-        spectrum=[
-            f"{direction_name(d)}: standard deviation {d.sd:.2g}"
-            f"{'' if d.identifiable else ', not identifiable'}"
-            for d in result.directions
         ],
         strong=correlations(result),
         **assumptions(result),
@@ -338,7 +319,7 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             for one in result.recordings
         ],
         definitions={
-            "method": f"{by['method']}, loss {by['loss']}",
+            "loss": by["loss"],
             "tolerance": f"{by['rtol']:g}",
             "seed": str(by["seed"]),
             "sensors": ", ".join(
@@ -348,5 +329,4 @@ def page(result: IdentificationResult, drawn: list[Trace], failures: dict[str, s
             "units": "SI throughout; pictures show lengths in mm",
             "written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         },
-        decided=json.dumps(by, indent=1, ensure_ascii=False),
     )

@@ -9,7 +9,7 @@ Tests are of one channel in one recording where possible:
     motion    F: no correlation with the predicted reading, its rates, or other channels
     channels  Bartlett: no correlation between channels at one time
     onset     Mann and Whitney: residuals are not larger from a certain time on
-    outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
+    outliers  kurtosis (Anscombe and Glynn): tails are those of a normal distribution
     priors    normal: estimates are where their priors expect them
 
 p-values are adjusted by Holm's method: with a right model, the probability that any falls below
@@ -17,10 +17,10 @@ p-values are adjusted by Holm's method: with a right model, the probability that
 although intervals allow for it: it may come from a sensor, or from a wrong model.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Literal, NamedTuple
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from scipy.special import ndtri_exp
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.sentences import Finding, Severity
 from torchsoft.sysid.unknowns import Sensor
 
 CLEAR = 4.0
@@ -59,13 +60,9 @@ class Part(NamedTuple):
     whitened: Callable[[Array], Array] = lambda rows: rows
     saturated: int = 0
 
-    @property
-    def name(self) -> str:
-        """Name in sentences."""
-        return f"{self.channel} of `{self.recording}`"
-
-    def verdict(self, test: "Test", p: float, size: float, words: str) -> "Verdict":
-        return Verdict(test, self.recording, self.channel, p, size, f"{self.name} {words}")
+    def result(self, test: "Test", p: float, size: float, **facts: Any) -> "ResidualTest":
+        """The result of a test of this part."""
+        return ResidualTest(test, self.recording, self.channel, p, size, facts)
 
 
 def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
@@ -124,9 +121,6 @@ FAINT = 0.5
 """Residuals over the noise below which their pattern is not tested, since the noise is
 overstated."""
 
-MOST = 3
-"""Most channels that a sentence names; it counts the others."""
-
 MEDIAN = 0.37
 """Efficiency of the level by the median residual, relative to the mean square."""
 
@@ -138,31 +132,43 @@ exceeds by chance; over the noise."""
 Test = Literal["level", "white", "motion", "channels", "onset", "outliers", "priors"]
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """Result of one test of one channel in one recording (None for all): its p-value, the p-value
-    adjusted for all tests, the size of the effect, and the effect in words."""
+class ResidualTest(NamedTuple):
+    """Result of one test of one channel in one recording (None for all): its p-value, the size of
+    the effect with further facts, and the p-value adjusted for all tests."""
 
     test: Test
     recording: str | None
     channel: str | None
     p: float
     size: float
-    words: str
+    facts: Mapping[str, Any] = MappingProxyType({})
     adjusted: float = 1.0
 
     @property
     def alarming(self) -> bool:
         return self.adjusted < LEVEL
 
+    @property
+    def code(self) -> str:
+        """Code of its finding."""
+        if self.test != "level":
+            return self.test
+        return "larger" if self.size > 1 else "smaller"
 
-def systematic(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    @property
+    def case(self) -> dict[str, Any]:
+        """Its facts as a case of a finding."""
+        where = {"recording": self.recording, "channel": self.channel}
+        return {name: one for name, one in where.items() if one} | {"size": self.size, **self.facts}
+
+
+def systematic(tests: Sequence[ResidualTest]) -> list[ResidualTest]:
     """The alarms that a wrong model causes, the clearest first: residuals that are too large,
     coloured, follow the motion, or belong together."""
     kinds = ("white", "motion", "channels")
     found = [
         one
-        for one in verdicts
+        for one in tests
         if one.alarming and (one.test in kinds or (one.test == "level" and one.size > 1))
     ]
     return sorted(found, key=lambda one: one.p)
@@ -170,7 +176,7 @@ def systematic(verdicts: Sequence[Verdict]) -> list[Verdict]:
 
 def judge_residuals(
     parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
-) -> list[Verdict]:
+) -> list[ResidualTest]:
     """All tests of a fit's whitened residuals r (m,), with the Jacobian J (m, n) by the free
     coordinates; the last rows are those of the named `priors`.
 
@@ -179,28 +185,26 @@ def judge_residuals(
     """
     Q, R = np.linalg.qr(J)
     seen = np.abs(np.diag(R)) > 1e-9 * max(np.abs(np.diag(R)).max(initial=0.0), 1e-300)
-    Q, out = Q[:, seen], list[Verdict]()
+    Q, out = Q[:, seen], list[ResidualTest]()
     sums = [level(part, r, Q, robust) for part in parts]
-    out += [verdict for verdict, _, _ in sums]
+    out += [test for test, _, _ in sums]
     exact = [(square, dof) for part, (_, square, dof) in zip(parts, sums) if part.noise is None]
     if len(exact) > 1:
         square, dof = (float(sum(some)) for some in zip(*exact))
-        words = f"all of them together {(square / dof) ** 0.5:.3g} times, in {dof:.0f} samples"
-        out.append(
-            Verdict("level", None, None, two_sided(square, dof), (square / dof) ** 0.5, words)
-        )
+        p, size = two_sided(square, dof), (square / dof) ** 0.5
+        out.append(ResidualTest("level", None, None, p, size, {"samples": dof}))
     recordings = {
         one: [part for part in parts if part.recording == one]
         for one in dict.fromkeys(part.recording for part in parts)
     }
-    begins = {one: found for one, mine in recordings.items() if (found := onset(mine))}
-    out += begins.values()
+    onsets = {one: found for one, mine in recordings.items() if (found := onset(mine))}
+    out += onsets.values()
     for part in parts:
         if float(np.mean(part.raw**2)) < FAINT**2:
             continue
         out.append(white(part, r))
         out += lines_up(part, [p for p in parts if p.recording == part.recording], r, Q)
-        if not robust and part.recording not in begins:  # what follows are no outliers
+        if not robust and part.recording not in onsets:  # what follows are no outliers
             out.append(outliers(part, r))
     for recording, mine in recordings.items():
         out += together(recording, mine, r, Q)
@@ -211,13 +215,13 @@ def judge_residuals(
     return holm(out)
 
 
-def holm(verdicts: Sequence[Verdict]) -> list[Verdict]:
-    """Verdicts with p-values adjusted by Holm's method, in the same order."""
-    p, n = np.array([f.p for f in verdicts]), len(verdicts)
+def holm(tests: Sequence[ResidualTest]) -> list[ResidualTest]:
+    """Tests with p-values adjusted by Holm's method, in the same order."""
+    p, n = np.array([one.p for one in tests]), len(tests)
     order = np.argsort(p)
     adjusted = np.empty(n)
     adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * (n - np.arange(n))), 1.0)
-    return [replace(f, adjusted=float(a)) for f, a in zip(verdicts, adjusted)]
+    return [one._replace(adjusted=float(a)) for one, a in zip(tests, adjusted)]
 
 
 def two_sided(square: float, dof: float) -> float:
@@ -225,7 +229,7 @@ def two_sided(square: float, dof: float) -> float:
     return float(min(1.0, 2 * min(stats.chi2.sf(square, dof), stats.chi2.cdf(square, dof))))
 
 
-def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float, float]:
+def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[ResidualTest, float, float]:
     """Test of the sum of squares against the stated noise; returns also that sum and its degrees of
     freedom.
 
@@ -245,8 +249,7 @@ def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float,
         worth *= part.noise.effective(n) / n
     dof = worth * free
     square, size = mean * worth, float((mean / free) ** 0.5)
-    verdict = part.verdict("level", two_sided(square, dof), size, f"{size:.3g} times")
-    return verdict, square, dof
+    return part.result("level", two_sided(square, dof), size), square, dof
 
 
 def autocorrelation(r: Array) -> Array:
@@ -272,10 +275,10 @@ def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
     return float(rho[0]), float(stats.chi2.sf(Q, lags - coefficients))
 
 
-def white(part: Part, r: Array) -> Verdict:
+def white(part: Part, r: Array) -> ResidualTest:
     """Test of whiteness of the whitened residuals."""
     rho, p = whiteness(r[part.rows], part.noise.order if part.noise is not None else 0)
-    return part.verdict("white", p, rho, f"(neighbouring samples correlate by {rho:.2f})")
+    return part.result("white", p, rho)
 
 
 def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, Array]:
@@ -302,7 +305,7 @@ def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, A
     return p, min(taken / max(own, 1e-300), 1.0), alone
 
 
-def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
+def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[ResidualTest]:
     """Tests of correlation with the predicted reading, as a wrong sensor would cause it, and with
     other channels and their rates, as a wrong law would."""
     out, t = [], part.t
@@ -329,8 +332,7 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
             continue
         p, share, alone = explained(part, np.stack(list(signals.values()), 1), r, Q)
         best = list(signals)[int(np.argmax(np.abs(alone)))]
-        words = f"({share:.0%} of it, most like {best})"
-        out.append(part.verdict("motion", p, share, words))
+        out.append(part.result("motion", p, share, like=best))
     return out
 
 
@@ -360,7 +362,7 @@ def largest_change(part: Part) -> Change:
     return Change(min(1.0, p), float(part.t[k[i]]), low, high, part.channel)
 
 
-def onset(mine: Sequence[Part]) -> Verdict | None:
+def onset(mine: Sequence[Part]) -> ResidualTest | None:
     """Test of a misfit that begins at a certain time, of the parts of one recording. It begins with
     the first residual beyond `BEYOND` in any channel that fits until then."""
     changes = [
@@ -377,32 +379,22 @@ def onset(mine: Sequence[Part]) -> Verdict | None:
             if np.sum(part.raw[:i] ** 2) < BEFORE**2 * i:
                 first.append((float(part.t[i]), part.channel, float(np.abs(part.raw[i]))))
     time, channel, size = min(first)
-    words = (
-        f"`{recording}` at t = {time:.4g} s, where {channel} is off by {size:.2g} times the noise "
-        f"(residuals of {clear.channel} are {clear.before:.2g} times the noise before t = "
-        f"{clear.time:.4g} s, and {clear.after:.2g} times after)"
-    )
-    return Verdict("onset", recording, None, clear.p, clear.after, words)
+    facts = {"time": time, "first": channel, "off": size, "before": clear.before}
+    return ResidualTest("onset", recording, clear.channel, clear.p, clear.after, facts)
 
 
-def outliers(part: Part, r: Array) -> Verdict:
-    """Tests of the largest residual (Grubbs), and of heavy tails (Anscombe and Glynn)."""
+def outliers(part: Part, r: Array) -> ResidualTest:
+    """Test of heavy tails (Anscombe and Glynn)."""
     rows = r[part.rows]
     m, at = len(rows), int(np.argmax(np.abs(rows)))
-    sd = float(rows.std(ddof=1)) if m > 2 else 0.0
-    if m < LAGS or sd == 0:
-        return part.verdict("outliers", 1.0, 0.0, "(too short to tell)")
-    G = float(np.abs(rows - rows.mean())[at]) / sd
-    beyond = (m - 1) ** 2 - m * G**2
-    t = G * (m * (m - 2) / beyond) ** 0.5 if beyond > 0 else np.inf
-    grubbs = min(1.0, 2 * m * float(stats.t.sf(t, m - 2)))
+    if m < LAGS or np.ptp(rows) == 0:
+        return part.result("outliers", 1.0, 0.0)
     tails = float(stats.kurtosistest(rows, alternative="greater").pvalue)
     largest = abs(float(rows[at]))
-    words = f"(the largest {largest:.1f} times the noise, at t = {part.t[at]:.4g} s)"
-    return part.verdict("outliers", min(1.0, 2 * min(grubbs, tails)), largest, words)
+    return part.result("outliers", tails, largest, time=float(part.t[at]))
 
 
-def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
+def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[ResidualTest]:
     """Test of correlation between channels sampled at the same times (Bartlett)."""
     longest = max((p.t for p in parts), key=len)
     alike = [
@@ -418,66 +410,35 @@ def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[
     C = np.atleast_2d(np.corrcoef(rows))
     square = -(n - 1 - (2 * k + 5) / 6) * float(np.linalg.slogdet(C)[1])
     i, j = np.unravel_index(int(np.argmax(np.abs(np.triu(C, 1)))), C.shape)
-    words = (
-        f"{alike[i].channel} and {alike[j].channel} of `{recording}` (correlation {C[i, j]:.2f})"
-    )
+    facts = {"channels": f"{alike[i].channel} and {alike[j].channel}"}
     p = float(stats.chi2.sf(square, k * (k - 1) / 2))
-    return [Verdict("channels", recording, None, p, float(C[i, j]), words)]
+    return [ResidualTest("channels", recording, None, p, float(C[i, j]), facts)]
 
 
-def contradicted(name: str, r: float, q: Array) -> Verdict:
+def contradicted(name: str, r: float, q: Array) -> ResidualTest:
     """Test of the residual r of a prior, whose row of Q is q (n,)."""
     free = max(1.0 - float(q @ q), 0.0)
     z = float(r) / free**0.5 if free > 1e-9 else 0.0  # without data it is where the prior is
-    return Verdict(
-        "priors",
-        None,
-        None,
-        2 * float(stats.norm.sf(abs(z))),
-        abs(z),
-        f"{name} by {abs(z):.2g} standard deviations",
-    )
+    p = 2 * float(stats.norm.sf(abs(z)))
+    return ResidualTest("priors", None, None, p, abs(z), {"prior": name})
 
 
-SENTENCES: dict[str, str] = {
-    "onset": "the misfit begins in {}: look for what happened then (samples lost, a clock that "
-    "jumped, a knock, a motion that the model does not describe), or fit the data before it",
-    "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or "
-    "the noise larger",
-    "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or "
-    "intervals are too wide, and faults of the model stay hidden",
-    "white": "residuals are not white in {}: something systematic is left, and intervals may be "
-    "too narrow",
-    "motion": "residuals follow the motion in {}: a sensor is not as it was stated, or the model "
-    "is wrong",
-    "channels": "residuals of different channels belong together, {}: the model leaves out "
-    "something that moves both",
-    "outliers": "there are outliers in {}: look at these samples, or take a robust loss",
-    "priors": "the data contradict what was known before, {}: the prior is wrong, or the model",
-}
-
-
-def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> dict[str, str]:
-    """By kind of alarm a sentence that names recordings and channels, the clearest first; `widened`
-    [1] is the factor on intervals for residuals that are too large."""
-    kinds: dict[str, list[Verdict]] = {kind: [] for kind in SENTENCES}
-    for verdict in sorted(
-        (f for f in verdicts if f.alarming), key=lambda f: (f.recording is None, f.p)
-    ):
-        kinds[
-            verdict.test if verdict.test != "level" else "larger" if verdict.size > 1 else "smaller"
-        ].append(verdict)
-    out = {
-        kind: SENTENCES[kind].format(named([f.words for f in some]))
-        for kind, some in kinds.items()
-        if some
-    }
-    if "larger" in out and widened >= 1.005:
-        out["larger"] += f"; intervals are widened by {widened:.3g}"
+def residual_findings(
+    tests: Sequence[ResidualTest], widened: float = 1.0, severity: Severity = "warning"
+) -> list[Finding]:
+    """A finding for each kind of alarm, with its cases, the clearest first. `severity` is that of
+    what a wrong model causes; `widened` [1] is the factor on intervals for residuals that are too
+    large."""
+    found, model = dict[str, list[ResidualTest]](), systematic(tests)
+    order = sorted((one for one in tests if one.alarming), key=lambda t: (t.recording is None, t.p))
+    for code in ("onset", "larger", "smaller", "white", "motion", "channels", "outliers", "priors"):
+        mine = [one for one in order if one.code == code]
+        found |= {code: mine} if mine else {}
+    out = list[Finding]()
+    for code, some in found.items():
+        facts: dict[str, Any] = {"cases": [one.case for one in some]}
+        if code == "larger" and widened >= 1.005:
+            facts["widened"] = widened
+        usual: Severity = "note" if code == "smaller" else "warning"
+        out.append(Finding(code, severity if some[0] in model else usual, facts))
     return out
-
-
-def named(words: Sequence[str]) -> str:
-    """The first `MOST` words, and the number of others."""
-    more = len(words) - MOST
-    return ", ".join(words[:MOST]) + (f" and {more} more" if more > 0 else "")

@@ -30,7 +30,6 @@ from torchsoft.rigs.written import files_renamed
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.estimate import (
     ChannelResiduals,
-    Contribution,
     Direction,
     Estimate,
 )
@@ -39,6 +38,7 @@ from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.sentences import HEADLINES, IDENTIFIED, Finding
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
 
@@ -46,8 +46,8 @@ from torchsoft.tables import Number, line, refusing, shown
 @dataclass(frozen=True)
 class RecordedRig:
     """A recording and its rig: fingerprint, length [s], start, the rig's class, its parameters and
-    laws before the fit (`description`), the `identified` parameters, and the values `began` of the
-    start's coordinates.
+    laws before the fit (`description`), the `identified` parameters, and the `initial` values of
+    the start's coordinates.
 
     `tables` are those of the rig file that it was built from; None for a rig with parts of its own,
     or with files beside its own.
@@ -63,7 +63,7 @@ class RecordedRig:
     description: dict[str, Any]
     tables: dict[str, Any] | None
     identified: dict[str, float]
-    began: dict[str, float]
+    initial: dict[str, float]
 
     @property
     def known(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
         files_renamed(dict(rig.tables or {}), lambda name, files=files: files.append(name) or name)
         tables = None if rig.tables is None or files else dict(rig.tables)
         identified = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
-        began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
+        initial = {name: value for name, value in values.items() if name.startswith(PREFIX)}
         start = line(str(recording.start), 300)
         one = RecordedRig(
             recording.name,
@@ -128,7 +128,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
             rig.description(),
             tables,
             identified,
-            began,
+            initial,
         )
         out.append(one)
     return out
@@ -137,7 +137,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
 # The result
 
 
-SCHEMA = "torchsoft-answer-8"
+SCHEMA = "torchsoft-answer-9"
 """Name and version of the file format."""
 
 
@@ -145,10 +145,6 @@ LARGEST = 1e9
 """Largest size [B] of an answer's file."""
 
 Verdict = Literal["holds", "doubtful", "does not explain"]
-
-UNEXPLAINED = 1.25
-"""RMS residual of a channel, over its stated noise, above which the headline says that the model
-does not explain the data."""
 
 
 @dataclass(frozen=True)
@@ -186,12 +182,7 @@ class IdentificationResult(Shown):
     heldout: dict[
         str, dict[str, Number]
     ]  # NRMSE of recordings that were not fitted, by recording and channel
-    notices: list[str]
-    doubts: list[str]  # the notices that speak against the model
-    # whether residuals are those of a right model, at least under the suspect that is named
-    explained: bool
-    # assumptions that the data would not show to be wrong, though estimates move
-    unseen: list[str]
+    findings: list[Finding]  # the gravest first
     stages: list[dict[str, Any]]
     cost: dict[str, Number]
     made_by: dict[str, Any]
@@ -200,7 +191,6 @@ class IdentificationResult(Shown):
     unknowns: dict[str, Unknown] = field(default_factory=dict, repr=False)
     sensors: dict[str, Sensor] = field(default_factory=dict, repr=False)
     coordinates: list[Coordinate] = field(default_factory=list, repr=False)
-    contributions: list[Contribution] = field(default_factory=list, repr=False)
     combinations: list[Combination] = field(default_factory=list, repr=False)
     noise: list[ChannelNoise] = field(default_factory=list, repr=False)
     assumptions: list[AssumptionTest] = field(default_factory=list, repr=False)
@@ -235,44 +225,24 @@ class IdentificationResult(Shown):
             else:
                 low, high = one.ci95
                 rows.append((one.label, f"{one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}"))
-        rows += [("note", notice) for notice in self.notices]
-        rows += [("unseen", sentence) for sentence in self.unseen]
+        rows += [(one.severity, str(one)) for one in self.findings]
         return self.headline, rows
 
     @property
     def verdict(self) -> Verdict:
         """Whether the model holds, is in doubt, or does not explain the data."""
-        if not self.explained or not all(one.stated < UNEXPLAINED for one in self.residuals):
+        severities = {one.severity for one in self.findings}
+        if "error" in severities:
             return "does not explain"
-        return "doubtful" if self.doubts else "holds"
+        return "doubtful" if "warning" in severities else "holds"
 
     @property
     def headline(self) -> str:
-        """First line of a report: the verdict on the model, where it is not that it holds, and the
-        number of identifiable parameters."""
+        """First line of a report: the verdict, and the number of identifiable parameters."""
         mine = [e for e in self.estimates if e.kind == "parameter"]
-        text = (
-            f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = "
-            f"{self.chi2:.3g}"
-        )
-        if not abs(self.chi2_whitened - self.chi2) < 0.1 * self.chi2:
-            text += f", {self.chi2_whitened:.3g} once whitened"
-        if self.verdict == "doubtful":
-            several = len(self.doubts) > 1
-            held = f"{len(self.doubts)} notes below speak" if several else "a note below speaks"
-            return f"The model is doubtful, {held} against it; if it holds, {text}"
-        if self.verdict == "holds":
-            return text
-        worst = max(self.residuals, key=lambda one: one.stated)
-        size = f"residuals of {worst.channel} are {worst.stated:.2g} times the stated noise"
-        if worst.stated < UNEXPLAINED:
-            size = f"{len(self.doubts)} notes below say what it leaves"
-            if len(self.doubts) == 1:
-                size = "a note below says what it leaves"
-        return (
-            f"The model does not explain the data: {size} (χ² = {self.chi2:.3g}), and "
-            "intervals may miss the truth"
-        )
+        count = sum(e.identifiable for e in mine)
+        identified = IDENTIFIED.format(count=count, parameters=len(mine), chi2=self.chi2)
+        return HEADLINES[self.verdict].format(identified=identified, chi2=self.chi2)
 
     def recorded(self, recording: str | None = None) -> RecordedRig:
         """A recording and its rig, by default the first. Raises `ValueError` for an unknown one,
@@ -387,6 +357,8 @@ class IdentificationResult(Shown):
         """Content of the file."""
         content = {"verdict": self.verdict}
         content |= finite(adapter().dump_python(self, mode="json", by_alias=True))
+        for one, finding in zip(content["findings"], self.findings):
+            one["text"] = str(finding)
         return json.dumps(
             {"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False
         )
@@ -436,6 +408,9 @@ def schema() -> dict[str, Any]:
     """The JSON Schema (2020-12) of the file."""
     definition = finite(adapter().json_schema(by_alias=True, mode="serialization"))
     definition["properties"].pop("rigs", None)
+    finding = definition["$defs"]["Finding"]
+    finding["properties"]["text"] = {"type": "string", "description": "The finding in words."}
+    finding["required"].append("text")
     head = {
         "schema": {"const": SCHEMA, "description": "Name and version of the file's form."},
         "checksum": {
@@ -481,7 +456,11 @@ def load_answer(path: str | Path) -> IdentificationResult:
             f"{path} is damaged: its content is not what was saved; restore it from a copy, or "
             "identify again"
         )
-    content.pop("verdict", None)  # it follows from the rest
+    content.pop("verdict", None)  # it follows from the rest, as texts do
+    findings = content.get("findings")
+    for one in findings if isinstance(findings, list) else ():
+        if isinstance(one, dict):
+            one.pop("text", None)
     # of a steep friction law, which was fitted nevertheless
     with refusing(content, str(path)), warnings.catch_warnings(action="ignore"):
         return adapter().validate_json(json.dumps(content))

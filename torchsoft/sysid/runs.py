@@ -37,16 +37,12 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.prediction import (
     FailedRun,
     Frozen,
-    Misfit,
     Prediction,
-    Readout,
-    Signals,
     Steps,
     initial_state,
-    misfit,
     predict,
 )
-from torchsoft.sysid.recording import BETWEEN, Array, Grid, Recording, RunContext
+from torchsoft.sysid.recording import BETWEEN, Grid, Recording, RunContext
 
 MEANING = (
     "Runs of an identification that is not done; torchsoft removes the .run files in this folder "
@@ -56,7 +52,7 @@ MEANING = (
 RUN = re.compile(r"[0-9a-f]{64}\.run")
 """Names of files with results."""
 
-KINDS = {kind.__name__: kind for kind in (Prediction, Misfit, FailedRun)}
+KINDS = {kind.__name__: kind for kind in (Prediction, FailedRun)}
 """Types of results of a run."""
 
 PROGRAM = (
@@ -170,9 +166,8 @@ class Job(NamedTuple):
     """One run: index of the recording, values of the unknowns, names to differentiate by, and
     steps.
 
-    `interpolated` requests a grid between the samples; `judged` requests the misfit and its
-    gradient in place of the signals, and holds every sensor's readout.
-    `varied` are amounts of variations of the recording, by name.
+    `interpolated` requests a grid between the samples; `varied` are amounts of variations of the
+    recording, by name.
     """
 
     recording: int
@@ -180,7 +175,6 @@ class Job(NamedTuple):
     names: tuple[str, ...]
     steps: Steps
     interpolated: bool = False
-    judged: tuple[Readout, ...] | None = None
     varied: tuple[tuple[str, float], ...] = ()
 
 
@@ -211,11 +205,11 @@ class Runner:
             raise ValueError(f"`workers` must be positive, but is {workers}")
         self.variations = dict(variations or {})
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
-        self.simulations = self.jacobians = self.gradients = self.remembered = 0
+        self.simulations = self.jacobians = self.remembered = 0
         self._work = 0.0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
-        beginnings = {recording.beginning for recording in self.recordings}
-        self._alike, self._lock = len(beginnings) < len(self.recordings), Lock()
+        starts = {recording.start_fingerprint for recording in self.recordings}
+        self._alike, self._lock = len(starts) < len(self.recordings), Lock()
         self._starts: dict[Any, tuple[Tensor, Tensor]] = {}
         self._watched: dict[str, Prediction] = {}
         self._idle: list[list[RunContext]] = [
@@ -235,7 +229,7 @@ class Runner:
         return out
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
-        """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
+        """Results in the order of the jobs: `Prediction` or `FailedRun`."""
         self._starts = {}
         out = [self._journal.recall(job) if self._journal is not None else None for job in jobs]
         remembered = [result is not None for result in out]
@@ -270,12 +264,12 @@ class Runner:
         else:
             idle = self._idle[job.recording]
             try:
-                begun = idle.pop()
+                context = idle.pop()
             except IndexError:
-                begun = self.recordings[job.recording].begin()
-            start = partial(self._start, begun, job) if self._alike else None
-            result = simulated(self.recordings[job.recording], begun, job, start)
-            idle.append(begun)
+                context = self.recordings[job.recording].run_context()
+            start = partial(self._start, context, job) if self._alike else None
+            result = simulated(self.recordings[job.recording], context, job, start)
+            idle.append(context)
         if self._journal is not None:
             self._journal.keep(job, result)
         return result
@@ -288,8 +282,8 @@ class Runner:
         def run(one: Recording, job: Job = plain, fine: bool = False) -> Any:
             nonlocal work
             tied = tuple(one.tied) if job.names else ()
-            job = job._replace(steps=since(job.steps, one.begins), names=(*tied, *job.names))
-            made = simulated(one, one.begin(), job, grid=between(one, job) if fine else None)
+            job = job._replace(steps=since(job.steps, one.run_start), names=(*tied, *job.names))
+            made = simulated(one, one.run_context(), job, grid=between(one, job) if fine else None)
             if isinstance(made, FailedRun):
                 raise SimulationFailed(made.reason, made.time)
             if one is not stated:  # which is made once for many
@@ -304,7 +298,7 @@ class Runner:
         def watched(one: Recording, derived: bool = False) -> Prediction:
             """The run on a fine grid, with the derivatives of the job if they are asked for; the
             last one of the recording as stated is kept."""
-            fine = plain._replace(names=plain.names if derived else (), judged=None)
+            fine = plain._replace(names=plain.names if derived else ())
             if one is not stated:
                 return run(one, fine, True)
             with self._lock:
@@ -326,12 +320,12 @@ class Runner:
         except SimulationFailed as failure:
             return FailedRun(failure.reason, failure.time)
 
-    def _start(self, begun: RunContext, job: Job) -> tuple[Tensor, Tensor]:
+    def _start(self, context: RunContext, job: Job) -> tuple[Tensor, Tensor]:
         """The initial state of a run, computed once for recordings that begin alike."""
-        key = self.recordings[job.recording].beginning, repr((job.values, job.names))
+        key = self.recordings[job.recording].start_fingerprint, repr((job.values, job.names))
         with self._lock:
             if key not in self._starts:
-                self._starts[key] = initial_state(begun, job.values, job.names)
+                self._starts[key] = initial_state(context, job.values, job.names)
             return self._starts[key]
 
     def _length(self, job: Job) -> float:
@@ -343,9 +337,7 @@ class Runner:
     def _count(self, job: Job, remembered: bool, work: float) -> None:
         self._work += work
         self.remembered += remembered
-        if job.judged is not None:
-            self.gradients += 1
-        elif job.names:
+        if job.names:
             self.jacobians += 1
         else:
             self.simulations += 1
@@ -357,12 +349,12 @@ EARLY = 2e-3
 """Steps [s] before frozen ones, where the run of a varied recording begins earlier."""
 
 
-def since(steps: Steps, begin: float) -> Steps:
+def since(steps: Steps, start: float) -> Steps:
     """The same steps for a run that begins at another time [s]."""
-    if not isinstance(steps, Frozen) or begin == steps.knots[0]:
+    if not isinstance(steps, Frozen) or start == steps.knots[0]:
         return steps
     knots = steps.knots
-    early = np.arange(begin, knots[0], EARLY) if begin < knots[0] else np.array([begin])
+    early = np.arange(start, knots[0], EARLY) if start < knots[0] else np.array([start])
     return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
 
 
@@ -375,29 +367,16 @@ def between(recording: Recording, job: Job) -> Grid:
 
 def simulated(
     recording: Recording,
-    begun: RunContext,
+    context: RunContext,
     job: Job,
     start: Callable[[], tuple[Tensor, Tensor]] | None = None,
     grid: Grid | None = None,
 ) -> Any:
-    """A `Prediction`, a `Misfit`, or a `FailedRun`, with a rig that no other thread uses; `start`
+    """A `Prediction` or a `FailedRun`, with a rig that no other thread uses; `start`
     computes the initial state. The grid is the recording's own unless another is given."""
     grid = recording.grid(job.interpolated) if grid is None else grid
-    run = begun, job.values, grid, job.names, job.steps
     try:
-        if job.judged is None:
-            return predict(*run, start() if start is not None else None)
-        return misfit(*run, lambda signals: judge(recording, job.judged or (), signals))
+        known = start() if start is not None else None
+        return predict(context, job.values, grid, job.names, job.steps, known)
     except SimulationFailed as failure:
         return FailedRun(failure.reason, failure.time)
-
-
-def judge(
-    recording: Recording, judged: Sequence[Readout], signals: Signals
-) -> tuple[float, Array, Array]:
-    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the
-    nuisances of every readout (readouts, nuisances)."""
-    rows = [one.adjoint(signals, *recording.samples[one.channel]) for one in judged]
-    loss = sum(0.5 * float(r @ r) for r, _, _ in rows)
-    on_signals = sum((part for _, part, _ in rows), np.zeros(signals.values.shape))
-    return loss, on_signals, np.stack([part for _, _, part in rows])

@@ -19,12 +19,12 @@ from torchsoft.sysid.fit import Fit, fisher
 from torchsoft.sysid.new_fits import MOST, NewFits
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.refits import columns
-from torchsoft.sysid.residual_tests import Verdict
+from torchsoft.sysid.residual_tests import ResidualTest
 from torchsoft.sysid.unknowns import NUISANCES
 
 TEMPERED = 0.46
-"""Power of the likelihood in odds. Suspects only resemble what is wrong, so that one is named
-beside the best, with odds of 1 %, that leaves `EVIDENT` more of the sum of squares."""
+"""Power of the likelihood in scores. Suspects only resemble what is wrong, so that one is named
+beside the best, with a score of 1 %, that leaves `EVIDENT` more of the sum of squares."""
 
 
 class Checked(NamedTuple):
@@ -44,11 +44,11 @@ class Checked(NamedTuple):
     besides: tuple[AssumptionTest, ...] = ()
     """Effects that the data favour to first order besides the likeliest suspect, each beside those
     before it."""
-    alarms: tuple[Verdict, ...] = ()
+    alarms: tuple[ResidualTest, ...] = ()
     """Alarms of the residuals under the likeliest suspect, or of the fit without a suspect."""
-    left: tuple[Verdict, ...] = ()
+    left: tuple[ResidualTest, ...] = ()
     """Alarms under the likeliest suspect and the effects besides."""
-    as_stated: tuple[Verdict, ...] = ()
+    as_stated: tuple[ResidualTest, ...] = ()
     """Alarms of the residuals of the fit itself."""
     sd: Mapping[str, float] = MappingProxyType({})
     """Standard deviations of the free coordinates, by label."""
@@ -58,7 +58,7 @@ class Checked(NamedTuple):
         """Suspects that the data favour, the likeliest first, those that pass the tests before
         others."""
         mine = [one for one in self.checks if one.suspected]
-        return sorted(mine, key=lambda one: (-one.odds, -one.passed, -one.gain))
+        return sorted(mine, key=lambda one: (-one.score, -one.passed, -one.gain))
 
     @property
     def explained(self) -> bool:
@@ -165,8 +165,8 @@ def rivals(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) 
     return near if len(near) > 1 or any(checks[one.name].far for one in near) else []
 
 
-def with_odds(checks: Sequence[AssumptionTest], dof: int) -> list[AssumptionTest]:
-    """Tests with odds: shares of the evidence, by Schwarz's criterion and `TEMPERED`, of the
+def with_scores(checks: Sequence[AssumptionTest], dof: int) -> list[AssumptionTest]:
+    """Tests with scores: shares of the evidence, by Schwarz's criterion and `TEMPERED`, of the
     suspects that pass the tests of a fit with `dof` degrees of freedom, or of all where none does.
     A new fit with a law that holds or does not has no amplitude."""
     out = list(checks)
@@ -182,18 +182,18 @@ def with_odds(checks: Sequence[AssumptionTest], dof: int) -> list[AssumptionTest
         for one in some
     ]
     left = np.array([one.left for one in some])
-    score = left / rest + np.log(dof) * np.array(amplitudes)
-    odds = np.exp(-0.5 * TEMPERED * (score - score.min()))
-    for one, share in zip(some, odds / odds.sum()):
-        out[out.index(one)] = replace(one, odds=float(share))
+    deviance = left / rest + np.log(dof) * np.array(amplitudes)
+    likelihood = np.exp(-0.5 * TEMPERED * (deviance - deviance.min()))
+    for one, share in zip(some, likelihood / likelihood.sum()):
+        out[out.index(one)] = replace(one, score=float(share))
     return out
 
 
 def compared(checked: Checked, judge: Judge) -> Checked:
-    """Tests with odds, and what is left under the likeliest suspect."""
-    out = with_odds(checked.checks, judge.dof)
+    """Tests with scores, and what is left under the likeliest suspect."""
+    out = with_scores(checked.checks, judge.dof)
     favoured = [one for one in out if one.suspected]
     if not favoured:
         return checked._replace(alarms=checked.as_stated)
-    besides, alone, left = judge.besides(max(favoured, key=lambda one: one.odds), out)
+    besides, alone, left = judge.besides(max(favoured, key=lambda one: one.score), out)
     return checked._replace(checks=out, besides=besides, alarms=tuple(alone), left=tuple(left))

@@ -56,16 +56,16 @@ def record(
     """
     rig, _, t = planned
     sensors = by_channel([rig], sensors)
-    begins = start or Standing.built(planned)
+    initial = start or Standing.built(planned)
     at = np.arange(float(t[0]), float(t[-1]) + 0.5 / rate, 1.0 / rate)
-    made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)
-    begun, early = made.begin(), int(begins.lead > 0)
+    made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, initial)
+    context, early = made.run_context(), int(initial.lead > 0)
     if isinstance(truth, Rig):
         own, truth = deepcopy(truth), {}
         own.reference = rig.reference
-        begun = begun._replace(rig=own, y0=begins.begin(own, made.samples))
-    grid = Grid(torch.from_numpy(np.append([at[0] - begins.lead] * early, at)), early)
-    exact, rng = predict(begun, truth, grid, (), rtol).signals, np.random.default_rng(seed)
+        context = context._replace(rig=own, y0=initial.initial_state(own, made.samples))
+    grid = Grid(torch.from_numpy(np.append([at[0] - initial.lead] * early, at)), early)
+    exact, rng = predict(context, truth, grid, (), rtol).signals, np.random.default_rng(seed)
     samples = {}
     for channel, sensor in sensors.items():
         error = noise * sensor.noise * rng.standard_normal(len(at))

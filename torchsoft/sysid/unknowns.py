@@ -350,6 +350,74 @@ AT_BOUND = 1e-4
 it."""
 
 
+def check_unknown(
+    name: str,
+    u: Unknown,
+    unknowns: Mapping[str, Unknown],
+    recordings: Sequence[Recording],
+    given: Mapping[str, float],
+) -> None:
+    """Raises `ValueError` for an unknown that is no scalar parameter of every rig, or whose ratio
+    is to something else; `given` are the parameters of the first rig."""
+    for one in given.keys() & {name, u.ratio_to}:
+        if without := next((r.name for r in recordings[1:] if one not in r.parameters), None):
+            raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`")
+    if name not in given:
+        tensors = dict(recordings[0].rig.named_parameters())
+        several = tensors.get(recordings[0].rig.aliases.get(name, name))
+        if several is not None and several.ndim:
+            raise ValueError(
+                f"unknowns: `{line(name, 80)}` cannot be identified: it has "
+                f"{several.numel()} numbers, and an unknown is one"
+            )
+        raise ValueError(
+            f"unknowns: `{line(name, 80)}` cannot be identified; "
+            f"{suggestion(name, given, 'known:')}"
+        )
+    if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
+        raise ValueError(
+            f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is not another parameter of the model"
+        )
+    if u.ratio_to is not None and u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
+        raise ValueError(f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself")
+
+
+def parameter_coordinate(
+    name: str, u: Unknown, unknowns: Mapping[str, Unknown], recordings: Sequence[Recording]
+) -> Coordinate:
+    """Coordinate of an unknown parameter, with its start and its bounds. Raises `ValueError` where
+    these are impossible."""
+    nominal = own_value(name, u, recordings) if u.nominal is None else u.nominal
+    if u.scale == "log" and nominal <= 0:
+        raise ValueError(
+            f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive "
+            "`nominal`, or scale = 'linear'"
+        )
+    ends = [limits(name, unknowns, r) for r in recordings]
+    least, most = max(least for least, _ in ends), min(most for _, most in ends)
+    for field in ("low", "high", "nominal"):
+        value = getattr(u, field)
+        if value is not None and not least <= value <= most:
+            quantity = f"{name} / {u.ratio_to}" if u.ratio_to else name
+            where = " in all recordings" if len(set(ends)) > 1 else ""
+            raise ValueError(
+                f"unknowns.{name}.{field} = {value:g} is beyond what {quantity} may be"
+                f"{where}, from {least:g} to {most:g}"
+            )
+    low = max(nominal / SPREAD, least) if u.low is None else u.low
+    high = min(nominal * SPREAD, most) if u.high is None else u.high
+    median = u.prior.median if u.prior else nominal
+    for field, value in (("nominal", nominal), ("prior.median", median)):
+        if not low <= value <= high or low == high:
+            raise ValueError(
+                f"unknowns.{name}.{field} = {value:g} is not between low = {low:g} and "
+                f"high = {high:g}"
+            )
+    return Coordinate(
+        name, "parameter", None, nominal, low, high, u.scale, u.ratio_to, u.fixed, u.prior
+    )
+
+
 class Coordinates:
     """All coordinates of a problem, in a fixed order, and the map from their vector x (n,) to
     parameters of the rig, starts of runs, faults of sensors, and amounts of variations, which have
@@ -374,77 +442,10 @@ class Coordinates:
             if not name.startswith(PREFIX)
         }
         for name, u in unknowns.items():
-            for one in given.keys() & {name, u.ratio_to}:
-                if without := next(
-                    (r.name for r in recordings[1:] if one not in r.parameters), None
-                ):
-                    raise ValueError(
-                        f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`"
-                    )
-            if name not in given:
-                tensors = dict(recordings[0].rig.named_parameters())
-                several = tensors.get(recordings[0].rig.aliases.get(name, name))
-                if several is not None and several.ndim:
-                    raise ValueError(
-                        f"unknowns: `{line(name, 80)}` cannot be identified: it has "
-                        f"{several.numel()} numbers, and an unknown is one"
-                    )
-                raise ValueError(
-                    f"unknowns: `{line(name, 80)}` cannot be identified; "
-                    f"{suggestion(name, given, 'known:')}"
-                )
-            if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
-                raise ValueError(
-                    f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is not another parameter of "
-                    "the model"
-                )
-            if u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
-                raise ValueError(
-                    f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself"
-                )
-            nominal = own_value(name, u, recordings) if u.nominal is None else u.nominal
-            if u.scale == "log" and nominal <= 0:
-                raise ValueError(
-                    f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive "
-                    "`nominal`, or scale = 'linear'"
-                )
-            ends = [limits(name, unknowns, r) for r in recordings]
-            least, most = max(least for least, _ in ends), min(most for _, most in ends)
-            for field in ("low", "high", "nominal"):
-                value = getattr(u, field)
-                if value is not None and not least <= value <= most:
-                    quantity = f"{name} / {u.ratio_to}" if u.ratio_to else name
-                    where = " in all recordings" if len(set(ends)) > 1 else ""
-                    raise ValueError(
-                        f"unknowns.{name}.{field} = {value:g} is beyond what {quantity} may be"
-                        f"{where}, from {least:g} to {most:g}"
-                    )
-            low = max(nominal / SPREAD, least) if u.low is None else u.low
-            high = min(nominal * SPREAD, most) if u.high is None else u.high
-            for field, value in (
-                ("nominal", nominal),
-                ("prior.median", u.prior.median if u.prior else nominal),
-            ):
-                if not low <= value <= high or low == high:
-                    raise ValueError(
-                        f"unknowns.{name}.{field} = {value:g} is not between low = {low:g} and "
-                        f"high = {high:g}"
-                    )
-            for where in (None,) if u.per == "all" else self.recordings:
-                self.all.append(
-                    Coordinate(
-                        name,
-                        "parameter",
-                        where,
-                        nominal,
-                        low,
-                        high,
-                        u.scale,
-                        u.ratio_to,
-                        u.fixed,
-                        u.prior,
-                    )
-                )
+            check_unknown(name, u, unknowns, recordings, given)
+            one = parameter_coordinate(name, u, unknowns, recordings)
+            every = (None,) if u.per == "all" else self.recordings
+            self.all += [replace(one, recording=where) for where in every]
         for r in recordings:
             for pair in r.rig.ordered.items():
                 self._check_order(*pair, r.parameters)
@@ -503,7 +504,7 @@ class Coordinates:
             [c.to_x(c.high) for c in self.all]
         )
 
-    def begun(self, known: Mapping[str, float]) -> Array:
+    def with_known(self, known: Mapping[str, float]) -> Array:
         """Vector x (n,) with the `known` entries by label, and the nominal values elsewhere."""
         return np.array([known.get(label, own) for label, own in zip(self.labels, self.start)])
 
@@ -559,6 +560,20 @@ class Coordinates:
             for i, c in enumerate(self.all)
             if c.name == channel and not c.of_the_rig and c.recording in (None, recording)
         }  # pyright: ignore[reportReturnType]
+
+    def log_prior_volume(self, x: Array) -> tuple[float, Array]:
+        """Logarithm of d value / d x at x (n,) of the coordinates whose prior is normal on a
+        logarithmic scale, or log-normal on a linear one, and its gradient (n,): the factor between
+        densities of values and of coordinates."""
+        total, gradient = 0.0, np.zeros(len(x))
+        for i, prior in self.priors:
+            c = self.all[i]
+            if c.scale == "log" and prior.kind == "normal":
+                total, gradient[i] = total + float(x[i]), 1.0
+            elif c.scale == "linear" and prior.kind == "log-normal":
+                value = c.to_value(x[i])
+                total, gradient[i] = total - math.log(value), -c.slope(x[i]) / value
+        return total, gradient
 
     @property
     def priors(self) -> list[tuple[int, Prior]]:
