@@ -73,7 +73,7 @@ MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("workers",), 3, "`workers` is not known here"),
     (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
     (("rig",), None, "rig should be a table"),
-    (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),
+    (("rig", "bodies", "disc", "mass"), -1.0, r"^rig: bodies\.disc\.mass"),
     (("kinds", 0, "name"), "grip", "kinds: every name once"),
     (("kinds", 0, "fixed", "motion.x_e"), {"kind": "hold"}, "kinds.0.*x_e.*did you mean `x_d`"),
     (("kinds", 0, "fixed", E), 1e6, "kinds.0.parameters.materials.rubber.E is in `fixed` as well"),

@@ -97,8 +97,9 @@ class Subject:
     @cached_property
     def template(self) -> Rig:
         """A rig with the parts and meshes that all trajectories share."""
+        file = self.file  # which names the field of its own errors
         try:
-            return self.file.assemble()
+            return file.assemble()
         except ValueError as error:
             raise ValueError(f"rig: {error}") from None
 
