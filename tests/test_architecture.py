@@ -41,7 +41,7 @@ FLOWS = {
         planner columns configuration measured design figures report .
     """,
     "testing": "energy laws gradients .",
-    "plan": "knots problem search planning .",
+    "plan": "knots problem search sqp planning .",
     "rigs": """
         fields places parts control motion outputs schema naming geometry initial built assembly
         build excite written recorded findings check goal run .

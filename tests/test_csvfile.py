@@ -1,11 +1,13 @@
 """Tables of numbers as laboratories' programs write them."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from openpyxl import Workbook
 
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
@@ -43,7 +45,9 @@ def test_every_form_reads_the_same(form, tmp_path):
 FORMS = st.fixed_dictionaries({
     "separator": st.sampled_from(",;\t"), "mark": st.sampled_from(".,"),
     "encoding": st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"]),
-    "end": st.sampled_from(["\n", "\r\n"]), "unit": st.sampled_from(["mm", "\xb5m", "m"]),
+    "end": st.sampled_from(["\n", "\r\n"]), "column": st.sampled_from(
+        [("x", "mm"), ("x", "\xb5m"), ("x", "m"), *(("force", unit) for unit in UNITS["N"])]
+    ),
 })  # fmt: skip
 NUMBERS = st.lists(
     st.tuples(*[st.floats(-1e6, 1e6).filter(lambda x: x == 0 or abs(x) > 1e-9)] * 2),
@@ -55,16 +59,17 @@ NUMBERS = st.lists(
 @given(FORMS, NUMBERS)
 def test_numbers_come_back_whatever_the_form(tmp_path_factory, form, rows):
     """Over separators, decimal marks, encodings, ends of lines and units."""
-    separator, mark = form["separator"], form["mark"]
+    separator, mark, (name, unit) = form["separator"], form["mark"], form["column"]
     assume(separator != mark)
-    lines = [("t [s]", f"x [{form['unit']}]"), *((repr(t), repr(x)) for t, x in rows)]
+    lines = [("t [s]", f"{name} [{unit}]"), *((repr(t), repr(x)) for t, x in rows)]
     text = form["end"].join(separator.join(one) for one in lines)
     heading, _, body = text.partition(form["end"])
     path = tmp_path_factory.mktemp("csv") / "test.csv"
     path.write_bytes(f"{heading}{form['end']}{body.replace('.', mark)}".encode(form["encoding"]))
-    table, scale = read(path), UNITS["m"][form["unit"]]
+    table, (_, values) = read(path), zip(*rows)
     assert np.allclose(table.values["t"], [t for t, _ in rows], rtol=1e-14, atol=0)
-    assert np.allclose(table.values["x"], [scale * x for _, x in rows], rtol=1e-14, atol=0)
+    expected = UNITS["m" if name == "x" else "N"][unit] * np.array(values)
+    assert np.allclose(table.values[name], expected, rtol=1e-14, atol=0)
 
 
 CELLS = ["1", "-2.5", "3e2", "", " 4 ", "1,5", "2.000,5", "x", "nan", "inf", "1_0", "0x1", "\uff11",
@@ -108,50 +113,48 @@ def test_other_headings_and_columns_to_ignore(tmp_path):
     assert read(path, headings={"Zeit": "t"}, ignore=None).ignored == ("Kraft", "Temp", "Weg")
 
 
-@pytest.mark.parametrize(("unit", "newtons"), [("gf", 9.80665e-3), ("kgf", 9.80665), ("kN", 1e3)])
-def test_forces_are_in_newtons(unit, newtons, tmp_path):
-    path = tmp_path / "test.csv"
-    path.write_text(f"t [s],force [{unit}]\n0,1\n1,2\n")
-    assert read(path).values["force"] == pytest.approx([newtons, 2 * newtons], rel=1e-12)
+def test_forces_of_scales_are_weights():
+    """Of standard gravity."""
+    assert (UNITS["N"]["gf"], UNITS["N"]["kgf"]) == pytest.approx((9.80665e-3, 9.80665), rel=1e-12)
+
+
+def workbook(path: Path, **sheets: list[list[Any]]) -> Workbook:
+    """A workbook of sheets with these rows, saved to a path."""
+    book = Workbook()
+    book.remove(book.worksheets[0])
+    for title, rows in sheets.items():
+        sheet = book.create_sheet(title)
+        for row in rows:
+            sheet.append(row)
+    book.save(path)
+    return book
 
 
 def test_workbooks(tmp_path):
-    from openpyxl import Workbook
-
-    path, book = tmp_path / "test.xlsx", Workbook()
-    sheet = book.create_sheet("Data")
-    for row in (["made by", None, None], ["t", "force", "x"], ["s", "N", "mm"], [None] * 3):
-        sheet.append(row)
-    for row in zip(T, FORCE, (1, 2, 4)):
-        sheet.append(row)
-    book.save(path)
+    path = tmp_path / "test.xlsx"
+    heading = [["made by", None, None], ["t", "force", "x"], ["s", "N", "mm"], [None] * 3]
+    rows = [*heading, *map(list, zip(T, FORCE, (1, 2, 4)))]
+    workbook(path, Data=rows)
     table = read(path)
     assert np.allclose(table.values["force"], FORCE)
     assert (table.heading, table.rows) == (2, [5, 6, 7])
-    book.copy_worksheet(sheet)
-    book.save(path)
-    with pytest.raises(ValueError, match="a table in each of the sheets Data, Data Copy: keep one"):
+    workbook(path, Data=rows, Copy=rows)
+    with pytest.raises(ValueError, match="a table in each of the sheets Data, Copy: keep one"):
         read(path)
 
 
 @pytest.mark.parametrize("state", ["hidden", "veryHidden"])
 def test_hidden_worksheets_are_not_read(state, tmp_path):
-    from openpyxl import Workbook
-
-    path, book = tmp_path / "test.xlsx", Workbook()
-    for sheet, rows in (
-        (book.worksheets[0], [["t [s]", "x [mm]"], [0, 1], [1, 2]]),
-        (book.create_sheet("old"), [["t [s]", "x [mm]", "force [N]"], [0, 7, 7], [1, 8, 8]]),
-    ):
-        for row in rows:
-            sheet.append(row)
+    path = tmp_path / "test.xlsx"
+    shown = [["t [s]", "x [mm]"], [0, 1], [1, 2]]
+    book = workbook(path, shown=shown, old=[["t [s]", "force [N]"], [0, 7], [1, 8]])
     book["old"].sheet_state = state
     book.create_chartsheet("chart")
     book.save(path)
     values = read(path).values
     assert values.keys() == {"t", "x"}
     assert values["x"] == pytest.approx([1e-3, 2e-3])
-    book.remove(book.worksheets[0])
+    book.remove(book["shown"])
     book.active = 1
     book.save(path)
     with pytest.raises(ValueError, match=r"no visible worksheet .* unhide old"):
@@ -169,13 +172,9 @@ def test_hidden_worksheets_are_not_read(state, tmp_path):
     ],
 )
 def test_cells_of_workbooks_mean_what_they_display(heading, form, value, expected, tmp_path):
-    from openpyxl import Workbook
-
-    path, book = tmp_path / "test.xlsx", Workbook()
-    sheet = book.worksheets[0]
-    for row in (["t [s]", heading], [0, 0], [1, value]):
-        sheet.append(row)
-    sheet["B3"].number_format = form
+    path = tmp_path / "test.xlsx"
+    book = workbook(path, Data=[["t [s]", heading], [0, 0], [1, value]])
+    book["Data"]["B3"].number_format = form
     book.save(path)
     if isinstance(expected, str):
         with pytest.raises(ValueError, match=expected):

@@ -71,10 +71,9 @@ MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("channels",), ["x_disk"], "channels: `x_disk` is no channel of the rig; there are x_disc"),
     (("channels",), ["x_disc", "x_disc"], "channels: every name once"),
     (("workers",), 3, "`workers` is not known here"),
-    (("grasp_depth",), {}, r"grasp_depth is of torchsoft 0\.2\.0 and before"),
     (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
     (("rig",), None, "rig should be a table"),
-    (("rig", "bodies", "disc", "mass"), -1.0, r"rig: bodies\.disc\.mass"),
+    (("rig", "bodies", "disc", "mass"), -1.0, r"^rig: bodies\.disc\.mass"),
     (("kinds", 0, "name"), "grip", "kinds: every name once"),
     (("kinds", 0, "fixed", "motion.x_e"), {"kind": "hold"}, "kinds.0.*x_e.*did you mean `x_d`"),
     (("kinds", 0, "fixed", E), 1e6, "kinds.0.parameters.materials.rubber.E is in `fixed` as well"),
@@ -90,8 +89,6 @@ MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
 
 @pytest.mark.parametrize(("place", "value", "message"), MISTAKES)
 def test_a_mistake_is_named_by_its_field(tree, place, value, message):
-    if "grasp_depth" in place:
-        tree = {name: one for name, one in tree.items() if name != "rig"}
     with pytest.raises(InvalidTable) as error:
         Config.model_validate(changed(tree, place, value))
     assert re.search(message, str(error.value)), str(error.value)

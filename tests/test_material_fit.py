@@ -207,7 +207,6 @@ def test_the_modulus_of_a_pull_is_that_of_its_range(test, sign, tmp_path):
     assert isinstance(found, Pull)
     result = modulus(found)
     assert result.values["E"] == pytest.approx(0.8e6 - 0.8e6 * 0.1, rel=1e-3)
-    assert result.ends == pytest.approx((0.76e6, 0.68e6), rel=1e-6)
     for notice in ("slope goes from 0.76 to 0.68 MPa", "row 2 to row 11: strains below 0.05",
             "90 rows from row 33 to row 122: strains above 0.15",
             "60 rows from row 123 to row 182: after the largest strain"):  # fmt: skip
@@ -430,7 +429,7 @@ COMMANDS = {
     "creeping": (lambda f: plain(f, creeping(2e-3)), [], "generalised_kelvin of 2", 1e6 / 3.5),
     "sweep": (lambda f: table(f / "test.csv", SAME[5][0]), [], "prony of 2 terms", 4e5),
     "pull": (lambda f: table(f / "test.csv", pull()), ["--test", "tension", "--range", "0", "0.1",
-        "--length", "0.02", "--area", "6e-6", "--tau", "0.02"], "strains from 0 to 0.1", 0.76e6),
+        "--length", "0.02", "--area", "6e-6", "--tau", "0.02"], "kelvin_voigt, residual", 0.76e6),
     "energy": (lambda f: table(f / "test.csv", columns("tension", TRUE["ogden"])), [*FITTED,
         "ogden", "--terms", "2", "--also", "shear={}/shear.csv"], "residual", 2.3e5 * 2.98),
     "slow": (lambda f: table(f / "test.csv", columns("tension", TRUE["neo_hookean"])), [*FITTED,

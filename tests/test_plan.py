@@ -20,7 +20,7 @@ from torchsoft.cli import main
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Moves
 from torchsoft.plan.problem import Evaluator, Free, Terms, Variables
-from torchsoft.plan.search import Search
+from torchsoft.plan.search import Criterion, Search
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.goal import Goal, drawn, plan_file
 from torchsoft.rigs.written import template, to_toml
@@ -73,8 +73,8 @@ def turned():
 def searched(free: Free, rtol: float, over: Any = None, terms: Terms | None = None) -> Search:
     variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
     terms = terms or Terms(None, {"turn": TURN}, {})
-    evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, over or {}, rtol, None)
-    return Search(evaluator, "mean", 1.0, math.inf, tqdm(disable=True))
+    evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, over or {}, rtol)
+    return Search(evaluator, Criterion(variables, False, 1.0), math.inf, tqdm(disable=True))
 
 
 def test_slopes_are_the_differences():
@@ -85,7 +85,7 @@ def test_slopes_are_the_differences():
     objective = lambda run: run["effort_left_y"].square().mean()
     over = {"materials.silicone.E": torch.tensor([5e5, 5.2e5]).double()}
     search = searched(free, 1e-8, over, Terms(objective, {"turn": TURN} | PLACE, limits))
-    evaluate, z = search.evaluator.evaluate, search.origin.copy()
+    evaluate, z = search.evaluator.evaluate, search.evaluator.variables.start.copy()
     z[:3] += [-0.1, 0.12, -0.05]
     found = evaluate(z)
     assert found.errors.shape == (2, 3)
@@ -97,8 +97,8 @@ def test_slopes_are_the_differences():
         for part in ("value", "errors", "excess")
     ]
     np.testing.assert_allclose(slopes @ way, np.concatenate(differences, 1), rtol=1e-3, atol=5e-3)
-    more, less = (search.changed(z + s * way)[0] for s in (1, -1))
-    assert search.changed(z)[1] @ way == pytest.approx((more - less) / 2, rel=1e-9)
+    more, less = (search.criterion.changed(z + s * way)[0] for s in (1, -1))
+    assert search.criterion.changed(z)[1] @ way == pytest.approx((more - less) / 2, rel=1e-9)
 
 
 def test_limits_measure_the_run(turned):

@@ -142,7 +142,7 @@ def make(options: argparse.Namespace) -> int:
 
 def slurm(options: argparse.Namespace) -> int:
     """Print a job array."""
-    from torchsoft.datasets.generate import job_array
+    from torchsoft.datasets.slurm import job_array
 
     script, price = job_array(options.config, options.out, options.parts)
     say(script.rstrip(), needed=True)

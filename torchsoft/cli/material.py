@@ -8,9 +8,8 @@ from torchsoft.cli.results import add_command, add_out, say, try_folder
 from torchsoft.materials.kinds import ENERGIES, PULLS
 
 if TYPE_CHECKING:
-    from torchsoft.materials.energies import EnergyFit
+    from torchsoft.materials.energies import PullFit
     from torchsoft.materials.fit import Fit
-    from torchsoft.materials.modulus import Modulus
 
 MATERIAL_FIT = """\
 Which material did this in a test?
@@ -130,7 +129,8 @@ def fit_material(options: argparse.Namespace) -> int:
         if value is not None and name not in assumed:
             raise ValueError(f"{options.file}: the test determines {name}: leave --{name} out")
     try_folder(options.out, options.force)
-    stated = {name: x for name, x in vars(options).items() if name in OPTIONS}
+    others = ("file", "out", "force", "run", "command")
+    stated = {name: x for name, x in vars(options).items() if name not in others}
     write(found, options.out, assumed, stated)
     say(printed(found))
     say(f"written to {', '.join(str(options.out / name) for name in FILES)}")
@@ -140,14 +140,8 @@ def fit_material(options: argparse.Namespace) -> int:
 TIMELESS = ("kelvin_voigt", *ENERGIES)
 """Kinds of materials whose tests determine no time."""
 
-OPTIONS = (
-    "test", "energy", "also", "relaxation", "fast", "true", "terms", *SIZES, "range", "column",
-    "ignore", *ASSUMED,
-)  # fmt: skip
-"""Options that say how a file is read."""
 
-
-def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus | EnergyFit":
+def tested(options: argparse.Namespace, nu: float) -> "Fit | PullFit":
     """The material of a test. Raises `ValueError`."""
     from torchsoft.materials.fit import fit
     from torchsoft.materials.measured import Pull, read
@@ -175,7 +169,7 @@ def tested(options: argparse.Namespace, nu: float) -> "Fit | Modulus | EnergyFit
     return modulus(test)
 
 
-def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "EnergyFit":
+def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "PullFit":
     """The strain energy of a table and of those of --also. Raises `ValueError`."""
     from torchsoft.materials.energies import fit_energy
     from torchsoft.materials.fit import fit

@@ -37,7 +37,7 @@ def card(url: str) -> str:
         config=config,
         rig=subject.template,
         variables=subject.variables,
-        example=next(iter(subject.signals), "stored_energy"),
+        example=next(iter(subject.channels), "stored_energy"),
         failed=failed.tolist(),
         by_split=by_split(data),
         reasons=sorted({line(reason, 100) for reason in data.reason.values[failed]}),

@@ -212,7 +212,7 @@ def summary(url: str, data: xr.Dataset) -> str:
 def figure(data: xr.Dataset, config: Config) -> Figure:
     """Coverage of a dataset: each drawn parameter over the next one by split, with failures
     crossed, and up to three channels of some sound trajectories over time."""
-    drawn, series = config.parameters, list(config.subject.signals)[:3]
+    drawn, series = config.parameters, list(config.subject.channels)[:3]
     columns = min(4, len(drawn) + len(series))
     rows = -(-(len(drawn) + len(series)) // columns)
     failed = data.failed.values.astype(bool)

@@ -15,6 +15,8 @@ from pydantic import (
 )
 from scipy.special import ndtr, ndtri
 
+from torchsoft.datasets.rig_files import place
+from torchsoft.rigs.build import RigFile
 from torchsoft.tables import LISTED, Table, is_huge
 
 WIDTH = 4.0
@@ -201,3 +203,15 @@ class Kind(Table):
     """values in it, or whole tables such as a motion, by the names of the rig file's tables"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
     """distributions of its own, added to those of all kinds, or in their place"""
+
+
+def in_ratio(
+    file: RigFile, parameters: Mapping[str, Distribution], drawn: Mapping[str, float]
+) -> dict[str, float]:
+    """Parameters by name from the drawn numbers, which are values or ratios to other parameters."""
+    out = dict(drawn)
+    for name, one in parameters.items():
+        if (base := one.ratio_to) is not None:
+            of = drawn[base] if base in drawn else place(file, base).value
+            out[name] = drawn[name] * of
+    return out

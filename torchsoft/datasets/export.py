@@ -29,7 +29,7 @@ def export_logs(url: str, out: Path) -> str:
     check_apart(url, "--out", out)
     if out.is_dir() and any(out.iterdir()):
         raise ValueError(f"--out: {out} is not empty; name a new folder")
-    channels, labels = list(subject.signals), [*subject.labels, "split"]
+    channels, labels = list(subject.channels), [*subject.config.parameters, "split"]
     kept, parent = data[[*channels, *labels]], out.absolute().parent
     with store_errors(str(out)):
         make_folder(parent)

@@ -14,9 +14,6 @@ STEP = 0.02
 """Largest step [s] of the stepper: twice the pads' own time, and the energy balance is off by
 percents."""
 
-OUTDATED = ("grasp_depth", "settle", "feed_forward")
-"""Fields of configurations from before version 0.3, which had no rig file."""
-
 
 class Fractions(Table):
     """Fractions of the trajectories; the rest is for testing."""
@@ -85,15 +82,7 @@ class Fields(Table):
     @model_validator(mode="before")
     @classmethod
     def _times_are_those_of_the_rig(cls, data: Any) -> Any:
-        if not isinstance(data, Mapping):
-            return data
-        if "rig" not in data and (old := [name for name in OUTDATED if name in data]):
-            raise ValueError(
-                f"{old[0]} is of torchsoft 0.2.0 and before, which makes, checks and exports such "
-                'datasets; now every configuration names a rig, such as rig = "paper", and '
-                "`fixed`, `parameters` and `kinds` speak of its tables"
-            )
-        if not isinstance(data.get("rig"), Mapping):
+        if not isinstance(data, Mapping) or not isinstance(data.get("rig"), Mapping):
             return data
         return outputs_of(data["rig"]) | dict(data)
 

@@ -5,14 +5,12 @@ Each part has shards of its own, and no two processes make one shard at the same
 """
 
 import math
-import shlex
 import statistics
 import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,10 +19,11 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 from tqdm import tqdm
 
-from torchsoft.cost import Cost, rig_row, rig_step, span, steps_per_second
+from torchsoft.cost import Cost, rig_row, rig_step, steps_per_second
 from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, folder, read_bytes
+from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, read_bytes
+from torchsoft.datasets.schema import energies, surfaces
 from torchsoft.datasets.subject import Row, Subject, Task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.parallel import executor, local_processes, single_threaded
@@ -46,7 +45,7 @@ def points(config: Config) -> NDArray[np.floating]:
     A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to
     its size.
     """
-    dimensions, rng = config.subject.drawn, np.random.default_rng(config.seed)
+    dimensions, rng = config.subject.dimensions, np.random.default_rng(config.seed)
     if config.method == "latin_hypercube":
         return qmc.LatinHypercube(dimensions, rng=rng).random(config.trajectories)
     power = int(np.ceil(np.log2(config.trajectories)))
@@ -85,15 +84,15 @@ def simulate_task(config: Config, task: Task) -> Row:
 @torch.no_grad()
 def series(subject: Subject, rig: Rig, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
-    out: Row = {name: run[name].numpy() for name in subject.signals}
-    for pad, touching in subject.surfaces.items() if subject.config.nodal else ():
+    out: Row = {name: run[name].numpy() for name in subject.channels}
+    for pad, touching in surfaces(subject.template).items() if subject.config.nodal else ():
         for name in touching:
             out[f"normal_force_{name}"] = run.force[name][..., 0].numpy()
             out[f"friction_force_{name}"] = run.force[name][..., 1].numpy()
             depth = rig.penetration(name, run.state)
             out[f"contact_{name}"] = (depth > 0).numpy().astype(np.uint8)
         out[f"displacement_{pad}"] = (rig.pads[pad].spread @ run.displacement[pad]).numpy()
-    for kind, (_, parts) in subject.energies.items():
+    for kind, (_, parts) in energies(subject.template).items():
         known = run.energy if kind == "stored" else getattr(run, kind)
         out[f"{kind}_energy"] = np.stack([known[part].numpy() for part in parts], -1)
     out["injected_energy"], out["energy_residual"] = (
@@ -124,10 +123,6 @@ PATIENCE = 60.0
 
 SURE = 2.0
 """Half width of the estimated range of times, in standard errors of the mean."""
-
-
-BAR = "{l_bar}{bar}| {n:.1f}/{total:.1f}{unit} [{elapsed}<{remaining}, {rate_noinv_fmt}{postfix}]"
-"""What a bar in simulated seconds says."""
 
 
 class Log:
@@ -168,65 +163,66 @@ def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
     return [shard for shard in part.shards(config) if shard not in finished]
 
 
-def cost(
-    config: Config, workers: int, count: int | None = None,
-    each: tuple[float, float, float] | None = None,
-) -> Cost:  # fmt: skip
-    """Cost of `count` trajectories, by default all, on `workers` workers. `each` is the least and
-    the longest time [s] of one trajectory and its steps, by default those of `usual`."""
-    subject = config.subject
-    count = config.trajectories if count is None else count
+class Each(NamedTuple):
+    """One trajectory: its least and longest time [s], and its steps."""
+
+    least: float
+    longest: float
+    steps: float
+
+
+def cost(config: Config, workers: int, each: Each | None = None) -> Cost:
+    """Cost of the whole set on `workers` workers, by default by experience."""
+    subject, count = config.subject, config.trajectories
     at_once = max(min(workers, config.shards), 1)
-    least, most, steps = usual(config) if each is None else each
-    kept = sum(  # of one trajectory [GiB]
-        v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in config.subject.variables.values()
-    )
-    shard = 2 * kept * min(
-        config.trajectories_per_shard, config.trajectories
-    ) + config.samples * rig_row(subject.template)
-    design = 8 * 2 * config.trajectories * subject.drawn / 2**30
+    one = usual(config) if each is None else each
+    arrays = subject.variables.values()
+    kept = sum(v.kept.itemsize * math.prod(v.shape[1:]) for v in arrays) / 2**30  # [GiB]
+    rows = 2 * kept * min(config.trajectories_per_shard, count)
+    shard = rows + config.samples * rig_row(subject.template)
+    design = 8 * 2 * count * subject.dimensions / 2**30
     return Cost(
-        steps=count * steps,
-        seconds=count * most / at_once,
-        least=count * least / at_once,
+        steps=count * one.steps,
+        seconds=count * one.longest / at_once,
+        least=count * one.least / at_once,
         memory=design + shard * at_once,
         disk=kept * count,
     )
 
 
-def usual(config: Config) -> tuple[float, float, float]:
-    """Time [s] of a trajectory, twice, and its steps by experience, on the high side."""
+def usual(config: Config) -> Each:
+    """A trajectory by experience, on the high side."""
     subject = config.subject
-    seconds, step = config.duration, subject.steps.get("step")
+    duration, step = config.duration, subject.steps.get("step")
     if step is not None:
-        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
+        steps = duration / config.sample_interval * math.ceil(config.sample_interval / step)
     else:  # an output between two steps takes half the time of a step
         rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
-        steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
-    return (seconds := steps * rig_step(subject.template) + STATICS), seconds, steps
+        steps = duration * steps_per_second(rtol) + 0.5 * config.samples
+    seconds = steps * rig_step(subject.template) + STATICS
+    return Each(seconds, seconds, steps)
 
 
-def measured(config: Config) -> tuple[float, float, float]:
-    """Least and longest time [s] and steps of a trajectory, from the first trajectories of the set.
-    One run before them loads the kernels; the times are of the processor, which other programs
-    hardly change."""
-    design, times, steps = points(config), list[float](), 0
+def measured(config: Config) -> Each:
+    """A trajectory by the first ones of the set. One run before them loads the kernels; the times
+    are of the processor, which other programs hardly change."""
+    design, times, steps = points(config), list[float](), list[int]()
     with single_threaded():
         for i in (0, *range(TRIED)):
             began = time.thread_time()
-            row = simulate_task(config, config.subject.task(i, design[i]))
-            steps += row["steps"] if times else 0
+            steps.append(simulate_task(config, config.subject.task(i, design[i]))["steps"])
             times.append(time.thread_time() - began)
     mean, error = statistics.mean(times[1:]), SURE * statistics.stdev(times[1:]) / TRIED**0.5
-    return max(mean - error, 0.0), mean + error, steps / TRIED
+    return Each(max(mean - error, 0.0), mean + error, statistics.mean(steps[1:]))
 
 
 def estimate(config: Config, url: str, workers: int, part: Part = WHOLE) -> Cost:
     """Cost of the unfinished shards of a part; a few trajectories are timed where there are
     many."""
     count = sum(len(config.rows(shard)) for shard in unfinished(config, url, part))
-    tried = count >= MANY and (TRIED + 1) * usual(config)[1] < PATIENCE
-    return cost(config, workers, count, measured(config) if tried else None)
+    tried = count >= MANY and (TRIED + 1) * usual(config).longest < PATIENCE
+    whole = cost(config, workers, measured(config) if tried else None)
+    return whole.part(count / config.trajectories)
 
 
 class Serial(Executor):
@@ -241,15 +237,14 @@ class Serial(Executor):
 def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
     """Simulate and write one shard. Returns how many of its trajectories are finished and how many
     of those simulated here failed, (0, 0) where another process makes the shard."""
-    config, rows = store.config, list[dict[str, Any]]()
-    with store.claim(shard) as simulated, single_threaded():
-        if simulated is None:
+    config = store.config
+    with store.claim(shard) as mine, single_threaded():
+        if not mine:
             return 0, 0
         if store.finished(shard):  # by another process, since it was submitted
             return len(config.rows(shard)), 0
-        for i, u in zip(config.rows(shard), design, strict=True):
-            rows.append(simulate_task(config, config.subject.task(i, u)))
-            simulated()
+        tasks = zip(config.rows(shard), design, strict=True)
+        rows = [simulate_task(config, config.subject.task(i, u)) for i, u in tasks]
         store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
 
@@ -267,13 +262,12 @@ def generate(
     mine = part.shards(config)
     store, design = open_or_create(url, config), points(config)
     left, failed = [shard for shard in store.unfinished() if shard in mine][::-1], 0
-    running = dict[Future[tuple[int, int]], int]()
-    total = sum(len(config.rows(shard)) for shard in mine)
-    finished = total - sum(len(config.rows(shard)) for shard in left)
-    each, terminal = config.duration, sys.stderr.isatty()
+    running = set[Future[tuple[int, int]]]()
+    of = lambda shards: sum(len(config.rows(shard)) for shard in shards)
+    terminal = sys.stderr.isatty()
     with tqdm(
-        total=total * each, initial=finished * each, unit=" simulated s", bar_format=BAR,
-        disable=not progress, file=None if terminal else Log(), smoothing=0.05,
+        total=of(mine), initial=of(mine) - of(left), unit=" trajectories", disable=not progress,
+        file=None if terminal else Log(), smoothing=0.05,
         mininterval=0.1 if terminal else 30.0,  # [s]
     ) as bar:  # fmt: skip
         try:
@@ -281,15 +275,13 @@ def generate(
                 while left and len(running) < 3 * max(workers, 1):
                     here = config.rows(shard := left.pop())
                     some = design[here.start : here.stop]
-                    running[executor.submit(run_shard, store, shard, some)] = shard
-                done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+                    running.add(executor.submit(run_shard, store, shard, some))
+                done, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
-                    count, bad = future.result()
-                    finished, failed = finished + count, failed + bad
-                    del running[future]
-                bar.set_postfix_str(f"{failed} failed", refresh=False)
-                simulated = finished + sum(map(store.simulated, running.values()))
-                bar.update(max(simulated * each - bar.n, 0.0))
+                    finished, bad = future.result()
+                    failed += bad
+                    bar.set_postfix_str(f"{failed} failed", refresh=False)
+                    bar.update(finished)
         finally:
             for future in running:
                 future.cancel()
@@ -315,62 +307,3 @@ def dask_cluster(address: str) -> Iterator[Executor]:
         raise StoreError("--scheduler needs Dask: pip install 'torchsoft[scale]'") from None
     with Client(address) as client:
         yield client.get_executor(retries=3, pure=False)
-
-
-# A job array of SLURM for a dataset in parts; each part can be submitted alone and repeatedly.
-
-
-SPARE, LEAST = 3.0, 600.0
-"""Requested time over the estimate [1], and least requested time [s]."""
-
-BASE = 1.5
-"""Memory of a process [GiB] without its shard."""
-
-BEGINNING = 5
-"""Time [s] that a process takes to begin with its first shard."""
-
-SCRIPT = """\
-#!/bin/bash
-#SBATCH --job-name={name}
-#SBATCH --array={array}
-#SBATCH --cpus-per-task=1
-#SBATCH --mem={memory}G
-#SBATCH --time={hours:02d}:{minutes:02d}:00
-#SBATCH --output=%x-%A_%a.log
-# Add what your cluster wants, such as --partition and --account. A part that was stopped, or a job
-# that is submitted again, makes what is missing. Then: {check}
-export OMP_NUM_THREADS=1
-exec {command} --part "$SLURM_ARRAY_TASK_ID/{parts}" --workers "${{SLURM_CPUS_PER_TASK:-1}}" --yes
-"""
-
-
-def job_array(path: Path, url: str, parts: int) -> tuple[str, str]:
-    """The script for `sbatch`, and a sentence on its cost. Raises `ValueError` for more parts than
-    shards, and where no shard is left to make."""
-    config = Config.from_toml(path)
-    lacking = set(unfinished(config, url))
-    left = [i for i in range(1, parts + 1) if lacking & set(Part(i, parts).shards(config))]
-    if parts < 1 or not left:
-        raise ValueError(
-            f"--parts should be 1 or more, not {parts}" if parts < 1
-            else f"{url}: all {config.shards} shards are finished; there is nothing to be made"
-        )  # fmt: skip
-    out = str(here.absolute()) if (here := folder(url)) else url
-    program = [sys.executable, "-m", "torchsoft", "dataset"]
-    whole = estimate(config, url, 1)
-    most = max(len(lacking.intersection(Part(i, parts).shards(config))) for i in left)
-    price = whole.part(most / len(lacking))
-    minutes = math.ceil(max(SPARE * price.seconds, LEAST) / 60)
-    estimates = (
-        f"each of {len(left)} tasks: {price.sentence}; all of them: "
-        f"{span(whole.least, whole.seconds)} of one core, {whole.disk:.2g} GiB on the disk; "
-        f"every task also takes {BEGINNING:g} s to start and {BASE:g} GiB for its process"
-    )
-    script = SCRIPT.format(
-        name=f"torchsoft-{path.stem}".replace(" ", "-"), parts=parts,
-        array=f"1-{parts}" if len(left) == parts else ",".join(map(str, left)),
-        memory=math.ceil(BASE + 1.5 * price.memory), hours=minutes // 60, minutes=minutes % 60,
-        command=shlex.join([*program, "make", str(path.absolute()), "--out", out]),
-        check=shlex.join([*program, "check", out]),
-    )  # fmt: skip
-    return script, estimates

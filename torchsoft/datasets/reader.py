@@ -137,12 +137,8 @@ class Trajectories(Shown, Dataset[dict[str, Tensor]]):
         window: int | None = None, stride: int | None = None, dtype: torch.dtype = torch.float64,
         unfinished: bool = False, memory: float | None = None,
     ) -> None:  # fmt: skip
-        self.url, self.variables, self.dtype, self.unfinished = (
-            str(url),
-            tuple(variables),
-            dtype,
-            unfinished,
-        )
+        self.url, self.variables = str(url), tuple(variables)
+        self.dtype, self.unfinished = dtype, unfinished
         self._opened = dict[int, xr.Dataset]()
         if dtype not in DTYPES:
             raise ValueError(
@@ -153,23 +149,19 @@ class Trajectories(Shown, Dataset[dict[str, Tensor]]):
                 f"`split` must be one of {', '.join(map(repr, SPLITS))}, but is {split!r}"
             )
         arrays, samples = self.data.variables, self.data.sizes["time"]
-        known = [
-            k for k, v in arrays.items() if v.dims[:1] == ("trajectory",) and v.dtype.kind in "fiu"
-        ]
+        per_trajectory = {str(k): v for k, v in arrays.items() if v.dims[:1] == ("trajectory",)}
+        known = sorted(name for name, v in per_trajectory.items() if v.dtype.kind in "fiu")
         for name in self.variables:
             if name not in known:
                 raise ValueError(
                     f"`variables` has no numbers named {name!r}; "
-                    f"{suggestion(name, sorted(map(str, known)), 'known:')}"
+                    f"{suggestion(name, known, 'known:')}"
                 )
         self.window = samples if window is None else whole("window", window, 1)
         if self.window > samples:
             raise ValueError(f"`window` must be 1 to {samples} samples, but is {window}")
-        self.starts = range(
-            0,
-            samples - self.window + 1,
-            self.window if stride is None else whole("stride", stride, 1),
-        )
+        step = self.window if stride is None else whole("stride", stride, 1)
+        self.starts = range(0, samples - self.window + 1, step)
         usable = arrays["failed"].values == 0  # so that those of unfinished shards are not
         if split is not None:
             usable &= arrays["split"].values == split
@@ -178,7 +170,8 @@ class Trajectories(Shown, Dataset[dict[str, Tensor]]):
             raise ValueError(f"`memory` must be a number of GiB, 0 or more, but is {memory!r}")
         most = HELD * machine_memory() if memory is None else memory
         self.fits = self.size <= most * 2**30
-        self._held = self._read(self.trajectories) if self.fits else None
+        if self.fits:
+            self._all  # noqa: B018 -- read before processes are forked
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         units = {name: self.data.variables[name].attrs.get("units", "") for name in self.variables}
@@ -208,7 +201,13 @@ class Trajectories(Shown, Dataset[dict[str, Tensor]]):
         return self._opened[os.getpid()]
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_opened": {}, "_held": None}
+        """Without what was read: a copy reads it again."""
+        return {k: x for k, x in vars(self).items() if k != "_all"} | {"_opened": {}}
+
+    @cached_property
+    def _all(self) -> dict[str, Tensor]:
+        """The variables of all trajectories."""
+        return self._read(self.trajectories)
 
     def __len__(self) -> int:
         return len(self.trajectories) * len(self.starts)
@@ -217,13 +216,11 @@ class Trajectories(Shown, Dataset[dict[str, Tensor]]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} is out of range for {len(self)} windows")
         which, window = divmod(index % len(self), len(self.starts))
-        if self.fits and self._held is None:  # in a process that was spawned
-            self._held = self._read(self.trajectories)
-        trajectory, start = int(self.trajectories[which]), self.starts[window]
-        if self._held is not None:
-            return self._item(self._held, which, trajectory, start)
-        at = slice(start, start + self.window)
-        return self._item(self._read(self.trajectories[[which]], at), 0, trajectory, start, 0)
+        start = self.starts[window]
+        if self.fits:
+            return self._item(self._all, which, which, start, start)
+        stretch = slice(start, start + self.window)
+        return self._item(self._read(self.trajectories[[which]], stretch), 0, which, start, 0)
 
     def streamed(self, *, shards: int = 4, seed: int = 0) -> "Streamed":
         """All windows once a sweep, each file read once, for sets that do not fit in memory: so
@@ -231,11 +228,11 @@ class Trajectories(Shown, Dataset[dict[str, Tensor]]):
         return Streamed(self, whole("shards", shards, 1), whole("seed", seed, 0))
 
     def _item(
-        self, held: dict[str, Tensor], row: int, trajectory: int, start: int, at: int | None = None
+        self, held: dict[str, Tensor], row: int, which: int, start: int, first: int
     ) -> dict[str, Tensor]:
-        """The window from sample `at` of row `row` of `held`, by default from `start`; `trajectory`
-        and `start` are its labels."""
-        first = start if at is None else at
+        """The window of trajectory number `which` that begins at sample `start`: what is `held` in
+        row `row`, from its sample `first` on."""
+        trajectory = int(self.trajectories[which])
         item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
         for name, values in held.items():
             part = values[row]
@@ -293,8 +290,9 @@ class Streamed(IterableDataset[dict[str, Tensor]]):
         shard = windows.trajectories // windows._shard_size
         order = shuffle.permutation(np.unique(shard))[worker::of]
         for i in range(0, len(order), self.shards):
-            here = windows.trajectories[np.isin(shard, order[i : i + self.shards])]
-            held, count = windows._read(here), len(windows.starts)
+            here = np.flatnonzero(np.isin(shard, order[i : i + self.shards]))
+            held, count = windows._read(windows.trajectories[here]), len(windows.starts)
             for k in shuffle.permutation(len(here) * count).tolist():
                 row, window = divmod(k, count)
-                yield windows._item(held, row, int(here[row]), windows.starts[window])
+                start = windows.starts[window]
+                yield windows._item(held, row, int(here[row]), start, start)

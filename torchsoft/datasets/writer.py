@@ -3,8 +3,8 @@ data."""
 
 import subprocess
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from torchsoft.datasets.files import (
     store_errors,
     write_bytes,
 )  # fmt: skip
+from torchsoft.datasets.schema import coordinates
 from torchsoft.files import PARTIAL, claimed, finite, remove_partials
 
 SMALL = (ZstdCodec(level=3), Crc32cCodec())
@@ -63,32 +64,16 @@ class Store:
         return all(fs.exists(f"{root}/{key}") for key in needed)
 
     @contextmanager
-    def claim(self, shard: int) -> Iterator[Callable[[], object] | None]:
-        """Claim a shard for one process. Yields a function to call after every simulated
-        trajectory, or None while another process makes the shard. Object stores, and file systems
-        without locks, let several processes claim one shard; they write the same content."""
-        if (path := self.claim_file(shard)) is None:
-            yield lambda: None
-            return
-
-        def simulated() -> None:
-            with path.open("ab") as file:
-                file.write(b".")
-
-        with store_errors(self.url), claimed(path) as mine:
-            yield simulated if mine else None
-
-    def claim_file(self, shard: int) -> Path | None:
-        """The lock file of a shard in the making, which has one byte for every simulated
-        trajectory."""
-        here = folder(self.url)
-        return here and here / f"{record_key(shard)}.{0:016}.partial"
-
-    def simulated(self, shard: int) -> int:
-        """Number of simulated trajectories of an unfinished shard, in whichever process."""
-        with suppress(OSError):
-            return path.stat().st_size if (path := self.claim_file(shard)) else 0
-        return 0
+    def claim(self, shard: int) -> Iterator[bool]:
+        """Whether a shard is claimed for this process: no other process makes it. Object stores,
+        and file systems without locks, let several processes claim one shard; they write the same
+        content."""
+        if here := folder(self.url):
+            partial = here / f"{record_key(shard)}.{0:016}.partial"
+            with store_errors(self.url), claimed(partial) as mine:
+                yield mine
+        else:
+            yield True
 
     def write(self, shard: int, rows: list[dict[str, Any]]) -> None:
         """Write a whole shard, then its record. Raises `StoreError` when there is no room or no
@@ -204,24 +189,11 @@ def laid_out(config: Config) -> dict[str, bytes]:
             attributes=attributes, fill_value=int(name == "failed") or variable.empty, **storage,
             # what was never written counts as failed
         )  # fmt: skip
-    trajectories = np.arange(config.trajectories)
-    columns: dict[str, tuple[tuple[str, ...], Any, str, str]] = {
-        "time": (
-            ("time",), np.arange(config.samples) * config.sample_interval, "s",
-            "time since the start",
-        ),
-        **config.subject.columns(),
-        "trajectory": (
-            ("trajectory",), trajectories, "1", "number of the trajectory in the design"
-        ),
-        "axis": (
-            ("axis",), np.array(["x", "y"], np.dtypes.StringDType()), "1", "names of the axes"
-        ),
-    }  # fmt: skip
-    for name, (dimensions, values, unit, meaning) in columns.items():
+    for name, one in coordinates(config, config.subject.template).items():
         group.create_array(
-            name, data=values, chunks=values.shape, dimension_names=dimensions, compressors=SMALL,
-            attributes={"units": unit, "long_name": meaning}, config={"write_empty_chunks": True},
+            name, data=one.values, chunks=one.values.shape, dimension_names=one.dimensions,
+            attributes={"units": one.unit, "long_name": one.meaning}, compressors=SMALL,
+            config={"write_empty_chunks": True},
         )  # fmt: skip
     # consolidated metadata is zarr-python's and xarray's own addition
     with warnings.catch_warnings(action="ignore"):

@@ -100,8 +100,7 @@ class Dynamics:
         solver: Mapping[str, Any], disturbances: Ranges,
     ) -> None:  # fmt: skip
         self.rig, self._built, self.solver = built.rig, built, dict(solver)
-        self._reference: Reference | None = None
-        self._stepper: ImplicitStepper | None = None
+        self._read: Read | None = None
         self.goal, self.reward = goal, reward
         self.interval, self.samples = positive("interval", interval), whole("samples", samples, 1)
         if self.interval < SHORTEST:
@@ -172,8 +171,8 @@ class Dynamics:
         """The moment at the time `begin`, after the rig's own motion, without disturbance. The
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
-        y0, t = self._read_parameters(), torch.tensor([0.0, self.start or LOOK]).double()
-        own, rows = self.reference, attached([self._run(t, y0, None).solved])[0]
+        self._read, t = self._read_parameters(), torch.tensor([0.0, self.start or LOOK]).double()
+        own, rows = self.reference, attached([self._run(t, self._read.y0, None).solved])[0]
         there = -1 if self.start else 0
         with torch.no_grad():
             now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
@@ -182,32 +181,38 @@ class Dynamics:
         none = torch.zeros(len(self.disturbances), 2, dtype=torch.float64)
         return Moment(rows.y[there], reached, 0, target, none, rows.recorded[there])
 
-    def _read_parameters(self) -> Tensor:
-        """Read the parameters of the rig: its stepper and its reference. Returns its initial
-        state."""
-        y0, self._reference = started(self.rig, self._built.initial, "discrete")
+    def _read_parameters(self) -> "Read":
+        """What follows from the parameters of the rig as they are."""
+        y0, reference = started(self.rig, self._built.initial, "discrete")
         with torch.enable_grad():  # a step may be differentiated, whatever is done here
-            task = prepare(
-                self.rig, [0.0, 1.0], y0=y0, reference=self._reference, gradient="discrete",
+            stepper = prepare(
+                self.rig, [0.0, 1.0], y0=y0, reference=reference, gradient="discrete",
                 **self.solver,
-            )  # fmt: skip
-        self._stepper, set_by = task.stepper, [*self.actions, *self.disturbances]
-        self._set = [self.rig.signals.index(name) for name in set_by]
-        t, lines = torch.tensor([0.0, LOOK]).double(), torch.zeros(len(set_by), 2).double()
-        self._motion = task.stepper.compiled.followed(self._following(t, lines), 0.0)
-        return y0
+            ).stepper  # fmt: skip
+        t, lines = torch.tensor([0.0, LOOK]).double(), torch.zeros(len(self._set_by), 2).double()
+        motion = stepper.compiled.followed(self._following(reference, t, lines), 0.0)
+        return Read(y0, reference, stepper, motion)
+
+    @property
+    def _known(self) -> "Read":
+        """What was read of the rig last, or now."""
+        if self._read is None:
+            self._read = self._read_parameters()
+        return self._read
 
     @property
     def reference(self) -> Reference:
         """The rig's own motion, with the parameters that were read."""
-        if self._reference is None:
-            self._read_parameters()
-        assert self._reference is not None
-        return self._reference
+        return self._known.reference
+
+    @property
+    def _set_by(self) -> list[str]:
+        """Signals that actions or disturbances set."""
+        return [*self.actions, *self.disturbances]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what was read: a copy reads the parameters of its own rig."""
-        return self.__dict__ | {"_stepper": None, "_motion": None, "_reference": None}
+        return self.__dict__ | {"_read": None}
 
     def step(self, now: Moment, action: Tensor, knots: Tensor | None = None) -> Transition:
         """The transition from a moment to the next control time, with an action (actions,) in [-1,
@@ -294,34 +299,41 @@ class Dynamics:
         when, peak = now.peaks[:, :1], now.peaks[:, 1:]
         return own + torch.where((when == steps) & (steps > 0), peak, 0.0)
 
-    def _following(self, times: Tensor, values: Tensor) -> Reference:
+    def _following(self, own: Reference, times: Tensor, values: Tensor) -> Reference:
         """The rig's own reference, with lines between two values each (signals, 2) for signals set
         by actions or disturbances."""
-        own = {name: self.reference[name] for name in self.rig.signals}
-        lines = [Lines(times, row) for row in values]
-        return Reference(**own | dict(zip((*self.actions, *self.disturbances), lines)))
+        signals = {name: own[name] for name in self.rig.signals}
+        lines = {name: Lines(times, row) for name, row in zip(self._set_by, values)}
+        return Reference(**signals | lines)
 
     def _run(
         self, t: Tensor, y: Tensor, values: Tensor | None, knots: Tensor | None = None
     ) -> RunOutcome:
         """A run with lines between `values` (signals, 2) for signals set by actions or
         disturbances, or by the rig's own motion."""
-        if self._stepper is None:
-            self._read_parameters()
-        stepper = self._stepper
-        assert stepper is not None
-        given = knots is not None or stepper.step is not None
-        if values is not None and self._motion.known and not (given or torch.is_grad_enabled()):
-            times = t.numpy()
-            motion = self._motion.on_lines(self._set, times[0], times[-1], values.numpy())
-            stepper = stepper.moving(motion, times[0])
-        elif values is not None:
-            stepper = stepper.following(self._following(t[[0, -1]], values))
+        _, own, stepper, motion = self._known
+        steps_are_given = knots is not None or stepper.step is not None
+        if values is None:
+            stepper = stepper.following(own)
+        elif motion.known and not steps_are_given and not torch.is_grad_enabled():
+            first, last = t.numpy()[[0, -1]]
+            places = [self.rig.signals.index(name) for name in self._set_by]
+            stepper = stepper.moving(motion.on_lines(places, first, last, values.numpy()), first)
         else:
-            stepper = stepper.following(self.reference)
+            stepper = stepper.following(self._following(own, t[[0, -1]], values))
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)
+
+
+class Read(NamedTuple):
+    """What follows from the parameters of a rig: its initial state y0 (size,), its own motion, its
+    stepper, and the motion of one between control times as the kernels take it."""
+
+    y0: Tensor
+    reference: Reference
+    stepper: ImplicitStepper
+    motion: Any
 
 
 def check_names(field: str, given: Iterable[str], known: Iterable[str], listed: str) -> None:

@@ -16,10 +16,11 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torchsoft.materials.fit import UNSURE, Fit
+from torchsoft.materials.fit import Fit, arguments, covariance_root, hardly_determined
 from torchsoft.materials.kinds import ENERGIES
 from torchsoft.materials.measured import Array, Pull, instant_time
 from torchsoft.physics.hyperelastic import KINDS, Hyperelastic, Ogden
+from torchsoft.physics.material import Material
 from torchsoft.quantity import quantities
 
 EXPONENTS = (2.0, -2.0, 5.0, -5.0, 1.0)
@@ -37,8 +38,8 @@ do not go further."""
 
 
 @dataclass(frozen=True)
-class EnergyFit:
-    """An energy fitted to `pulls`, one or more tables: `values` of its coefficients with their
+class PullFit:
+    """A material fitted to `pulls`, one or more tables: `values` of its coefficients with their
     standard deviations `sd`, those of branches behind them; the `fitted` nominal stress, table by
     table; the `relaxation` test's series that the branches are of, if any."""
 
@@ -67,8 +68,10 @@ class EnergyFit:
 
     def method(self) -> dict[str, Any]:
         """How the coefficients were found, and how well they fit, for a summary in JSON."""
+        line = self.kind == "kelvin_voigt"
+        model = "of a straight line" if line else "of an incompressible specimen"
         own: dict[str, Any] = {
-            "method": "least squares of the nominal stress of an incompressible specimen",
+            "method": f"least squares of the nominal stress {model}",
             "tables": [
                 {
                     "file": pull.path.name,
@@ -81,15 +84,14 @@ class EnergyFit:
             "residual_rms": self.rms,
             "residual_of": "of the largest",
         }
-        if self.relaxation is None:
-            return own
-        return own | {
-            "relaxation": {
-                "file": self.relaxation.measured.path.name,
-                "sha256": sha256(self.relaxation.measured.path.read_bytes()).hexdigest(),
+        if self.relaxation is not None:
+            path = self.relaxation.measured.path
+            own["relaxation"] = {
+                "file": path.name,
+                "sha256": sha256(path.read_bytes()).hexdigest(),
                 **self.relaxation.method(),
             }
-        }
+        return own
 
     @property
     def rms(self) -> float:
@@ -100,53 +102,49 @@ class EnergyFit:
     def table(self) -> dict[str, Any]:
         """The arguments of the material's constructor that the tests determine, and with branches a
         tau that is small beside their times."""
-        values, count = list(self.values.values()), self.relaxation.terms if self.relaxation else 0
-        own = arguments(self.kind, values[: len(values) - 2 * count])
-        if not count:
-            return own
-        moduli, times = values[-2 * count : -count], values[-count:]
-        return own | {"moduli": moduli, "times": times, "tau": instant_time(times)}
+        own = arguments(self.values, BRANCHES)
+        return own | ({"tau": instant_time(own["times"])} if self.relaxation else {})
 
-    def relaxing(self, series: Fit, fast: bool) -> "EnergyFit":
+    def relaxing(self, series: Fit, fast: bool) -> "PullFit":
         """The energy with the branches of a relaxation test: strengths over its relaxed modulus,
         and times. Pulls that were `fast` against them determine the instantaneous energy, which is
         that of the relaxed material times 1 + the sum of these strengths; others determine the
         relaxed one."""
-        count, E = series.terms, series.values["E"]
-        shares = {f"E_{k}": series.values[f"E_{k}"] / E for k in range(1, count + 1)}
-        part = 1 / (1 + sum(shares.values())) if fast else 1.0
-        scaled = lambda of: {k: x if k.startswith("alpha") else part * x for k, x in of.items()}
-        values, sd = scaled(self.values), scaled(self.sd)
-        table = arguments(self.kind, list(values.values()))
-        relaxed = made(self.kind, table, nu=0.45, rho=1e3, tau=1.0, depth=1.0).E.item()
-        times = [f"tau_{k}" for k in range(1, count + 1)]
-        values |= {name: relaxed * share for name, share in shares.items()}
-        sd |= {name: relaxed * series.sd[name] / E for name in shares}
-        values |= {name: series.values[name] for name in times}
-        sd |= {name: series.sd[name] for name in times}
-        said = (
-            f"fast against the times of {series.measured.path.name}, so that they determine 1 + "
-            "the sum of its strengths over its relaxed modulus times the relaxed energy, which is "
-            "written"
-            if fast
-            else f"slow against the times of {series.measured.path.name}, so that they determine "
-            "the relaxed energy"
+        strengths = [name for name in series.values if name.startswith("E_")]
+        E = series.values["E"]
+        total = 1 + sum(series.values[name] for name in strengths) / E
+        values, sd = (
+            {k: x if k.startswith("alpha") or not fast else x / total for k, x in of.items()}
+            for of in (self.values, self.sd)
         )
-        own = (*self.notices[:-1], f"the pulls count as {said}", *series.notices)
-        return replace(self, values=values, sd=sd, notices=own, relaxation=series)
+        relaxed = made(self.kind, arguments(values), nu=0.45, **UNIT).E.item()
+        for own, of_series in ((values, series.values), (sd, series.sd)):
+            own |= {name: relaxed * of_series[name] / E for name in strengths}
+            own |= {name: x for name, x in of_series.items() if name.startswith("tau_")}
+        meaning = (
+            "1 + the sum of its strengths over its relaxed modulus times the relaxed energy, which "
+            "is written"
+            if fast
+            else "the relaxed energy"
+        )
+        count_as = (
+            f"the pulls count as {'fast' if fast else 'slow'} against the times of "
+            f"{series.measured.path.name}, so that they determine {meaning}"
+        )
+        notices = (*self.notices[:-1], count_as, *series.notices)
+        return replace(self, values=values, sd=sd, notices=notices, relaxation=series)
 
-    def material(self, **others: float) -> Hyperelastic:
+    def material(self, **others: float) -> Material:
         """The material, with stated values of nu, rho, depth, and without branches tau, of which
         these tests have no information."""
-        return made(self.kind, self.table(), **others)
+        return KINDS[self.kind](**self.table(), **others)
 
 
-def arguments(kind: str, values: Sequence[float]) -> dict[str, Any]:
-    """Coefficients by the names of the constructor's arguments."""
-    if kind == "ogden":
-        half = len(values) // 2
-        return {"mu": list(values[:half]), "alpha": list(values[half:])}
-    return dict(zip(ENERGIES[kind], values))
+BRANCHES = {"E": "moduli", "tau": "times"}
+"""Arguments of the numbered coefficients of relaxing branches."""
+
+UNIT = {"rho": 1e3, "tau": 1.0, "depth": 1.0}
+"""Values of a material whose stress at rest is asked for, which does not depend on them."""
 
 
 def made(kind: str, table: Mapping[str, Any], **others: float) -> Hyperelastic:
@@ -183,9 +181,7 @@ def stretches(pull: Pull) -> Array:
     return 1 - pull.strain if pull.test == "compression" else 1 + pull.strain
 
 
-def fit_energy(
-    pulls: Sequence[Pull], kind: str, *, nu: float, terms: int | None = None
-) -> EnergyFit:
+def fit_energy(pulls: Sequence[Pull], kind: str, *, nu: float, terms: int | None = None) -> PullFit:
     """The energy of a kind that fits the tables best, every row relative to the largest stress of
     its table; `terms` are those of Ogden's, one by default. Poisson's ratio `nu` makes E of a shear
     modulus.
@@ -195,70 +191,73 @@ def fit_energy(
     """
     if terms is not None and kind != "ogden":
         raise ValueError(f"`terms` are those of ogden, but the energy is {kind}")
-    count = 2 * (terms or 1) if kind == "ogden" else len(ENERGIES[kind])
+    numbers = range(1, (terms or 1) + 1)
+    names = list(ENERGIES[kind])
+    if kind == "ogden":
+        names = [f"{symbol}_{k}" for symbol in names for k in numbers]
     rows = sum(len(pull.strain) for pull in pulls)
-    if rows < 2 * count or not 1 <= (terms or 1) <= len(EXPONENTS):
-        raise ValueError(f"{rows} rows do not determine {count} coefficients; take fewer terms")
+    if rows < 2 * len(names) or not 1 <= (terms or 1) <= len(EXPONENTS):
+        raise ValueError(
+            f"{rows} rows do not determine {len(names)} coefficients; take fewer terms"
+        )
     sizes = np.concatenate([np.full(len(p.stress), np.abs(p.stress).max()) for p in pulls])
     target = np.concatenate([pull.stress for pull in pulls]) / sizes
 
-    def material(values: Sequence[float]) -> Hyperelastic:
-        return made(kind, arguments(kind, values), nu=nu, rho=1e3, tau=1.0, depth=1.0)
-
     @cache
-    def column(*values: float) -> Array:
-        return measured_stress(material(values), pulls) / sizes
+    def column(*unit: tuple[str, Any]) -> Array:
+        return measured_stress(made(kind, arguments(dict(unit)), nu=nu, **UNIT), pulls) / sizes
 
     def columns(exponents: Array) -> Array:
         """Stresses per coefficient in which they are linear, over `sizes`: (rows, coefficients)."""
-        exponents = np.where(abs(exponents) < STEP, STEP, exponents)  # zero is no exponent
-        units = [(1.0, alpha) for alpha in exponents] if kind == "ogden" else np.eye(count).tolist()
-        return np.stack([column(*one) for one in units], 1)
-
-    def solved(A: Array) -> Array:
-        scale = np.linalg.norm(A, axis=0)
-        return np.linalg.lstsq(A / scale, target, DEPENDENT)[0] / scale
+        if kind == "ogden":
+            units = [{"mu_1": 1.0, "alpha_1": alpha} for alpha in not_zero(exponents).tolist()]
+        else:
+            units = [dict.fromkeys(names, 0.0) | {name: 1.0} for name in names]
+        return np.stack([column(*one.items()) for one in units], 1)
 
     def residuals(exponents: Array) -> Array:
         A = columns(exponents)
-        return A @ solved(A) - target
+        return A @ solved(A, target) - target
 
     exponents = np.empty(0)
     if kind == "ogden":
         allowed = quantities(Ogden)["alpha"]
         bounds = allowed.low, allowed.high
-        starts = [np.roll(EXPONENTS, -k)[: terms or 1] for k in range(len(EXPONENTS))]
+        starts = [np.roll(EXPONENTS, -k)[: len(numbers)] for k in range(len(EXPONENTS))]
         found = [least_squares(residuals, start, bounds=bounds, max_nfev=100) for start in starts]
-        exponents = min(found, key=lambda one: (solved(columns(one.x)).sum() <= 0, one.cost)).x
-        exponents = np.where(abs(exponents) < STEP, STEP, exponents)
-    A = columns(exponents)
-    linear = solved(A)
-    best = [*linear.tolist(), *exponents.tolist()]
-    energy, fitted = material(best), A @ linear
+        exponents = not_zero(
+            min(found, key=lambda one: (solved(columns(one.x), target).sum() <= 0, one.cost)).x
+        )
+    jacobian = A = columns(exponents)
+    linear = solved(A, target)
+    if kind == "ogden":
+        slopes = (columns(exponents + STEP) - columns(exponents - STEP)) / (2 * STEP) * linear
+        jacobian = np.column_stack((A, slopes))
+    values = dict(zip(names, [*linear.tolist(), *exponents.tolist()]))
+    energy, fitted = made(kind, arguments(values), nu=nu, **UNIT), A @ linear
     if not (shear := energy.shear.item()) > 0:
         raise ValueError(
             f"{pulls[0].path}: the {kind} energy that fits best has a shear modulus of "
             f"{shear:.4g} Pa at small strains, but it must be positive: take another "
             "energy or fewer terms, or look at the stresses of the smallest strains"
         )
-    jacobian = A
-    if kind == "ogden":
-        slopes = (columns(exponents + STEP) - columns(exponents - STEP)) / (2 * STEP) * linear
-        jacobian = np.column_stack((A, slopes))
-    unit = np.linalg.norm(jacobian, axis=0)
-    _, s, V = np.linalg.svd(jacobian / unit, full_matrices=False)
-    spread = ((V.T / np.maximum(s, 1e-300)) ** 2).sum(1)
-    sd = np.sqrt(spread * ((fitted - target) ** 2).sum() / max(rows - count, 1)) / unit
-    half = range(1, count // 2 + 1)
-    names = (
-        [f"{symbol}_{k}" for symbol in ENERGIES[kind] for k in half]
-        if kind == "ogden"
-        else list(ENERGIES[kind])
-    )
-    values, deviations = dict(zip(names, best)), dict(zip(names, sd.tolist()))
+    variance = ((fitted - target) ** 2).sum() / max(rows - len(names), 1)
+    sd = np.sqrt((covariance_root(jacobian) ** 2).sum(1) * variance)
     curves = np.split(fitted * sizes, np.cumsum([len(pull.stress) for pull in pulls])[:-1])
+    deviations = dict(zip(names, sd.tolist()))
     sentences = tuple(notices(pulls, energy, values, deviations))
-    return EnergyFit(tuple(pulls), kind, values, deviations, tuple(curves), sentences)
+    return PullFit(tuple(pulls), kind, values, deviations, tuple(curves), sentences)
+
+
+def not_zero(exponents: Array) -> Array:
+    """Exponents, with a small one in place of zero, which is none."""
+    return np.where(abs(exponents) < STEP, STEP, exponents)
+
+
+def solved(A: Array, target: Array) -> Array:
+    """The least-squares solution x (n,) of A x = target."""
+    scale = np.linalg.norm(A, axis=0)
+    return np.linalg.lstsq(A / scale, target, DEPENDENT)[0] / scale
 
 
 def measured_stress(material: Hyperelastic, pulls: Sequence[Pull]) -> Array:
@@ -293,10 +292,7 @@ def notices(
                 f"not stable: in {test} the nominal stress falls at a stretch of {nearest:.3g}; a "
                 "pad that comes there collapses, so take fewer terms or more tests"
             )
-    unsure = [name for name in values if not sd[name] <= UNSURE * abs(values[name])]
-    if unsure:
-        names = ", ".join(unsure)
-        yield f"hardly determined, with a standard deviation above {UNSURE:.0%}: {names}"
+    yield from hardly_determined(values, sd)
     limit = quantities(Ogden)["alpha"].high
     extreme = [
         name for name in values if name.startswith("alpha") and abs(values[name]) > 0.99 * limit

@@ -9,6 +9,7 @@ count relative to the largest response, or to the response of each row (`Measure
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,12 +94,11 @@ class Fit:
     @property
     def undetermined(self) -> list[str]:
         """Terms, with their values, whose strength the rows do not determine."""
-        symbol = "E" if self.kind == "prony" else "J"
-        found = [(f"{symbol}_{k}", f"tau_{k}") for k in range(1, self.terms + 1)]
         return [
-            f"{name} = {self.values[name]:.3g} at {self.values[tau]:.3g} s"
-            for name, tau in found
-            if not self.sd[name] <= UNSURE * self.values[name]
+            f"{name} = {self.values[name]:.3g} at {self.values[f'tau_{number}']:.3g} s"
+            for name in unsure(self.values, self.sd)
+            for symbol, _, number in [name.partition("_")]
+            if number and symbol != "tau"
         ]
 
     @property
@@ -134,18 +134,51 @@ class Fit:
 
     def table(self) -> dict[str, Any]:
         """The arguments of the material's constructor that the test determines, and tau_instant."""
-        symbol, argument = ("E", "moduli") if self.kind == "prony" else ("J", "J")
-        numbers = range(1, self.terms + 1)
-        tau = [self.values[f"tau_{k}"] for k in numbers]
-        strengths = [self.values[f"{symbol}_{k}"] for k in numbers]
-        instant = instant_time(tau)
+        own = arguments(self.values, {"E": "moduli"})
+        instant = instant_time(own["tau"])
         if isinstance(self.measured, Spectrum):  # its dashpot adds omega tau_instant to the loss
             instant = min(instant, SWEPT_PART * self.measured.window[0])
-        return {"E": self.values["E"], argument: strengths, "tau": tau, "tau_instant": instant}
+        return own | {"tau_instant": instant}
 
-    def material(self, *, nu: float, rho: float, depth: float) -> Material:
-        """The material, with stated values where a test in one dimension has no information."""
-        return KINDS[self.kind](**self.table(), nu=nu, rho=rho, depth=depth)
+    def material(self, **others: float) -> Material:
+        """The material, with stated values of nu, rho and depth, of which a test in one dimension
+        has no information."""
+        return KINDS[self.kind](**self.table(), **others)
+
+
+def arguments(
+    values: Mapping[str, float], names: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, Any]:
+    """Coefficients as the arguments of a constructor: `mu_2` is the second entry of the list `mu`,
+    or of the list that `names` has for it."""
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        symbol, _, number = name.partition("_")
+        if number:
+            out.setdefault(names.get(symbol, symbol), []).append(value)
+        else:
+            out[name] = value
+    return out
+
+
+def unsure(values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
+    """Coefficients with large standard deviations."""
+    return [name for name in values if not sd[name] <= UNSURE * abs(values[name])]
+
+
+def hardly_determined(values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
+    """A notice on coefficients with large standard deviations, if there are any."""
+    names = ", ".join(unsure(values, sd))
+    known = f"hardly determined, with a standard deviation above {UNSURE:.0%}: {names}"
+    return [known] if names else []
+
+
+def covariance_root(jacobian: Array) -> Array:
+    """A matrix R (n, n), for which R times its transpose is the inverse of that of the jacobian
+    (rows, n) times it."""
+    unit = np.linalg.norm(jacobian, axis=0)
+    _, s, V = np.linalg.svd(jacobian / unit, full_matrices=False)
+    return V.T / np.maximum(s, 1e-300) / unit[:, None]
 
 
 class Trial(NamedTuple):
@@ -274,8 +307,7 @@ def concluded(measured: Measured | Spectrum, best: Trial, scores: Mapping[int, f
     )
     n, parameters = best.J.shape
     independent = (1 - min(max(correlation, 0.0), 0.99)) / (1 + min(max(correlation, 0.0), 0.99))
-    _, s, V = np.linalg.svd(best.J, full_matrices=False)
-    root = G @ (V.T / np.maximum(s, 1e-300))
+    root = G @ covariance_root(best.J)
     sd = np.sqrt((root**2).sum(1) * float(best.r @ best.r) / ((n - parameters) * independent))
     fitted = measured.answer + best.r * measured.size
     made = dict(zip(names, values.tolist())), dict(zip(names, sd.tolist()))
@@ -326,11 +358,7 @@ def notices(
     ]
     if edge:
         sentences.append(f"at the edge of what the rows resolve, or beyond: {', '.join(edge)}")
-    unsure = [name for name in values if not sd[name] <= UNSURE * values[name]]
-    if unsure:
-        sentences.append(
-            f"hardly determined, with a standard deviation above {UNSURE:.0%}: {', '.join(unsure)}"
-        )
+    sentences += hardly_determined(values, sd)
     if len(scores) > 1 and terms == max(scores):
         sentences.append(
             f"more terms than {terms} might fit better still: the criterion was falling up to there"

@@ -32,9 +32,6 @@ MARECHAL = (
 )
 SMOOTH_ON = "Smooth-On Inc., Dragon Skin series, technical bulletin"
 
-RHO, TAU = 1100.0, 10e-3
-"""Assumed density [kg/m3] and retardation time [s]."""
-
 SHORE_A = (20.0, 80.0)
 """Hardnesses for which the relation between Shore A and Young's modulus is taken: at the ends of
 the scale it is not one."""
@@ -88,70 +85,55 @@ class Preset:
         return "\n".join([self.name, *rows])
 
 
-def preset(name: str, E: float, origin: str) -> Preset:
-    """A rubber of a published modulus [Pa]; the rest is assumed."""
-    return completed(name, {"E": Coefficient(E, "published", origin)})
+ASSUMED = {
+    "nu": Coefficient(0.49, "assumed", "nearly incompressible, as rubber is"),
+    "rho": Coefficient(1100.0, "assumed", "of silicone; counts for inertial pads only"),
+    "tau": Coefficient(10e-3, "assumed", "fit it to a test, or identify it"),
+}
+"""Coefficients that none of the sources gives."""
+
+
+def rubber(name: str, source: Literal["published", "fitted"], origin: str, **own: float) -> Preset:
+    """A rubber whose `own` coefficients are of one origin; the others are assumed."""
+    coefficients = {symbol: Coefficient(value, source, origin) for symbol, value in own.items()}
+    return Preset(name, coefficients | ASSUMED)
+
+
+def silicone(name: str, hardness: float, secant: float) -> Preset:
+    """A silicone by the Shore A hardness in its data sheet, whose modulus at 100 % strain is a
+    `secant` [Pa]."""
+    origin = (
+        f"{hardness:g} Shore A ({SMOOTH_ON}), by the relation of {GENT}: of small strains, good to "
+        f"some tens of per cent; the sheet's secant at 100 % strain is {1e-6 * secant:.2g} MPa, "
+        "and strips of it that were pulled so far are as soft"
+    )
+    return rubber(name, "published", origin, E=from_shore_a(hardness))
 
 
 def stretched(name: str, mu: float, alpha: float, residual: float) -> Preset:
     """A silicone at finite strain, by Ogden's energy of one term, with what is left of the stress
     [1]."""
     origin = f"to stretches from 1 to 2, {residual:.1%} of the largest stress left, of {MARECHAL}"
-    values = {"mu": mu, "alpha": alpha}
-    own = {symbol: Coefficient(value, "fitted", origin) for symbol, value in values.items()}
-    return completed(f"{name}, finite strain", own)
+    return rubber(f"{name}, finite strain", "fitted", origin, mu=mu, alpha=alpha)
 
 
-def completed(name: str, own: Mapping[str, Coefficient]) -> Preset:
-    """A rubber whose other numbers are assumed."""
-    return Preset(
-        name,
-        {
-            **own,
-            "nu": Coefficient(0.49, "assumed", "nearly incompressible, as rubber is"),
-            "rho": Coefficient(RHO, "assumed", "of silicone; counts for inertial pads only"),
-            "tau": Coefficient(TAU, "assumed", "fit it to a test, or identify it"),
-        },
-    )
-
-
-def silicone(name: str, hardness: float, secant: float, sheet: str) -> Preset:
-    """A silicone by the Shore A hardness in its data sheet, whose modulus at 100 % strain is a
-    `secant` [Pa]."""
-    return preset(
-        name,
-        from_shore_a(hardness),
-        f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}: of small strains, good to "
-        f"some tens of per cent; the sheet's secant at 100 % strain is {1e-6 * secant:.2g} MPa, "
-        "and strips of it that were pulled so far are as soft",
-    )
-
-
-def natural_rubber(hardness: int, E: float) -> Preset:
-    """Natural rubber of an IRHD hardness with its Young's modulus [Pa]."""
-    return preset(
-        f"natural rubber {hardness} IRHD", E, f"table of hardness and elastic moduli, {LINDLEY}"
-    )
-
+CURED = "of curing temperatures from 25 to 200 C"
+HARDNESS = f"table of hardness and elastic moduli, {LINDLEY}"
 
 PRESETS: Mapping[str, Preset] = {
     one.name: one
     for one in (
-        silicone("Dragon Skin 20", 20.0, 0.34e6, SMOOTH_ON),
-        silicone("Dragon Skin 30", 30.0, 0.59e6, SMOOTH_ON),
-        preset(
-            "Sylgard 184, softest",
-            1.32e6,
-            f"44 Shore A, least of curing temperatures from 25 to 200 C, {JOHNSTON}",
+        silicone("Dragon Skin 20", 20.0, 0.34e6),
+        silicone("Dragon Skin 30", 30.0, 0.59e6),
+        rubber(
+            "Sylgard 184, softest", "published", f"44 Shore A, least {CURED}, {JOHNSTON}", E=1.32e6
         ),
-        preset(
-            "Sylgard 184, hardest",
-            2.97e6,
-            f"54 Shore A, most of curing temperatures from 25 to 200 C, {JOHNSTON}",
+        rubber(
+            "Sylgard 184, hardest", "published", f"54 Shore A, most {CURED}, {JOHNSTON}", E=2.97e6
         ),
-        natural_rubber(40, 1.50e6),
-        natural_rubber(50, 2.20e6),
-        natural_rubber(60, 4.45e6),
+        rubber("natural rubber 40 IRHD", "published", HARDNESS, E=1.50e6),
+        rubber("natural rubber 50 IRHD", "published", HARDNESS, E=2.20e6),
+        rubber("natural rubber 60 IRHD", "published", HARDNESS, E=4.45e6),
         stretched("Dragon Skin 10 Medium", 40.2e3, 3.25, 0.0066),
         stretched("Dragon Skin 20", 112e3, 3.29, 0.009),
         stretched("Dragon Skin 30", 168e3, 3.06, 0.0029),

@@ -13,11 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchsoft.files import finite, save_text, write_json
-from torchsoft.materials.energies import EnergyFit, stretches
+from torchsoft.materials.energies import PullFit, stretches
 from torchsoft.materials.fit import Fit
 from torchsoft.materials.measured import Spectrum
-from torchsoft.materials.modulus import Modulus
-from torchsoft.physics.hyperelastic import KINDS
 from torchsoft.physics.validity import check_numbers, sound
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, new_figure, save
 from torchsoft.plot.scene import INK
@@ -37,7 +35,7 @@ UNITS = {
 FILES = ("material.toml", "summary.json", "fit.png")
 """Files that are written."""
 
-Found = Fit | Modulus | EnergyFit
+Found = Fit | PullFit
 """A material fitted to a test."""
 
 
@@ -48,7 +46,7 @@ def write(
     those of the command. Each file appears whole or not at all. Raises `ValueError` for
     coefficients that no material has."""
     try:
-        material = KINDS[found.kind](**found.table(), **assumed)
+        material = found.material(**assumed)
         check_numbers(material)
         sound(material)
     except ValueError as error:
@@ -138,15 +136,10 @@ def drawn(found: Found) -> Figure:
     return figure
 
 
-def draw_stress(data: Axes, left: Axes, found: Modulus | EnergyFit) -> None:
+def draw_stress(data: Axes, left: Axes, found: PullFit) -> None:
     """Nominal stress of every table and of the fit, and their differences: over the stretch, or
     over 1 + the amount of shear."""
-    pulls, curves = (
-        (found.pulls, found.fitted)
-        if isinstance(found, EnergyFit)
-        else ([found.measured], [found.fitted])
-    )
-    for number, (pull, curve) in enumerate(zip(pulls, curves)):
+    for number, (pull, curve) in enumerate(zip(found.pulls, found.fitted)):
         x, colour = stretches(pull) + (pull.test == "shear"), f"C{number}"
         label = f"{pull.test}, {len(x)} rows"
         data.plot(x, MPA * pull.stress, ".", color=colour, ms=4, label=label)
@@ -162,54 +155,54 @@ def draw_stress(data: Axes, left: Axes, found: Modulus | EnergyFit) -> None:
     )
 
 
+RESPONSES = {
+    ("prony", False): ("stress", "MPa", MPA),
+    ("prony", True): ("modulus", "MPa", MPA),
+    ("generalised_kelvin", False): ("strain", "1", 1.0),
+    ("generalised_kelvin", True): ("compliance", "1/MPa", 1 / MPA),
+}
+"""Response, its unit in figures and the factor to that, by kind and whether it is per load."""
+
+
 def draw_series(figure: Figure, fit: Fit) -> None:
     """Measured and fitted response over time, their difference, and strengths over times with 95 %
     intervals; times that the rows do not resolve are grey. The time axis is logarithmic: a row at t
     = 0 is left out."""
-    m, relaxes, swept = fit.measured, fit.kind == "prony", isinstance(fit.measured, Spectrum)
-    quantity, unit, scale = {
-        (True, False): ("stress", "MPa", MPA),
-        (True, True): ("modulus", "MPa", MPA),
-        (False, False): ("strain", "1", 1.0),
-        (False, True): ("compliance", "1/MPa", 1 / MPA),
-    }[relaxes, m.per_load]
+    m, swept = fit.measured, isinstance(fit.measured, Spectrum)
+    quantity, unit, scale = RESPONSES[fit.kind, m.per_load]
     data, left, spectrum = figure.subplots(3, 1, height_ratios=(3, 1.4, 2), sharex=True)
     parts = {"storage": ".", "loss": "x"} if swept else {"measured": "."}
     seen = m.t > 0
     responses = (np.split(scale * x, len(parts)) for x in (m.answer, fit.fitted, fit.residual))
     for (part, mark), measured, fitted, residual in zip(parts.items(), *responses):
-        data.plot(
-            m.t[seen], measured[seen], mark, color=INK, ms=4, label=f"{part}, {len(m.t)} rows"
-        )
+        label = f"{part}, {len(m.t)} rows"
+        data.plot(m.t[seen], measured[seen], mark, color=INK, ms=4, label=label)
         data.plot(m.t[seen], fitted[seen], color=OTHER)
         left.plot(m.t[seen], residual[seen], mark, color=INK, ms=4)
     data.set(ylabel=f"{quantity} [{unit}]", title=f"a) {quantity}; the lines are fitted")
     data.set_yscale("log" if m.relative else "linear")
     data.legend()
     left.axhline(0.0, color=OTHER)
-    left.set(
-        ylabel=f"residual [{unit}]",
-        title=f"b) measured less fitted, neighbours correlate by {fit.correlation:.2f}",
+    correlated = f"neighbours correlate by {fit.correlation:.2f}"
+    left.set(ylabel=f"residual [{unit}]", title=f"b) measured less fitted, {correlated}")
+    symbol, size, unit = ("E", MPA, "MPa") if fit.kind == "prony" else ("J", 1.0, "1")
+    numbers = range(1, fit.terms + 1)
+    (y, yerr), (x, xerr) = (
+        np.array([(fit.values[name], 1.96 * fit.sd[name]) for name in names]).T
+        for names in ([f"{symbol}_{k}" for k in numbers], [f"tau_{k}" for k in numbers])
     )
-    symbol, size, unit = ("E", MPA, " [MPa]") if relaxes else ("J", 1.0, " [1]")
-    for k in range(1, fit.terms + 1):
-        tau, strength = f"tau_{k}", f"{symbol}_{k}"
-        x, y = fit.values[tau], size * fit.values[strength]
-        factors = [np.exp(1.96 * fit.sd[name] / fit.values[name]) for name in (tau, strength)]
-        xerr, yerr = ([[v - v / factor], [v * factor - v]] for v, factor in zip((x, y), factors))
-        spectrum.errorbar(x, y, yerr, xerr, fmt="o", color=ACTUAL, capsize=3)
-    E, sd = fit.values["E"], fit.sd["E"]
+    spectrum.errorbar(x, size * y, size * yerr, xerr, fmt="o", color=ACTUAL, capsize=3)
     spectrum.margins(y=0.2)
+    E, sd = fit.values["E"], fit.sd["E"]
+    low, high = m.window
     spectrum.set(
         xscale="log",
         yscale="log",
         xlabel="1 / circular frequency [s]" if swept else "time [s]",
-        ylabel=f"${symbol}_i${unit}",
+        ylabel=f"${symbol}_i$ [{unit}]",
         title=f"c) terms; E = {MPA * E:.4g} MPa ± {1.96 * sd / E:.1%}, relaxed",
+        xlim=(low / 3, 3 * high),
     )
-    low, high = m.window
-    left_end, right_end = spectrum.get_xlim()
     for axes in (data, left, spectrum):
-        for span in ((min(left_end, low / 3), low), (high, max(right_end, 3 * high))):
-            axes.axvspan(*span, color="#f0f0f0", lw=0, zorder=0)
-    spectrum.set_xlim(low / 3, 3 * high)
+        axes.axvspan(low / 3, low, color="#f0f0f0", lw=0, zorder=0)
+        axes.axvspan(high, 3 * high, color="#f0f0f0", lw=0, zorder=0)

@@ -4,7 +4,6 @@ import time as clock
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.metadata import version
 from typing import Any, Literal
 
@@ -20,7 +19,8 @@ from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.plan.problem import Evaluation, Evaluator, Free, Term, Terms, Variables
-from torchsoft.plan.search import SLACK, Search, Stopped, Visit
+from torchsoft.plan.search import SLACK, Criterion, Search, Stopped, Visit, adam
+from torchsoft.plan.sqp import slsqp
 from torchsoft.solve.simulate import Start, started
 from torchsoft.solve.trajectory import Trajectory
 
@@ -94,8 +94,8 @@ def plan(
     y0: Numbers | Start, reference: Reference | None = None,
     over: Mapping[str, Numbers] | None = None,
     robust: Robust = "mean", method: Method = "slsqp", iterations: int = 50, rate: float = 0.02,
-    starts: int = 1, change: float | None = None, seconds: float = float("inf"),
-    rtol: float = RTOL, threads: int | None = None, seed: int = 0, progress: bool = False,
+    starts: int = 1, seconds: float = float("inf"), rtol: float = RTOL, seed: int = 0,
+    progress: bool = False,
 ) -> Plan:  # fmt: skip
     """Choose the free variables of a rig so that its run from y0 (size,) over the times t (T,) [s]
     reaches all targets within all limits. A `y0` that is a function of the rig, such as
@@ -105,9 +105,8 @@ def plan(
     least and largest value (infinite ones are allowed). `objective` (a number, which is lowered),
     `targets` (errors over a tolerance, which are brought to zero) and `limits` (excess over a
     scale, which is kept from being positive) are functions in torch of a `Trajectory`, such as
-    `Target` and `Limit`, by name. `change` weighs half the squared change of the variables, in
-    units of the speed or range allowed: by default 1 without an objective, so that the plan is the
-    one nearest to the motion given, else 0.
+    `Target` and `Limit`, by name. Without an objective the plan is the one nearest to the motion
+    given, by half the squared change of the variables in units of the speed or range allowed.
 
     `over` holds draws of uncertain parameters by name (draws, ...), y0 their starts (draws, size)
     if these differ, the first draw being the nominal one. With `robust` "mean" the mean error of
@@ -137,19 +136,22 @@ def plan(
     followed = rig.reference if reference is None else reference
     variables = Variables(rig, followed, free, float(t[-1]))
     terms = Terms(objective, targets or {}, limits or {})
-    evaluator = Evaluator(rig, t, variables, terms, y0, drawn, rtol, threads)
-    weight = (1.0 if objective is None else 0.0) if change is None else change
+    evaluator = Evaluator(rig, t, variables, terms, y0, drawn, rtol)
+    change = 1.0 if objective is None else 0.0
     notices, checked = list[str](), None
     with tqdm(desc="plan", unit=" evaluations", disable=hidden(progress)) as bar:
-        search = Search(evaluator, robust, weight, seconds, bar)
+        criterion = Criterion(variables, robust == "worst", change)
+        search = Search(evaluator, criterion, seconds, bar)
         try:
             search.begin(starts, seed)
-            go = search.slsqp if method == "slsqp" else partial(search.adam, rate=rate)
-            go(search.found.z, iterations)
+            if method == "slsqp":
+                slsqp(search, search.found.z, iterations)
+            else:
+                adam(search, search.found.z, iterations, rate)
             checked = evaluator.evaluate(search.found.z, CHECK * rtol, gradient=False)
             if method == "slsqp" and not kept(checked)[:1].all():
                 search.refine(POLISH * rtol)
-                search.slsqp(search.found.z, iterations)
+                slsqp(search, search.found.z, iterations)
         except KeyboardInterrupt:
             if search.best is None:
                 raise
@@ -163,8 +165,8 @@ def plan(
     return finished(search, checked, rig, notices, {
         "torchsoft": version("torchsoft"), "method": method, "robust": robust,
         "free": {k: tuple(v) if isinstance(v, tuple) else v.model_dump() for k, v in free.items()},
-        "draws": evaluator.draws, "iterations": iterations, "starts": starts, "change": weight,
-        "rtol": rtol, "seed": seed,
+        "draws": evaluator.draws, "iterations": iterations, "starts": starts, "rtol": rtol,
+        "seed": seed,
     })  # fmt: skip
 
 
@@ -196,35 +198,21 @@ def finished(
         evaluation = search.found
     assert evaluation.batch is not None
     run = next(one for one in evaluation.batch.trajectories if one is not None)
-    names = evaluator.terms.labels(run)
     errors, excess = (
-        {name: torch.from_numpy(column) for name, column in zip(those, values.T)}
-        for those, values in zip(names, (evaluation.errors, evaluation.excess))
+        {name: torch.from_numpy(column) for name, column in zip(names, values.T)}
+        for names, values in zip(
+            evaluator.terms.labels(run), (evaluation.errors, evaluation.excess)
+        )
     )
-    reasons: list[str] = []
-    if not held[0]:
-        reasons += [
-            f"{name} is {float(e[0]):+.3g} tolerances off"
-            for name, e in errors.items()
-            if abs(float(e[0])) > 1
-        ]
-        reasons += [
-            f"{name} is exceeded by {float(e[0]):.2%}"
-            for name, e in excess.items()
-            if float(e[0]) > SLACK
-        ]
-        reasons += [*search.evaluator.variables.active(z), *slips(run)]
-        reasons += [f"further on a run fails: {reason}" for reason in search.failures[-1:]]
-    now, start = torch.from_numpy(z), evaluator.starts[0]
-    parameters = evaluator.variables.parameters(now)
-    planned = deepcopy(rig)
+    reasons = [] if held[0] else [*misses(errors, excess), *obstacles(search, run)]
+    variables, now = evaluator.variables, torch.from_numpy(z)
+    planned, parameters, start = deepcopy(rig), variables.parameters(now), evaluator.starts[0]
     with torch.no_grad():
         for name, value in parameters.items():
             planned.parameter(name).copy_(value)
     start = started(planned, start, "none") if callable(start) else start
-    reference = evaluator.variables.reference(now, start.reference)
-    planned.reference = reference
-    combined = evaluation.value.max() if search.robust == "worst" else evaluation.value.mean()
+    planned.reference = reference = variables.reference(now, start.reference)
+    combined = evaluation.value.max() if search.criterion.worst else evaluation.value.mean()
     return Plan(
         rig=planned, reference=reference, parameters=parameters, trajectory=run,
         value=float(combined),
@@ -235,6 +223,25 @@ def finished(
             "checked_rtol": rtol,
         },
     )  # fmt: skip
+
+
+def misses(errors: Mapping[str, Tensor], excess: Mapping[str, Tensor]) -> list[str]:
+    """Sentences on targets and limits that the first draw misses."""
+    off = {name: float(e[0]) for name, e in errors.items() if abs(float(e[0])) > 1}
+    over = {name: float(e[0]) for name, e in excess.items() if float(e[0]) > SLACK}
+    return [
+        *(f"{name} is {error:+.3g} tolerances off" for name, error in off.items()),
+        *(f"{name} is exceeded by {part:.2%}" for name, part in over.items()),
+    ]
+
+
+def obstacles(search: Search, run: Trajectory) -> list[str]:
+    """What holds the best plan of a search back: active bounds, slip, and a run that fails."""
+    return [
+        *search.evaluator.variables.active(search.found.z),
+        *slips(run),
+        *(f"further on a run fails: {reason}" for reason in search.failures[-1:]),
+    ]
 
 
 def slips(run: Trajectory) -> list[str]:

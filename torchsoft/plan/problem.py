@@ -288,7 +288,7 @@ class Evaluator:
 
     def __init__(
         self, rig: Rig, t: Tensor, variables: Variables, terms: Terms, y0: Tensor | Start,
-        over: Mapping[str, Tensor], rtol: float, threads: int | None,
+        over: Mapping[str, Tensor], rtol: float,
     ) -> None:  # fmt: skip
         if twice := set(over) & set(variables.shapes):
             raise ValueError(f"`{min(twice)}` is both free and drawn; leave it out of one of them")
@@ -300,7 +300,7 @@ class Evaluator:
             raise ValueError(f"every draw needs one entry, but there are: {listed}")
         self.draws = next(iter(counts.values()), 1)
         self.rig, self.t, self.variables, self.terms = rig, t, variables, terms
-        self.over, self.rtol, self.threads, self.evaluations = dict(over), rtol, threads, 0
+        self.over, self.rtol, self.evaluations = dict(over), rtol, 0
         self.starts = self._starts(y0)
 
     def _starts(self, y0: Tensor | Start) -> list[Initial | Start]:
@@ -332,7 +332,7 @@ class Evaluator:
             batch = simulate_batch(
                 self.rig, self.t, parameters=self.over | self.variables.parameters(rows),
                 y0=[self._planned(*one) for one in zip(rows, self.starts)],
-                rtol=self.rtol if rtol is None else rtol, threads=self.threads,
+                rtol=self.rtol if rtol is None else rtol,
                 gradient="discrete" if gradient else "none",
             )  # fmt: skip
         failure = "; ".join(f"draw {i}: {reason}" for i, reason in list(batch.failures.items())[:1])
