@@ -191,6 +191,6 @@ def test_a_misfit_is_not_explained_away(tmp_path: Path, capsys: pytest.CaptureFi
         warnings.simplefilter("always")
         low, high = interval(tmp_path, recorded(tmp_path, t, y, np.interp(t + 0.06, t, force)))
     said = capsys.readouterr()
-    assert "which is a misfit of the model and no noise" in said.out
+    assert "The model does not explain the data" in said.out
     assert said.err.count("friction falls") <= 1
     assert 10e3 < low < 12e3 < high < 18e3

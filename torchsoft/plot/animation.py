@@ -59,8 +59,6 @@ from torchsoft.solve.trajectory import Trajectory
 FRAMES_PER_SECOND = 12.5
 """Frame rate; the delay of a GIF's frame is a multiple of 10 ms."""
 
-DPI = 110
-
 Picture = NDArray[np.uint8]
 
 
@@ -79,15 +77,15 @@ def pace(speed: float) -> str:
     return f"\n{times:g} times {'as fast' if speed > 1 else 'slower'}"
 
 
-def render(run: Trajectory, times: Array, title: str, curve: Curve) -> Iterator[Picture]:
+def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and below it a coordinate over
     time. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
     with rc_context(STYLE):
         x, y = limits(setup, shown)
         tall = 7.0 * float(np.ptp(y) / np.ptp(x)) + 2.2
-        height = 2 * round(0.5 * DPI * min(max(5.8, tall), 8.6)) / DPI  # H.264: even
-        figure = Figure(figsize=(8.0, height), dpi=DPI, layout="constrained")
+        height = 2 * round(0.5 * dpi * min(max(5.8, tall), 8.6)) / dpi  # H.264: even
+        figure = Figure(figsize=(8.0, height), dpi=dpi, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         whole, strip = figure.subplots(2, 1, height_ratios=(height - 1.26, 1.26))
         scene = Scene(whole, setup, shown)
@@ -119,7 +117,7 @@ def render(run: Trajectory, times: Array, title: str, curve: Curve) -> Iterator[
 
 
 def animate(
-    run: Trajectory, path: Path, *, frames: int = 150, progress: bool = False,
+    run: Trajectory, path: Path, *, frames: int = 150, dpi: int = 110, progress: bool = False,
     title: str = "", follow: str = "", slow: float = 0.0,
 ) -> None:  # fmt: skip
     """Write `frames` pictures of the whole run as .gif, or as .mp4 where imageio-ffmpeg is
@@ -142,7 +140,7 @@ def animate(
             f"{suggestion(followed, known, 'there are')}"
         )
     bar = tqdm(
-        render(run, times, title, known[followed]),
+        render(run, times, dpi, title, known[followed]),
         "animation",
         len(times),
         unit="frame",
