@@ -206,7 +206,7 @@ def test_a_tolerance_too_coarse_for_the_data_is_reported_and_tightened():
     error = lambda answer: np.log(answer[worst.name].last / BASE.table()[worst.name]["value"])
     assert abs(error(coarse)) > worst.relative_sd  # so the notice is needed
     assert abs(worst.step_bias_sd) > 0.5
-    better = fit(data, {E: Unknown(), TAU: Unknown()}, 3e-2)
+    better = fit(data, {E: Unknown(), TAU: Unknown()}, 3e-2, tightenings=3)
     assert not any(one.code == "steps-too-coarse" for one in better.findings)
     assert better.made_by["rtol"] < 3e-2
     assert abs(error(better)) < 0.2 * abs(error(coarse))
