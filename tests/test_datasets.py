@@ -398,6 +398,7 @@ def test_a_trajectory_is_the_run_of_the_rig_file_with_its_values(tmp_path):
     assert all("units" in one.attrs for one in data.data_vars.values())
 
 
+@pytest.mark.slow
 def test_other_pads_and_contacts_are_kept_whole(tmp_path):
     """The kinetic energy of inertial pads is in the balance; series of nodes are those of all
     contact points between them."""
@@ -482,6 +483,7 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
     assert np.isnan(row["theta_disc"]).all()
 
 
+@pytest.mark.slow
 def test_a_log_is_a_recording(made, data, half, tmp_path, capsys):
     """To the last bit, of a set or of a run; one that is damaged or of others is rejected."""
     export = ["dataset", "export", str(made[0]), "--out", str(tmp_path / "logs")]
@@ -535,6 +537,7 @@ def test_folders_that_hold_something_else_are_rejected(made, tmp_path):
         open_or_create(str(made[0]), made[1].model_copy(update={"seed": 99}))
 
 
+@pytest.mark.slow
 def test_the_check_draws_the_coverage_outside_of_the_set(made, data, tmp_path, capsys):
     picture = str(tmp_path / "coverage.png")
     assert main(["dataset", "check", str(made[0]), "--picture", picture]) == 0
@@ -589,6 +592,7 @@ def test_the_job_array_makes_its_part(made, half, tmp_path, monkeypatch, capsys)
         main(["dataset", "make", str(path), "--out", str(half), "--part", "3/2"])
 
 
+@pytest.mark.slow
 def test_an_estimate_is_measured_on_the_sets_own_runs(made, data, tmp_path):
     """Of what is left."""
     many = made[1].model_copy(update={"trajectories": 300})

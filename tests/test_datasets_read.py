@@ -46,6 +46,7 @@ DAMAGE: dict[str, Callable[[bytes, float], bytes | None]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=8, derandomize=True, deadline=None)
 @given(st.sampled_from([*DAMAGE]), st.floats(0, 1, exclude_max=True), st.randoms())
 def test_any_damage_is_found_by_the_check_and_never_read(made, data, how, place, random):

@@ -92,6 +92,7 @@ def test_a_given_start_is_held_constant():
     assert_same(run, simulate(built.rig, built.t, y0=built.y0, **built.solver))
 
 
+@pytest.mark.slow
 def test_every_run_of_a_batch_starts_at_its_own_parameters():
     built, moduli = FILE.build(), torch.tensor([0.4e6, 0.9e6], dtype=torch.float64)
     moduli.requires_grad_()

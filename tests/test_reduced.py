@@ -342,6 +342,7 @@ def test_bodies_of_a_record_have_any_names(beside):
     assert "x_d" not in one
 
 
+@pytest.mark.slow
 def test_saved_runs_are_reduced_by_a_command(tmp_path, capsys):
     """Small waves about a settled grasp; the last run is predicted."""
     files = [str(tmp_path / f"{seed}.nc") for seed in range(2)]

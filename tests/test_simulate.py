@@ -195,6 +195,7 @@ def test_torch_compile_leaves_a_run_alone():
     assert torch.equal(*slopes)
 
 
+@pytest.mark.slow
 def test_settings_of_the_process_change_no_bit():
     """torch's default dtype, denormal numbers flushed, numpy's errors raised."""
     roll = {"kind": "multi_sine", "amplitude": 1e-3, "band": (5.0, 20.0)}

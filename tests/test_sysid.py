@@ -317,6 +317,7 @@ def test_residuals_are_the_same_to_the_bit_alone_with_others_and_in_threads(shor
         np.testing.assert_array_equal(found.J, np.concatenate([one.J, one.J, other.J]))
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_continues_and_ends_the_same_to_the_bit(short, tmp_path, monkeypatch):
     problem = Problem([short], SENSORS, {E: Unknown(nominal=1e6)} | known(TAU, K_N, MU_S, MU_K))
     plan = [Stage("all", ("short",), (E,), 1e-3)]

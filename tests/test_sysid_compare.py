@@ -167,6 +167,7 @@ def stroke():
     return laws(STROKE, 0.55)
 
 
+@pytest.mark.slow
 def test_a_users_own_law_is_named_where_contacts_slip(stroke, tmp_path):
     found = compare(stroke, plans=plans(stroke))
     assert (found.outcome, found.law) == ("law", "viscous"), found.verdict

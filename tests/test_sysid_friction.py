@@ -63,6 +63,7 @@ def test_its_parameters_are_found_beside_those_of_the_pads(jerks):
     assert answer[ALPHA].unit == ""
 
 
+@pytest.mark.slow
 def test_its_derivatives_by_both_routes_are_those_of_differences(jerks):
     slack = {BETA: Unknown(scale="linear", nominal=1.0, low=0.0, high=100.0)}
     ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}

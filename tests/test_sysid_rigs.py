@@ -196,6 +196,7 @@ def test_what_is_no_angle_is_not_unwrapped(folder):
     assert not len(wraps(10.0 * np.arange(9)))  # degrees taken for radians are another mistake
 
 
+@pytest.mark.slow
 def test_a_rehearsal_reports_what_an_experiment_would_identify(folder):
     """Its recording is a template of the real one: the same configuration accepts it."""
     plan, out = folder / "plan.toml", folder / "out"

@@ -107,6 +107,7 @@ def test_a_fault_reads_as_its_closed_form_and_has_its_derivatives(dense, strokes
     check_derivatives(problem, x, 1e-4, 1e-4, only=[c.labels[i], E], runner=runner)
 
 
+@pytest.mark.slow
 def test_every_other_kind_of_coordinate_has_its_derivatives(strokes):
     """Of ratios, of values of each recording, linear ones, those with a prior, a place of the disc,
     and a sensor that is saturated."""
