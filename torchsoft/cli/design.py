@@ -1,10 +1,17 @@
 """The command `design`: motions for an identification."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import add_command, add_out, add_progress, say, sorted_files, try_folder
+from torchsoft.cli.results import (
+    add_command,
+    add_files,
+    add_out,
+    add_progress,
+    say,
+    sorted_files,
+    try_folder,
+)
 
 DESIGN = """\
 Which motion of the rig should be recorded?
@@ -22,10 +29,7 @@ def add_commands(commands: Any) -> None:
     one = add_command(
         commands, "design", design, "find a motion that identifies parameters", DESIGN
     )
-    one.add_argument(
-        "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml",
-        help="recordings, if there are any, and one configuration",
-    )  # fmt: skip
+    add_files(one, "recordings, if there are any, and one configuration")
     add_out(one, "design")
     one.add_argument("--workers", type=int, default=1, help="threads of the search (%(default)s)")
     add_progress(one)

@@ -7,6 +7,7 @@ from typing import Any
 
 from torchsoft.cli.results import (
     add_command,
+    add_files,
     add_out,
     add_progress,
     failed,
@@ -28,10 +29,7 @@ def add_commands(commands: Any) -> None:
     one = add_command(
         commands, "profile", profile, "find intervals by likelihood profiles", PROFILE
     )
-    one.add_argument(
-        "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml",
-        help="data files and a configuration",
-    )  # fmt: skip
+    add_files(one)
     one.add_argument(
         "--answer", type=Path, default=Path("out/identify/answer.json"),
         help="answer of the identification (%(default)s)",

@@ -33,6 +33,12 @@ def add_out(command: Any, folder: str, **more: Any) -> None:
     )
 
 
+def add_files(command: Any, help: str = "data files and a configuration") -> None:
+    """Add the data files and the configuration of an identification."""
+    metavar = "DATA.csv ... CONFIG.toml"
+    command.add_argument("files", nargs="+", type=Path, metavar=metavar, help=help)
+
+
 def add_yes(command: Any) -> None:
     """Add the option on costly work."""
     meaning = "begin even what takes hours, or much memory or disk"

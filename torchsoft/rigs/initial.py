@@ -3,6 +3,7 @@ parameters, differentiable in them."""
 
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -25,6 +26,9 @@ from torchsoft.rigs.schema import RigTables
 
 Held = Callable[[str, float], Tensor]
 """Effort () [N, N.m] that holds a coordinate at a time [s]."""
+
+Signals = Mapping[str, Piecewise] | Reference
+"""Signals by name."""
 
 STIFF = 100.0
 """Largest stiffness of a contact, over that of a point of its pad, at which a failed equilibrium is
@@ -81,9 +85,14 @@ def signal(
         raise ValueError(f"{prefix}{error}") from None
 
 
-def reference(file: RigTables, poses: Mapping[str, Tensor], held: Held) -> Reference:
-    """All motions, for bodies that start at `poses`. Raises `ValueError` naming the field."""
-    return Reference(**{name: signal(file, name, poses, held) for name in file.motion})
+def reference(
+    file: RigTables, poses: Mapping[str, Tensor], held: Held,
+    made: Mapping[str, Piecewise] = MappingProxyType({}),
+) -> Reference:  # fmt: skip
+    """All motions, those that are `made` already among them, for bodies that start at `poses`.
+    Raises `ValueError` naming the field."""
+    names = file.motion
+    return Reference(**{k: made[k] if k in made else signal(file, k, poses, held) for k in names})
 
 
 def sole_user(file: RigTables, motion: str, role: str) -> str:
@@ -98,11 +107,11 @@ def placed_at(poses: Mapping[str, Tensor], coordinate: str) -> Tensor:
     return poses[body][axis]
 
 
-def setpoints(file: RigTables, poses: Mapping[str, Tensor]) -> Reference:
+def setpoints(file: RigTables, poses: Mapping[str, Tensor]) -> dict[str, Piecewise]:
     """The motions that coordinates follow, for bodies that start at `poses`. Raises as `signal`."""
     fed = {"feed_forward"}
     names = [k for k, users in file.followers().items() if {role for role, _ in users} != fed]
-    return Reference(**{name: signal(file, name, poses) for name in names})
+    return {name: signal(file, name, poses) for name in names}
 
 
 class FollowedStart(NamedTuple):
@@ -173,7 +182,7 @@ def followed_motions(
 
 
 def holding_effort(
-    file: RigTables, rig: Rig, start: Poses, signals: Reference, coordinate: str, time: float
+    file: RigTables, rig: Rig, start: Poses, signals: Signals, coordinate: str, time: float
 ) -> Tensor:
     """The effort () [N, N.m] that holds a coordinate, without friction, with bodies at their
     set-points at a time [s], or else where they rest or start. Raises `ValueError`."""
@@ -192,7 +201,7 @@ def holding_effort(
 
 
 def at_setpoints(
-    file: RigTables, start: Poses, signals: Reference, time: float
+    file: RigTables, start: Poses, signals: Signals, time: float
 ) -> tuple[Poses, Collection[tuple[str, int]]]:
     """Poses at a time [s] of bodies that follow set-points and drives exactly and start at `start`,
     and the coordinates that do, by body and axis."""
