@@ -2,8 +2,8 @@
 
 1. Score tests of all suspects order them: those that would explain most come first, and those with
    costly runs last.
-2. Successive halving: every suspect of a bracket gets one step; then the better half goes on with
-   twice as many evaluations, until a few finalists are left.
+2. Successive halving: every suspect of a bracket gets one step; then the best third goes on with
+   three times as many evaluations, until a few finalists are left.
 3. Finalists are fitted until they converge, on fine steps. The search ends after a bracket in which
    one explains the misfit, and when refits took all of the effort.
 """
@@ -27,14 +27,14 @@ from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
 BRACKET, FINALISTS = 16, 3
-"""Suspects of a bracket, unless the fit is far off, and those that are fitted to the end."""
+"""Suspects of a bracket, and those of it that are fitted until they converge."""
 
 FAR = 2.0
-"""Misfit per sample above which score tests order suspects wrongly, so that the bracket has all of
-them."""
+"""Misfit per sample above which score tests order suspects wrongly, so that the first
+bracket has all of them but costly ones."""
 
-EVALUATIONS = 2
-"""Evaluations of every suspect in the first round of halving."""
+KEPT = 3
+"""One in so many suspects goes on after a round, with so many times as many evaluations."""
 
 COMPLETE, ROUGH = 20, 1e-3
 """Most evaluations of a finalist, and its relative tolerance."""
@@ -55,8 +55,8 @@ FIRST_STEP = 1.0
 NEARLY = 0.99
 """Part of the misfit above the noise from which on a suspect seems to explain it."""
 
-RIVAL = 0.3
-"""Part of its gain that a rival of such a suspect has at least."""
+RIVAL = 0.5
+"""Part of the gain of such a suspect from which on another is its rival."""
 
 HALVINGS = 10
 """Most halvings of the range of a suspect where the rig is impossible at its end."""
@@ -190,21 +190,21 @@ def search(
     bar = tqdm(total=len(queue), unit="suspect", disable=hidden(end.progress))
     with bar, warnings.catch_warnings(action="ignore"):
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
-        size = len(queue) if end.chi2 > FAR else BRACKET
+        size = sum(not one.costly for one in queue) if end.chi2 > FAR else BRACKET
         while queue and end.runner.work < most:
             bracket, queue = queue[:size], queue[size:]
-            fits, dropped, evaluations = dict[Suspect, Fit](), list[Suspect](), EVALUATIONS
+            fits, dropped, evaluations = dict[Suspect, Fit](), list[Suspect](), KEPT
             for one in bracket:
                 bar.set_description(plain(f"first step with {one.name} free"))
                 if (fit := first_step(end, one, tests[one.name], linear)) is not None:
                     fits[one] = fit
                 bar.update()
             while len(fits) > FINALISTS:
-                kept = better_half(fits, linear)
+                kept = best_of(fits, linear)
                 dropped += [one for one in fits if one not in kept]
                 bar.set_description(f"{len(kept)} suspects, {evaluations} evaluations each")
                 fits = {one: carried_on(fits[one], evaluations) for one in kept}
-                evaluations *= 2
+                evaluations *= KEPT
             yield from ((replace(tests[one.name], dropped=True), None) for one in dropped)
             ends, best = dict[Suspect, Fit](), np.inf
             for one in sorted(fits, key=lambda one: fits[one].square):
@@ -244,11 +244,11 @@ def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised)
     return best
 
 
-def better_half(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
-    """The half of the fits that leaves least, and at least the finalists; without those far behind
-    one that explains the misfit."""
+def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
+    """The fits that go on after a round: those that leave least, without those far behind one that
+    explains the misfit."""
     ranked = sorted(fits, key=lambda one: fits[one].square)
-    kept = ranked[: max(len(ranked) // 2, FINALISTS)]
+    kept = ranked[: max(len(ranked) // KEPT, FINALISTS)]
     gains = {one: linear.square - fits[one].square for one in kept}
     if gains[kept[0]] < NEARLY * (linear.square - linear.dof):
         return kept
