@@ -284,7 +284,6 @@ def test_the_designed_motion_is_a_rig_file_that_runs(folder):
     assert max(map(abs, motion.values)) <= 0.5 + 1e-9
     first, *later = [visit["value"] for visit in written["history"]]
     assert min(later) < first
-    assert (folder / "out/design.png").stat().st_size > 10_000
     rig, y0, t = file.build()
     assert simulate(rig, t[:3], y0=y0)["x_disc"].isfinite().all()
     followed = rig.follow(torch.tensor([0.5, 0.8]).double())[:, rig.signals.index("theta_d"), 0]
