@@ -249,6 +249,15 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "None of the {count} refitted suspects explains the misfit.",
         "Residuals still fail a test ({alarms}).",
     ),
+    # profiles
+    "profile-open": (
+        "{estimate} has no {end} bound of its 95 % interval within {value:.4g}: {reason}.",
+    ),
+    "profile-steps": (
+        "The {end} end of the profile of {estimate} is uncertain: steps chosen anew there change "
+        "|r|^2 by {change:.2g}.",
+        "Take a tighter tolerance than rtol = {rtol:g}.",
+    ),
 }
 """Sentences by code, the first one short. A sentence without a fact in it is always there."""
 
