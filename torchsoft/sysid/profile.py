@@ -194,17 +194,17 @@ def refit(o: Fit, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
 
 
 def interval_end(
-    o: Fit, i: int, side: Side, curve: PchipInterpolator, sign: int
+    o: Fit, i: int, side: Side, curve: tuple[Array, Array], sign: int
 ) -> tuple[float | None, list[Finding]]:
-    """One end of the interval in physical units, by the `curve` of the signed square root of the
-    rise, with a finding where it was not found or is uncertain."""
+    """One end of the interval in physical units, by the `curve` of x and the signed square root
+    of the rise, with a finding where it was not found or is uncertain."""
     one, (points, reason) = o.problem.coordinates.all[i], side
     facts: dict[str, Any] = {"estimate": one.label, "end": "upper" if sign > 0 else "lower"}
     if reason:
         facts |= {"value": one.to_value(points[-1].x[i]), "reason": reason}
         return None, [Finding("profile-open", "note", facts)]
     low, high = sorted((points[-1].x[i], points[-2].x[i]))
-    roots = curve.solve(sign * RISE**0.5)
+    roots = PchipInterpolator(*curve).solve(sign * RISE**0.5)
     end = one.to_value(float(roots[(roots >= low) & (roots <= high)][0]))
     change = o.step_effect(points[-1].x)
     if abs(change) < CHOSEN_ANEW * o.variance:
@@ -218,7 +218,7 @@ def assemble(o: Fit, i: int, below: Side, above: Side) -> Profile:
     points, half = [*below[0][:0:-1], *above[0]], RISE**0.5 * sd(o, i)
     x = np.array([point.x[i] for point in points])
     rises = np.maximum([point.rise for point in points], 0.0)
-    curve = PchipInterpolator(x, np.sign(x - o.x[i]) * np.sqrt(rises))
+    curve = x, np.sign(x - o.x[i]) * np.sqrt(rises)
     lower, found = interval_end(o, i, below, curve, -1)
     upper, more = interval_end(o, i, above, curve, 1)
     others = [k for k in np.flatnonzero(o.free) if k != i]
