@@ -258,6 +258,32 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "|r|^2 by {change:.2g}.",
         "Take a tighter tolerance than rtol = {rtol:g}.",
     ),
+    # laws
+    "law": ("`{law}` made these data: {cases}.",),
+    "no-law": (
+        "None of the laws explains these data.",
+        "The best, `{best}`, has chi2 = {chi2:.3g} (p = {p:.1g}).",
+        "The best, `{best}`, misses the held-out recordings (p = {heldout_p:.1g}).",
+        "The best, `{best}`, leaves residuals that follow {patterned}.",
+        "It is nearer than {ahead}, but that does not make it right.",
+        "Or the noise is not as it was stated: it is larger, or coloured.",
+    ),
+    "laws-alike": ("The data cannot tell which law made them.",),
+    "law-contradicted": (
+        "Held-out recordings speak for `{other}` and fitted ones for `{best}`, each by more than "
+        "noise does.",
+    ),
+    "law-evidence": (
+        "The evidence for `{best}` over `{other}` is {evidence:.2g} nats ({enough:g} are needed), "
+        "and z = {z:.2g} ({apart:g} is needed).",
+        "The steps of the simulation change the evidence by {numerical:.2g}: take a tighter "
+        "tolerance.",
+        "Their predictions differ by {distance:.2g} times the noise over all samples together: "
+        "these motions and sensors cannot tell them apart.",
+    ),
+    "law-unconverged": (
+        "The fit of `{law}` has not converged, so it may be better than it looks.",
+    ),
 }
 """Sentences by code, the first one short. A sentence without a fact in it is always there."""
 
@@ -282,6 +308,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "alarms": ("{test}", " in {channel} of `{recording}`"),
     "no-suspect": ("{name}", " ({part:.0%} of the misfit)"),
     "causes": (*SUSPECT, ", score {score:.2g}"),
+    "law": ("`{other}` is behind by {evidence:.3g} nats, {z:.2g} standard deviations",),
 }
 CASES |= {"smaller": CASES["larger"]}
 """Clauses of one case by the code of its finding; suspects are the default."""
