@@ -284,6 +284,21 @@ SENTENCES: dict[str, tuple[str, ...]] = {
     "law-unconverged": (
         "The fit of `{law}` has not converged, so it may be better than it looks.",
     ),
+    # designs
+    "design-interrupted": ("Interrupted after {done} of {iterations} iterations.",),
+    "design-limit": ("{channel} reaches {part:.1%} of the way to its limits.",),
+    "design-nonlinear": (
+        "A fit with rtol = {rtol:g} that starts a standard deviation from the truth ends {off:.2g} "
+        "of them from it in `{estimate}`.",
+        "Take finer steps, and count intervals that hold before this motion is used.",
+    ),
+    "design-failed": ("{count} motions that the search tested could not be run.",),
+    "design-file": (
+        "The written file cannot be run: {failure}.",
+        "motion.{signal} of the written file is up to {off:.3g} off what the search found, of "
+        '{most:.3g}: the file makes "start" or "held" anew with the new motion; give numbers in '
+        "their place.",
+    ),
 }
 """Sentences by code, the first one short. A sentence without a fact in it is always there."""
 
