@@ -52,7 +52,9 @@ def design(options: argparse.Namespace) -> int:
     say(chosen.table())
     if chosen.found is not None:
         say(f"\n{chosen.rated[0].name}, its knots moved:\n{chosen.found.table()}")
-        for notice in (*chosen.found.limits, *chosen.found.notices):
-            say(f"note: {notice}")
+        for limit in chosen.found.limits:
+            say(f"note: {limit}")
+        for finding in chosen.found.findings:
+            say(f"{finding.severity}: {finding}")
     say(f"written to {options.out / 'motion.toml'} and {options.out / 'design.json'}")
     return 0 if chosen.found is None or chosen.found.confirmed else 1
