@@ -302,7 +302,7 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (replaced('rig = "orientation"', ""), "rig is missing: say rig"),
+        (replaced('rig = "orientation"', ""), "rig is missing"),
         (replaced("x_upper = ", "x_uper = "), "limits.x_uper = .* did you mean `x_upper`\\?"),
         (replaced("twist.motion", "twist.motions"), "design.candidates.twist: `motions` is not"),
         (replaced("theta_d = {low", "theta = {low"), "no Profile called `theta`"),
