@@ -215,18 +215,13 @@ class IdentificationResult(Shown):
         )
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
-        rows = []
-        for one in self.estimates:
-            unit = "" if one.unit == "1" else f" {one.unit}"
-            if one.value is None or one.ci95 is None:
-                rows.append(
-                    (one.label, f"not determined by the data; ended at {one.last:.4g}{unit}")
-                )
-            else:
-                low, high = one.ci95
-                rows.append((one.label, f"{one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}"))
+        rows = [(one.label, one.found) for one in self.estimates]
         rows += [(one.severity, str(one)) for one in self.findings]
         return self.headline, rows
+
+    def table(self) -> str:
+        """The headline, and a line for each estimate."""
+        return "\n".join([self.headline, *(f"{e.label:34s} {e.found}" for e in self.estimates)])
 
     @property
     def verdict(self) -> Verdict:
@@ -367,21 +362,6 @@ class IdentificationResult(Shown):
         """Write the JSON file. It appears whole or not at all."""
         save_text(path, self.to_json())
 
-    def table(self) -> str:
-        """The headline, and a line for each estimate."""
-        rows = [self.headline, f"{'parameter':34s} {'estimate':>12s}   95 % interval"]
-        for e in self.estimates:
-            if e.value is None or e.ci95 is None:
-                rows.append(
-                    f"{e.label:34s} {'none':>12s}   not identifiable (the search ended at "
-                    f"{e.last:.3g} {e.unit})"
-                )
-            else:
-                rows.append(
-                    f"{e.label:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}"
-                )
-        return "\n".join(rows)
-
 
 @cache
 def adapter() -> TypeAdapter[IdentificationResult]:
@@ -441,15 +421,9 @@ def load_answer(path: str | Path) -> IdentificationResult:
         ) from None
     form = content.pop("schema", None) if isinstance(content, dict) else None
     if form != SCHEMA:
-        older = isinstance(content, dict) and {"estimates", "made_by"} <= content.keys()
-        reason = (
-            "an older version wrote it, so identify again"
-            if form is None and older
-            else f"its `schema` is {shown(form)}"
-        )
         raise ValueError(
-            f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: "
-            f"{reason}"
+            f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: its "
+            f"`schema` is {shown(form)}; if an older version wrote it, identify again"
         )
     if content.pop("checksum", None) != checksum(content):
         raise ValueError(
