@@ -13,7 +13,6 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -41,13 +40,11 @@ from torchsoft.sysid.fit import Combination, Fit
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Reading
-from torchsoft.sysid.report import direction_name, figure, report
-from torchsoft.sysid.result import ChannelNoise, checksum, recorded_rigs, schema
+from torchsoft.sysid.report import figure, report
+from torchsoft.sysid.result import ChannelNoise, checksum, recorded_rigs
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
 
-SCHEMA = Path(__file__).parents[1] / "docs" / "answer.schema.json"
-PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
 BASE = PAPER.override({"pad.elements_x": 60, "pad.elements_y": 1, "contact.v_s": 0.05})
 E, NU, FRICTION = "materials.rubber.E", "materials.rubber.nu", "laws.steel_on_rubber.friction"
 K_N, R_N = "laws.steel_on_rubber.K_n", "laws.steel_on_rubber.R_n"
@@ -216,19 +213,13 @@ def example(kind: Any) -> Any:
     return tuple(example(one) for one in inner if one is not Ellipsis)
 
 
-def test_what_is_saved_comes_back_and_is_what_the_published_schema_says(full, path, tmp_path):
-    published = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    assert published == schema(), f"write it anew: {PUBLISH}"
+def test_what_is_saved_comes_back(full, path, tmp_path):
     whole = example(IdentificationResult)
     whole.save(tmp_path / "answer.json")
-    check = jsonschema.Draft202012Validator(schema())
     for one, file in ((full, path), (whole, tmp_path / "answer.json")):
         text = file.read_text(encoding="utf-8")
         content = json.loads(text)
-        assert [error.message for error in check.iter_errors(content)] == []
-        assert not check.is_valid(content | {"more": 1})
-        content["estimates"][0]["seen"] = "yes"
-        assert [[*e.path] for e in check.iter_errors(content)] == [["estimates", 0, "seen"]]
+        assert content["verdict"] == one.verdict
         answer = load_answer(file)
         assert answer.to_json() == text == one.to_json()
         assert answer.table() == one.table()
@@ -429,8 +420,6 @@ def test_the_page_holds_what_the_answer_holds(page, full):
         f"only {E} / {K_N}^0.5 is determined (2 %), not each ({E} 30 %, {K_N} 40 %)\n",
     ):
         assert shown in text
-    for name in (direction_name(d) for d in full.directions if not d.identifiable):
-        assert f"\n{name} may change without a trace in the data\n" in page.text
 
 
 def test_warnings_come_first_then_parameters_starts_and_sensors(page, full):

@@ -47,7 +47,7 @@ BOUNDS = {
 }
 SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "effort_y")}
 BOTH = {E: Unknown(), K_N: Unknown()}
-KINDS: tuple[Optimality, ...] = ("D", "A", "worst")
+KINDS: tuple[Optimality, ...] = ("D", "A")
 
 
 @pytest.fixture(scope="module")

@@ -134,7 +134,7 @@ REJECTED_DATA: list[tuple[Change, str]] = [
     (both(scale(THETA, 0.18 / math.pi), put(1, THETA, "theta [rad]")),
         r"column `theta_C` moves already, by .* rad: is its unit right\?"),
     # the start
-    (scale(X_C, 1.0, 5.0), r"row 2, column `x_C`: it begins at 0.065\d* m, but .* 0.0603 m: are its unit"),
+    (scale(X_C, 1.0, 5.0), r"row 2, column `x_C`: it begins at 0.065\d* m, but .* m: are its unit"),
     (scale(X_C, 1.0, 1.25), r"row 2, column `x_C`: it begins at 0.0615"),
     (scale(X_C, -1.0), r"begins at -0.0603\d* m, but the rig file at 0.0603 m: are its unit, sign"),
     (scale(THETA, 1.0, 500.0), r"`theta_C`: it begins at 0.49\d* rad, but .* at 0 rad"),

@@ -186,8 +186,8 @@ def design(
     Of the plan's samples only the times count; the other recordings and the priors contribute their
     information. Faults of sensors are nuisances, which the criterion marginalises. Beside the
     covariance it counts errors of a fit from finite steps and nonlinear samples (`Planner.errors`),
-    at the nominal values. `criterion` is "D" (the volume of the errors), "A" (their mean square) or
-    "worst". `bounds` holds the travel, speed and free knots of signals of the reference, `limits`
+    at the nominal values. `criterion` is "D" (the volume of the errors) or "A" (their mean square).
+    `bounds` holds the travel, speed and free knots of signals of the reference, `limits`
     the ranges (low, high) [unit] of channels of the run, such as forces.
 
     The search begins with the plan's own motion. Each of the `iterations` takes a run with

@@ -42,11 +42,7 @@ from torchsoft.sysid.unknowns import in_full
 # Criteria of optimal design
 
 
-Optimality = Literal["D", "A", "worst"]
-
-SHARPNESS = 12.0
-"""Sharpness of the smooth maximum, which exceeds the largest logarithm by ln(parameters) over this
-at most."""
+Optimality = Literal["D", "A"]
 
 
 def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
@@ -54,8 +50,8 @@ def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
     standard deviation, the smaller the better, and its derivative (s, s) by C.
 
     "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root
-    mean square of the standard deviations; "worst" the largest of them, smoothed. With one
-    parameter the three are the same, and are called c-optimality. Raises `ValueError` for another.
+    mean square of the standard deviations. With one parameter both are the same, and are called
+    c-optimality. Raises `ValueError` for another.
     """
     if criterion not in get_args(Optimality):
         raise ValueError(
@@ -63,13 +59,8 @@ def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
         )
     if criterion == "D":
         return 0.5 * float(np.linalg.slogdet(C)[1]) / len(C), 0.5 * np.linalg.inv(C) / len(C)
-    variances = np.diag(C)
-    if criterion == "A":
-        return 0.5 * float(np.log(variances.mean())), 0.5 * np.eye(len(C)) / variances.sum()
-    logs = 0.5 * np.log(variances)
-    parts = np.exp(SHARPNESS * (logs - logs.max()))
-    value = float(logs.max() + np.log(parts.sum()) / SHARPNESS)
-    return value, np.diag(0.5 * parts / parts.sum() / variances)
+    total = float(np.trace(C))
+    return 0.5 * float(np.log(total / len(C))), 0.5 * np.eye(len(C)) / total
 
 
 def chosen(

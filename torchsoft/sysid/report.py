@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from torchsoft.files import save_text
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE
 from torchsoft.sysid.assumption_tests import AssumptionTest
-from torchsoft.sysid.estimate import Direction, Estimate
+from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Reading
 from torchsoft.sysid.result import IdentificationResult
@@ -43,9 +43,6 @@ SIZE = 5.4, 3.6
 
 STRONG = 0.7
 """Least correlation of two coordinates that the page names."""
-
-MOST_NAMES = 3
-"""Most components in the name of a direction."""
 
 
 def report(
@@ -100,16 +97,6 @@ def columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[tuple[in
         numbers = sum(text.strip(" −+×")[:1].isdigit() for text in texts)
         out += [(i, "n" if i > 0 and 2 * numbers > len(texts) else "")] if texts else []
     return out
-
-
-def direction_name(d: Direction) -> str:
-    """Largest components of a direction, such as `pad.E − 0.24 contact.K_n`."""
-    terms, sign = list[str](), -1 if next(iter(d.components.values()), 0.0) < 0 else 1
-    for name, value in [*d.components.items()][:MOST_NAMES]:
-        minus = "− " if sign * value < 0 else "+ " if terms else ""
-        factor = f"{abs(value):.2f} " if abs(value) < 0.995 else ""
-        terms.append(f"{minus}{factor}{name}")
-    return " ".join(terms) + (" …" if len(d.components) > MOST_NAMES else "")
 
 
 @rc_context(STYLE)
@@ -261,7 +248,6 @@ def page(
     """The HTML text."""
 
     by: dict[str, Any] = result.made_by
-    weak = [direction_name(d) for d in result.directions if not d.identifiable]
     moving, harmless = assumptions(result)
     cost = {"simulations": "simulations", "jacobians": "Jacobians",
             "remembered": "of them read from the checkpoint"}  # fmt: skip
@@ -275,10 +261,7 @@ def page(
         fitted=", ".join(one.name for one in result.recordings if one.fitted),
         findings=[(one.severity, str(one)) for one in result.findings],
         estimates=estimates(result),
-        combined=[
-            *(one.sentence for one in result.combinations),
-            *(f"{name} may change without a trace in the data" for name in weak),
-        ],
+        combined=[one.sentence for one in result.combinations],
         strong=correlations(result),
         moving=moving,
         harmless=harmless,

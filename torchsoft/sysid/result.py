@@ -1,8 +1,7 @@
 """Result of an identification as plain data, with the rigs of its recordings; `answer.json` holds
 it.
 
-The schema of the file, `schema()`, is published as `docs/answer.schema.json`. A checksum of the
-content tells a damaged file.
+A checksum of the content tells a damaged file.
 """
 
 import json
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -369,44 +368,8 @@ def adapter() -> TypeAdapter[IdentificationResult]:
 
 
 def checksum(content: Any) -> str:
-    """Checksum of JSON content, independent of the order of names and of whether 1 is written as
-    1.0."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(one) for key, one in value.items()}
-        if isinstance(value, list):
-            return [plain(one) for one in value]
-        return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-    return sha256(
-        json.dumps(plain(content), sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
-
-
-def schema() -> dict[str, Any]:
-    """The JSON Schema (2020-12) of the file."""
-    definition = finite(adapter().json_schema(by_alias=True, mode="serialization"))
-    definition["properties"].pop("rigs", None)
-    finding = definition["$defs"]["Finding"]
-    finding["properties"]["text"] = {"type": "string", "description": "The finding in words."}
-    finding["required"].append("text")
-    head = {
-        "schema": {"const": SCHEMA, "description": "Name and version of the file's form."},
-        "checksum": {
-            "type": "string",
-            "pattern": "^[0-9a-f]{64}$",
-            "description": "SHA-256 of the rest, names sorted.",
-        },
-        "verdict": {"enum": list(get_args(Verdict)), "description": "What is said of the model."},
-    }
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"urn:{SCHEMA}",
-        **definition,
-        "properties": head | definition["properties"],
-        "required": [*head, *definition["required"]],
-    }
+    """Checksum of JSON content, independent of the order of names."""
+    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def load_answer(path: str | Path) -> IdentificationResult:
