@@ -311,8 +311,7 @@ def write_template(stated: Config, made: Recording, path: Path) -> None:
     followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
     columns = {"t": made.times} | dict(zip(rig.signals, followed))
     columns |= {channel: y for channel, (_, y) in made.samples.items()}
-    called = {of: heading for heading, of in known.headings.items()}
-    units = {called.get(one, one): known.units[one] for one in columns}
+    units = {known.heading(one): known.units[one] for one in columns}
     csvfile.write(path, dict(zip(units, columns.values())), units)
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchsoft.cost import RUN, Cost, rig_row, rig_step, steps_per_second
 from torchsoft.csvfile import UNITS
+from torchsoft.display import suggestion
 from torchsoft.physics.channels import Seen, measurable, read, units
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
@@ -44,7 +45,7 @@ from torchsoft.sysid.prechecks import channel as channel_of
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Sensor, by_channel
-from torchsoft.tables import line
+from torchsoft.tables import line, shown
 
 # Recordings of the rig that a rig file describes.
 #
@@ -84,10 +85,25 @@ def vocabulary(rig: Rig, stated: Mapping[str, Column]) -> Vocabulary:
     known |= {name: touch.unit(name) for name in touch}
     names = (*signals, *(f"{name}_dot" for name in signals), *measurable(rig), *touch)
     columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
-    headings = {heading: one.of for heading, one in stated.items() if one.of is not None}
-    unwrapped = [heading for heading, one in stated.items() if one.unwrap]
-    short = {name: full for name, full in rig.short.items() if full in columns}
-    return Vocabulary(columns, signals, short=short).renamed(headings, unwrapped)
+    usual = {short: full for short, full in rig.short.items() if full in columns}
+    usual |= {name: name for name in columns}
+    headings, unwrapped = dict[str, str](), list[str]()
+    for heading, one in stated.items():
+        name = usual.get(one.of or heading, one.of or heading)
+        if name not in columns:
+            raise ValueError(
+                f"columns.{heading} = {shown(name)} is no channel of the rig; "
+                f"{suggestion(name, columns, 'there are')}"
+            )
+        if one.unwrap and columns[name] != "rad":
+            raise ValueError(
+                f"columns.{heading}.unwrap: `{name}` is in {columns[name]}, and only angles "
+                "wrap: leave it out"
+            )
+        headings |= {heading: name} if one.of else {}
+        unwrapped += [name] if one.unwrap else []
+    usual = {heading: name for heading, name in usual.items() if name not in headings.values()}
+    return Vocabulary(columns, signals, usual | headings, tuple(unwrapped))
 
 
 def followed(tables: Tables, rig: Rig) -> Reference:
