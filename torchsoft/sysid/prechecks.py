@@ -213,9 +213,12 @@ def is_derived(signal: Sampled) -> bool:
     return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
 
 
-def thinned(signal: Sampled, every: int, derived: bool) -> Sampled:
-    """The signal at every so-many-th row, with rates `derived` from these rows or its own."""
-    rates = None if derived else signal.rates.detach()[::every]
+def thinned(signal: Any, every: int, other_rates: bool) -> Any:
+    """A recorded signal at every so-many-th row, with its own rates or those of a spline through
+    the values; other signals as they are."""
+    if not isinstance(signal, Sampled):
+        return signal
+    rates = None if other_rates or is_derived(signal) else signal.rates.detach()[::every]
     return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
 
 
@@ -223,27 +226,22 @@ def thinned(signal: Sampled, every: int, derived: bool) -> Sampled:
 def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
     """Errors between rows of an actuator's set-point, in the channels with sensors."""
     rig, actuator = recording.rig, recording.rig.actuators[name]
-    signal, feed = rig.reference[actuator.setpoint], None
+    signal = rig.reference[actuator.setpoint]
     if not isinstance(signal, Sampled) or len(signal.times) < 9:
         return []
-    if actuator.feed_forward:
-        feed = rig.reference[actuator.feed_forward]
-    t, derived = signal.times, is_derived(signal)
+    t, signals = signal.times, [rig.reference[one] for one in actuator.reads]
     inside = torch.cat([t[:-1] + part * t.diff() for part in PARTS]).sort().values
     inside = inside[inside <= t[2 * ((len(t) - 1) // 2)]]
-    x, v = signal(inside)
-    places, efforts = list[Tensor](), list[Tensor]()
-    for every, own_rates in ((1, derived), (2, derived), (1, True)):
-        place, rate = thinned(signal, every, own_rates)(inside)
-        fed: Any = thinned(feed, every, is_derived(feed)) if isinstance(feed, Sampled) else feed
-        more = () if fed is None else fed(inside)
-        places.append(place)
-        efforts.append(actuator(torch.stack((place, rate, *more, x, v), -1)))
+    seen, places, efforts = signal(inside), list[Tensor](), list[Tensor]()
+    for every, other_rates in ((1, False), (2, False), (1, True)):
+        asked = [x for one in signals for x in thinned(one, every, other_rates)(inside)]
+        places.append(asked[0])
+        efforts.append(actuator(torch.stack((*asked, *seen), -1)))
     out = list[Gap]()
     for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
         if own in sensors:
-            sparser, other_rates = (rms((one - by[0]).numpy()) for one in by[1:])
-            error = max(sparser / (2**ORDER - 1), other_rates)
+            sparser, other = (rms((one - by[0]).numpy()) for one in by[1:])
+            error = max(sparser / (2**ORDER - 1), other)
             out.append(Gap(own, error, error / sensors[own].sd))
     return out
 
