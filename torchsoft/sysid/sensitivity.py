@@ -182,7 +182,9 @@ def largest_efforts(end: Fit) -> dict[str, float]:
     jobs = end.problem.jobs(end.x, end.which, end.at.steps or end.rtol, None)
     for job, run in zip(jobs, end.runner.run(jobs)):
         recording = end.problem.recordings[job.recording]
-        for name in recording.rig.actuators if not isinstance(run, FailedRun) else ():
+        if isinstance(run, FailedRun):
+            continue
+        for name in recording.rig.actuators:
             effort = run.signals[:, recording.channels.index(effort_channel(name))]
             out[name] = max(out.get(name, 0.0), float(np.abs(effort).max()))
     return out
