@@ -320,7 +320,7 @@ something is "unconfirmed", "doubtful", or "none" of the suspects explains it; t
 
 CAUSES = "cause", "causes", "rivals"
 UNSETTLED = {"rivals", "far", "likeliest", "no-suspect"}
-RISKS = {"undetectable", "exact", "undetectable-others", "hinted"}
+RISKS = {"undetectable", "untestable", "undetectable-others", "contradicted"}
 """Codes of findings: that name causes, that ask for refits, and on what the data would not show."""
 
 
