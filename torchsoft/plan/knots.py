@@ -21,10 +21,12 @@ PEAK = 35 / 16
 
 
 class Range(Table):
-    """Values from `low` to `high` [their unit]."""
+    """Range of a value."""
 
     low: float
+    """lowest value [its unit]"""
     high: float
+    """highest value [its unit]"""
 
     @model_validator(mode="after")
     def _is_ordered(self) -> Self:
@@ -34,16 +36,14 @@ class Range(Table):
 
 
 class Bounds(Range):
-    """Bounds of a signal of the reference: values from `low` to `high` [its unit], at `speed` [its
-    unit/s] at most.
-
-    Knots later than `after` [s] are free. Their times are free too if `shortest` [s] is given, the
-    least time between two.
-    """
+    """Bounds of a signal of the reference, whose knots the search may move."""
 
     speed: float = Field(gt=0)
+    """largest rate of the signal [its unit/s]"""
     after: float = 0.0
+    """time after which knots are free [s]"""
     shortest: float | None = Field(default=None, gt=0)
+    """least time between two knots; if given, the times of knots are free too [s]"""
 
 
 def profile(reference: Reference, name: str) -> Profile:
