@@ -8,9 +8,8 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from tqdm import tqdm
 from torchsoft.cost import Cost, rig_row, rig_step, steps_per_second
 from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, read_bytes
+from torchsoft.datasets.files import MANIFEST, Manifest, read_bytes
 from torchsoft.datasets.schema import energies, surfaces
 from torchsoft.datasets.subject import Row, Subject, Task
 from torchsoft.datasets.writer import Store, open_or_create
@@ -296,14 +295,3 @@ def local_workers(workers: int) -> AbstractContextManager[Executor]:
     if workers > THREADS:
         return local_processes(workers)
     return executor(workers) if workers else Serial()
-
-
-@contextmanager
-def dask_cluster(address: str) -> Iterator[Executor]:
-    """An existing Dask cluster as an executor; shards of a lost worker go to the others."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise StoreError("--scheduler needs Dask: pip install 'torchsoft[scale]'") from None
-    with Client(address) as client:
-        yield client.get_executor(retries=3, pure=False)
