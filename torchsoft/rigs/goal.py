@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsoft.physics.rig import Rig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
-from torchsoft.plan.planning import RTOL, Method, Robust
+from torchsoft.plan.planning import RTOL, Method
 from torchsoft.plan.problem import Free, Terms
 from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
@@ -36,7 +36,6 @@ class Goal(Table):
     limits: dict[Name, Limit] = Field(default_factory=dict)
     uncertain: dict[Name, Range] = Field(default_factory=dict)
     draws: int = Field(default=8, ge=1, le=10_000)
-    robust: Robust = "mean"
     method: Method = "slsqp"
     iterations: int = Field(default=50, ge=1, le=100_000)
     starts: int = Field(default=1, ge=1, le=4096)
@@ -105,7 +104,7 @@ def plan_file(
     built = file.build()
     found = plan(
         built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits,
-        y0=built.initial, over=over, robust=goal.robust, method=goal.method,
+        y0=built.initial, over=over, method=goal.method,
         iterations=goal.iterations, starts=goal.starts, seconds=goal.seconds, rtol=goal.rtol,
         seed=goal.seed, progress=progress,
     )  # fmt: skip
