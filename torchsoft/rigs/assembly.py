@@ -107,7 +107,7 @@ def build(file: RigTables, parts: Mapping[str, Any] | None = None) -> BuiltRig:
     rig.reference = reference(file, poses, held, made)
     y0 = settled_pads(file, rig, poses, rig.reference)
     warn_of_moments(rig, y0, file.starts)
-    followed = followed_motions(file, poses, held, rig.reference)
+    followed = followed_motions(file, poses, rig.reference)
     solver, y0 = file.solver.model_dump(exclude_none=True), moving(rig, y0, file.starts)
     built = BuiltRig(rig, y0, file.outputs.times(), file, followed, solver)
     built.last.update(key=built.key(rig), start=Initial(y0, rig.reference))
