@@ -74,7 +74,7 @@ def searched(free: Free, rtol: float, over: Any = None, terms: Terms | None = No
     variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
     terms = terms or Terms(None, {"turn": TURN}, {})
     evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, over or {}, rtol)
-    return Search(evaluator, Criterion(variables, False, 1.0), math.inf, tqdm(disable=True))
+    return Search(evaluator, Criterion(variables, 1.0), math.inf, tqdm(disable=True))
 
 
 def test_slopes_are_the_differences():
