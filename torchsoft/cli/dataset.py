@@ -10,8 +10,7 @@ from torchsoft.cli.results import add_command, add_yes, failed, say
 MAKE = """\
 Simulates the dataset of CONFIG.toml, shard by shard, into a folder or what fsspec opens. Ctrl-C and
 kill are safe at any moment, and the same command makes what is missing. Any number of processes may
-write into one folder: --part 2/8 makes every eighth shard from the second on, and no shard is made
-by two at a time."""
+write into one folder: --part 2/8 makes every eighth shard from the second on."""
 
 MOST = 1000
 """Most local workers."""
@@ -90,9 +89,6 @@ def make(options: argparse.Namespace) -> int:
         return 130
     made = sum(len(config.rows(shard)) for shard in mine.shards(config))
     left = generate.unfinished(config, options.out)
-    if elsewhere := [shard for shard in left if shard in mine.shards(config)]:
-        say(f"another process is making shards {listed(elsewhere)}")
-        made -= sum(len(config.rows(shard)) for shard in elsewhere)
     say(
         f"{made} trajectories in {options.out}; of those made now "
         + (f"{bad} failed, each with its reason" if bad else "none failed")

@@ -2,8 +2,7 @@
 parameters, differentiable in them."""
 
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
-from types import MappingProxyType
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -85,14 +84,21 @@ def signal(
         raise ValueError(f"{prefix}{error}") from None
 
 
+def ordered(file: RigTables) -> list[str]:
+    """Names of motions, those that coordinates follow before those that are fed forward."""
+    return sorted(file.motion, key=lambda name: bool(sole_user(file, name, "feed_forward")))
+
+
 def reference(
-    file: RigTables, poses: Mapping[str, Tensor], held: Held,
-    made: Mapping[str, Piecewise] = MappingProxyType({}),
-) -> Reference:  # fmt: skip
-    """All motions, those that are `made` already among them, for bodies that start at `poses`.
-    Raises `ValueError` naming the field."""
-    names = file.motion
-    return Reference(**{k: made[k] if k in made else signal(file, k, poses, held) for k in names})
+    file: RigTables, poses: Mapping[str, Tensor], held: Callable[[Signals, str, float], Tensor]
+) -> Reference:
+    """All motions, for bodies that start at `poses`; `held` is the effort that holds a coordinate
+    at a time where signals are. Raises `ValueError` naming the field."""
+    made = dict[str, Piecewise]()
+    known = cache(partial(held, made))
+    for name in ordered(file):
+        made[name] = signal(file, name, poses, known)
+    return Reference(**{name: made[name] for name in file.motion})
 
 
 def sole_user(file: RigTables, motion: str, role: str) -> str:
@@ -105,13 +111,6 @@ def placed_at(poses: Mapping[str, Tensor], coordinate: str) -> Tensor:
     """Value () [m or rad] of a coordinate such as "disc.x"."""
     body, axis = at(coordinate)
     return poses[body][axis]
-
-
-def setpoints(file: RigTables, poses: Mapping[str, Tensor]) -> dict[str, Piecewise]:
-    """The motions that coordinates follow, for bodies that start at `poses`. Raises as `signal`."""
-    fed = {"feed_forward"}
-    names = [k for k, users in file.followers().items() if {role for role, _ in users} != fed]
-    return {name: signal(file, name, poses) for name in names}
 
 
 class FollowedStart(NamedTuple):
@@ -143,8 +142,7 @@ def followed_motions(
     """Motions with values given as "start" or "held", by name, those that coordinates follow before
     those that are fed forward; as built for bodies that start at `poses`."""
     out = {}
-    fed_forward = lambda name: bool(sole_user(file, name, "feed_forward"))
-    for name in sorted(file.motion, key=fed_forward):
+    for name in ordered(file):
         motion = file.motion[name]
         if not motion.follows_start:
             continue
