@@ -163,7 +163,7 @@ class Variables:
         self.high = np.concatenate([unbounded, *high])
         # D z holds the ways between knots, so that a small change of it is a smooth one
         self.D = np.eye(self.n)
-        self.D[: self.moves.n, : self.moves.n] = self.moves.ways()
+        self.D[: self.moves.n, : self.moves.n] = self.moves.ways
         # A z <= b keeps knots within their bounds
         self.A = np.pad(self.moves.A, ((0, 0), (0, self.n - self.moves.n)))
         self.b = self.moves.b
