@@ -81,7 +81,7 @@ MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("kinds", 0, "parameters", "motion.x_d.stroke_time"), {"low": 1e-6, "high": 1e-2},
      "kinds.0.*stroke_time.low = 1e-06: impossible: .* makes 50000 strokes"),
     (("kinds", 0, "fixed", "motion.y_d"), {"kind": "hold", "value": 49e-3},
-     "kinds.0.parameters in their middle: impossible: `motion.y_d.values_2` is not in"),
+     "kinds.0.parameters.motion.y_d.values_2: `motion.y_d.values_2` is not in"),
     (("kinds", 0, "fixed", "motion.y_d.values"), ["held", 49e-3], '"held" stands for the effort'),
     (("kinds", 0, "fixed", "pads.lower.points"), 2, "kinds.0.fixed: it changes the contact points"),
 ]  # fmt: skip

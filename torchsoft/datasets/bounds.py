@@ -31,7 +31,7 @@ class Drawn(NamedTuple):
 
     def check(self, names: Iterable[str]) -> None:
         """Raises `ValueError` for parameters that are not numbers, or impossible together."""
-        for name in names:
+        for name in self.parameters:
             self._check_number(name)
         self._check_ends({*names})
 

@@ -186,7 +186,7 @@ class Subject:
             config.parameters
         )
         for kind, drawn in zip(config.kinds, self.kinds):
-            drawn.check([*kind.parameters, *(kind.fixed.keys() & config.parameters)])
+            drawn.check(kind.parameters)
         self.variables  # noqa: B018 -- raises
 
 
