@@ -11,6 +11,7 @@ from torchsoft.datasets.distributions import Distribution, in_ratio
 from torchsoft.datasets.rig_files import differs, place
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.fields import at_field
 from torchsoft.rigs.initial import reference
 from torchsoft.rigs.places import unit
 from torchsoft.tables import line, shown
@@ -38,32 +39,24 @@ class Drawn(NamedTuple):
     def _check_number(self, name: str) -> None:
         """Raises `ValueError` for a parameter that is not a number, or a ratio to something that is
         not."""
-        where, parameters = f"{self.where}parameters.{line(name, 80)}", self.parameters
-        if name in self.fixed:
-            raise ValueError(f"{where} is in `fixed` as well; leave one of them out")
-        try:
+        parameters = self.parameters
+        with at_field(f"{self.where}parameters.{line(name, 80)}"):
+            if name in self.fixed:
+                raise ValueError("it is in `fixed` as well; leave one of them out")
             _, value, field = place(self.file, name)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
-        if isinstance(value, int):
-            raise ValueError(f"{where} must be the same in every trajectory; set it in `fixed`")
-        word = isinstance(value, str) and unit(field)
-        if not (value is None or isinstance(value, float) or word):
-            raise ValueError(f"{where} is no number, but {shown(value)}")
-        base = parameters[name].ratio_to
-        if base is None:
-            return
-        own = f"{where}.ratio_to: {line(base, 80)}"
-        if base in parameters:
-            if base == name or parameters[base].ratio_to is not None:
-                raise ValueError(f"{own} is a ratio itself")
-            return
-        try:
-            of = place(self.file, base).value
-        except ValueError as error:
-            raise ValueError(f"{where}.ratio_to: {error}") from None
-        if not isinstance(of, float):
-            raise ValueError(f"{own} is no number, but {shown(of)}")
+            if isinstance(value, int):
+                raise ValueError("it must be the same in every trajectory; set it in `fixed`")
+            word = isinstance(value, str) and unit(field)
+            if not (value is None or isinstance(value, float) or word):
+                raise ValueError(f"it is no number, but {shown(value)}")
+            if (base := parameters[name].ratio_to) is None:
+                return
+            with at_field("ratio_to"):
+                if base in parameters and (base == name or parameters[base].ratio_to is not None):
+                    raise ValueError(f"{line(base, 80)} is a ratio itself")
+                of = 1.0 if base in parameters else place(self.file, base).value
+                if not isinstance(of, float):
+                    raise ValueError(f"{line(base, 80)} is no number, but {shown(of)}")
 
     def _check_ends(self, names: set[str]) -> None:
         """Raises `ValueError` where the rig file is impossible: as it is; with each bound of the

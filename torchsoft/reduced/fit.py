@@ -385,8 +385,9 @@ def choose(
     within `slack` of the best.
 
     Every equation has its own threshold: all combinations that differ in their terms are rolled
-    out. The error of a combination is the mean over the records of the states' worst NRMSE. Warns as `fit` does, of the
-    validation records. Raises `ValueError`, with the time, when all rollouts diverge.
+    out. The error of a combination is the mean over the records of the states' worst NRMSE. Warns
+    as `fit` does, of the validation records. Raises `ValueError`, with the time, when all rollouts
+    diverge.
     """
     fits: dict[str, dict[tuple[str, ...], tuple[float, Equation]]] = {
         target: {} for target in problem.regressions
