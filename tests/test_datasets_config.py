@@ -76,7 +76,7 @@ MISTAKES: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("rig", "bodies", "disc", "mass"), -1.0, r"^rig: bodies\.disc\.mass"),
     (("kinds", 0, "name"), "grip", "kinds: every name once"),
     (("kinds", 0, "fixed", "motion.x_e"), {"kind": "hold"}, "kinds.0.*x_e.*did you mean `x_d`"),
-    (("kinds", 0, "fixed", E), 1e6, "kinds.0.parameters.materials.rubber.E: it is in `fixed` as well"),
+    (("kinds", 0, "fixed", E), 1e6, "kinds.0.parameters.materials.rubber.E: it is in `fixed`"),
     (("kinds", 0, "parameters", "motion.x_d.values_2"), SPAN, "kinds.0.*values_2` is not in the"),
     (("kinds", 0, "parameters", "motion.x_d.stroke_time"), {"low": 1e-6, "high": 1e-2},
      "kinds.0.*stroke_time.low = 1e-06: impossible: .* makes 50000 strokes"),

@@ -15,7 +15,7 @@ from torchsoft.physics.rig import Rig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
 from torchsoft.plan.planning import RTOL, Method
-from torchsoft.plan.problem import Free, Terms
+from torchsoft.plan.problem import Terms
 from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
@@ -47,14 +47,6 @@ class Goal(Table):
     def from_toml(cls, path: str | Path) -> Self:
         """Read from a TOML file. Raises `InvalidTable` in one sentence."""
         return from_toml(path, cls.model_validate)
-
-    @property
-    def variables(self) -> Free:
-        """Free variables in the form that `plan` takes."""
-        return {
-            name: one if isinstance(one, Bounds) else (one.low, one.high)
-            for name, one in self.free.items()
-        }
 
 
 Draws = Mapping[str, Sequence[float] | NDArray[np.float64]]
@@ -103,7 +95,7 @@ def plan_file(
     over = drawn(file, goal, goal.draws, goal.seed, known) if goal.uncertain or known else {}
     built = file.build()
     found = plan(
-        built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits,
+        built.rig, built.t, goal.free, targets=goal.targets, limits=goal.limits,
         y0=built.initial, over=over, method=goal.method,
         iterations=goal.iterations, starts=goal.starts, seconds=goal.seconds, rtol=goal.rtol,
         seed=goal.seed, progress=progress,
