@@ -32,7 +32,6 @@ from torchsoft.sysid.fit import FAR_OFF, Fit, Loss, Stage, Unreachable, fisher
 from torchsoft.sysid.plan import FINER, default_plan, refine_steps, run_plan, shown
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.refits import coarsened
 from torchsoft.sysid.result import (
     ChannelNoise,
     IdentificationResult,
@@ -40,6 +39,7 @@ from torchsoft.sysid.result import (
     seen_together,
 )
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.search import coarsened
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
 from torchsoft.sysid.sentences import SEVERITIES
 from torchsoft.tables import SEED, Table, plain

@@ -6,6 +6,7 @@ from typing import Any
 
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.assumptions import AMOUNTS
+from torchsoft.sysid.search import RIVAL
 from torchsoft.sysid.sensitivity import Checked
 from torchsoft.sysid.sentences import TESTS, Finding, Severity
 
@@ -40,7 +41,6 @@ def suspect_findings(checked: Checked, unexplained: Severity) -> list[Finding]:
         return without_suspect(checked, unexplained)
     best, *others = checked.favoured
     facts: dict[str, Any] = {"cases": [best.case], "gain": best.gain}
-    candidates = [one for one in checked.checks if one.name in checked.candidates]
     estimate, shift = best.shift
     if not checked.as_stated:
         facts["others"] = [one.name for one in others if one.score > LIKELY]
@@ -50,10 +50,11 @@ def suspect_findings(checked: Checked, unexplained: Severity) -> list[Finding]:
         if not checked.left:
             facts["besides"] = [one.name for one in checked.besides]
         return [Finding("nearest" if best.refitted else "likeliest", "error", facts)]
-    if len(candidates) > 1:
-        cases = [one.case for one in sorted(candidates, key=lambda one: -one.gain)]
+    rivals = [one for one in checked.checks if one.suspected and one.gain > RIVAL * best.gain]
+    if not best.refitted and len(rivals) > 1:
+        cases = [one.case for one in sorted(rivals, key=lambda one: -one.gain)]
         return [Finding("rivals", "warning", {"cases": cases, "count": len(cases)})]
-    if best.far and len(candidates) < 2:
+    if best.far:
         return [Finding("far", "warning", facts | {"estimate": estimate, "shift": abs(shift)})]
     likely = [best, *(one for one in others if one.score > LIKELY and one.passed)]
     if len(likely) > 1:
@@ -72,12 +73,12 @@ def suspect_findings(checked: Checked, unexplained: Severity) -> list[Finding]:
 def without_suspect(checked: Checked, severity: Severity) -> list[Finding]:
     """A finding where the data favour no suspect, and residuals fail a test."""
     refitted = [one for one in checked.checks if one.refitted]
-    if checked.candidates and checked.alarms:
+    if checked.alarms and not checked.searched:
         nearest = sorted(checked.checks, key=lambda one: -one.gain)[:NEAREST]
         square = max((one.left + one.gain for one in checked.checks), default=1.0)
         cases = [{"name": one.name, "part": one.gain / square} for one in nearest]
         return [Finding("no-suspect", severity, {"cases": cases})]
-    if checked.alarms and refitted:
+    if checked.alarms:
         facts = {"count": len(refitted), "alarms": alarms_of(checked)}
         return [Finding("none", severity, facts)]
     return []
@@ -127,7 +128,7 @@ def risk_findings(checked: Checked) -> list[Finding]:
     than a standard deviation: the largest shift, and the assumptions that the data contradict,
     though not evidently."""
     hidden, exact, hinted = list[AssumptionTest](), list[AssumptionTest](), list[AssumptionTest]()
-    measured = [c for c in checked.checks if c.kind in ("known", "sensor") and not c.unchecked]
+    measured = [c for c in checked.checks if c.has_amount and not c.unchecked]
     for c in measured:
         if abs(c.favoured) > CONTRADICTED * c.favoured_sd and (c.favoured > 0 or not c.one_sided):
             hinted.append(c)

@@ -121,7 +121,7 @@ FAULTS: dict[str, Fault] = {
     "delay": Fault("s", "came late", 1e-4, 0.02),
     "gain": Fault("1", "were too sensitive", 1e-3, 0.5),
     "drift": Fault("{}/s", "drifted upwards", 0.1, 1e4, grows=True),
-    "misalignment": Fault("rad"),
+    "misalignment": Fault("rad", "were turned", 1e-3, 0.2),
     "inertia": Fault("kg"),
     "clock": Fault("1", "ran too fast", 1e-4, 0.05, grows=True),
     "lag": Fault("s", "came through a low-pass", 1e-4, 0.05, one_sided=True),
@@ -243,10 +243,10 @@ def by_channel(
 @dataclass(frozen=True)
 class Coordinate:
     """One entry of the vector of coordinates: name and kind, its bounds and start in physical
-    units, its scale, and its prior. A `variation` is an assumption of which this is the amount."""
+    units, its scale, and its prior. An `alternative` changes the recordings by an amount."""
 
     name: str
-    kind: Literal["parameter", "start", "variation"] | Nuisance
+    kind: Literal["parameter", "start", "alternative"] | Nuisance
     recording: str | None
     nominal: float
     low: float
@@ -264,7 +264,7 @@ class Coordinate:
     @property
     def label(self) -> str:
         """Readable name: `materials.rubber.E`, `bodies.a.mass / bodies.b.mass`, `delay of x_C`."""
-        plain = self.of_the_rig or self.kind == "variation"
+        plain = self.of_the_rig or self.kind == "alternative"
         quantity = self.name if plain else f"{self.kind} of {self.name}"
         ratio = f" / {self.ratio_to}" if self.ratio_to else ""
         return f"{quantity}{ratio}" + (f" in {self.recording}" if self.recording else "")
@@ -420,8 +420,8 @@ def parameter_coordinate(
 
 class Coordinates:
     """All coordinates of a problem, in a fixed order, and the map from their vector x (n,) to
-    parameters of the rig, starts of runs, faults of sensors, and amounts of variations, which have
-    bounds by name. Coordinates `held`, by label, are not free.
+    parameters of the rig, starts of runs, faults of sensors, and amounts of alternatives, which
+    have bounds by name. Coordinates `held`, by label, are not free.
 
     Raises `ValueError` for unknowns that some recording's rig lacks, a ratio to an unknown
     parameter, or a nominal value or median of a prior out of bounds.
@@ -463,7 +463,7 @@ class Coordinates:
                 )
                 self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
         for name, (low, high) in (amounts or {}).items():
-            self.all.append(Coordinate(name, "variation", None, 0.0, low, high))
+            self.all.append(Coordinate(name, "alternative", None, 0.0, low, high))
         self.all = [replace(c, fixed=c.fixed or c.label in held) for c in self.all]
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 
