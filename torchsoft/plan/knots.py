@@ -118,7 +118,9 @@ class Moves:
             flat.append(values[first:])
         self.unit = np.concatenate(units)
         self.n = len(self.unit)
-        self.A, self.b, self.ways = block_diag(*A), np.concatenate(b), block_diag(*ways)
+        self.A: Array = np.asarray(block_diag(*A))
+        self.ways: Array = np.asarray(block_diag(*ways))
+        self.b = np.concatenate(b)
         self.start = self.nearest(np.concatenate(flat) / self.unit)
 
     def values(self, z: Tensor) -> dict[str, Tensor]:

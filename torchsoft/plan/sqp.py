@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.optimize import Bounds, minimize
+from scipy.optimize import minimize
 
 from torchsoft.plan.knots import Array
 from torchsoft.plan.problem import Evaluation
@@ -86,7 +86,7 @@ class Stage:
         """Whether SLSQP converges. Raises `Settled`, `Failed` and `GradientFailed`."""
         found = minimize(
             self._objective, self._x, jac=self._gradient, method="SLSQP",
-            bounds=Bounds(self.variables.low, self.variables.high),
+            bounds=list(zip(self.variables.low, self.variables.high)),
             constraints=self._constraints(), options={"maxiter": iterations, "ftol": ACCURACY},
         )  # fmt: skip
         return found.status == 0
