@@ -2,8 +2,8 @@
 
 1. Score tests of all suspects order them: those that would explain most come first, and those with
    costly runs last.
-2. Successive halving: every suspect of a bracket gets one step; then the better half goes on with
-   twice as many evaluations, until a few finalists are left.
+2. Successive halving: every suspect of a bracket gets one step; then the best third goes on with
+   three times as many evaluations, until a few finalists are left.
 3. Finalists are fitted until they converge, on fine steps. The search ends after a bracket in which
    one explains the misfit, and when refits took all of the effort.
 """
@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -20,21 +21,21 @@ from torchsoft.display import hidden
 from torchsoft.sysid.assumption_tests import EVIDENT, AssumptionTest, Linearised
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
-from torchsoft.sysid.plan import LOOSE, SCANNED, USUAL, continued, refine_steps
+from torchsoft.sysid.plan import LOOSE, USUAL, continued, refine_steps, scanned
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
 BRACKET, FINALISTS = 16, 3
-"""Suspects of a bracket, unless the fit is far off, and those that are fitted to the end."""
+"""Suspects of a bracket, and those of it that are fitted until they converge."""
 
 FAR = 2.0
-"""Misfit per sample above which score tests order suspects wrongly, so that the bracket has all of
-them."""
+"""Misfit per sample above which score tests order suspects wrongly, so that the first
+bracket has all of them but costly ones."""
 
-EVALUATIONS = 2
-"""Evaluations of every suspect in the first round of halving."""
+KEPT = 3
+"""One in so many suspects goes on after a round, with so many times as many evaluations."""
 
 COMPLETE, ROUGH = 20, 1e-3
 """Most evaluations of a finalist, and its relative tolerance."""
@@ -55,8 +56,8 @@ FIRST_STEP = 1.0
 NEARLY = 0.99
 """Part of the misfit above the noise from which on a suspect seems to explain it."""
 
-RIVAL = 0.3
-"""Part of its gain that a rival of such a suspect has at least."""
+RIVAL = 0.5
+"""Part of the gain of such a suspect from which on another is its rival."""
 
 HALVINGS = 10
 """Most halvings of the range of a suspect where the rig is impossible at its end."""
@@ -185,36 +186,46 @@ def search(
     Yields the test of every suspect that was tried: of finalists that of the refit, and the refit.
     It ends when refits took `effort` times the work of the fit.
     """
-    queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))
+    queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))  # 1.
     most = end.runner.work * (1.0 + effort)
     bar = tqdm(total=len(queue), unit="suspect", disable=hidden(end.progress))
     with bar, warnings.catch_warnings(action="ignore"):
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
-        size = len(queue) if end.chi2 > FAR else BRACKET
+        size = sum(not one.costly for one in queue) if end.chi2 > FAR else BRACKET
         while queue and end.runner.work < most:
             bracket, queue = queue[:size], queue[size:]
-            fits, dropped, evaluations = dict[Suspect, Fit](), list[Suspect](), EVALUATIONS
-            for one in bracket:
-                bar.set_description(plain(f"first step with {one.name} free"))
-                if (fit := first_step(end, one, tests[one.name], linear)) is not None:
-                    fits[one] = fit
-                bar.update()
+            fits, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
             while len(fits) > FINALISTS:
-                kept = better_half(fits, linear)
-                dropped += [one for one in fits if one not in kept]
+                kept = best_of(fits, linear)
                 bar.set_description(f"{len(kept)} suspects, {evaluations} evaluations each")
                 fits = {one: carried_on(fits[one], evaluations) for one in kept}
-                evaluations *= 2
-            yield from ((replace(tests[one.name], dropped=True), None) for one in dropped)
-            ends, best = dict[Suspect, Fit](), np.inf
-            for one in sorted(fits, key=lambda one: fits[one].square):
+                evaluations *= KEPT
+            dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
+            yield from ((test, None) for test in dropped)
+            best, explained = np.inf, False
+            for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
                 bar.set_description(plain(f"refit with {one.name} free"))
-                ends[one] = finished(fits[one].by(end.rtol), best + COMPARABLE)
-                best = min(best, ends[one].square)
-            found = {one: linear.refit_test(one, fit, tests[one.name]) for one, fit in ends.items()}
-            yield from ((found[one], ends[one]) for one in found)
-            if any(test.suspected and test.passed for test in found.values()):
+                refit = finished(fits[one].by(end.rtol), best + COMPARABLE)
+                test = linear.refit_test(one, refit, tests[one.name])
+                yield test, refit
+                best = min(best, refit.square)
+                explained = explained or bool(test.suspected and test.passed)
+            if explained:
                 return
+
+
+def first_steps(
+    end: Fit, bracket: Sequence[Suspect], tests: Mapping[str, AssumptionTest], linear: Linearised,
+    bar: "tqdm[Any]",
+) -> dict[Suspect, Fit]:  # fmt: skip
+    """First steps with each suspect of a bracket, of those that can be simulated."""
+    fits = dict[Suspect, Fit]()
+    for one in bracket:
+        bar.set_description(plain(f"first step with {one.name} free"))
+        if (fit := first_step(end, one, tests[one.name], linear)) is not None:
+            fits[one] = fit
+        bar.update()
+    return fits
 
 
 def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised) -> Fit | None:
@@ -244,11 +255,11 @@ def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised)
     return best
 
 
-def better_half(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
-    """The half of the fits that leaves least, and at least the finalists; without those far behind
-    one that explains the misfit."""
+def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
+    """The fits that go on after a round: those that leave least, without those far behind one that
+    explains the misfit."""
     ranked = sorted(fits, key=lambda one: fits[one].square)
-    kept = ranked[: max(len(ranked) // 2, FINALISTS)]
+    kept = ranked[: max(len(ranked) // KEPT, FINALISTS)]
     gains = {one: linear.square - fits[one].square for one in kept}
     if gains[kept[0]] < NEARLY * (linear.square - linear.dof):
         return kept
@@ -267,8 +278,7 @@ def finished(fit: Fit, most: float = np.inf) -> Fit:
     on fine steps where it leaves at most `most` of the sum of squares."""
     c = fit.problem.coordinates
     stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
-    scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-    stage = replace(fit.stage, scanned=scans, evaluations=COMPLETE, tolerance=ROUGH)
+    stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
     end = continued(fit, stage) or fit
     if end.square > most:
         return end._replace(converged=False)
