@@ -42,7 +42,6 @@ ELSEWHERE = {
     "out/logs": "test_datasets.py",
     "LeRobotDataset": "a package",
     "out/the_well": "a package",
-    "sbatch": "a cluster",
 }
 """Parts of blocks that need more than a test has, and where they are tried instead."""
 LONG = "laboratory", "identification", "reduced"
