@@ -236,7 +236,7 @@ REPORTED: dict[str, tuple[dict[str, Any], *tuple[str, ...]]] = {
     "milliseconds": (csv("t [s],x_d [m]\n0,0\n1000,1e-3\n2000,0\n"),
         r"warning: motion\.x_d\.file: .*lasts 2000 s.*millisec"),
     "millimetres": (csv("t [s],x_d [m]\n0,0\n1,12\n2,0\n"),
-        r"warning: motion\.x_d: .*goes 12 m, .* is it in millimetres"),
+        r"warning: bodies\.disc: the run ends early: at t = 0\.0\d+ s `disc` was lost: it left"),
 }  # fmt: skip
 """Changes of the template by dotted names, or the content of a file, and what is reported."""
 
