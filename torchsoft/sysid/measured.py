@@ -217,7 +217,7 @@ class FirstRows(NamedTuple):
     name: str
     unit: str
     table: Columns
-    rows: Array
+    rows: Sequence[int]
     t: Array
     y: Array
     noise: float
@@ -240,7 +240,9 @@ def check_start(
             sensor = sensors.get(name)
             noise, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
             table = tables.of(name)
-            columns.append(FirstRows(name, unit, table, rows, t[rows], y[rows], noise, bias))
+            columns.append(
+                FirstRows(name, unit, table, rows.tolist(), t[rows], y[rows], noise, bias)
+            )
     check_places(made, y0, own, first, columns)
     check_rest(made, y0, own, first, columns)
 

@@ -383,7 +383,7 @@ def correlated_channels(
     n = rows.shape[1] - sum(float(np.sum(Q[p.rows] ** 2)) for p in alike) / k
     if n < 4 * k or (rows.std(1) == 0).any():
         return []
-    C = np.corrcoef(rows)
+    C = np.atleast_2d(np.corrcoef(rows))
     square = -(n - 1 - (2 * k + 5) / 6) * float(np.linalg.slogdet(C)[1])
     i, j = np.unravel_index(int(np.argmax(np.abs(np.triu(C, 1)))), C.shape)
     facts = {"channels": f"{alike[i].channel} and {alike[j].channel}"}
