@@ -41,7 +41,11 @@ def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
 
 def scaled(recording: Recording, part: float, name: str) -> Recording:
     """Change a parameter of the rig by a relative amount."""
-    return with_rig(recording, lambda rig: rig.parameter(name).mul_(1 + part) and None)
+
+    def change(rig: Rig) -> None:
+        rig.parameter(name).mul_(1 + part)
+
+    return with_rig(recording, change)
 
 
 # Laws
@@ -198,9 +202,9 @@ def off_centre(recording: Recording, by: float, body: str, axis: int) -> Recordi
     centre = by * np.eye(2)[axis]
 
     def change(rig: Rig) -> None:
-        shape = rig.bodies[body].shape
+        shape, (x, y) = rig.bodies[body].shape, centre.tolist()
         assert shape is not None
-        rig.bodies[body].shape = Eccentric(shape, *centre.tolist())
+        rig.bodies[body].shape = Eccentric(shape, x, y)
 
     (x, y, angle), (v_x, v_y, spin) = start.bodies[body]
     (c_x,), (c_y,) = rotated(centre, np.array([angle]))
@@ -269,8 +273,8 @@ def of_fifth_degree(one: Sampled) -> Sampled:
         slopes = CubicSpline(t, rates)(t, 1)
         curve = BPoly.from_derivatives(t, np.stack((y, rates, slopes), 1))
     fine = np.append((t[:-1, None] + np.diff(t)[:, None] * np.arange(4) / 4).ravel(), t[-1])
-    return Sampled(*(torch.tensor(a, dtype=torch.float64) for a in (fine, curve(fine))),
-                   torch.tensor(curve(fine, 1), dtype=torch.float64))  # fmt: skip
+    values, rates = (torch.from_numpy(curve(fine, k)) for k in (0, 1))
+    return Sampled(torch.from_numpy(fine), values, rates)
 
 
 def retimed(recording: Recording, rate: float, shift: float) -> Recording | None:

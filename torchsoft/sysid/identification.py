@@ -240,21 +240,29 @@ def concluded(
         made_by=made_by | provenance(problem),
         covariance=C.tolist(),
         recordings=recorded_rigs(end),
-        unknowns=dict(problem.unknowns),
-        sensors=dict(problem.sensors),
-        coordinates=[
+        combinations=seen_together(end, C),
+        assumptions=checked.checks,
+        **described(end),
+    )
+
+
+def described(end: Fit) -> dict[str, Any]:
+    """The problem of a fit, as fields of its answer."""
+    problem = end.problem
+    return {
+        "unknowns": dict(problem.unknowns),
+        "sensors": dict(problem.sensors),
+        "coordinates": [
             replace(one, fixed=not is_free)
             for one, is_free in zip(problem.coordinates.all, end.free)
         ],
-        combinations=seen_together(end, C),
-        noise=[
+        "noise": [
             ChannelNoise(name, model, [*end.colour[name].scores] if name in end.colour else [])
             for name, model in problem.noise.items()
         ],
-        assumptions=checked.checks,
-        versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
-        rigs={recording.name: recording.rig for recording in problem.recordings},
-    )
+        "versions": {"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
+        "rigs": {recording.name: recording.rig for recording in problem.recordings},
+    }
 
 
 def work(end: Fit) -> dict[str, float]:

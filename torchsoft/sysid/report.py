@@ -173,8 +173,8 @@ def assumptions(result: IdentificationResult) -> tuple[list[list[str]], list[lis
     moving, harmless = list[list[str]](), list[list[str]]()
     for one in sorted(result.assumptions, key=lambda one: -abs(one.most_moved[1])):
         label, move = one.most_moved
-        favoured, seen, measurable = "", "", one.kind in ("known", "sensor")
-        if np.isfinite(one.favoured_sd) and not one.unchecked and one.kind != "several":
+        favoured, seen, measurable = "", "", one.has_amount
+        if np.isfinite(one.favoured_sd) and not one.unchecked:
             by = one.unit if measurable else "of that"
             favoured = f"{signed(one.favoured)} ± {grouped(one.favoured_sd, 2)} {by}".strip()
         if np.isfinite(one.detectable) and measurable:
@@ -189,11 +189,15 @@ def favour(one: AssumptionTest) -> str:
     """Conclusion of the test of an assumption; empty where the data agree with it."""
     if one.unchecked:
         return f"not checked: {one.unchecked}"
+    if one.dropped:
+        return (
+            "not excluded: its refit was left to others that gained more" if one.suspected else ""
+        )
     if one.suspected:
         how = "in a refit" if one.refitted else "by a score test"
         cause = "" if one.passed else ", but others are left"
         return f"suspected: lowers the sum of squares by {one.gain:.0f} {how}{cause}"
-    if one.kind in ("known", "sensor") and abs(one.favoured) > CONTRADICTED * one.favoured_sd:
+    if one.has_amount and abs(one.favoured) > CONTRADICTED * one.favoured_sd:
         return "differs by more than chance; other suspects explain more"
     return ""
 

@@ -185,35 +185,36 @@ def search(
     Yields the test of every suspect that was tried: of finalists that of the refit, and the refit.
     It ends when refits took `effort` times the work of the fit.
     """
-    queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))
+    queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))  # 1.
     most = end.runner.work * (1.0 + effort)
     bar = tqdm(total=len(queue), unit="suspect", disable=hidden(end.progress))
     with bar, warnings.catch_warnings(action="ignore"):
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
         size = sum(not one.costly for one in queue) if end.chi2 > FAR else BRACKET
         while queue and end.runner.work < most:
-            bracket, queue = queue[:size], queue[size:]
-            fits, dropped, evaluations = dict[Suspect, Fit](), list[Suspect](), KEPT
-            for one in bracket:
+            bracket, queue, fits = queue[:size], queue[size:], dict[Suspect, Fit]()
+            for one in bracket:  # 2.
                 bar.set_description(plain(f"first step with {one.name} free"))
                 if (fit := first_step(end, one, tests[one.name], linear)) is not None:
                     fits[one] = fit
                 bar.update()
+            evaluations = KEPT
             while len(fits) > FINALISTS:
                 kept = best_of(fits, linear)
-                dropped += [one for one in fits if one not in kept]
                 bar.set_description(f"{len(kept)} suspects, {evaluations} evaluations each")
                 fits = {one: carried_on(fits[one], evaluations) for one in kept}
                 evaluations *= KEPT
-            yield from ((replace(tests[one.name], dropped=True), None) for one in dropped)
-            ends, best = dict[Suspect, Fit](), np.inf
-            for one in sorted(fits, key=lambda one: fits[one].square):
+            dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
+            yield from ((test, None) for test in dropped)
+            best, explained = np.inf, False
+            for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
                 bar.set_description(plain(f"refit with {one.name} free"))
-                ends[one] = finished(fits[one].by(end.rtol), best + COMPARABLE)
-                best = min(best, ends[one].square)
-            found = {one: linear.refit_test(one, fit, tests[one.name]) for one, fit in ends.items()}
-            yield from ((found[one], ends[one]) for one in found)
-            if any(test.suspected and test.passed for test in found.values()):
+                refit = finished(fits[one].by(end.rtol), best + COMPARABLE)
+                test = linear.refit_test(one, refit, tests[one.name])
+                yield test, refit
+                best = min(best, refit.square)
+                explained = explained or bool(test.suspected and test.passed)
+            if explained:
                 return
 
 

@@ -7,7 +7,9 @@ determine it.
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -86,55 +88,83 @@ class Checked(NamedTuple):
 def check_assumptions(end: Fit, *, doubtful: bool = False, effort: float = 0.0) -> Checked:
     """Score tests of the assumptions at the end of a fit, `search.coarsened`; with an `effort`, the
     search for the cause if it is `doubtful`. An interruption keeps what was tested."""
-    every = [one for one in suspects_of(end) if doubtful or not one.costly]
-    tests, columns = dict[str, AssumptionTest](), dict[str, tuple[Suspect, Array]]()
-    refits, searched, late = dict[str, Fit](), False, list[str]()
-    untried = [one.name for one in every if one.change is not None]
-    exact, J = exact_columns(end, every)
-    linear = Linearised(end, J)
-    try:
-        with warnings.catch_warnings(action="ignore"):  # such as of pads that creep for long
-            alternatives = (difference_column(end, one) for one in every if one.change is not None)
-            for one, d, reason in (found for some in (exact, alternatives) for found in some):
-                if one.change is not None:
-                    untried.remove(one.name)
-                elif d is not None and not d.any():
-                    continue
-                if d is None:
-                    unchecked = {"left": linear.square, "unchecked": reason}
-                    tests[one.name] = assumption_test(one, **unchecked)
-                else:
-                    columns[one.name] = one, d
-                    tests[one.name] = linear.score_test(one, d)
-        if effort and doubtful:
-            searched = True
-            open_to_refits = [
-                one for one in every
-                if one.name in tests and (one.name in columns or one.kind == "law")
-            ]  # fmt: skip
-            late = [one.name for one in open_to_refits]
-            for test, fit in search(end, open_to_refits, tests, linear, effort):
-                tests[test.name] = test
-                late.remove(test.name)
-                if fit is not None:
-                    refits[test.name] = fit
-    except KeyboardInterrupt:  # the fit is done: what was tested is kept
-        untried += [f"a refit with {name} free" for name in late]
-        late = []
-    numerical = [d for one, d in columns.values() if one.kind == "numerical"]
-    rows = np.stack(numerical, 1) if numerical else np.zeros((len(linear.r), 0))
-    out = with_scores([*tests.values()], linear.dof)
-    late = [] if any(one.refitted and one.passed for one in out) else late
+    scored = score_tests(end, [one for one in suspects_of(end) if doubtful or not one.costly])
+    refits = Refits(scored.tests)
+    if effort and doubtful and not scored.untried:
+        refits = refitted(end, scored, effort)
+    linear = scored.linear
+    tests = with_scores([*refits.tests.values()], linear.dof)
+    numerical = [d for one, d in scored.columns.values() if one.kind == "numerical"]
     done = Checked(
-        out, rows, linear.J, searched, tuple(untried), tuple(late),
+        tests,
+        np.stack(numerical, 1) if numerical else np.zeros((len(linear.r), 0)),
+        linear.J,
+        searched=bool(refits.fits),
+        untried=scored.untried + refits.untried,
+        late=() if any(one.refitted and one.passed for one in tests) else refits.late,
         as_stated=tuple(linear.alarms(linear.r, linear.J)),
         sd=dict(zip(linear.labels, linear.sd.tolist())),
-    )  # fmt: skip
+    )
     if not done.favoured:
         return done._replace(alarms=done.as_stated)
     best = done.favoured[0]
-    besides, alone, left = linear.besides(best, refits.get(best.name), columns)
+    besides, alone, left = linear.besides(best, refits.fits.get(best.name), scored.columns)
     return done._replace(besides=tuple(besides), alarms=tuple(alone), left=tuple(left))
+
+
+class Scored(NamedTuple):
+    """The suspects that were tested, with their tests and columns by name; names of those that an
+    interruption left out."""
+
+    linear: Linearised
+    tested: list[Suspect]
+    tests: dict[str, AssumptionTest]
+    columns: dict[str, tuple[Suspect, Array]]
+    untried: tuple[str, ...]
+
+
+def score_tests(end: Fit, every: Sequence[Suspect]) -> Scored:
+    """Score tests of suspects, of those that need a run of their own last."""
+    exact, J = exact_columns(end, every)
+    linear, tests = Linearised(end, J), dict[str, AssumptionTest]()
+    columns = dict[str, tuple[Suspect, Array]]()
+    alternatives = [one for one in every if one.change is not None]
+    found = chain(exact, (difference_column(end, one) for one in alternatives))
+    with suppress(KeyboardInterrupt), warnings.catch_warnings(action="ignore"):
+        for one, d, reason in found:
+            if d is None:
+                unchecked = {"left": linear.square, "unchecked": reason}
+                tests[one.name] = assumption_test(one, **unchecked)
+            elif d.any() or one.change is not None:
+                columns[one.name] = one, d
+                tests[one.name] = linear.score_test(one, d)
+    untried = tuple(one.name for one in alternatives if one.name not in tests)
+    return Scored(linear, [one for one in every if one.name in tests], tests, columns, untried)
+
+
+class Refits(NamedTuple):
+    """Tests, those of refitted suspects by their refits, and the refits, by name; suspects that the
+    effort, or an interruption, left out."""
+
+    tests: dict[str, AssumptionTest]
+    fits: Mapping[str, Fit] = MappingProxyType({})
+    late: tuple[str, ...] = ()
+    untried: tuple[str, ...] = ()
+
+
+def refitted(end: Fit, scored: Scored, effort: float) -> Refits:
+    """The search for the cause among the suspects with a score test, and laws without one."""
+    tests, fits = dict(scored.tests), dict[str, Fit]()
+    some = [one for one in scored.tested if one.kind == "law" or one.name in scored.columns]
+    left = [one.name for one in some]
+    try:
+        for test, fit in search(end, some, scored.tests, scored.linear, effort):
+            tests[test.name] = test
+            left.remove(test.name)
+            fits |= {} if fit is None else {test.name: fit}
+    except KeyboardInterrupt:
+        return Refits(tests, fits, untried=tuple(f"a refit with {name} free" for name in left))
+    return Refits(tests, fits, late=tuple(left))
 
 
 def suspects_of(end: Fit) -> list[Suspect]:
@@ -152,7 +182,9 @@ def largest_efforts(end: Fit) -> dict[str, float]:
     jobs = end.problem.jobs(end.x, end.which, end.at.steps or end.rtol, None)
     for job, run in zip(jobs, end.runner.run(jobs)):
         recording = end.problem.recordings[job.recording]
-        for name in recording.rig.actuators if not isinstance(run, FailedRun) else ():
+        if isinstance(run, FailedRun):
+            continue
+        for name in recording.rig.actuators:
             effort = run.signals[:, recording.channels.index(effort_channel(name))]
             out[name] = max(out.get(name, 0.0), float(np.abs(effort).max()))
     return out
