@@ -118,7 +118,7 @@ class Recording:
 
     @property
     def run_start(self) -> float:
-        """InitialState of the run [s]."""
+        """Initial time of the run [s]."""
         return float(self.times[0] - self.start.lead)
 
     @property
@@ -169,8 +169,8 @@ class Recording:
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
     def grid(self, interpolated: bool) -> Grid:
-        """Times to simulate: the begin, where it is before the samples, then the samples' own
-        times, or a regular grid from `REACH` before the first, but not before the begin, to `REACH`
+        """Times to simulate: the initial time, where it is before the samples, then the samples' own
+        times, or a regular grid from `REACH` before the first, but not before the initial time, to `REACH`
         after the last."""
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):

@@ -127,7 +127,7 @@ MEDIAN = 0.37
 """Efficiency of the level by the median residual, relative to the mean square."""
 
 SUDDEN, BEFORE, BEYOND = 3.0, 2.0, 5.0
-"""Least ratio of rms residuals after a time to those before it at which a misfit begins there,
+"""Least ratio of rms residuals after a time to those before it at which a misfit starts there,
 largest rms residual before it, and the residual that shows it first, which one sample in a million
 exceeds by chance; over the noise."""
 
@@ -337,8 +337,8 @@ def largest_change(part: Part) -> ResidualTest:
 
 
 def onset(mine: Sequence[Part]) -> list[ResidualTest]:
-    """Test of a misfit that begins at a certain time, of the parts of one recording; empty where
-    none does. It begins with the first residual beyond `BEYOND` in any channel that fits until
+    """Test of a misfit that starts at a certain time, of the parts of one recording; empty where
+    none does. It starts with the first residual beyond `BEYOND` in any channel that fits until
     then."""
     changes = [
         one

@@ -134,7 +134,7 @@ class Sensor(Table):
     plane; the `inertia` [kg] between a force sensor and the body that it pushes, whose acceleration
     it does not feel; the `clock` [1] that runs too fast, counted from the middle of the recording;
     the `lag` [s], the time constant of a low-pass of first order that rests at the first sample;
-    the `backlash` [unit], the width of the play of a gear, in the middle of which it begins.
+    the `backlash` [unit], the width of the play of a gear, in the middle of which it starts.
     Zero leaves a fault out; others are identified, one for all recordings or one for each (`per`).
     Samples at `low` or `high` [unit] or beyond are saturated: they only say that value plus noise
     is there or beyond (Tobin's likelihood), and the noise must be white. Readings in steps of a
