@@ -221,8 +221,8 @@ def reference_from(rig: Rig, start: Start, pose: Mapping[str, Tensor]) -> Refere
 
 
 def warn_of_memory(rig: Rig, lead: float) -> None:
-    """Warns of massless pads that do not forget their initial state before the first sample, `lead` [s]
-    later."""
+    """Warns of massless pads that do not forget their initial state before the first sample,
+    `lead` [s] later."""
     for name, pad in rig.pads.items():
         longest = float(pad.chain()[1].detach().max())
         if not pad.inertial and lead < FORGOTTEN * longest:

@@ -169,9 +169,9 @@ class Recording:
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
     def grid(self, interpolated: bool) -> Grid:
-        """Times to simulate: the initial time, where it is before the samples, then the samples' own
-        times, or a regular grid from `REACH` before the first, but not before the initial time, to `REACH`
-        after the last."""
+        """Times to simulate: the initial time, where it is before the samples, then the samples'
+        own times, or a regular grid from `REACH` before the first, but not before the initial time,
+        to `REACH` after the last."""
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
