@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from torchsoft.sysid.estimate import Quantity
 from torchsoft.sysid.fit import Check
 from torchsoft.sysid.residual_tests import ResidualTest
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.search import best_of
 from torchsoft.sysid.sensitivity import Checked, with_scores
 from torchsoft.sysid.suspects import LIKELY, risk_findings, suspect_findings
 
@@ -325,6 +327,25 @@ def test_constants_of_the_computation_widen_intervals_and_are_named():
     assert "so b, c were not refitted" in effort
     assert re.search(rf"{E} depends on .* pads have 10 .* by 1\.5 .* {wide:.2g} times as", moves)
     assert "could not be checked (pads have 10 elements): a run failed" in unknown
+
+
+@pytest.mark.parametrize(
+    ("squares", "kept"),
+    [
+        ([900.0, 800.0, 700.0, 850.0, 750.0, 950.0], "ceb"),  # finalists at least
+        ([500.0 + 40 * k for k in range(12)], "abcd"),  # the best third
+        ([102.0, 400.0, 600.0, 900.0], "ab"),  # half the gain of one that explains the misfit
+        ([120.0, 400.0, 600.0, 900.0], "abc"),  # which this one does not
+    ],
+)
+def test_the_best_of_a_bracket_go_on(squares, kept):
+    end = optimum(ClosedForm(lambda x: [x[0]], 1), 0.0)
+    linear: Any = SimpleNamespace(square=1000.0, dof=100)
+    fits: Any = {
+        name: end._replace(at=end.at._replace(r=np.array([square**0.5])))
+        for name, square in zip("abcdefghijkl", squares)
+    }
+    assert [*best_of(fits, linear)] == [*kept]
 
 
 def estimate(name: str, **more: Any) -> Estimate:

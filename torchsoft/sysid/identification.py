@@ -41,7 +41,7 @@ from torchsoft.sysid.result import (
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.search import coarsened
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
-from torchsoft.sysid.sentences import SEVERITIES
+from torchsoft.sysid.sentences import SEVERITIES, Finding
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
@@ -126,24 +126,27 @@ def identify(
     looks = accepted(precheck(problem, runner, fitted), acknowledged)
     for finding in looks if progress else ():
         tqdm.write(plain(f"{finding.severity}: {finding}"), file=sys.stderr)
-    try:
-        if plan is None:
-            plan = default_plan(problem, runner, rtol, fitted, starts)
-        start = Fit(problem, runner, problem.coordinates.start, loss=loss, progress=progress)
-        planned = run_plan(start, plan, seed=seed)
-    except Unreachable as error:  # what looks wrong with the recordings may be the cause
-        raise Unreachable(error.failed, looks) from None
+    start = Fit(problem, runner, problem.coordinates.start, loss=loss, progress=progress)
+    planned = fit_plan(start, plan, settings, fitted, looks)
     far_off = is_far_off(planned)
     end = refined(planned, 0 if far_off or loss != "linear" else tightenings)
     residuals = check_residuals(end)
     checked = check_suspects(end, residuals, settings)
 
     made_by: dict[str, Any] = settings.model_dump()
-    made_by |= {"rtol": end.rtol, "rtol_asked": plan[-1].rtol, "acknowledged": [*acknowledged]}
+    made_by |= {"rtol": end.rtol, "rtol_asked": asked(plan, settings)}
+    made_by |= {"acknowledged": [*acknowledged]}
     answer = concluded(end, residuals, checked, heldout, made_by, far_off)
+    return completed(answer, looks, clock.perf_counter() - started)
+
+
+def completed(
+    answer: IdentificationResult, looks: Sequence[Finding], wall_s: float
+) -> IdentificationResult:
+    """The answer with what was found before the fit, the gravest findings first, and the time that
+    it took [s]."""
     findings = sorted([*looks, *answer.findings], key=lambda one: SEVERITIES.index(one.severity))
-    cost = answer.cost | {"wall_s": clock.perf_counter() - started}
-    return replace(answer, findings=findings, cost=cost)
+    return replace(answer, findings=findings, cost=answer.cost | {"wall_s": wall_s})
 
 
 def explain(problem: Problem, **options: Any) -> IdentificationResult:
@@ -172,6 +175,29 @@ def check_arguments(
             "`starts` and `rtol` are those of the default plan: set them in the stages of `plan` "
             "instead"
         )
+
+
+def fit_plan(
+    start: Fit,
+    plan: Sequence[Stage] | None,
+    settings: Settings,
+    fitted: Sequence[str],
+    looks: Sequence[Finding],
+) -> Fit:
+    """The fit of a plan, by default of `default_plan`. Raises `Unreachable` with what looks wrong
+    with the recordings, since that may be its cause."""
+    try:
+        if plan is None:
+            rtol, starts = settings.rtol, settings.starts
+            plan = default_plan(start.problem, start.runner, rtol, fitted, starts)
+        return run_plan(start, plan, seed=settings.seed)
+    except Unreachable as error:
+        raise Unreachable(error.failed, looks) from None
+
+
+def asked(plan: Sequence[Stage] | None, settings: Settings) -> float:
+    """Tolerance of the last stage of a plan."""
+    return settings.rtol if plan is None else plan[-1].rtol
 
 
 def is_far_off(planned: Fit) -> bool:

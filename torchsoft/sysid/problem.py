@@ -83,6 +83,29 @@ def with_extensions(
     return added, out
 
 
+def check_sensors(
+    recordings: Sequence[Recording], sensors: Collection[str], sampled: Collection[str]
+) -> None:
+    """Raises `ValueError` for a sensor of no channel, or without samples, and for a recording
+    without samples of any sensor."""
+    touch = [Touch(recording.rig) for recording in recordings]
+    known = dict.fromkeys(c for recording in recordings for c in recording.channels)
+    for channel in sensors:
+        felt = any(channel in one or channel in one.arrays for one in touch)
+        if channel not in known and not felt:
+            raise ValueError(
+                f"sensors: `{line(channel, 80)}` is not a channel; "
+                f"{suggestion(channel, known, 'known:')}"
+            )
+        if channel not in sampled:
+            raise ValueError(f"sensors: no recording has samples of `{channel}`")
+    for recording in recordings:
+        if not set(sensors) & set(recording.samples):
+            raise ValueError(
+                f"recording `{recording.name}` has samples of none of the sensors {list(sensors)}"
+            )
+
+
 def check_ends(
     coordinates: Coordinates, recordings: Sequence[Recording], held: Collection[str]
 ) -> None:
@@ -157,25 +180,7 @@ class Problem(Shown):
         sensors, unknowns = by_channel(rigs, sensors, sampled), by_parameter(rigs, unknowns)
         if not recordings or len(set(names)) < len(names):
             raise ValueError(f"recordings need names of their own, but are called {names}")
-        for channel in sensors:
-            touch = [Touch(recording.rig) for recording in recordings]
-            if not any(
-                channel in recording.channels or channel in one or channel in one.arrays
-                for recording, one in zip(recordings, touch)
-            ):
-                known = dict.fromkeys(c for recording in recordings for c in recording.channels)
-                raise ValueError(
-                    f"sensors: `{line(channel, 80)}` is not a channel; "
-                    f"{suggestion(channel, known, 'known:')}"
-                )
-            if channel not in sampled:
-                raise ValueError(f"sensors: no recording has samples of `{channel}`")
-        for recording in recordings:
-            if not set(sensors) & set(recording.samples):
-                raise ValueError(
-                    f"recording `{recording.name}` has samples of none of the sensors "
-                    f"{list(sensors)}"
-                )
+        check_sensors(recordings, sensors, sampled)
         recordings, unknowns = with_extensions(recordings, unknowns)
         unknowns = {
             name: u.model_copy(update={"fixed": True}) if name in held else u

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -20,7 +21,7 @@ from torchsoft.display import hidden
 from torchsoft.sysid.assumption_tests import EVIDENT, AssumptionTest, Linearised
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
-from torchsoft.sysid.plan import LOOSE, SCANNED, USUAL, continued, refine_steps
+from torchsoft.sysid.plan import LOOSE, USUAL, continued, refine_steps, scanned
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import FAULTS, Unknown
@@ -192,13 +193,8 @@ def search(
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
         size = sum(not one.costly for one in queue) if end.chi2 > FAR else BRACKET
         while queue and end.runner.work < most:
-            bracket, queue, fits = queue[:size], queue[size:], dict[Suspect, Fit]()
-            for one in bracket:  # 2.
-                bar.set_description(plain(f"first step with {one.name} free"))
-                if (fit := first_step(end, one, tests[one.name], linear)) is not None:
-                    fits[one] = fit
-                bar.update()
-            evaluations = KEPT
+            bracket, queue = queue[:size], queue[size:]
+            fits, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
             while len(fits) > FINALISTS:
                 kept = best_of(fits, linear)
                 bar.set_description(f"{len(kept)} suspects, {evaluations} evaluations each")
@@ -216,6 +212,20 @@ def search(
                 explained = explained or bool(test.suspected and test.passed)
             if explained:
                 return
+
+
+def first_steps(
+    end: Fit, bracket: Sequence[Suspect], tests: Mapping[str, AssumptionTest], linear: Linearised,
+    bar: "tqdm[Any]",
+) -> dict[Suspect, Fit]:  # fmt: skip
+    """First steps with each suspect of a bracket, of those that can be simulated."""
+    fits = dict[Suspect, Fit]()
+    for one in bracket:
+        bar.set_description(plain(f"first step with {one.name} free"))
+        if (fit := first_step(end, one, tests[one.name], linear)) is not None:
+            fits[one] = fit
+        bar.update()
+    return fits
 
 
 def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised) -> Fit | None:
@@ -268,8 +278,7 @@ def finished(fit: Fit, most: float = np.inf) -> Fit:
     on fine steps where it leaves at most `most` of the sum of squares."""
     c = fit.problem.coordinates
     stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
-    scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-    stage = replace(fit.stage, scanned=scans, evaluations=COMPLETE, tolerance=ROUGH)
+    stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
     end = continued(fit, stage) or fit
     if end.square > most:
         return end._replace(converged=False)
