@@ -189,7 +189,7 @@ def pages_of_tables() -> dict[str, Page]:
     study = {
         "Top level": identification.Config, "Unknowns": Unknown, "Priors": Prior,
         "Sensors": Sensor, "Columns": identification.Column, "Start at rest": identification.Rest,
-        "Start in motion": identification.Moving, "Known coordinates": identification.Known,
+        "Start in motion": identification.Moving, "Known coordinates": identification.Given,
         "Fit": Settings, "Recordings": identification.Entry, "Competing laws": identification.Law,
         "Rehearsal": identification.Rehearsal, "Design": identification.DesignTable,
         "Bounds of a signal": Bounds,

@@ -50,8 +50,6 @@ class Fields(Table):
     """trajectories that a worker simulates at once and keeps in memory, and that a file holds"""
     samples_per_chunk: int = Field(250, ge=1, le=10_000_000)
     """samples of one trajectory that are read and decompressed at once"""
-    method: Literal["sobol", "latin_hypercube"] = "sobol"
-    """design of the drawn parameters; a longer Sobol sequence starts with the shorter one"""
     duration: float = Field(ge=1e-3, le=1e4)
     """duration of every trajectory; that of the rig file if not given [s]"""
     sample_interval: float = Field(5e-3, ge=1e-6, le=1.0)

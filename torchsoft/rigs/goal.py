@@ -14,8 +14,8 @@ from torch import Tensor
 from torchsoft.physics.rig import Rig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
-from torchsoft.plan.planning import RTOL, Method, Robust
-from torchsoft.plan.problem import Free, Terms
+from torchsoft.plan.planning import RTOL, Method
+from torchsoft.plan.problem import Terms
 from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
@@ -41,8 +41,6 @@ class Goal(Table):
     """ranges of parameters that are not known exactly, by name"""
     draws: int = Field(default=8, ge=1, le=10_000)
     """random values of the uncertain parameters that the plan takes into account"""
-    robust: Robust = "mean"
-    """"mean": minimise the mean over all draws; "worst": minimise the worst draw"""
     method: Method = "slsqp"
     """optimiser: "slsqp" uses sequential quadratic programming, "adam" first-order steps"""
     iterations: int = Field(default=50, ge=1, le=100_000)
@@ -60,14 +58,6 @@ class Goal(Table):
     def from_toml(cls, path: str | Path) -> Self:
         """Read from a TOML file. Raises `InvalidTable` in one sentence."""
         return from_toml(path, cls.model_validate)
-
-    @property
-    def variables(self) -> Free:
-        """Free variables in the form that `plan` takes."""
-        return {
-            name: one if isinstance(one, Bounds) else (one.low, one.high)
-            for name, one in self.free.items()
-        }
 
 
 Draws = Mapping[str, Sequence[float] | NDArray[np.float64]]
@@ -116,8 +106,8 @@ def plan_file(
     over = drawn(file, goal, goal.draws, goal.seed, known) if goal.uncertain or known else {}
     built = file.build()
     found = plan(
-        built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits,
-        y0=built.initial, over=over, robust=goal.robust, method=goal.method,
+        built.rig, built.t, goal.free, targets=goal.targets, limits=goal.limits,
+        y0=built.initial, over=over, method=goal.method,
         iterations=goal.iterations, starts=goal.starts, seconds=goal.seconds, rtol=goal.rtol,
         seed=goal.seed, progress=progress,
     )  # fmt: skip

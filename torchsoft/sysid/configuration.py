@@ -43,7 +43,7 @@ class Rest(Table):
     """standard deviation of the place of a coordinate, such as "disc.x", by its name [m or rad]"""
 
 
-class Known(Table):
+class Given(Table):
     """Prior knowledge of a coordinate or rate."""
 
     mean: float = Field(ge=-1e6, le=1e6)
@@ -52,7 +52,7 @@ class Known(Table):
     """standard deviation; 0 for a known value [as the mean]"""
 
     @model_validator(mode="after")
-    def _is_a_distribution(self) -> "Known":
+    def _is_a_distribution(self) -> "Given":
         resolvable(self.sd, self.mean)
         return self
 
@@ -64,7 +64,7 @@ class Moving(Table):
     kind: Literal["moving"] = "moving"
     lead: float = Field(default=LEAD, gt=0, le=10)
     """duration of the first samples, from which the initial state is estimated [s]"""
-    given: dict[Name, Known] = Field(default_factory=dict)
+    given: dict[Name, Given] = Field(default_factory=dict)
     """prior knowledge of coordinates and rates, such as "disc.x" and "disc.v_x", by name"""
 
 

@@ -370,8 +370,9 @@ def check_unknown(
             raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`")
     if name not in given:
         several = dict(rig.named_parameters()).get(rig.aliases.get(name, name))
-        many = several is not None and several.ndim
-        why = f"it has {several.numel()} numbers, and an unknown is one" if many else ""
+        why = ""
+        if several is not None and several.ndim:
+            why = f"it has {several.numel()} numbers, and an unknown is one"
         raise ValueError(
             f"unknowns: `{line(name, 80)}` cannot be identified; "
             f"{why or suggestion(name, given, 'known:')}"
