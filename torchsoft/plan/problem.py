@@ -13,7 +13,7 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.plan.knots import Array, Bounds, Moves
+from torchsoft.plan.knots import Array, Bounds, Moves, Range
 from torchsoft.solve.batch import Batch, own_values, simulate_batch
 from torchsoft.solve.simulate import Initial, Start, started
 from torchsoft.solve.trajectory import Trajectory
@@ -36,13 +36,16 @@ def samples(run: Trajectory, channel: str) -> Tensor:
 
 
 class Target(Table):
-    """Target for a channel: `value` [its unit] at the time `at` [s], by default the end of the run,
-    within `tolerance`."""
+    """Target for a channel at one time."""
 
     channel: str
+    """name of a channel of the run"""
     value: float
+    """value to reach [the channel's unit]"""
     tolerance: float = Field(gt=0)
+    """permitted error [the channel's unit]"""
     at: float | None = None
+    """time at which it is reached; the end of the run if not given [s]"""
 
     def __call__(self, run: Trajectory) -> Tensor:
         """Error () over the tolerance, interpolated linearly between outputs."""
@@ -58,14 +61,18 @@ class Target(Table):
 
 
 class Limit(Table):
-    """Limit of a channel: between `low` and `high` [its unit], one of which may be missing, from
-    `since` to `until` [s]."""
+    """Limit of a channel over a time; `low` or `high` may be missing, not both."""
 
     channel: str
+    """name of a channel of the run"""
     low: float | None = None
+    """lower limit; none if not given [the channel's unit]"""
     high: float | None = None
+    """upper limit; none if not given [the channel's unit]"""
     since: float | None = None
+    """time from which it holds; the start of the run if not given [s]"""
     until: float | None = None
+    """time until which it holds; the end of the run if not given [s]"""
 
     @model_validator(mode="after")
     def _has_a_bound(self) -> Self:
@@ -115,7 +122,7 @@ def evaluated(terms: Mapping[str, Term], run: Trajectory, field: str) -> dict[st
 # Free variables of a plan: knots of motions, and parameters of a rig of any shape.
 
 
-Free = Mapping[str, Bounds | tuple[float, float]]
+Free = Mapping[str, Bounds | Range | tuple[float, float]]
 """Bounds of a motion's knots by its name, or lower and upper bound of a parameter by its name."""
 
 
@@ -139,7 +146,7 @@ class Variables:
             if isinstance(one, Bounds):
                 continue
             value = rig.parameter(name).detach()
-            least, most = one
+            least, most = (one.low, one.high) if isinstance(one, Range) else one
             if not least < most:
                 raise ValueError(f"free.{name} = ({least:g}, {most:g}): low must be below high")
             if not bool(((value >= least) & (value <= most)).all()):
@@ -163,7 +170,7 @@ class Variables:
         self.high = np.concatenate([unbounded, *high])
         # D z holds the ways between knots, so that a small change of it is a smooth one
         self.D = np.eye(self.n)
-        self.D[: self.moves.n, : self.moves.n] = self.moves.ways()
+        self.D[: self.moves.n, : self.moves.n] = self.moves.ways
         # A z <= b keeps knots within their bounds
         self.A = np.pad(self.moves.A, ((0, 0), (0, self.n - self.moves.n)))
         self.b = self.moves.b
