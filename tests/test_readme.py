@@ -44,7 +44,7 @@ SHORTER = {
 ELSEWHERE = {
     "pip install": "an installation",
     "rehearse fit.toml": "test_sysid_rigs.py",
-    "explain heavy.csv": "test_sysid_suspects.py",
+    "explain drive.csv": "test_sysid_suspects.py",
     "out/logs": "test_datasets.py",
     "LeRobotDataset": "a package",
     "stable_baselines3": "test_envs.py",
