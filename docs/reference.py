@@ -8,43 +8,39 @@ import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args, get_origin
 
 from pydantic import BaseModel
 from sphinx.pycode import ModuleAnalyzer
 
 from torchsoft.cli import command_parser
 from torchsoft.csvfile import UNITS
-from torchsoft.datasets import config as dataset
-from torchsoft.datasets import distributions
-from torchsoft.datasets.fields import Fields, Fractions
+from torchsoft.datasets.config import Config as Dataset
+from torchsoft.datasets.fields import Fields
 from torchsoft.materials.presets import PRESETS
 from torchsoft.physics.channels import EFFORT, POSE, RATE, declared
-from torchsoft.plan import Bounds, Limit, Target
-from torchsoft.plan.knots import Range
 from torchsoft.rigs import RigFile, parts
 from torchsoft.rigs.build import ready
-from torchsoft.rigs.control import ActuatorTable, ControllerTable
 from torchsoft.rigs.excite import CATALOGUE
 from torchsoft.rigs.goal import Goal
-from torchsoft.rigs.motion import ComponentTable
-from torchsoft.rigs.outputs import OutputsTable, SolverTable
 from torchsoft.rigs.schema import RigTables
 from torchsoft.solve.trajectory import Touch
-from torchsoft.sysid import configuration as identification
-from torchsoft.sysid.identification import Settings
-from torchsoft.sysid.unknowns import FAULTS, Prior, Sensor, Unknown
+from torchsoft.sysid.configuration import Config as Identification
+from torchsoft.sysid.unknowns import FAULTS
 from torchsoft.tables import toml_value
 
 ROOT = Path(__file__).parents[1]
 
 
+Tables = list[tuple[str, type[BaseModel]]]
+
+
 class Page(NamedTuple):
-    """A page: its title, an introduction, tables by their headings, and what follows them."""
+    """A page: its title, an introduction, headings and tables, and what follows them."""
 
     title: str
     introduction: str
-    tables: dict[str, type[BaseModel]]
+    tables: Tables
     more: str = ""
 
 
@@ -56,10 +52,29 @@ def tables(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from tables(one)
 
 
-def kinds(table: type[BaseModel], field: str) -> dict[str, type[BaseModel]]:
-    """Tables that a field accepts, by their kind."""
+def kind_of(table: type[BaseModel]) -> str:
+    """Kind of a table, or its name where it has none."""
+    field = table.model_fields.get("kind")
+    return field.default if field else table.__name__.removesuffix("Table").lower()
+
+
+def kinds(table: type[BaseModel], field: str) -> Tables:
+    """Tables that a field accepts, by their kind, and the tables within them."""
     found = tables(table.model_fields[field].annotation)
-    return {f"`{one.model_fields['kind'].default}`": one for one in found}
+    return [pair for one in found for pair in nested(one, f"`{kind_of(one)}`")]
+
+
+def nested(table: type[BaseModel], heading: str = "Top level", path: str = "") -> Tables:
+    """A table and all tables within it, by headings, which are the paths of their keys."""
+    found: Tables = [(heading, table)]
+    for name, field in table.model_fields.items():
+        inner = [*tables(field.annotation)]
+        within = f"{path}.{name}".lstrip(".") + ".*" * (get_origin(field.annotation) is dict)
+        for one in inner:
+            kind = f": {kind_of(one)}" if len(inner) > 1 else ""
+            place = f"[[{within}]]" if get_origin(field.annotation) is tuple else f"[{within}]"
+            found += nested(one, f"`{place}`{kind}", within)
+    return found
 
 
 def prose(text: str) -> str:
@@ -114,13 +129,14 @@ def unit_of(row: Any) -> str:
     return next(filter(None, map(unit_of, row)), "") if isinstance(row, list) else ""
 
 
+SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+
+
 def bounds(row: dict[str, Any]) -> str:
     """Bounds of a number, from its JSON schema."""
-    low = f"> {row['exclusiveMinimum']:g}" if "exclusiveMinimum" in row else ""
-    high = f"< {row['exclusiveMaximum']:g}" if "exclusiveMaximum" in row else ""
-    low = low or (f"≥ {row['minimum']:g}" if "minimum" in row else "")
-    high = high or (f"≤ {row['maximum']:g}" if "maximum" in row else "")
-    return ", ".join(filter(None, (low, high)))
+    known = [key for key in SIGNS if key in row]
+    inner = [key for key in known if key[0] == "e" or f"exclusive{key.capitalize()}" not in known]
+    return ", ".join(f"{SIGNS[key]} {row[key]:g}" for key in inner)
 
 
 def value(row: dict[str, Any], where: dict[str, str]) -> str:
@@ -141,7 +157,8 @@ def value(row: dict[str, Any], where: dict[str, str]) -> str:
     if kind == "array":
         return f"list of: {value(row['items'], where)}"
     if kind == "object" and isinstance(row.get("additionalProperties"), dict):
-        return f"by name: {value(row['additionalProperties'], where)}"
+        entry = value(row["additionalProperties"], where)
+        return entry if "](" in entry else f"by name: {entry}"
     names = {"boolean": "`true` or `false`", "string": "text", "object": "table", "any": "any"}
     return " ".join(filter(None, (names.get(kind, kind), bounds(row))))
 
@@ -178,48 +195,33 @@ def keys(table: type[BaseModel], where: dict[str, str]) -> str:
     return grid(("key", "accepts", "unit", "default", "meaning"), rows)
 
 
-def pages_of_tables() -> dict[str, Page]:
-    """The pages that consist of tables."""
-    rigs = {
-        "Top level": RigTables, "Bodies": parts.BodyTable, "Start of a body": parts.StartTable,
-        "Start at a depth": parts.DepthTable, "Start under a force": parts.ForceTable,
-        "Contacts": parts.ContactTable, "Taxels": parts.TaxelsTable, "Actuators": ActuatorTable,
-        "Controllers": ControllerTable, "Outputs": OutputsTable, "Solver": SolverTable,
-    }  # fmt: skip
-    study = {
-        "Top level": identification.Config, "Unknowns": Unknown, "Priors": Prior,
-        "Sensors": Sensor, "Columns": identification.Column, "Start at rest": identification.Rest,
-        "Start in motion": identification.Moving, "Known coordinates": identification.Given,
-        "Fit": Settings, "Recordings": identification.Entry, "Competing laws": identification.Law,
-        "Rehearsal": identification.Rehearsal, "Design": identification.DesignTable,
-        "Bounds of a signal": Bounds,
-    }  # fmt: skip
-    sets = {
-        "Top level": dataset.Config, "Splits": Fractions, "Uniform": distributions.Uniform,
-        "Normal": distributions.Normal, "Choice": distributions.Choice,
-        "Kinds": distributions.Kind,
-    }  # fmt: skip
-    goals = {"Top level": Goal, "Free motions": Bounds, "Free parameters": Range,
-             "Targets": Target, "Limits": Limit}  # fmt: skip
-    laws = {"Contact laws": parts.LawTable} | kinds(parts.LawTable, "friction")
-    motions = kinds(RigTables, "motion") | {"One sine": ComponentTable}
-    return {
-        "rigs": Page("Rig files", RIGS, rigs, ready_rigs()),
-        "shapes": Page("Shapes", "Values of `shape` in `[bodies.*]`, by their `kind`.",
-                       kinds(parts.BodyTable, "shape")),
-        "pads": Page("Pads", "Tables `[pads.*]`, by their `kind`; a block if none is given.",
-                     kinds(RigTables, "pads")),
+def declared_pages() -> dict[str, Page]:
+    """The pages by the names of their files."""
+    laws = [("Contact laws", parts.LawTable), *kinds(parts.LawTable, "friction")]
+    elsewhere = {
+        "shapes": Page("Shapes", SHAPES, kinds(parts.BodyTable, "shape")),
+        "pads": Page("Pads", PADS, kinds(RigTables, "pads")),
         "materials": Page("Materials", MATERIALS, kinds(RigTables, "materials"), presets()),
         "laws": Page("Contact and friction laws", LAWS, laws),
-        "motions": Page("Motions", "Tables `[motion.*]`, by their `kind`.", motions),
-        "channels": Page("Channels", CHANNELS, {}, channels()),
-        "identification": Page("Identification files", STUDY, study, faults()),
-        "goals": Page("Goals of a plan", "A goal is the second file of `torchsoft plan`.", goals),
-        "datasets": Page("Dataset files", SETS, sets, arrays()),
-        "commands": Page("Commands", "Every command has `--help`.", {}, command_line()),
-    }  # fmt: skip
+        "motions": Page("Motions", MOTIONS, kinds(RigTables, "motion")),
+    }
+    there = {table for page in elsewhere.values() for _, table in page.tables}
+    rigs = [(heading, table) for heading, table in nested(RigTables) if table not in there]
+    return {
+        "rigs": Page("Rig files", RIGS, rigs, ready_rigs()),
+        **elsewhere,
+        "channels": Page("Channels", CHANNELS, [], channels()),
+        "identification": Page("Identification files", STUDY, nested(Identification), faults()),
+        "goals": Page("Goals of a plan", GOALS, nested(Goal)),
+        "datasets": Page("Dataset files", SETS, nested(Dataset), arrays()),
+        "commands": Page("Commands", "Every command has `--help`.", [], command_line()),
+    }
 
 
+SHAPES = "Values of `shape` in `[bodies.*]`, by their `kind`."
+PADS = "Tables `[pads.*]`, by their `kind`; a block if none is given."
+MOTIONS = "Tables `[motion.*]`, by their `kind`."
+GOALS = "A goal is the second file of `torchsoft plan`."
 RIGS = """\
 A rig and its run are one TOML file, in SI units. The model is planar: x points to the right, y
 upwards, and angles are positive anticlockwise. A table `[bodies.*]` is written `[bodies.disc]` for
@@ -316,7 +318,7 @@ def faults() -> str:
 
 def arrays() -> str:
     """Arrays of a dataset."""
-    made = dataset.Config.from_toml(ROOT / "data_gen" / "configs" / "smoke.toml")
+    made = Dataset.from_toml(ROOT / "data_gen" / "configs" / "smoke.toml")
     rows = [
         (f"`{name}`", ", ".join(one.sizes), one.unit, prose(one.meaning))
         for name, one in made.subject.variables.items()
@@ -365,19 +367,21 @@ def of_parser(parser: argparse.ArgumentParser) -> Iterator[str]:
 def pages() -> dict[str, str]:
     """Markdown of every page of the reference, by the name of its file. Raises `ValueError` for a
     key without a meaning, `KeyError` for a table that is on no page."""
-    every, where = pages_of_tables(), dict[str, dict[str, str]]()
+    every, where = declared_pages(), dict[str, dict[str, str]]()
     for name, page in every.items():
-        for heading, table in page.tables.items():
+        for heading, table in page.tables:
             slug = re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
-            link = f"[{heading.lower()}]({name}.md#{slug})"
+            link = f"[{heading}]({name}.md#{slug})"
             where.setdefault(table.__name__, {}).setdefault(name, link)
     out = {}
     for name, page in every.items():
         near = {table: own.get(name, next(iter(own.values()))) for table, own in where.items()}
         sections = [f"# {page.title}", page.introduction]
-        for heading, table in page.tables.items():
-            text = described(table, 1 if name == "shapes" else None)
-            sections += [f"## {heading}", text, keys(table, near)]
+        first = {table: heading for heading, table in reversed(page.tables)}
+        for heading, table in page.tables:
+            if first[table] == heading:
+                text = described(table, 1 if name == "shapes" else None)
+                sections += [f"## {heading}", text, keys(table, near)]
         out[f"{name}.md"] = "\n\n".join(filter(None, (*sections, page.more))) + "\n"
     contents = "```{toctree}\n" + "\n".join(every) + "\n```\n"
     out["index.md"] = f"# Files, channels and commands\n\n{INDEX}\n\n{contents}"
