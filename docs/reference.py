@@ -180,8 +180,8 @@ def keys(table: type[BaseModel], where: dict[str, str]) -> str:
     key without a meaning."""
     rows = []
     for name, row in table.model_json_schema()["properties"].items():
-        if name in ("kind", "files") and (name == "kind" or issubclass(table, Fields)):
-            continue
+        if "const" in row or (name == "files" and issubclass(table, Fields)):
+            continue  # the kind, which is the heading, and what the command fills in
         text, unit = row.get("description") or attribute_meaning(table, name), unit_of(row)
         if not text:
             raise ValueError(
@@ -190,8 +190,8 @@ def keys(table: type[BaseModel], where: dict[str, str]) -> str:
         stated = re.search(r" \[([^\[\]]+)\]$", text)
         if stated and unit in ("", stated[1]):
             text, unit = text[: stated.start()], stated[1]
-        cells = f"`{name}`", value(row, where), unit, default(table, name, text), prose(text)
-        rows.append(cells)
+        shown = default(table, name, text)
+        rows.append((f"`{name}`", value(row, where), unit, shown, prose(text)))
     return grid(("key", "accepts", "unit", "default", "meaning"), rows)
 
 
@@ -288,19 +288,21 @@ def channels() -> str:
             (f"`{key}`", unit) for key, (unit, _) in Touch(rig).single.items() if key not in found
         ]
         single += [(f"`{key}.0` to `{key}.{n - 1}`", "N") for key, n in Touch(rig).arrays.items()]
-        text += [FORCES,
-                 grid(("channel", "unit"), single)]  # fmt: skip
+        text += [FORCES, grid(("channel", "unit"), single)]
     return "\n\n".join(text)
 
 
 def faults() -> str:
     """Faults of sensors, units of columns, and excitations."""
     rows = [
-        (f"`{name}`", one.unit.format("the channel's unit") if one.unit == "{}"
-         else one.unit.format("its unit"), "yes" if one.one_sided else "",
-         one.clause if one.clause else "not tested")
+        (
+            f"`{name}`",
+            one.unit.format("its unit"),
+            "yes" * one.one_sided,
+            one.clause or "not tested",
+        )
         for name, one in FAULTS.items()
-    ]  # fmt: skip
+    ]
     text = (
         "A fault is identified if the sensor states its largest size. Others are tested after the "
         "fit, as assumptions."
@@ -353,10 +355,10 @@ def of_parser(parser: argparse.ArgumentParser) -> Iterator[str]:
         yield from (prose(one) for one in re.split(r"\n\s*\n", parser.description or ""))
         show = parser._get_formatter()
         rows = [
-            (f"`{argument(one)}`",
-             prose(show._expand_help(one) if one.help else ""))
-            for one in parser._actions if not isinstance(one, argparse._HelpAction)
-        ]  # fmt: skip
+            (f"`{argument(one)}`", prose(show._expand_help(one) if one.help else ""))
+            for one in parser._actions
+            if not isinstance(one, argparse._HelpAction)
+        ]
         if rows:
             yield grid(("argument", "meaning"), rows)
     for group in groups:
