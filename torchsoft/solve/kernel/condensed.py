@@ -9,7 +9,7 @@ and u = C sum of J z. At the end of a stage, with rest = tau + a h,
 from typing import Any
 
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.linear import add, dot, row_of
+from torchsoft.solve.kernel.linear import add, dot
 from torchsoft.solve.kernel.table import Array
 
 NEGLIGIBLE = 1e-14
@@ -42,6 +42,13 @@ def mobility(rig: Any, pad: int, a: float) -> float:
 def size_of(rig: Any, pad: int) -> int:
     """Number of surface dofs."""
     return 2 * (rig.pad_node_start[pad + 1] - rig.pad_node_start[pad])
+
+
+@compiled
+def row_of(rig: Any, pad: int, dof: int) -> slice:
+    """Row of a surface dof in the compliances."""
+    start, size = rig.condensed_C_start[pad], size_of(rig, pad)
+    return slice(start + dof * size, start + (dof + 1) * size)
 
 
 @compiled
@@ -79,14 +86,14 @@ def displace(rig: Any, work: Any, pad: int, low: int, high: int) -> None:
     of `begin`."""
     first, last = rig.pad_node_start[pad], rig.pad_node_start[pad + 1]
     zeta, rate = work.zeta[2 * first : 2 * last], work.zeta_rate[2 * first : 2 * last]
-    left, right, size = 0, 2 * (last - first), 2 * (last - first)
+    left, right = 0, 2 * (last - first)
     while left < right and abs(zeta[left]) < NEGLIGIBLE:
         left += 1
     while right > left and abs(zeta[right - 1]) < NEGLIGIBLE:
         right -= 1
     zeta, rate, soft = zeta[left:right], rate[left:right], softness(rig, pad)
     for i in range(2 * low, 2 * high):
-        row = row_of(rig.condensed_C, rig.condensed_C_start[pad], i - 2 * first, size)[left:right]
+        row = rig.condensed_C[row_of(rig, pad, i - 2 * first)][left:right]
         work.u[i // 2, i % 2], work.free[i // 2, i % 2] = (
             soft * dot(row, zeta),
             -soft * dot(row, rate),
@@ -111,15 +118,15 @@ def relation(rig: Any, work: Any, pad: int, a: float) -> None:
 @compiled
 def propose(rig: Any, work: Any, pad: int, a: float) -> None:
     """Nodal rates work.u_dot_new under the forces work.F_new, in the window."""
-    first, start, size = rig.pad_node_start[pad], rig.condensed_C_start[pad], size_of(rig, pad)
-    scale, low, high = mobility(rig, pad, a), 2 * work.low[pad], 2 * work.high[pad]
+    first, scale = rig.pad_node_start[pad], mobility(rig, pad, a)
+    low, high = 2 * work.low[pad], 2 * work.high[pad]
     rates = work.u_dot_new[low:high]
     for i in range(rates.size):
         rates[i] = work.free[(low + i) // 2, i % 2]
     for i in range(work.counts[pad]):
         node = work.touched[first + i]
         for r in range(2):
-            row = row_of(rig.condensed_C, start, 2 * (node - first) + r, size)
+            row = rig.condensed_C[row_of(rig, pad, 2 * (node - first) + r)]
             add(scale * work.F_new[node, r], row[low - 2 * first :], rates)
 
 
@@ -127,9 +134,9 @@ def propose(rig: Any, work: Any, pad: int, a: float) -> None:
 def quadratic(rig: Any, pad: int, x: Array, low: int, high: int) -> float:
     """x C x of a vector of surface dofs that is zero but from `low` to `high`, with the stored
     compliance C."""
-    total, size, inside = 0.0, size_of(rig, pad), x[low:high]
+    total, inside = 0.0, x[low:high]
     for m in range(inside.size):
-        row = row_of(rig.condensed_C, rig.condensed_C_start[pad], low + m, size)
+        row = rig.condensed_C[row_of(rig, pad, low + m)]
         total += inside[m] * dot(inside, row[low:])
     return total
 
@@ -234,14 +241,14 @@ def push(
         node = work.touched[first + i]
         for r in range(2):
             dof = 2 * (node - first) + r
-            row = row_of(rig.condensed_C, rig.condensed_C_start[pad], dof, size)
+            row = rig.condensed_C[row_of(rig, pad, dof)]
             u, v = du[node, r], dv[node, r]
             u[:], v[:] = 0.0, 0.0
             for j in range(left, right):
                 add(soft * row[j], dzeta[j], u)
                 add(soft * row[j], drate[j], v)
             if stiffer:
-                row = row_of(rig.condensed_dC, rig.condensed_C_start[pad], dof, size)[left:right]
+                row = rig.condensed_dC[row_of(rig, pad, dof)][left:right]
                 add(soft * dot(row, zeta[left:]), dp[material + 1], u)
                 add(soft * dot(row, rate[left:]), dp[material + 1], v)
 
@@ -249,16 +256,11 @@ def push(
 @compiled
 def push_rates(rig: Any, work: Any, tangents: Any, pad: int, a: float, X: Array) -> None:
     """Tangents of the touched nodes' rates, less tangents.v, under those of the nodal forces X."""
-    first, n, size, scale = (
-        rig.pad_node_start[pad],
-        work.counts[pad],
-        size_of(rig, pad),
-        mobility(rig, pad, a),
-    )
+    first, n, scale = rig.pad_node_start[pad], work.counts[pad], mobility(rig, pad, a)
     for i in range(n):
         for o in range(2):
             dof = 2 * (work.touched[first + i] - first) + o
-            row = row_of(rig.condensed_C, rig.condensed_C_start[pad], dof, size)
+            row = rig.condensed_C[row_of(rig, pad, dof)]
             for j in range(n):
                 for q in range(2):
                     c = scale * row[2 * (work.touched[first + j] - first) + q]
@@ -309,7 +311,7 @@ def pull_state(
     """Cotangents of the state at the stage's start and of the material, from those of the nodal
     rates and displacements, `scratch.rate` and `scratch.u`."""
     p, first, start = rig.p, rig.pad_node_start[pad], rig.pad_y_start[pad]
-    size, start_C = size_of(rig, pad), rig.condensed_C_start[pad]
+    size = size_of(rig, pad)
     chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
     material, soft = chain + 2 * branches, softness(rig, pad)
     by_rate, by_u = scratch.surface[0], scratch.surface[1]
@@ -319,7 +321,7 @@ def pull_state(
         for r in range(2):
             c, d = soft * scratch.rate[node, r], soft * scratch.u[node, r]
             if c != 0.0 or d != 0.0:
-                row = row_of(rig.condensed_C, start_C, 2 * (node - first) + r, size)
+                row = rig.condensed_C[row_of(rig, pad, 2 * (node - first) + r)]
                 add(c, row, by_rate[:size])
                 add(d, row, by_u[:size])
     scale_bar, left, right = 0.0, size, 0
@@ -344,5 +346,5 @@ def pull_state(
         for r in range(2):
             c, d = soft * scratch.rate[node, r], soft * scratch.u[node, r]
             if c != 0.0 or d != 0.0:
-                row = row_of(rig.condensed_dC, start_C, 2 * (node - first) + r, size)[left:right]
+                row = rig.condensed_dC[row_of(rig, pad, 2 * (node - first) + r)][left:right]
                 p_bar[material + 1] += c * dot(row, z_dot[left:]) + d * dot(row, zeta[left:])

@@ -4,7 +4,7 @@ Inner loops run over views from 0 on: an index that might be negative, as Python
 loop from being vectorised.
 """
 
-from torchsoft.solve.kernel import compiled, inlined
+from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.table import Array
 
 
@@ -58,12 +58,6 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
             add(-A[k, i], b[i], right)
         for j in range(m):
             right[j] *= inverse
-
-
-@inlined
-def row_of(matrices: Array, start: int, i: int, size: int) -> Array:
-    """Row i of the matrix with rows of `size` that begins at `start`, a view."""
-    return matrices[start + i * size : start + (i + 1) * size]
 
 
 @compiled

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled, inlined
+from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import FIELD, LANES
 from torchsoft.solve.kernel.invoke import (
     call_linearise,
@@ -142,12 +142,12 @@ def evaluate(rig: Any, work: Any, pad: int, y: Array, a: float) -> tuple[float, 
     return worst, squares
 
 
-@inlined
-def matrix(rig: Any, work: Any, pad: int) -> Array:
-    """A of a pad, a view."""
+@compiled
+def matrix_of(rig: Any, pad: int) -> slice:
+    """Place of a pad's A in work.band."""
     n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
     at = rig.nodal_band_start[pad]
-    return work.band[at : at + n * (2 * rig.nodal_band[pad] + 1)]
+    return slice(at, at + n * (2 * rig.nodal_band[pad] + 1))
 
 
 @compiled
@@ -194,7 +194,7 @@ def relinearise(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
 def factor(rig: Any, work: Any, pad: int, a: float) -> None:
     """A of a pad, factorised, in work.band, from the elements' derivatives."""
     first, last, band = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.nodal_band[pad]
-    width, A, corners = 2 * band + 1, matrix(rig, work, pad), rig.nodal_dof.shape[1]
+    width, A, corners = 2 * band + 1, work.band[matrix_of(rig, pad)], rig.nodal_dof.shape[1]
     A[:] = 0.0
     for e in range(rig.nodal_element_start[pad], rig.nodal_element_start[pad + 1]):
         J, lane = work.element_J[e // LANES], e % LANES
@@ -214,13 +214,13 @@ def factor(rig: Any, work: Any, pad: int, a: float) -> None:
 def solve(rig: Any, work: Any, pad: int, b: Array, m: int, first: int) -> None:
     """A^-1 of m right-hand sides b (dofs m,), zero before dof `first`, in place."""
     n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
-    solve_banded(matrix(rig, work, pad), n, rig.nodal_band[pad], b, m, first)
+    solve_banded(work.band[matrix_of(rig, pad)], n, rig.nodal_band[pad], b, m, first)
 
 
 @compiled
 def solve_back(rig: Any, work: Any, pad: int, b: Array) -> None:
     """A^-T of b (dofs,) in place."""
-    solve_transposed(matrix(rig, work, pad), b.size, rig.nodal_band[pad], b)
+    solve_transposed(work.band[matrix_of(rig, pad)], b.size, rig.nodal_band[pad], b)
 
 
 @compiled
@@ -239,7 +239,7 @@ def relation(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
         same &= work.touched[i] == work.held_touched[i]
     if not same:
         respond(rig, work, pad, a)
-    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
+    b, m = work.responses[responses_of(rig, work, pad)], responses_width(rig, work, pad)
     for j in range(2 * n):
         dof = rig.nodal_surface[2 * work.touched[nodes + j // 2] + j % 2]
         put(b[dof * m : dof * m + 2 * n], work.P[j, : 2 * n])
@@ -262,12 +262,12 @@ def responses_width(rig: Any, work: Any, pad: int) -> int:
     return 2 * work.held_count[pad] + (2 if inertial(rig, pad) else 0)
 
 
-@inlined
-def responses(rig: Any, work: Any, pad: int) -> Array:
-    """Held responses of a pad's dofs, row by row, a view."""
+@compiled
+def responses_of(rig: Any, work: Any, pad: int) -> slice:
+    """Place of the held responses of a pad's dofs, row by row, in work.responses."""
     n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
     at = rig.nodal_dof_start[pad] * (work.responses.size // rig.nodal_dof_start[-1])
-    return work.responses[at : at + n * responses_width(rig, work, pad)]
+    return slice(at, at + n * responses_width(rig, work, pad))
 
 
 @compiled
@@ -281,7 +281,7 @@ def respond(rig: Any, work: Any, pad: int, a: float) -> None:
     n, moved = work.counts[pad], 2 if inertial(rig, pad) else 0
     work.held_count[pad] = n
     put(work.touched[nodes : nodes + n], work.held_touched[nodes : nodes + n])
-    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
+    b, m = work.responses[responses_of(rig, work, pad)], responses_width(rig, work, pad)
     b[:] = 0.0
     for i in range(last - first if moved else 0):
         M = mass_rate(rig, pad, first + i, a)
@@ -385,7 +385,7 @@ def propose(rig: Any, work: Any, pad: int, dV: Array) -> None:
     for i in range(work.counts[pad]):
         node = work.touched[rig.pad_node_start[pad] + i]
         forces[2 * i], forces[2 * i + 1] = work.F_new[node, 0], work.F_new[node, 1]
-    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
+    b, m = work.responses[responses_of(rig, work, pad)], responses_width(rig, work, pad)
     x, y = 0.0, 0.0
     if inertial(rig, pad):
         x = dV[free[base]] if free[base] >= 0 else 0.0
