@@ -23,6 +23,15 @@ def add(factor: float, x: Array, out: Array) -> None:
 
 
 @compiled
+def carry(factor: float, x: Array, y: Array, back: bool) -> None:
+    """Add a multiple of vector x to y, or `back` of y to x: the transpose."""
+    if back:
+        add(factor, y, x)
+    else:
+        add(factor, x, y)
+
+
+@compiled
 def dot(x: Array, y: Array) -> float:
     """Product of two vectors, of x's length."""
     total = 0.0
