@@ -17,7 +17,7 @@ from torch import Tensor
 from torchsoft.caller import warn
 from torchsoft.codegen import Law
 from torchsoft.physics.contact import SoftContact
-from torchsoft.physics.elements import CONSTANTS, CORNERS
+from torchsoft.physics.elements import Quadrilateral
 from torchsoft.physics.energy import Integrals
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
@@ -283,8 +283,8 @@ class Model:
         columns = np.full((len(pads), len(self._bodies.coordinate)), -1, np.int64)
         for number, name in enumerate(rig.pads):
             touched = (3 * bodies.index(rig.contacts[key].body) for key in rig.contacts_of(name))
-            mine = np.isin(self._bodies.coordinate // 3 * 3, [base[number], *touched])
-            columns[number, mine] = np.arange(mine.sum())
+            involved = np.isin(self._bodies.coordinate // 3 * 3, [base[number], *touched])
+            columns[number, involved] = np.arange(involved.sum())
         ends = np.cumsum([0, *rig.point_counts.values()])
         owners = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
         return filled(
@@ -329,7 +329,7 @@ class Model:
         pads = [pad if pad.nodal else None for pad in rig.pads.values()]
         dofs = [0 if pad is None else 2 * pad.fields * pad.nodes for pad in pads]
         numbers = [None if pad is None else field_dofs(pad) for pad in pads]
-        band = [0 if dof is None else spread(dof) for dof in numbers]
+        band = [0 if dof is None else bandwidth(dof) for dof in numbers]
         fields = max((pad.fields for pad in rig.pads.values() if pad.nodal), default=1)
         elements = [0 if pad is None else -(-len(pad.corners) // LANES) * LANES for pad in pads]
         laws, starts, ends, density = list[Law | None](), list[int](), list[int](), list[int]()
@@ -365,12 +365,12 @@ class Model:
             p_first=starts, p_last=ends,
             X=joined(lambda pad: np.tile(pad.positions.numpy(), pad.fields).ravel()),
             area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2 * pad.fields)),
-            dof=np.concatenate([np.zeros((0, CORNERS * fields)), *(
-                filled_up(lengthened(dof, -1), CORNERS * fields) for dof in numbers
+            dof=np.concatenate([np.zeros((0, Quadrilateral.dofs * fields)), *(
+                filled_up(lengthened(dof, -1), Quadrilateral.dofs * fields) for dof in numbers
                 if dof is not None
             )]),
-            constants=joined(lambda pad: lengthened(pad.constants, 0.0), CONSTANTS),
-            surface=np.concatenate([np.zeros(0), *surface]),
+            constants=joined(lambda pad: lengthened(pad.constants, 0.0), Quadrilateral.constants),
+            surface=np.concatenate([np.zeros(0), *surface]), field=Quadrilateral.dofs,
         )  # fmt: skip
 
     def _make_sources(self) -> Sources:
@@ -498,7 +498,7 @@ def filled_up(rows: Index, width: int) -> Index:
     return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=-1)
 
 
-def spread(corners: Index) -> int:
+def bandwidth(corners: Index) -> int:
     """Largest difference between the dofs of one element, bonded ones (below zero) apart."""
     free = corners >= 0
     most = np.where(free, corners, -1).max(1) - np.where(free, corners, corners.max()).min(1)

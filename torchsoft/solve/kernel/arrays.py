@@ -58,11 +58,6 @@ but the powers are differentiated, by the motion and by s*."""
 CONDENSED, NODAL = range(2)
 """Kinds of pads: condensed onto its surface, or with the displacements of all of its nodes."""
 
-FIELD = 8
-"""Displacements of the four corners of an element in one field: its law has those of as many fields
-as any pad of the rig has, their rates and the element's constants as inputs, and as outputs the
-forces on them and the power that it dissipates."""
-
 LANES = 4
 """Elements whose law is called at once."""
 
@@ -154,7 +149,10 @@ class Nodal(NamedTuple):
     matrices; law addresses of its elements, ends of their parameters in p. Per dof: X, place of its
     node (its own coordinate), and area. Per element: its dofs, -1 where it is bonded and for fields
     that its pad has not, and constants; their number is a multiple of `LANES`, the last without
-    dofs. surface: dof of every surface dof."""
+    dofs. surface: dof of every surface dof. field: displacements of an element in one field; its
+    law has as inputs those of as many fields as any pad of the rig has, their rates and the
+    element's constants, of which the first are their gradients at the centre, and as outputs the
+    forces on them and the power that it dissipates."""
 
     dof_start: Index
     element_start: Index
@@ -174,6 +172,7 @@ class Nodal(NamedTuple):
     dof: IndexMatrix
     constants: Matrix
     surface: Index
+    field: int
 
 
 class Contacts(NamedTuple):

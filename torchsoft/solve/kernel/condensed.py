@@ -10,7 +10,7 @@ from typing import Any
 
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import AXES
-from torchsoft.solve.kernel.linear import add, dot
+from torchsoft.solve.kernel.linear import add, dot, put
 from torchsoft.solve.kernel.table import Array
 
 NEGLIGIBLE = 1e-14
@@ -296,12 +296,12 @@ def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: floa
     state and of the nodes' rates, along.own_rate."""
     first, size = rig.pad_node_start[pad], size_of(rig, pad)
     chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
+    rate_bar = along.by_rate[: AXES * work.counts[pad]]
+    put(along.own_rate[: work.counts[pad]], rate_bar)
     for i in range(work.counts[pad]):
         for r in range(AXES):
-            dof, total = AXES * (work.touched[first + i] - first) + r, 0.0
-            for j in range(work.counts[pad]):
-                for q in range(AXES):
-                    total += along.own_rate[j, q, 0] * work.P[AXES * i + r, AXES * j + q]
+            dof = AXES * (work.touched[first + i] - first) + r
+            total = dot(rate_bar, work.P[AXES * i + r])
             for branch in range(branches):
                 z_bar = y_bar[rig.pad_y_start[pad] + branch * size + dof, 0]
                 total += a * z_bar / (rig.p[chain + branches + branch] + a)

@@ -25,7 +25,9 @@ def add(factor: float, x: Array, out: Array) -> None:
 @compiled
 def carry(factor: float, x: Array, y: Array, back: bool) -> None:
     """Add a multiple of vector x to y, or `back` of y to x: the transpose."""
-    if back:
+    if back and x.size == 1:  # without the cost of a loop
+        x[0] += factor * y[0]
+    elif back:
         add(factor, y, x)
     else:
         add(factor, x, y)

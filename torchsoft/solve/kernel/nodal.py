@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled, contacts
-from torchsoft.solve.kernel.arrays import AXES, FIELD, LANES, PAIR, WRENCH
+from torchsoft.solve.kernel.arrays import AXES, LANES, PAIR, WRENCH
 from torchsoft.solve.kernel.invoke import (
     call_linearise,
     call_pull,
@@ -161,7 +161,9 @@ def strained(rig: Any, work: Any, g: int, a: float) -> float:
         for c in range(corners):
             off = abs(x[c, lane] - held[c, lane])
             off += a * abs(x[corners + c, lane] - held[corners + c, lane])
-            total += off * abs(x[2 * corners + c % FIELD, lane])  # gradients at the centre
+            total += off * abs(
+                x[2 * corners + c % rig.nodal_field, lane]
+            )  # gradients at the centre
         if not total <= worst:
             worst = total
     return worst
