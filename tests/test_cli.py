@@ -72,7 +72,6 @@ def test_neither_an_import_nor_help_waits_for_torch(code):
 COMMANDS = (
     "", "init", "check", "run", "plot", "plan", "reduce", "design", "rehearse", "identify",
     "explain", "profile", "material fit", "material presets", "dataset make", "dataset check",
-    "dataset export",
 )  # fmt: skip
 
 
@@ -264,7 +263,7 @@ def test_an_interrupt_among_the_assumptions_draws_nothing(folder, monkeypatch, c
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchsoft.sysid.refits.difference", interrupted)
+    monkeypatch.setattr("torchsoft.sysid.sensitivity.difference_column", interrupted)
     recorded(folder / "data.csv", 42)
     assert identify() == 130
     assert {*os.listdir("out")} == {"answer.json", "unfinished"}
