@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, partial
@@ -181,9 +182,9 @@ def alone() -> Iterator[None]:
     lock = None
     for folder in FOLDERS:
         with suppress(OSError):
-            if (lock := held(folder / "compiling", 0.0)) is None:
+            while (lock := held(folder / "compiling")) is None:
                 note(f"another process compiles kernels for {folder}; waiting for it")
-                lock = held(folder / "compiling", -1.0)
+                time.sleep(0.1)
             break
     try:
         yield
