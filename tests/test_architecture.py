@@ -49,8 +49,8 @@ FLOWS = {
     """,
     "cli": "results rigs plan identify profile design material dataset reduce plot .",
     "solve.kernel": """
-        table arrays objects . invoke linear sources contacts condensed nodal pads domain stage step
-        run adjoint tangent build
+        table arrays objects . invoke linear sources contacts condensed nodal transport pads domain
+        stage step run adjoint tangent build
     """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's

@@ -97,7 +97,7 @@ def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kin
     given = torch.stack(x, -1).numpy()
     for address, arrays in (
         (law.linearise, (given, p, out, J)),
-        (law.pullback, (given, p, w, bar)),
+        (law.pull, (given, p, w, bar)),
     ):
         call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(address)
         call(*(one.ctypes.data for one in arrays))

@@ -24,7 +24,7 @@ from torchsoft.physics.contact import (
     relative_motion,
     turned,
 )
-from torchsoft.physics.elements import CORNERS
+from torchsoft.physics.elements import Quadrilateral
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import check_names
@@ -518,7 +518,8 @@ class Graph(nn.Module):
         under the forces of a law of contact points, or of a branch. No dashpot is between two of
         them."""
         pad, part = self.pads[name], state.pads[name]
-        at, own = pad.at_corners(part), slice(CORNERS * field, CORNERS * (field + 1))
+        at, dofs = pad.at_corners(part), Quadrilateral.dofs
+        own = slice(dofs * field, dofs * (field + 1))
         others = own.start, at.shape[-1] - own.stop
         internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., own]
         balance = Balance(pad, internal, law)

@@ -154,6 +154,11 @@ class _Solutions(torch.autograd.Function):
         return None, None, *bars
 
 
+def columned(bars: Array) -> Array:
+    """Cotangents (., signals, 2) of signals, as (., 2 signals, 1)."""
+    return bars.reshape(len(bars), -1, 1)
+
+
 def run_adjoint(
     run: Solved, y_bar: Tensor | None, recorded_bar: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -180,9 +185,10 @@ def run_adjoint(
         plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
         failed, here = np.zeros(1, np.int64), segment.rows
         sweep = Backward(
-            room.system, room.work, room.of("Cotangents"), tape,
+            room.system, room.work, room.of("Directions", columns=1), tape,
             plan.h, segment.stages, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
-            rows[here], felt[here], outputs_bar[here], carried, p_bar, own_bar, failed,
+            rows[here], felt[here], columned(outputs_bar[here]), carried[:, None], p_bar[:, None],
+            columned(own_bar), failed,
         )  # fmt: skip
         with released_turn():
             call("backward", sweep)
@@ -289,16 +295,16 @@ def iterate(
     kept, felt = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
     segments: list[Segment] = []
     room = stepper.compiled.model.take(stepper.compiled.numbers)
-    work, tangents = (room.of(kind, columns=n) for kind in ("Work", "Tangents"))
+    work, along = (room.of(kind, columns=n) for kind in ("Work", "Directions"))
     for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop(0)
             plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
             rows = np.empty((len(plan.out_step), size, n))
-            along = signal_directions(stepper, plan.stage_times.ravel(), of_signals, n)
+            dsignals = signal_directions(stepper, plan.stage_times.ravel(), of_signals, n)
             sweep = Forward(
-                room.system, work, tangents, tape, plan.h, segment.stages, plan.out_step,
-                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, along, rows,
+                room.system, work, along, tape, plan.h, segment.stages, plan.out_step,
+                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, dsignals, rows,
                 felt[segment.rows],
             )  # fmt: skip
             with released_turn():
