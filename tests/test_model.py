@@ -96,5 +96,5 @@ def test_a_step_in_the_room_of_another_is_that_of_a_graph():
             assert torch.equal(one, other.detach())
         assert torch.equal(done.observation, graph.observation.detach())
         assert torch.equal(done.knots, graph.knots)
-        assert same(done.outcome.trajectory(), graph.outcome.trajectory())
+        assert same(Trajectory.of(done.solved), Trajectory.of(graph.solved))
         now = done.moment

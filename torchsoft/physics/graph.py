@@ -589,7 +589,7 @@ class Graph(nn.Module):
         return Port(Transformer(blocks), effort, pad.elements(name))
 
     def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:
-        """Weights and actuators."""
+        """Weights and actuators, which are sources unless they resist."""
         out = {}
         for name, body in self.weighted.items():
             force = weight(body.mass, self.gravity).expand(signals.shape[:-2])
@@ -603,17 +603,15 @@ class Graph(nn.Module):
             sensed = dict.fromkeys(
                 f"{one}_spin" if of == "theta" else one for one, _, of in measured
             )
-            force = self.actuator_effort(name, state, signals)
-            spin = axis == "theta"
-            own = f"{body}_spin" if spin else body
-            row = (
-                torch.ones(1, 1, 1, dtype=torch.float64)
-                if spin
-                else torch.eye(2, dtype=torch.float64)[None, COORDINATES.index(axis), None]
-            )
+            force = self.actuator_effort(name, state, signals)[..., None, None]
+            eye = torch.eye(3, dtype=torch.float64)[None, COORDINATES.index(axis), None]
+            own, row = (f"{body}_spin", eye[..., 2:]) if axis == "theta" else (body, eye[..., :2])
+            blocks, senses = {own: Block(row)}, tuple(one for one in sensed if one != own)
+            if actuator.resists:  # what the coordinate does to the ground, which does not turn
+                blocks[GROUND] = Block(-eye[..., :2])
             out[f"control_{name}"] = Port(
-                Transformer({own: Block(row)}), force[..., None, None], actuator.elements, True,
-                senses=tuple(one for one in sensed if one != own),
+                Transformer(blocks), -force if actuator.resists else force, actuator.elements,
+                not actuator.resists, senses,
             )  # fmt: skip
         return out
 

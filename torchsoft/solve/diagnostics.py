@@ -1,5 +1,6 @@
 """Diagnostics: the balance of a finished run's energies, the range of the theory, and stability."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, condensed, standing
 from torchsoft.solve.steps import UNITS, own_units
-from torchsoft.solve.trajectory import Ledger, Trajectory, displaced
+from torchsoft.solve.trajectory import Trajectory
 
 # Checks of a finished run: whether its energies balance, and whether its pads are pressed beyond
 # the theory.
@@ -58,22 +59,24 @@ def strained(strain: float, time: float) -> str:
     )
 
 
-def energy_scale(ledger: Ledger) -> float:
-    """Energy [J] by which a run's ledger is judged: stored at the start, and injected since."""
-    return max(float(ledger.stored[0]) + ledger.injected, NEGLIGIBLE)
+def energy_scale(run: Trajectory) -> float:
+    """Energy [J] by which a run is judged: stored at the start, and injected since."""
+    return max(float(run.stored_energy[0] + run.injected[-1].detach()), NEGLIGIBLE)
 
 
-def missing_energy(ledger: Ledger) -> float:
-    """Part of `energy_scale` that a run's ledger lacks, or has too much, at the most."""
-    left = ledger.stored - ledger.stored[0] - ledger.supplied + ledger.dissipated.sum(1)
-    return float(np.abs(left).max()) / energy_scale(ledger)
+def missing_energy(run: Trajectory) -> float:
+    """Part of `energy_scale` that a run lacks, or has too much, at the most."""
+    left = run.stored_energy - run.stored_energy[0]
+    left = left - sum(x.detach() for x in run.supplied.values())
+    left = left + sum(x.detach() for x in run.dissipated.values())
+    return float(left.abs().max()) / energy_scale(run)
 
 
 def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> dict[str, str]:
     """Run warnings: sentences on the faults of a finished run with a ledger, by their subject; on
     those of its gradient if it has one, or is said to be `differentiated`."""
-    run, ledger, found = trajectory, Ledger.of(trajectory), dict[str, str]()
-    scale, part = energy_scale(ledger), missing_energy(ledger)
+    run, found = trajectory, dict[str, str]()
+    scale, part = energy_scale(run), missing_energy(run)
     if not part <= RESIDUAL:
         longest = float(run.knots.diff().max())
         better = 0.4 * longest * min(1.0, RESIDUAL / part)
@@ -82,27 +85,28 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
             f"and injected since is missing or too much, with steps of {longest:.3g} s; try steps "
             f"of {better:.2g} s"
         )
-    falls = -np.diff(ledger.dissipated, axis=0).min(0, initial=0.0)
-    for name, back in zip(ledger.names, falls):
+    for name, energy in run.dissipated.items():
+        back = -np.diff(energy.detach().numpy()).min(initial=0.0)
         if back > SUPPLIED * scale:
             found[f"dissipated {name}"] = (
                 f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "
                 "check its law"
             )
-    if run.stats.failed_steps and "knots" in ledger.steps:
+    if run.stats.failed_steps and "knots" in run.step_choice:
         found["knots"] = (
             "Newton did not converge in some steps between the given `knots`, which were halved "
             "(`stats.failed_steps`): the run is not one of the same steps; its own `knots` are "
             "those that it took"
         )
-    slips = dict(zip(ledger.names, ledger.dissipated[-1]))["slip"] > 0
+    slips = bool(run.dissipated["slip"][-1] > 0)
     biased = slips and (differentiated or run.y.requires_grad or run.sensitivities is not None)
     for name in rig.contacts:
         if bounded := softened(run, rig, name):
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"
         if biased and (jump := jumped(run, rig, name)):
             found[f"gradient {name}"] = jump
-    most, atol = ledger.force, ledger.steps.get("atol", 0.0)
+    squares = [float(x.detach().square().sum(-1).max()) for x in run.force.values()]
+    most, atol = math.sqrt(max(squares, default=0.0)), run.step_choice.get("atol", 0.0)
     if 0 < RESOLVED * most < atol * UNITS["force"]:
         unit = own_units(rig)["force"]
         if RESOLVED * most < (off := atol * unit):
@@ -118,14 +122,23 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
         if isinstance(pad.material, Hyperelastic):
             continue
         limit, height = COMPRESSED * pad.mesh.height, pad.mesh.height
-        if 2 * ledger.displaced.get(name, np.inf) < limit:  # other nodes give way by less
+        if not pad.nodal and 2 * largest_bound(run, rig, name) < limit:
             continue
-        if not (deepest := displaced(run, name)) <= limit:
+        deepest = float(run.displacement[name].detach().norm(dim=-1).max())
+        if not deepest <= limit:
             found[f"pad {name}"] = (
                 f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond "
                 "linear elasticity"
             )
     return found
+
+
+@torch.no_grad()
+def largest_bound(run: Trajectory, rig: Rig, name: str) -> float:
+    """Bound of the displacements [m] of a condensed pad in a run."""
+    pad, forces = rig.pads[name], run.y[:, run.layout.slices["pads", name]].detach()
+    softest = pad.unit_compliance()[0].abs().max() / (pad.E * pad.material.depth)
+    return float(softest * forces.abs().sum(-1).max())
 
 
 @torch.no_grad()

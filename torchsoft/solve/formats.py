@@ -18,7 +18,8 @@ from torchsoft.physics.mesh import Array, StoredMesh
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.setup import Setup, von_mises
 from torchsoft.physics.state import Layout, State, StateBlock
-from torchsoft.solve.trajectory import Stats, Trajectory
+from torchsoft.solve.progress import Stats
+from torchsoft.solve.trajectory import Trajectory
 from torchsoft.tables import line
 
 # A run as an xarray Dataset, and back: everything that a `Trajectory` holds but its graph, under
@@ -260,6 +261,7 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
             fields["pads"][name] = torch.cat((displacement[name], *more), -1)
     state = State(**fields | {"pose": pose, "velocity": velocity})
     layout.check(y := layout.pack(state))
+    energy = by("energy", parts["energy"])
     return Trajectory(
         t=of("time"), y=y, state=state,
         channels={name: of(name) for name in parts["channels"]},
@@ -268,14 +270,15 @@ def _assembled(data: xr.Dataset, about: dict[str, Any], of: Callable[[str], Tens
             for name in contacts
         },
         loads=loads, displacement=displacement,
-        energy=by("energy", parts["energy"]), dissipated=by("dissipated", parts["dissipated"]),
+        energy=energy, stored_energy=sum(energy.values(), torch.zeros_like(of("time"))),
+        step_choice=about.get("steps", {}), dissipated=by("dissipated", parts["dissipated"]),
         supplied=by("supplied", parts["supplied"]),
         injected=of("injected"), stats=Stats(**stats), knots=of("knots"), layout=layout,
         made_by=about, wrt=tuple(wrt),
         sensitivities=of("sensitivities") if "sensitivities" in data else None,
         touch_sensitivities=by("sensitivities", touch),
         units={name: data[name].attrs.get("units", "") for name in parts["channels"]},
-        setup=setup, known_contact_state=by("contact_state", contacts),
+        setup=setup, contact_state=by("contact_state", contacts),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from torchsoft.caller import warn
 from torchsoft.codegen import Law
 from torchsoft.physics.contact import Friction, SoftContact
 from torchsoft.physics.elements import CONSTANTS, CORNERS
-from torchsoft.physics.energy import Integrals
+from torchsoft.physics.energy import integrals
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.pads import Pad
@@ -74,9 +74,6 @@ NOMINAL = 1e-3
 HELD = 3e-4
 """Strain up to which the derivatives of an element's forces are held while it changes, in Newton's
 method."""
-
-NEGLIGIBLE = 1e-9
-"""Nodal force [N] below which a node counts as unloaded."""
 
 KEPT, KEPT_BYTES = 8, 5e7
 """Most models that are kept, and arrays of theirs [bytes] beyond the last one's."""
@@ -153,7 +150,7 @@ class Model:
 
     def _read(self, values: Sequence[Tensor]) -> None:
         rig = self.rig
-        self.layout, self.integrals, self.signals = rig.layout, Integrals(rig), rig.signals
+        self.layout, self.integrals, self.signals = rig.layout, integrals(rig), rig.signals
         slices = self.layout.slices
         self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
         self.followed = len(rig.signals) + len(rig.fixed_values)
@@ -177,8 +174,6 @@ class Model:
         self.nodal = {
             name: 2 * pad.fields * pad.nodes for name, pad in rig.pads.items() if pad.nodal
         }
-        points = [2 * count for count in rig.point_counts.values()]
-        self.felt = [*points, 3 * len(rig.pads), 3 * len(rig.bodies) + 3]
         self._chains = [
             (at, n) for at, n in zip(self._condensed.chain_at, self._condensed.branches) if n
         ]
@@ -187,24 +182,11 @@ class Model:
         none = self.system(np.zeros(len(self._index)))
         self.no_tape = scratch("Tape", none, self.layout.size, stages=0, cap=0)
         self.widths = (
-            self.layout.size, len(self.integrals.names), recorded_size(none),
+            self.layout.size, len(rig.pads) + len(rig.actuators) + len(rig.bodies) + 4,
+            recorded_size(none),
             int(none.nodal_dof_start[-1]),
         )  # fmt: skip
         del self._made, self._places, self._shapes, self._matched, self._known, self._index
-
-    def displaced(self, p: Array, y: Array) -> dict[str, float]:
-        """Largest displacements of the loaded nodes of condensed pads [m] in states y (T, size)."""
-        own, out = self._condensed, dict[str, float]()
-        for name, here in self.condensed.items():
-            i = [*self.rig.pads].index(name)
-            at, n = own.chain_at[i], own.branches[i]
-            zeta = p[at : at + n] @ y[:, here].reshape(len(y), n, -1)
-            loaded = np.flatnonzero(np.abs(zeta).max(0) > NEGLIGIBLE) // 2 * 2
-            span = slice(*loaded[[0, -1]] + [0, 2]) if len(loaded) else slice(0)
-            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(2 * (zeta.shape[1:]))
-            u = p[at + 2 * n] * (zeta[:, span] @ C[span, span])
-            out[name] = float(np.sqrt((u.reshape(len(y), -1, 2) ** 2).sum(-1).max(initial=0.0)))
-        return out
 
     def system(self, p: Array) -> Any:
         """The rig's arrays with the vector of parameters p."""

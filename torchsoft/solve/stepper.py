@@ -115,7 +115,7 @@ class ImplicitStepper:
                 f"`tolerance` must be at least {least:.3g} N, but is {tolerance:g} N, "
                 "which rounding hides"
             )
-        self.layout, self.integrals = self.compiled.layout, self.compiled.model.integrals
+        self.layout = self.compiled.layout
         self.origin = 0.0
         self._motion: Followed | None = None
         self._cap, self._shortest = 64, SHORTEST
@@ -204,15 +204,20 @@ class ImplicitStepper:
             if not out.rows and not np.isfinite(out.signals[0]).all():
                 self.signals_at(np.zeros(1))  # which raises
             rows = slice(out.rows, out.rows + done)
-            out.rows, out.steps, out.solves = rows.stop, out.steps + steps, out.solves + solves
-            out.refused, out.failed = out.refused + refused, out.failed + failed
+            out.rows, stats = rows.stop, out.stats
+            stats.steps, stats.newton_iterations = (
+                stats.steps + steps,
+                stats.newton_iterations + solves,
+            )
+            stats.refused_steps += refused
+            stats.failed_steps += failed
             now.keep(plan.taken(steps, done), rows, before, tapes)
             if out.rows:
                 yield out
             if status == TAPE_FULL:
                 self._cap *= 2
             elif status == NEWTON_FAILED and given and out.rows and halvings < HALVINGS:
-                out.failed += 1
+                stats.failed_steps += 1
                 room.work.u_dot[:], room.work.rate[:] = 0.0, 0.0
                 ends = int(np.searchsorted(plan.out_step, steps, side="right"))
                 todo.append((plan.left(steps + 1, ends), halvings))

@@ -213,7 +213,7 @@ class Rates:
         self._followed = compiled.followed(compiled.reference, 0.0)
         self._signals = np.zeros((1, compiled.model.followed, 2))
         self._powers, self._wrenches = (
-            np.zeros(len(compiled.model.integrals.names)),
+            np.zeros(compiled.model.widths[1]),
             np.zeros((len(rig.pads), 3)),
         )
         self.calls = 0
