@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from torchsoft.display import suggestion
-from torchsoft.physics.balance import Balance, Forces
+from torchsoft.physics.balance import Forces, Nodes, contact_forces, corrected, newton
 from torchsoft.physics.contact import (
     Frame,
     PointLaw,
@@ -28,7 +28,7 @@ from torchsoft.physics.elements import CORNERS
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import check_names
-from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
+from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, weight
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import (
@@ -502,7 +502,7 @@ class Graph(nn.Module):
             return free
         with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
             first = law(torch.zeros_like(pad.spread @ free))
-        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
+        F, left = contact_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
         self._check_rates(name, left)
         return free + nodal(P, F)
 
@@ -521,16 +521,15 @@ class Graph(nn.Module):
         at, own = pad.at_corners(part), slice(CORNERS * field, CORNERS * (field + 1))
         others = own.start, at.shape[-1] - own.stop
         internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., own]
-        balance = Balance(pad, internal, law)
-        none = torch.zeros_like(part[..., :2])
+        nodes, none = Nodes(pad, internal, law), torch.zeros_like(part[..., :2])
         try:
-            rate, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
+            rate, solve, left = newton(nodes, none, RATE_TOLERANCE, RATE_ITERATIONS)
         except FloatingPointError:
             raise NoRates(
                 f"the massless pad `{name}` has no rates in this state; is an element inside out?"
             ) from None
         self._check_rates(name, left)
-        return balance.corrected(rate, factors)
+        return corrected(nodes, rate, solve)
 
     def _check_rates(self, name: str, left: float) -> None:
         """Raises `NoRates` for rates of a massless pad with a residual [m/s]."""
