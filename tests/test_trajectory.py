@@ -18,7 +18,7 @@ import torchsoft
 from torchsoft import Rig, Trajectory, simulate, simulate_batch
 from torchsoft.display import hidden
 from torchsoft.physics.extensions import extend
-from torchsoft.physics.setup import von_mises
+from torchsoft.physics.pads import von_mises
 from torchsoft.rigs.written import template
 from torchsoft.solve.formats import save
 from torchsoft.sysid.columns import read_csv
@@ -123,7 +123,7 @@ def test_vtk_files_are_read_back(tmp_path):
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         assert (abs(angle) > 1e-3) == (pad.base == "bracket")
         where = slice(first, first + count)
-        moved = own @ (turn @ pad.axes).T
+        moved = own @ (turn @ pad.axes.numpy()).T
         written = mesh.point_data["displacement"][where, :2]
         np.testing.assert_allclose(written, moved, atol=1e-15)
         nodes = pad.placed(pad.mesh.nodes) @ turn.T + [x, y]

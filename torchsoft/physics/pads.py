@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
+from scipy.sparse.linalg import SuperLU, splu
 from scipy.special import ndtr
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -24,15 +25,17 @@ from torchsoft.physics.elements import (
     element_energy,
     element_potential,
 )
-from torchsoft.physics.hyperelastic import Hyperelastic
+from torchsoft.physics.hyperelastic import Hyperelastic, again, described, plane
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import (
     Array,
     Index,
     Mesh,
+    dofs_of,
     lame_moduli,
     unit_compliance,
 )
+from torchsoft.physics.mesh.mesh import gradients
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import StateBlock
 from torchsoft.quantity import Length, Quantity, Ratio, check_declared, quantities
@@ -91,6 +94,7 @@ class Pad(nn.Module):
         )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
         kept = np.arange(len(mesh.free)) if self.nodal else mesh.surface
+        self.angle, self.mirrored = angle, mirrored
         c, s = np.cos(angle), np.sin(angle)
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
         self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
@@ -129,14 +133,40 @@ class Pad(nn.Module):
         self, mesh: Mesh, material: Material, inertial: bool, points: int,
         origin: Array | None = None, turn: float = 0.0,
     ) -> "Pad":  # fmt: skip
-        (c, s), at = self.axes[:, 0].tolist(), self.origin.numpy() if origin is None else origin
+        x, y = self.origin.tolist() if origin is None else origin
         pad = Pad(
-            mesh, material, base=self.base, origin=(float(at[0]), float(at[1])),
-            angle=float(np.arctan2(s, c)) + turn, mirrored=float(self.axes.det()) < 0,
-            inertial=inertial, points=points,
+            mesh, material, base=self.base, origin=(float(x), float(y)), angle=self.angle + turn,
+            mirrored=self.mirrored, inertial=inertial, points=points,
         )  # fmt: skip
         pad.E_ratio, pad.tau_ratio = self.E_ratio, self.tau_ratio
         return pad
+
+    def described(self) -> dict[str, Any]:
+        """Numbers and names of the pad as it is now, for files; not its mesh. Of a material of the
+        user's own only the small strains of the relaxed one are known."""
+        own = {name: getattr(self, name) for name in ("base", "angle", "mirrored", "inertial")}
+        ratios = {name: getattr(self, name) for name in ("E_ratio", "tau_ratio")}
+        known = {name: None if one is None else one.item() for name, one in ratios.items()}
+        material = described(self.material)
+        if material is None:
+            relaxed = {name: getattr(self.material, name).item() for name in RELAXED}
+            material = {"kind": None, "finite": isinstance(self.material, Hyperelastic), **relaxed}
+        origin = self.origin.tolist()
+        return {**own, **known, "points": self.points, "origin": origin, "material": material}
+
+    @classmethod
+    def again(cls, described: Mapping[str, Any], mesh: Mesh) -> "Pad":
+        """The pad that was `described`, on its mesh."""
+        given = dict(described["material"])
+        if given["kind"] is not None:
+            material = again(given)
+        else:
+            E, nu, rho, depth = (given[name] for name in RELAXED)
+            finite = given["finite"]
+            material = (
+                Hyperelastic(E, nu, rho, 1.0, depth) if finite else Material(E, nu, rho, depth)
+            )
+        return cls(mesh, **{**described, "material": material})
 
     @property
     def E(self) -> Tensor:
@@ -362,6 +392,114 @@ class Pad(nn.Module):
     def constants(self) -> Array:
         """Constants of every element (elements, 45) in the base's frame."""
         return constants_of(self.placed(self.mesh.nodes)[self.mesh.elements].tobytes())
+
+    # Fields inside of the pad, (..., mesh nodes or elements, components), in the pad's own axes.
+
+    def displacement(self, u: Array) -> Array:
+        """Displacements of all nodes of the mesh (..., mesh nodes, 2) [m], bonded ones too.
+
+        u (..., nodes, 2) [m]: displacements as a run records them, in the base's frame. A massless
+        pad has only its surface there; the interior is in equilibrium with it, u_i = -K_ii^-1 K_is
+        u_s.
+        """
+        mesh = self.mesh
+        own = (u.reshape(-1, *u.shape[-2:]) @ self.axes.numpy()).reshape(-1, 2 * u.shape[-2])
+        free = np.zeros((len(own), 2 * len(mesh.free)))
+        if self.nodal:
+            free[:] = own
+        else:
+            factor, interior, K_is = interior_solver(mesh, self.material.nu.item())
+            free[:, dofs_of(mesh.surface)] = own
+            free[:, interior] = -factor.solve(K_is @ own.T).T
+        out = np.zeros((len(own), len(mesh.nodes), 2))
+        out[:, mesh.free] = free.reshape(len(own), -1, 2)
+        return out.reshape(*u.shape[:-2], -1, 2)
+
+    def surface_points(self, u: Array) -> Array:
+        """Places (..., points, 2) [m] of the contact points in the frame of the base, of
+        displacements u (..., nodes, 2) [m] as a run records them."""
+        return (self.spread @ (self.positions + torch.from_numpy(u))).numpy()
+
+    def gradient(self, displacement: Array) -> Array:
+        """F (..., elements, 2, 2) at the centres of the elements, of displacements of all nodes."""
+        nodes = displacement[..., self.mesh.elements, :]
+        return np.eye(2) + np.einsum("eki,...ekj->...eji", slopes(self.mesh), nodes)
+
+    def strain(self, displacement: Array) -> Array:
+        """Strains (e_xx, e_yy, e_xy) at the centres of the elements (..., elements, 3), of
+        displacements of all nodes; of a pad at finite strain they are U - 1, F = R U."""
+        F = self.gradient(displacement)
+        U = 0.5 * (F + np.swapaxes(F, -1, -2))
+        if isinstance(self.material, Hyperelastic):
+            C, J = np.swapaxes(F, -1, -2) @ F, np.linalg.det(F)
+            U = (C + J[..., None, None] * np.eye(2)) / np.sqrt(
+                np.trace(C, axis1=-2, axis2=-1) + 2 * J
+            )[..., None, None]
+        return np.stack((U[..., 0, 0] - 1, U[..., 1, 1] - 1, U[..., 0, 1]), -1)
+
+    def largest_strain(self, u: Array) -> Array:
+        """Largest principal strain (...) at the centres of the elements, by its modulus, of
+        displacements u (..., nodes, 2) [m] as a run records them."""
+        e = self.strain(self.displacement(u))
+        mean, half = 0.5 * (e[..., 0] + e[..., 1]), 0.5 * (e[..., 0] - e[..., 1])
+        return (np.abs(mean) + np.hypot(half, e[..., 2])).max(-1)
+
+    @torch.inference_mode(False)
+    def stress(self, displacement: Array) -> Array:
+        """Elastic stresses (s_xx, s_yy, s_zz, s_xy) [Pa] (..., elements, 4) of the relaxed material
+        in plane strain, at the centres of the elements, of displacements of all nodes; Cauchy's of
+        a pad at finite strain, P F^T / det F of the first Piola-Kirchhoff stress P = dW/dF. The
+        part that the dashpots carry is not in them.
+
+        Raises `ValueError` for an energy of the user's own, which runs do not hold.
+        """
+        ratio = 1.0 if self.E_ratio is None else self.E_ratio.item()
+        if not isinstance(self.material, Hyperelastic):
+            strain = self.strain(displacement)
+            moduli = ratio * self.material.E.item(), self.material.nu.item()
+            lame_lambda, lame_mu = lame_moduli(*moduli)
+            mean = lame_lambda * (strain[..., 0] + strain[..., 1])
+            parts = [mean + 2 * lame_mu * strain[..., i] for i in (0, 1)]
+            return np.stack((*parts, mean, 2 * lame_mu * strain[..., 2]), -1)
+        if type(self.material) is Hyperelastic:
+            raise ValueError(
+                "the strain energy of the pad is one of your own, which runs do not hold, so that "
+                "its stresses are not known; plot something else"
+            )
+        F = plane(torch.from_numpy(self.gradient(displacement)))
+        with torch.enable_grad():
+            W = self.material.energy(F.requires_grad_()).sum()
+            (P,) = torch.autograd.grad(W, F)
+        stress = ratio * (P @ F.detach().mT / F.detach().det()[..., None, None]).numpy()
+        return np.stack([stress[..., i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1))], -1)
+
+
+RELAXED = ("E", "nu", "rho", "depth")
+"""Numbers of a material that files keep of one of the user's own."""
+
+
+def von_mises(stress: Array) -> Array:
+    """Von Mises' equivalent stress [Pa] (...) of stresses (..., 4)."""
+    xx, yy, zz, xy = (stress[..., i] for i in range(4))
+    return np.sqrt(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * xy**2)
+
+
+@lru_cache(maxsize=8)
+def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, Index, Array]:
+    """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in
+    `mesh.surface` order.
+
+    The interior's displacement depends on the surface's only, for any E and depth; both are 1.
+    """
+    K, surface = mesh.stiffness(*lame_moduli(1.0, nu)).tocsc(), dofs_of(mesh.surface)
+    interior = np.setdiff1d(np.arange(2 * len(mesh.free)), surface)
+    return splu(K[interior][:, interior]), interior, K[interior][:, surface].toarray()
+
+
+@lru_cache(maxsize=8)
+def slopes(mesh: Mesh) -> Array:
+    """Gradients (elements, 4, 2) [1/m] of the shape functions at the centres of the elements."""
+    return gradients(mesh.nodes[mesh.elements], 0.0, 0.0)[1]
 
 
 @lru_cache(maxsize=8)

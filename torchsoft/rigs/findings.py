@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.graph import Graph
+from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.motion import hold
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
@@ -131,8 +132,8 @@ def strains(run: Run) -> Iterator[Diagnostic]:
     """Findings on linear pads that are strained beyond linear elasticity, with the cause, and notes
     on strains that are not small."""
     for name, u in run.trajectory.displacement.items():
-        pad, setup = run.rig.pads[name], run.trajectory.setup.pads[name]
-        if setup.finite:
+        pad = run.rig.pads[name]
+        if isinstance(pad.material, Hyperelastic):
             continue
         give = u.detach().norm(dim=-1)
         row, node = divmod(int(give.argmax()), give.shape[1])
@@ -151,7 +152,7 @@ def strains(run: Run) -> Iterator[Diagnostic]:
                 f"{part:.0%} of its height{cause}, and forces are wrong above {LINEAR:.0%}; press "
                 "or move less, take less friction, or a thicker or stiffer pad",
             )  # fmt: skip
-        elif (strain := float(setup.largest_strain(u[row].detach().numpy()))) > SMALL_STRAIN:
+        elif (strain := float(pad.largest_strain(u[row].detach().numpy()))) > SMALL_STRAIN:
             yield Diagnostic("note", f"pads.{name}", strained(strain, run.time(row)))
 
 

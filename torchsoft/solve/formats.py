@@ -15,8 +15,9 @@ from torch import Tensor
 from torchsoft.extras import needed
 from torchsoft.files import check_file, check_seal, replacing, seal
 from torchsoft.physics.mesh import Array, StoredMesh
+from torchsoft.physics.pads import von_mises
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
-from torchsoft.physics.setup import Setup, von_mises
+from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import Layout, State, StateBlock
 from torchsoft.solve.progress import Stats
 from torchsoft.solve.trajectory import Trajectory
@@ -417,7 +418,7 @@ def write(run: Trajectory, path: Path, times: Sequence[float] | None = None) -> 
                 else run.state.pose[pad.base][row].detach().tolist()
             )  # fmt: skip
             turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            axes = turn @ pad.axes
+            axes = turn @ pad.axes.numpy()
             points.append(pad.placed(pad.mesh.nodes) @ turn.T + [x, y])
             moved.append(own @ axes.T)
             strain = pad.strain(own)
