@@ -20,7 +20,7 @@ from torchsoft.display import hidden
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import von_mises
 from torchsoft.rigs.written import template
-from torchsoft.solve.formats import save
+from torchsoft.solve.netcdf import save
 from torchsoft.sysid.columns import read_csv
 from torchsoft.sysid.measured import vocabulary
 
@@ -90,9 +90,10 @@ EDITED = {
        for name in ("mesh_nodes_L", "setup", "stats")},
     "text": (lambda data: data.assign(x_C=("time", ["fast"] * len(T))), "`x_C` must be finite"),
     "three samples": (lambda data: data.assign(x_C=("i", np.zeros(3), data.x_C.attrs)),
-        "length 3 on {'time': 'x_C'}"),
+        "`x_C` must be over ('time',), not ('i',)"),
     "furlong": (unit("effort_x", "furlong"), "`effort_x` must be `N`, not 'furlong'"),
-    "time goes back": (lambda data: data.assign_coords(time=data.time[::-1].values),
+    "time goes back": (lambda data: data.assign_coords(
+        time=("time", data.time[::-1].values, data.time.attrs)),
         "`time` must increase strictly"),
     "stats": (attribute("stats", {"steps": 3}), "do not fit together"),
     "setup": (attribute("setup", {"bodies": {"disc": {"colour": 1}}}), "do not fit together"),

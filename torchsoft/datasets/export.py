@@ -11,7 +11,7 @@ from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import Manifest, check_apart, store_errors
 from torchsoft.datasets.reader import Vouched
 from torchsoft.files import make_folder
-from torchsoft.solve.formats import write_log
+from torchsoft.solve.mcap import write_log
 
 
 def export_logs(url: str, out: Path) -> str:

@@ -183,9 +183,8 @@ def plates(setup: Setup) -> dict[str, float]:
     out = {}
     for name, pad in setup.pads.items():
         if pad.base is not None:
-            height = MM * float(
-                (pad.placed(np.zeros(2)) @ pad.axes.numpy())[1]
-            )  # of face over centre
+            origin = pad.placed(np.zeros(2)) @ pad.axes.numpy()
+            height = MM * float(origin[1])  # of face over centre
             if setup.bodies[pad.base].outline is not None:
                 out[name] = 0.0
             elif height > 5e-7:

@@ -346,7 +346,7 @@ class Trajectory(Shown):
 
     def to_xarray(self) -> xr.Dataset:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""
-        from torchsoft.solve.formats import to_xarray
+        from torchsoft.solve.netcdf import to_xarray
 
         return to_xarray(self)
 
@@ -367,20 +367,20 @@ class Trajectory(Shown):
     def to_vtk(self, path: str | Path, times: Sequence[float] | None = None) -> list[Path]:
         """Write the pads for ParaView and meshio: displacements [m], strains, stresses [Pa], one
         .vtu a sample and a .pvd that lists them; the files written. See
-        `torchsoft.solve.formats.write`."""
-        from torchsoft.solve.formats import write
+        `torchsoft.solve.vtk.write`."""
+        from torchsoft.solve.vtk import write
 
         return write(self, Path(path), times)
 
     def to_mcap(self, path: str | Path) -> None:
         """Write the channels as an MCAP log, a message a sample; needs the extra `export`."""
-        from torchsoft.solve.formats import write_log
+        from torchsoft.solve.mcap import write_log
 
         write_log(Path(path), self.to_xarray(), {})
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF with a checksum. The file appears whole or not at all."""
-        from torchsoft.solve.formats import save
+        from torchsoft.solve.netcdf import save
 
         save(self.to_xarray(), path)
 
@@ -388,6 +388,6 @@ class Trajectory(Shown):
     def load(path: str | Path) -> Trajectory:
         """The run that `save` wrote, without its rig. Raises `ValueError` for any other file and
         for one that is damaged, and `OSError`."""
-        from torchsoft.solve.formats import read
+        from torchsoft.solve.netcdf import from_xarray, load
 
-        return read(path)
+        return from_xarray(load(path), str(path))
