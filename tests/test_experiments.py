@@ -77,20 +77,6 @@ def step_accuracy(found):
 
 
 @claims
-def benchmark(found):
-    assert all(row["failures"] == 0 for row in found["batches"].values())
-    assert list(found["growth"]["wall_s"]) == ["61", "121"]
-
-
-@pytest.mark.slow
-def test_other_integrators_reach_the_solution_of_the_stepper():
-    module = program("benchmark")
-    rows = module.peers(module.Config(window=5e-3, repeats=1))
-    assert len(rows) == 9
-    assert all(rows.values())
-
-
-@claims
 def identify_contact(found):
     """Without noise the truth, with noise the truth within what was predicted."""
     cases = {case["case"]: case for case in found["cases"]}

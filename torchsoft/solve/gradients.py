@@ -118,7 +118,7 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[tuple[Tensor, Ten
         stepper, t = run.task.stepper, run.task.t
         times = [segment.plan.stage_times.ravel() for segment in run.segments or []]
         signals = stepper.signals_at(np.concatenate([*times, t.numpy() - stepper.origin]))
-        inputs += [run.task.y0, stepper.compiled.p, signals[: -len(t)], signals[-len(t) :]]
+        inputs += [run.task.y0, stepper.parameters.p, signals[: -len(t)], signals[-len(t) :]]
     flat = iter(_Solutions.apply(differentiated, threads, *inputs) if differentiated else ())
     solutions = zip(flat, flat)
     return [run.rows if run.segments is None else next(solutions) for run in runs]
@@ -126,7 +126,7 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[tuple[Tensor, Ten
 
 def wants_gradient(stepper: ImplicitStepper, y0: Tensor) -> bool:
     """Whether anything that a run is made with requires a gradient."""
-    tensors = (y0, stepper.compiled.p, *stepper.reference.parameters())
+    tensors = (y0, stepper.parameters.p, *stepper.reference.parameters())
     return any(x.requires_grad for x in tensors) or stepper.signals_at_start.requires_grad
 
 
@@ -180,10 +180,10 @@ def run_adjoint(
     sizes = sizes_of(stepper.layout, run.out.y)
     own = float((np.abs(rows) @ sizes).sum())
     own += float(np.abs(forces).sum()) * float(np.abs(run.out.recorded).max(initial=SMALL))
-    carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
+    carried, p_bar = np.zeros(size), np.zeros(len(stepper.parameters.p))
     segments, outputs_bar = run.segments or [], np.zeros((len(t), *run.out.signals.shape[1:]))
     signals_bar = [np.zeros_like(segment.stages) for segment in segments]
-    room = stepper.compiled.model.take(stepper.compiled.numbers)
+    room = stepper.parameters.model.take(stepper.parameters.numbers)
     for segment, own_bar in zip(reversed(segments), reversed(signals_bar)):
         plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
         failed, here = np.zeros(1, np.int64), segment.rows
@@ -197,9 +197,9 @@ def run_adjoint(
         if failed[0] >= 0:
             time = stepper.origin + plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
-    stepper.compiled.model.give(room)
+    stepper.parameters.model.give(room)
     if own > 0:
-        by_parameters = np.abs(p_bar * stepper.compiled.p.detach().numpy()).max(initial=0.0)
+        by_parameters = np.abs(p_bar * stepper.parameters.p.detach().numpy()).max(initial=0.0)
         warn_of_amplified(max(np.abs(carried * sizes).max(), by_parameters) / own)
     parts = carried, p_bar, np.concatenate(signals_bar), outputs_bar
     return tuple(torch.from_numpy(part) for part in parts)  # pyright: ignore[reportReturnType]
@@ -271,7 +271,7 @@ def signal_directions(
     signals = stepper.signals_at(times)
     out = np.zeros((*signals.shape[:2], 2, columns))
     out[..., : len(wrt)] = directions(signals, wrt)
-    driving = stepper.compiled.system.body_signal
+    driving = stepper.parameters.system.body_signal
     if out[:, driving[driving >= 0]].any():
         raise ValueError(
             "gradient='forward' has no derivatives by parameters that move fixed or driven bodies; "
@@ -290,11 +290,11 @@ def iterate(task: Task, wrt: Sequence[Tensor], columns: list[int], sums: Sums) -
     size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wrt))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
-    dp = np.zeros((len(stepper.compiled.p), n))
-    dp[:, : len(wrt)] = directions(stepper.compiled.p, wrt)
+    dp = np.zeros((len(stepper.parameters.p), n))
+    dp[:, : len(wrt)] = directions(stepper.parameters.p, wrt)
     kept, forces = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
     segments: list[Segment] = []
-    room = stepper.compiled.model.take(stepper.compiled.numbers)
+    room = stepper.parameters.model.take(stepper.parameters.numbers)
     work, tangents = (room.of(kind, columns=n) for kind in ("Work", "Tangents"))
     growing = stepper.integrate(task.y0.detach(), t, segments, float("inf"), outputs_too=count > 0)
     for out in growing:
@@ -312,7 +312,7 @@ def iterate(task: Task, wrt: Sequence[Tensor], columns: list[int], sums: Sums) -
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
         yield Solved(task, out, None, (torch.from_numpy(kept), torch.from_numpy(forces)))
-    stepper.compiled.model.give(room)
+    stepper.parameters.model.give(room)
     rigid = [k for k, column in enumerate(columns) if column in set(stepper.layout.rigid)]
     own = np.array([float(p.detach()) for p in wrt])
     moved = np.abs(kept[:, rigid, : len(wrt)] * own).max((0, 2), initial=0.0)

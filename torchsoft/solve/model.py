@@ -26,7 +26,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
-from torchsoft.physics.structure import Copies, Structure, structure_of
+from torchsoft.physics.structure import Structure, structure_of
 from torchsoft.physics.validity import (
     LARGEST,
     MISSING,
@@ -103,9 +103,9 @@ class Model:
     """
 
     def __init__(self, structure: Structure, values: Sequence[Tensor]) -> None:
-        self.copies = Copies(structure)
-        modules = self.copies.made(values)
+        modules = structure.copy(values)
         self.rig: Rig = modules[0]
+        self.structure = Structure(self.rig)
         self.rig.check_names()
         check_values(self.rig)
         check_groups(self.rig)
@@ -117,7 +117,7 @@ class Model:
         self._geometry = self._geometry_of(values)
         self._read(values)
         self._idle: list[Room] = []
-        self.last: tuple[Array, Tensor, dict[str, float]] | None = None
+        self.last: tuple[Array, Tensor, Tensor, dict[str, float]] | None = None
         self.motion: tuple[Any, Followed] | None = None
 
     def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
@@ -164,6 +164,7 @@ class Model:
         for value in (*values, *self._made.values()):
             self._places.setdefault(id(value), count)
             count += value.numel()
+        self.places = self._named_places()
         self._bodies = self._make_bodies()
         self._pads = self._make_pads()
         parts = self._bodies, self._make_sources(), self._pads, self._make_backs()
@@ -187,6 +188,14 @@ class Model:
             int(none.nodal_dof_start[-1]),
         )  # fmt: skip
         del self._made, self._places, self._shapes, self._matched, self._known, self._index
+
+    def _named_places(self) -> dict[str, slice]:
+        """Places of the parameters by all of their names, and of what is computed from them."""
+        named = dict(self.rig.named_parameters(remove_duplicate=False))
+        named |= {name: named[own] for name, own in self.rig.names.items() if own in named}
+        named |= {f"{kind} of {part}": value for (kind, part), value in self._made.items()}
+        firsts = {name: self._places[id(value)] for name, value in named.items()}
+        return {name: slice(at, at + named[name].numel()) for name, at in firsts.items()}
 
     def system(self, p: Array) -> Any:
         """The rig's arrays with the vector of parameters p."""

@@ -15,7 +15,7 @@ from torchsoft.physics.arguments import Numbers, positive, tensor
 from torchsoft.physics.channels import Touch
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.structure import Copies, Structure
+from torchsoft.physics.structure import Structure
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts, instability
 from torchsoft.solve.gradients import (
@@ -27,9 +27,9 @@ from torchsoft.solve.gradients import (
     iterate,
     march,
 )
+from torchsoft.solve.parameters import independent
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.stepper import ImplicitStepper
-from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Trajectory
 
 
@@ -176,7 +176,7 @@ def started(
     if values:
         structure = structure or Structure(rig)
         given = [values.get(id(x), x) for x in structure.parameters]
-        rig = Copies(structure).made(given)[0]
+        rig = structure.copy(given)[0]
     wanted = gradient == "forward" or (gradient == "discrete" and torch.is_grad_enabled())
     with torch.set_grad_enabled(wanted), independent():
         return start(rig)

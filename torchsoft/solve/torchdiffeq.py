@@ -141,7 +141,7 @@ class TorchdiffeqSolver:
             if parameters:
                 with torch.enable_grad():
                     times = np.concatenate([one.plan.stage_times.ravel() for one in segments])
-                    made_of = again.compiled.p, again.signals_at(times)
+                    made_of = again.parameters.p, again.signals_at(times)
                     value = torch.cat(
                         [(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]
                     ).sum()

@@ -19,9 +19,9 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import Layout, State
 from torchsoft.solve.gradients import Solved, attached, without_gradient
+from torchsoft.solve.parameters import independent
 from torchsoft.solve.progress import Progress, Stats
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.solve.system import independent
 
 if TYPE_CHECKING:  # these take as long to import as all of this package
     import pandas as pd
@@ -100,7 +100,7 @@ class Trajectory(Shown):
             run.sensitivities = of_states
             of_touch = touch.slopes(task.touch, of_sums, recorded).unbind(1)
             run.touch_sensitivities = dict(zip(task.touch, of_touch))
-        if not task.stepper.compiled.model.shared or not run._motion.known:
+        if not task.stepper.parameters.model.shared or not run._motion.known:
             run.complete()
         return run
 
@@ -146,7 +146,7 @@ class Trajectory(Shown):
     @later
     def rates(self) -> dict[str, Tensor]:
         """Rates of the displacements of nodal pads (T, nodes, 2 fields) [m/s]."""
-        widths, pads = self._stepper.compiled.model.nodal, self._stepper.rig.pads
+        widths, pads = self._stepper.parameters.model.nodal, self._stepper.rig.pads
         parts = torch.from_numpy(self._out.rate[: len(self.t)]).split([*widths.values()], -1)
         return {name: x.unflatten(-1, (pads[name].nodes, -1)) for name, x in zip(widths, parts)}
 
@@ -158,7 +158,7 @@ class Trajectory(Shown):
     @later
     def stored_energy(self) -> Tensor:
         """Sum of the stored energies (T,) [J], without a graph."""
-        if self._stepper.compiled.model.nodal:
+        if self._stepper.parameters.model.nodal:
             return sum(self.energy.values(), torch.zeros_like(self.t)).detach()
         return torch.from_numpy(self._out.stored[: len(self.t)])
 
@@ -227,7 +227,7 @@ class Trajectory(Shown):
         return without_gradient(name, rows, self.y)
 
     def _integrals(self, kind: str) -> dict[str, Tensor]:
-        every = self._stepper.compiled.model.integrals
+        every = self._stepper.parameters.model.integrals
         return {
             one.name: one.factor * self._integral(one.name, one.number)
             for one in every if one.kind == kind
