@@ -46,6 +46,9 @@ COMPRESSED = 0.5
 LATER = 0.005
 """Part of a contact's largest friction by which the bound of its fall raises it without a word."""
 
+LIGHTLY = 1e-6
+"""Force on a node over the largest, up to which it counts as unloaded."""
+
 SMALL_STRAIN = 0.05
 """Strain up to which linear elasticity holds without a note."""
 
@@ -122,8 +125,8 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
         if isinstance(pad.material, Hyperelastic):
             continue
         limit, height = COMPRESSED * pad.mesh.height, pad.mesh.height
-        if not pad.nodal and 2 * largest_bound(run, rig, name) < limit:
-            continue
+        if not pad.nodal and 2 * largest_under_load(run, rig, name) < limit:
+            continue  # other nodes are displaced less
         deepest = float(run.displacement[name].detach().norm(dim=-1).max())
         if not deepest <= limit:
             found[f"pad {name}"] = (
@@ -134,11 +137,16 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
 
 
 @torch.no_grad()
-def largest_bound(run: Trajectory, rig: Rig, name: str) -> float:
-    """Bound of the displacements [m] of a condensed pad in a run."""
-    pad, forces = rig.pads[name], run.y[:, run.layout.slices["pads", name]].detach()
-    softest = pad.unit_compliance()[0].abs().max() / (pad.E * pad.material.depth)
-    return float(softest * forces.abs().sum(-1).max())
+def largest_under_load(run: Trajectory, rig: Rig, name: str) -> float:
+    """Largest displacement [m] of the loaded nodes of a condensed pad in a run."""
+    pad, (fractions, _) = rig.pads[name], rig.pads[name].chain()
+    z = run.y[:, run.layout.slices["pads", name]].reshape(len(run.t), len(fractions), -1)
+    z = z[:, 0] if len(fractions) == 1 else (fractions[:, None] * z).sum(1)
+    sizes = z.reshape(len(z), -1, 2).abs().amax((0, 2))
+    loaded = (sizes > LIGHTLY * sizes.max()).repeat_interleave(2)
+    softness = pad.unit_compliance()[0][loaded][:, loaded] / (pad.E * pad.material.depth)
+    u = (z[:, loaded] @ softness).reshape(len(z), -1, 2)
+    return float(u.square().sum(-1).max().sqrt()) if bool(loaded.any()) else 0.0
 
 
 @torch.no_grad()
