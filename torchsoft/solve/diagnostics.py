@@ -1,6 +1,5 @@
 """Diagnostics: the balance of a finished run's energies, the range of the theory, and stability."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -46,8 +45,8 @@ COMPRESSED = 0.5
 LATER = 0.005
 """Part of a contact's largest friction by which the bound of its fall raises it without a word."""
 
-LIGHTLY = 1e-6
-"""Force on a node over the largest, up to which it counts as unloaded."""
+UNLOADED = 1e-9
+"""Nodal force [N] up to which a node counts as unloaded."""
 
 SMALL_STRAIN = 0.05
 """Strain up to which linear elasticity holds without a note."""
@@ -64,15 +63,15 @@ def strained(strain: float, time: float) -> str:
 
 def energy_scale(run: Trajectory) -> float:
     """Energy [J] by which a run is judged: stored at the start, and injected since."""
-    return max(float(run.stored_energy[0] + run.injected[-1].detach()), NEGLIGIBLE)
+    return max(run.stored_energy[0].item() + run.injected[-1].item(), NEGLIGIBLE)
 
 
 def missing_energy(run: Trajectory) -> float:
     """Part of `energy_scale` that a run lacks, or has too much, at the most."""
-    left = run.stored_energy - run.stored_energy[0]
-    left = left - sum(x.detach() for x in run.supplied.values())
-    left = left + sum(x.detach() for x in run.dissipated.values())
-    return float(left.abs().max()) / energy_scale(run)
+    total = lambda parts: sum(part.detach().numpy() for part in parts.values())
+    stored = run.stored_energy.numpy()
+    left = stored - stored[0] - total(run.supplied) + total(run.dissipated)
+    return float(np.abs(left).max()) / energy_scale(run)
 
 
 def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> dict[str, str]:
@@ -108,8 +107,9 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"
         if biased and (jump := jumped(run, rig, name)):
             found[f"gradient {name}"] = jump
-    squares = [float(x.detach().square().sum(-1).max()) for x in run.force.values()]
-    most, atol = math.sqrt(max(squares, default=0.0)), run.step_choice.get("atol", 0.0)
+    pairs = (np.moveaxis(x.detach().numpy(), -1, 0) for x in run.force.values())
+    most = max((float(np.sqrt((N**2 + T**2).max())) for N, T in pairs), default=0.0)
+    atol = run.step_choice.get("atol", 0.0)
     if 0 < RESOLVED * most < atol * UNITS["force"]:
         unit = own_units(rig)["force"]
         if RESOLVED * most < (off := atol * unit):
@@ -136,17 +136,17 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
     return found
 
 
-@torch.no_grad()
 def largest_under_load(run: Trajectory, rig: Rig, name: str) -> float:
     """Largest displacement [m] of the loaded nodes of a condensed pad in a run."""
-    pad, (fractions, _) = rig.pads[name], rig.pads[name].chain()
-    z = run.y[:, run.layout.slices["pads", name]].reshape(len(run.t), len(fractions), -1)
-    z = z[:, 0] if len(fractions) == 1 else (fractions[:, None] * z).sum(1)
-    sizes = z.reshape(len(z), -1, 2).abs().amax((0, 2))
-    loaded = (sizes > LIGHTLY * sizes.max()).repeat_interleave(2)
-    softness = pad.unit_compliance()[0][loaded][:, loaded] / (pad.E * pad.material.depth)
-    u = (z[:, loaded] @ softness).reshape(len(z), -1, 2)
-    return float(u.square().sum(-1).max().sqrt()) if bool(loaded.any()) else 0.0
+    pad, here = rig.pads[name], run.layout.slices["pads", name]
+    softness = 1 / (pad.E.item() * pad.material.depth.item())
+    fractions = pad.chain()[0].detach().numpy()
+    z = run.y.detach().numpy()[:, here].reshape(len(run.t), len(fractions), -1)
+    z = z[:, 0] if len(fractions) == 1 else fractions @ z
+    loaded = np.flatnonzero(np.abs(z).max(0) > UNLOADED) // 2 * 2
+    span = slice(*loaded[[0, -1]] + [0, 2]) if len(loaded) else slice(0)
+    u = softness * (z[:, span] @ pad.unit_compliance()[0].numpy()[span, span])
+    return float(np.sqrt((u[:, ::2] ** 2 + u[:, 1::2] ** 2).max(initial=0.0)))
 
 
 @torch.no_grad()

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchsoft.caller import warn
 from torchsoft.codegen import Law
+from torchsoft.physics.channels import recorded_slices
 from torchsoft.physics.contact import Friction, SoftContact
 from torchsoft.physics.elements import CONSTANTS, CORNERS
 from torchsoft.physics.energy import integrals
@@ -151,6 +152,7 @@ class Model:
     def _read(self, values: Sequence[Tensor]) -> None:
         rig = self.rig
         self.layout, self.integrals, self.signals = rig.layout, integrals(rig), rig.signals
+        self.recorded = recorded_slices(rig)
         slices = self.layout.slices
         self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
         self.followed = len(rig.signals) + len(rig.fixed_values)

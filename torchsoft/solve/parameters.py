@@ -137,7 +137,7 @@ class Parameters:
             raise ValueError(
                 f"the signal `{name}` of the reference is not finite at t = {time:.10g} s"
             )
-        if used.plain(self.rig.signals) is None and not torch.equal(
+        if not used.is_plain(self.rig.signals) and not torch.equal(
             followed, self.rig.follow(t, used)
         ):
             raise ValueError(

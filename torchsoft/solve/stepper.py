@@ -170,7 +170,7 @@ class ImplicitStepper:
         if not (finite := np.isfinite(y0.detach().numpy())).all():
             first = np.flatnonzero(~finite)[0]
             raise ValueError(f"`y0` must be finite, but component {first} is not")
-        if self.reference.plain(self.rig.signals) is None and (
+        if not self.reference.is_plain(self.rig.signals) and (
             wrong := reference_fault(self.reference, self.rig.signals, t)
         ):
             warn(wrong)

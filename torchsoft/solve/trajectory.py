@@ -4,6 +4,7 @@ their origin."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from functools import cached_property, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.display import Film, Shown, amount, suggestion
-from torchsoft.physics.channels import Seen, Touch, read, recorded_slices, units
+from torchsoft.physics.channels import Seen, Touch, read, units
 from torchsoft.physics.energy import contact_states, stored
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
@@ -39,8 +40,9 @@ def later(make: Callable[[Any], V]) -> cached_property[V]:
 
     @wraps(make)
     def made(run: Trajectory) -> V:
-        wanted = run.y.requires_grad
-        with torch.inference_mode(False), torch.set_grad_enabled(wanted), independent():
+        graph = run.y.requires_grad
+        apart = independent() if graph else nullcontext()
+        with torch.inference_mode(False), torch.set_grad_enabled(graph), apart:
             return make(run)
 
     return cached_property(made)
@@ -218,7 +220,7 @@ class Trajectory(Shown):
         return stepper.rig.follow(self.t, stepper.reference) if known is None else known
 
     def _recorded_of(self, kind: str) -> dict[str, Tensor]:
-        slices, recorded = recorded_slices(self._stepper.rig), self.recorded
+        slices, recorded = self._stepper.parameters.model.recorded, self.recorded
         assert recorded is not None
         return {name: recorded[:, here] for (of, name), here in slices.items() if of == kind}
 
